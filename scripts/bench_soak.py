@@ -153,8 +153,9 @@ class ReportChecker:
 class SoakRun:
     """Streams pulses through a session, plan after plan."""
 
-    def __init__(self, session, total, on_progress):
+    def __init__(self, session, total, lead_s, on_progress):
         self._session, self._total, self._on_progress = session, total, on_progress
+        self._lead_s = lead_s
         self._jobs = []
         self._submitted = 0
         self.reports = ReportChecker(session.scale)
@@ -163,7 +164,7 @@ class SoakRun:
         """Submit the next plan once half of the last one is sent."""
         count = min(PLAN_PULSES, self._total - self._submitted)
         if not self._jobs:
-            job = self._session.begin(build_points(self._submitted, count), self._session.board_s() + LEAD_S)
+            job = self._session.begin(build_points(self._submitted, count), self._session.board_s() + self._lead_s)
         else:
             last, last_count = self._jobs[-1]
             if last.end_index - last.next_to_send > PLAN_PULSES // 2:
@@ -199,8 +200,8 @@ def connect_and_arm(session):
         session.step(STEP_S, renew_lease=True)
 
 
-def run_soak(total):
-    """Run the test; return the rows of the table and the failures."""
+def run_soak(total, lead_s=LEAD_S):
+    """Run the test; return the rows of the table and the failures. lead_s: time from the first point to the start."""
     memory = []
     with tempfile.TemporaryDirectory() as folder, SoakBoard(Path(folder)) as board_process:
         session = BoardSession(SerialPort(str(board_process.port), BAUD), MonotonicClock(), build_requirements(BAUD))
@@ -209,7 +210,7 @@ def run_soak(total):
         def sample_memory(share):
             memory.append((share, read_memory_mib(os.getpid()), read_memory_mib(board_process.board.pid)))
 
-        run = SoakRun(session, total, sample_memory)
+        run = SoakRun(session, total, lead_s, sample_memory)
         start_s, start_cpu_s = time.monotonic(), time.process_time()
         try:
             run.run()

@@ -1,8 +1,8 @@
 """Benchmark of streaming: latency from a frame to its plan, its first byte on the link and its first light, under load.
 
 A daemon with a simulated board receives frames of 200 pixels at 20 per second, while other clients request the state
-as fast as they can. A bare FastAPI application in another process receives the same bodies at the same rate under the
-same load; its latency is the part that the web framework causes.
+1,250 times per second, or as fast as they are answered. A bare FastAPI application in another process receives the same
+bodies at the same rate under the same load; its latency is the part that the web framework causes.
 """
 
 import argparse
@@ -26,6 +26,8 @@ from stop_rig import FloodProcess  # noqa: E402
 RUNS = 50
 MINUTE_S = 60.0
 PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
+LOAD_HZ = 1250.0
+"""Requests of the other clients per second. At 0, the load is what server and clients can do."""
 LEASE_S = 0.1
 LOAD = "kept alive GETs"
 UNLIMITED_RATES = (
@@ -130,9 +132,10 @@ def start_bare_server(folder, port):
             time.sleep(0.05)
 
 
-def push_frames_under_load(url, tokens):
+def push_frames_under_load(url, tokens, load_hz):
     """Push frames while other clients request the state; return what push_frames does, and the answers per second."""
-    load, begin_s = FloodProcess(LOAD, url, tokens, PIXELS, CLIENTS), time.monotonic()
+    interval_s = CLIENTS / load_hz if load_hz else 0.0
+    load, begin_s = FloodProcess(LOAD, url, tokens, PIXELS, CLIENTS, interval_s), time.monotonic()
     try:
         results = push_frames(url)
     finally:
@@ -149,12 +152,12 @@ def format_percentiles(name, values, unit="ms"):
     ]
 
 
-def measure_latency():
+def measure_latency(load_hz=LOAD_HZ):
     """Measure frames over REST under load, at the daemon and at a bare FastAPI; return the rows of the table."""
     with tempfile.TemporaryDirectory() as folder:
         bare_server, url = start_bare_server(folder, 8459)
         try:
-            (bare_trips, *_), bare_rate = push_frames_under_load(url, {"viewer": TOKEN})
+            (bare_trips, *_), bare_rate = push_frames_under_load(url, {"viewer": TOKEN}, load_hz)
         finally:
             bare_server.terminate()
             bare_server.wait()
@@ -163,7 +166,7 @@ def measure_latency():
             daemon = Daemon(Path(folder), board.port, "display-1511", UNLIMITED_RATES, lease_s=LEASE_S)
             try:
                 daemon.arm()
-                (trips, _, state, plans), rate = push_frames_under_load(daemon.url, read_role_tokens(daemon))
+                (trips, _, state, plans), rate = push_frames_under_load(daemon.url, read_role_tokens(daemon), load_hz)
             finally:
                 daemon.stop()
         finally:
@@ -204,12 +207,15 @@ def main():
     parser = argparse.ArgumentParser(prog="scripts/bench stream", description=__doc__)
     parser.add_argument("--minutes", type=float, default=1.0, help="time of the full frames beside busy loops")
     parser.add_argument("--hours", type=float, help="the same in hours")
+    parser.add_argument(
+        "--load-hz", type=float, default=LOAD_HZ, help="requests per second of other clients, 0: no bound"
+    )
     parser.add_argument("--only", choices=("planning", "latency", "frames"), help="one part")
     options = parser.parse_args()
     duration_s = MINUTE_S * (options.minutes if options.hours is None else 60 * options.hours)
     parts = {
         "planning": measure_planning,
-        "latency": measure_latency,
+        "latency": lambda: measure_latency(options.load_hz),
         "frames": lambda: measure_full_frames(duration_s),
     }
     for name, measure in parts.items():

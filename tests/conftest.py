@@ -33,13 +33,19 @@ def pytest_addoption(parser):
     parser.addoption("--board", default=None, metavar="PORT", help="run the hardware tests on the board at PORT")
 
 
-SLOW_FOLDERS = ("blind", "property", "firmware", "servo", "calibration", "cli", "analysis", "conformance")
-SLOW_FILES = ("test_calibrate_loop.py", "test_home.py", "test_safe_exits.py")
-"""Slow folders and files, which run first: started last, one would occupy a worker while the others are idle."""
+SLOW = (
+    *("test_processes.py", "test_stop_and_states.py", "test_safe_exits.py", "test_page.py", "test_plans_and_roles.py"),
+    *("test_link_process.py", "test_conformance_pty.py", "test_firmware_board.py", "test_home.py", "test_service.py"),
+    *("test_security.py", "test_calibrate_loop.py", "test_telemetry.py", "test_openapi_document.py", "test_engine.py"),
+    *("test_demo.py", "test_link_faults_virtual.py", "blind", "test_fuzz.py", "test_model.py", "test_recording.py"),
+    *("test_diagnosis.py", "test_validation_study.py", "accuracy", "property", "firmware"),
+)
+"""Files and folders that take longest, in the order of their start: a worker with the last one keeps none waiting."""
 
 
 def pytest_collection_modifyitems(config, items):
-    items.sort(key=lambda item: item.path.name not in SLOW_FILES and item.path.parent.name not in SLOW_FOLDERS)
+    order = {name: number for number, name in enumerate(SLOW)}
+    items.sort(key=lambda item: min(order.get(name, len(SLOW)) for name in (item.path.name, item.path.parent.name)))
     if config.getoption("--board") is None:
         skip = pytest.mark.skip(reason="needs a real board: --board PORT")
         for item in items:

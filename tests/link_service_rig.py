@@ -115,17 +115,23 @@ class ServiceRig:
     def epoch(self):
         return self.service.epoch.number
 
-    def begin(self, points, epoch=None, start_in_s=0.05, ahead_s=None, crc=None):
+    @property
+    def pause_number(self):
+        return self.service.pauses.number
+
+    def begin(self, points, epoch=None, start_in_s=0.05, ahead_s=None, crc=None, pause=None):
         """Hand points over as the planner does; return the number of the job."""
         number, payload = next(self.job_numbers), points.encode_payload()
         fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "ahead_s": ahead_s}
+        fields |= {"pause": self.pause_number if pause is None else pause}
         fields |= {"start_s": self.session.board_s() + start_in_s, "crc": zlib.crc32(payload) if crc is None else crc}
         self.send(PLANNER, "begin", payload, **fields)
         return number
 
-    def splice(self, points, kept_points, epoch=None, ahead_s=None):
+    def splice(self, points, kept_points, epoch=None, ahead_s=None, pause=None):
         number, payload = next(self.job_numbers), points.encode_payload()
         fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "ahead_s": ahead_s}
+        fields |= {"pause": self.pause_number if pause is None else pause}
         fields |= {"kept_points": kept_points, "crc": zlib.crc32(payload)}
         return number, self.find_result(PLANNER, self.request(PLANNER, "splice", payload, **fields))
 

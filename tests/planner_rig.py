@@ -113,6 +113,7 @@ class PlannerRig(ServiceRig):
         if shift_s is not None:
             self.queue.on_board_restarted(shift_s)
         self.queue.update_jobs(self.remote.pop_refusal())
+        self.planner.follow_pause()
         self.queue.start_next()
 
     def submit(self, sequence, epoch, streamed=False, caller=""):

@@ -132,6 +132,10 @@ def _scale_width(factor):
     return change
 
 
+def _scale_ambient(run):
+    return replace(run, ambient_k=run.ambient_k - 273.15)
+
+
 DEGREES = 180.0 / np.pi
 WRONG_UNITS = {
     ("absorber_temperature_K", "°C"): _scale_value(NAMES[0], 1.0, -273.15),
@@ -154,6 +158,7 @@ WRONG_UNITS = {
     ("commands: t_s", "ms"): _scale_commands(1e3, 1.0, 1.0),
     ("bridge_width_m", "mm"): _scale_width(1e3),
     ("bridge_width_m", "µm"): _scale_width(1e6),
+    ("ambient_K", "°C"): _scale_ambient,
 }
 """Quantity and unit to a change of one run."""
 
@@ -184,6 +189,8 @@ def _shows(run, quantity):
     name = quantity.removesuffix("/t_s")
     if name in NAMES and name not in run.signals:
         return False
+    if quantity == "ambient_K":
+        return True
     if quantity in ("absorber_temperature_K", "power_W"):
         return len(run.pulses) > 0 if quantity == "power_W" else True
     if run.commands is not None:

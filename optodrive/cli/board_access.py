@@ -1,4 +1,4 @@
-"""Exclusive access to the configured board and its spot sensor, for `home` and `calibrate board`."""
+"""Exclusive access to the configured board and its spot sensor, for `home` and the calibrations on the board."""
 
 import signal
 import sys
@@ -38,9 +38,11 @@ class BoardAccess(NamedTuple):
 
 
 @contextmanager
-def open_board(config: str | None) -> Iterator[BoardAccess]:
+def open_board(config: str | None, calibrated_field: bool = False) -> Iterator[BoardAccess]:
     """Open the configured board and sensor; on exit, send ABORT and close both.
 
+    calibrated_field: aim by the field of the configuration; by default by the nominal one, for an invalid field.toml
+    must not prevent a new calibration.
     SIGTERM and SIGHUP end the block like Ctrl-C. Raises InputError for a configuration that cannot be used, and
     LinkError where a port cannot be opened.
     """
@@ -55,8 +57,8 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     from optodrive.planning.display_model import DisplayModel
 
     loaded = load_config(config)
-    # The nominal scan field is used: an invalid field.toml must not prevent a new calibration.
-    loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
+    if not calibrated_field:
+        loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()
     board, clock = loaded.board, MonotonicClock()
     transport, sensor_port = build_bench_transport(build_port_settings(board), config or DEFAULT_CONFIG)

@@ -1,4 +1,4 @@
-"""`optodrive status | arm | disarm | dim | stop`: control a running daemon."""
+"""`optodrive status | arm | disarm | dim | pause | resume | stop`: control a running daemon."""
 
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
@@ -7,7 +7,8 @@ import typer
 
 from optodrive.cli.options import DEFAULT_URL, HoldOption, JsonOption, UrlOption
 from optodrive.cli.output import print_json
-from optodrive.core.errors import OptodriveError
+from optodrive.core.errors import NotReadyError, OptodriveError
+from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
     from optodrive.daemon.responses.state import StateReport
@@ -20,7 +21,7 @@ STATE_TIMEOUT_S = 2.0
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (status, arm, disarm, dim, stop):
+    for command in (status, arm, disarm, dim, pause, resume, stop):
         app.command()(command)
 
 
@@ -49,7 +50,7 @@ def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption
     with Hold(client.policy.endpoint) as held:
         _print_state(client.call(READ_STATE), json)
         sys.stdout.flush()
-        print(f"optodrive: the board was disarmed: {held.wait()}", file=sys.stderr)
+        raise NotReadyError(f"the board was disarmed: {held.wait()}")
 
 
 def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -70,6 +71,22 @@ def dim(
     from optodrive.client.requests import build_dim_request
 
     _print_state(DaemonClient(url).call(build_dim_request(share)), json)
+
+
+def pause(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
+    """Switch the gate off; the board stays armed and plans wait, for five minutes at most."""
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import PAUSE
+
+    _print_state(DaemonClient(url).call(PAUSE), json)
+
+
+def resume(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
+    """Play what was left at the pause, and what waits."""
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import RESUME
+
+    _print_state(DaemonClient(url).call(RESUME), json)
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -103,7 +120,7 @@ def _print_stopped(result: dict[str, Any], error: OptodriveError, as_json: bool)
 
 def _format_limits(limits: "EffectiveLimits") -> str:
     values = limits.model_dump(exclude={"caps"})
-    return "; ".join(f"{cap.label} {values[cap.setting]:g} {cap.unit}" for cap in limits.caps.values())
+    return "; ".join(f"{cap.label} {format_quantity(values[cap.setting], cap.unit, 6)}" for cap in limits.caps.values())
 
 
 def _print_state(state: "StateReport", as_json: bool) -> None:
@@ -119,6 +136,8 @@ def _print_state(state: "StateReport", as_json: bool) -> None:
         print(f"control   armed by {state.control.caller} {state.control.armed_for_s:.0f} s ago{held}")
     if state.limits.power_share is not None and state.limits.power_share < 1.0:
         print(f"dim       pulses have at most {state.limits.power_share:g} of full power")
+    if queue.pause_ends_in_s is not None:
+        print(f"paused    dark until `optodrive resume`; disarms in {queue.pause_ends_in_s:.0f} s")
     print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")
     print(f"executed  {totals.executed} pulses of {totals.sent} sent")
     if link.state == "up":

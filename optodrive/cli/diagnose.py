@@ -8,9 +8,11 @@ import typer
 
 from optodrive.cli.options import ConfigOption
 from optodrive.cli.output import announce_compilation, print_json, show_step
+from optodrive.cli.signals import end_as_interrupted
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
+    from optodrive.core.provenance import Provenance
     from optodrive.core.types.measurements import Measurement
     from optodrive.device.config import Config
     from optodrive.lab.recording import DisplayRuns
@@ -37,6 +39,7 @@ class _DiagnosisOutput:
 
 
 def diagnose(
+    context: typer.Context,
     recordings: RecordingsArgument,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Write report.html, diagnosis.json, model.toml.")
@@ -71,15 +74,30 @@ def diagnose(
         raise InputError("--workers", workers, "no such option together with --dask: a cluster has its own workers")
     settings = None if config is None else load_config(config)
     runs = DisplayRuns.open(recordings)
-    title = ", ".join(path.name for path in recordings)
-    if len(runs.pixels) > MAX_JOINT_PIXELS:
-        output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers)
-    else:
-        output = _diagnose_jointly(recordings, title, seed, settings)
-    _write_output(output, out, json)
+    names = [path.name for path in recordings]
+    title, provenance = ", ".join(names), _capture_provenance(context, names, settings)
+    with end_as_interrupted():
+        if len(runs.pixels) > MAX_JOINT_PIXELS:
+            output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers, provenance)
+        else:
+            output = _diagnose_jointly(recordings, title, seed, settings, provenance)
+        _write_output(output, out, json)
 
 
-def _diagnose_jointly(recordings: list[Path], title: str, seed: int, config: "Config | None") -> _DiagnosisOutput:
+def _capture_provenance(context: typer.Context, recordings: list[str], config: "Config | None") -> "Provenance":
+    from json import dumps
+
+    from optodrive.core.provenance import Provenance
+
+    text = None if config is None else dumps(config.model_dump(mode="json"), sort_keys=True, ensure_ascii=False)
+    return Provenance.capture(
+        context.obj or (), recordings, None if config is None or text is None else (config.name, text)
+    )
+
+
+def _diagnose_jointly(
+    recordings: list[Path], title: str, seed: int, config: "Config | None", provenance: "Provenance"
+) -> _DiagnosisOutput:
     """Diagnose one pixel, or a few pixels with common parameters."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
     from optodrive.lab.diagnosis.model_file import build_model_toml
@@ -93,11 +111,22 @@ def _diagnose_jointly(recordings: list[Path], title: str, seed: int, config: "Co
     with show_step("reading") as on_progress:
         diagnosis = study(measurement, seed, prior, epsilon, on_progress)
     model = build_model_toml(diagnosis, title, width_m or DEFAULT_BRIDGE_WIDTH_M) if diagnosis.base else None
-    return _DiagnosisOutput(build_answer(diagnosis), build_narrative(diagnosis), build_report(diagnosis, title), model)
+    return _DiagnosisOutput(
+        build_answer(diagnosis) | {"provenance": provenance.to_dict()},
+        build_narrative(diagnosis),
+        build_report(diagnosis, title, provenance),
+        model,
+    )
 
 
 def _diagnose_per_pixel(
-    runs: "DisplayRuns", title: str, seed: int, config: "Config | None", dask: str | None, workers: int | None
+    runs: "DisplayRuns",
+    title: str,
+    seed: int,
+    config: "Config | None",
+    dask: str | None,
+    workers: int | None,
+    provenance: "Provenance",
 ) -> _DiagnosisOutput:
     """Diagnose many pixels independently."""
     from optodrive.cli.diagnose_display import diagnose_display
@@ -114,9 +143,9 @@ def _diagnose_per_pixel(
         else build_model_toml(median_parameters, title, width_m or DEFAULT_BRIDGE_WIDTH_M, description)
     )
     return _DiagnosisOutput(
-        build_display_answer(diagnosis),
+        build_display_answer(diagnosis) | {"provenance": provenance.to_dict()},
         build_display_narrative(diagnosis),
-        build_display_report(diagnosis, title, config),
+        build_display_report(diagnosis, title, config, provenance),
         model,
     )
 

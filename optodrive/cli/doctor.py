@@ -1,7 +1,9 @@
 """`optodrive doctor`: check the computer, the port and the board before a display is driven."""
 
+import sys
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,8 +21,15 @@ def register(app: typer.Typer) -> None:
     app.command()(doctor)
 
 
-def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
+def doctor(
+    config: ConfigOption = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Repeat the checks until Ctrl-C and show changes.")] = False,
+    json: JsonOption = False,
+) -> None:
     """Check computer, port and board without arming; exit status 1 where there is a problem."""
+    if watch:
+        _report_changes(config, json)
+        return
     findings = examine(config)
     problems = sum(finding.status == "problem" for finding in findings)
     warnings = sum(finding.status == "warning" for finding in findings)
@@ -28,13 +37,34 @@ def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
         counts = {"problems": problems, "warnings": warnings}
         print_json({"ok": not problems, **counts, "findings": [finding._asdict() for finding in findings]})
     else:
-        for finding in findings:
-            print(f"{MARKS[finding.status]}  {finding.check:14} {finding.observation}")
-            if finding.remedy:
-                print(f"{'':9}{'':14} {finding.remedy}")
+        _print_findings(findings)
         print(f"{problems} problems, {warnings} warnings")
     if problems:
         raise typer.Exit(1)
+
+
+def _print_findings(findings: "list[Finding]") -> None:
+    for finding in findings:
+        print(f"{MARKS[finding.status]}  {finding.check:14} {finding.observation}")
+        if finding.remedy:
+            print(f"{'':9}{'':14} {finding.remedy}")
+
+
+def _report_changes(config: str | None, json: bool) -> None:
+    """Print all findings and then, with the time of day, those that change; with `json`, one line per change."""
+    from json import dumps
+
+    from optodrive.cli.doctor_watch import watch
+    from optodrive.core.clock import MonotonicClock
+
+    for number, changed in enumerate(watch(lambda: examine(config), MonotonicClock())):
+        if json:
+            print(dumps({"unix_s": time.time(), "findings": [finding._asdict() for finding in changed]}), flush=True)
+            continue
+        if number:
+            print(time.strftime("%H:%M:%S"))
+        _print_findings(changed)
+        sys.stdout.flush()
 
 
 def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
@@ -58,5 +88,9 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
         ]
     findings += [host.check_clock(clock, loaded.board.lease_s), host.check_governor(root)]
     findings += [*host.check_disk(), host.check_kernels()]
+    if loaded.board.transport == "helios":
+        from optodrive.cli.doctor_helios import check_helios
+
+        return [*findings, *check_helios(loaded, clock)]
     port, free = check_port(loaded.board, root)
     return [*findings, *port, *(check_board(loaded, clock) if free else [])]

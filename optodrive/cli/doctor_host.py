@@ -10,6 +10,7 @@ from pathlib import Path
 
 from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
+from optodrive.core.quantity import format_quantity
 from optodrive.link.transport.port_state import ROOT, join_root
 
 MIN_PYTHON = (3, 11)
@@ -70,14 +71,17 @@ def check_clock(clock: Clock, lease_s: float) -> Finding:
     while (before_s := clock.now_s()) < end_s:
         clock.sleep(SLEEP_S)
         overshoot_s = max(overshoot_s, clock.now_s() - before_s - SLEEP_S)
-    observation = f"resolution {resolution_s * 1e9:.0f} ns; a 1 ms sleep overshot by max {overshoot_s * 1e3:.2f} ms"
+    resolution = format_quantity(resolution_s, "s")
+    observation = f"resolution {resolution}; a 1 ms sleep overshot by max {overshoot_s * 1e3:.2f} ms"
     if resolution_s > CLOCK_RESOLUTION_MAX_S:
         return report_problem(
             "clock", observation, "the monotonic clock is too coarse: select another clock source in the kernel"
         )
     if overshoot_s > lease_s / 2:
         return report_problem(
-            "clock", observation, f"more than half the lease of {lease_s:g} s: end other programs on this computer"
+            "clock",
+            observation,
+            f"more than half the lease of {format_quantity(lease_s, 's')}: end other programs on this computer",
         )
     if overshoot_s > OVERSHOOT_WARNING_S:
         return report_warning(

@@ -21,6 +21,7 @@ from optodrive.cli.options import (
 from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.core.errors import OptodriveError
+from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
     from optodrive.core.clock import Clock
@@ -219,6 +220,6 @@ def _format_playback(playback: dict[str, Any]) -> list[str]:
     ]
     if playback["underruns"]:
         lines.append(
-            f"underruns        {playback['underruns']}, at least {playback['underrun_s'] * 1e3:.1f} ms in total"
+            f"underruns        {playback['underruns']}, at least {format_quantity(playback['underrun_s'], 's')} in all"
         )
     return lines

@@ -1,15 +1,11 @@
 """`optodrive home`: centre the mirrors and check the board's inputs and outputs before any light is emitted."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from optodrive.cli.commissioning_steps import report_steps
 from optodrive.cli.options import ConfigOption, JsonOption
-from optodrive.cli.output import print_json
-from optodrive.core.errors import OptodriveError
-
-if TYPE_CHECKING:
-    from optodrive.lab.commissioning.homing import HomingResult
 
 
 def register(app: typer.Typer) -> None:
@@ -33,24 +29,7 @@ def home(
     from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.homing import Homing
 
-    results: list[HomingResult] = []
-
-    def report_step(step: "HomingResult") -> None:
-        results.append(step)
-        if not json:
-            print(f"{step.step:<11} {step.message}", flush=True)
-
-    failure = "interrupted"
-    try:
-        with open_board(config) as (board, spot_reader):
-            if spot_power_mw:
-                check_spot_power(board.config, spot_power_mw * 1e-3)
-            Homing(board, spot_reader, spot_power_mw * 1e-3, acknowledge).run(report_step)
-        failure = ""
-    except OptodriveError as error:
-        failure = str(error)
-        raise
-    finally:
-        if json:
-            steps = [{"step": step.step, "ok": True, "message": step.message, **step.details} for step in results]
-            print_json({"home": not failure, "steps": steps, "failure": failure or None})
+    with report_steps("home", json) as report_step, open_board(config) as (board, spot_reader):
+        if spot_power_mw:
+            check_spot_power(board.config, spot_power_mw * 1e-3)
+        Homing(board, spot_reader, spot_power_mw * 1e-3, acknowledge).run(report_step)

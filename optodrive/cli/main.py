@@ -1,6 +1,6 @@
 """The command line `optodrive`.
 
-An error is one line on stderr. Exit status: 0 done, 1 failed, 2 bad input, 130 interrupted.
+An error is one line on stderr; `exit_status.py` states the exit statuses.
 """
 
 import os
@@ -14,10 +14,13 @@ from optodrive.cli import (
     config,
     control,
     diagnose,
+    docs,
     doctor,
     field,
+    first_light,
     helios,
     home,
+    patterns,
     plan,
     play,
     recording,
@@ -25,13 +28,14 @@ from optodrive.cli import (
     service,
     simulate,
     terms,
+    token,
     validate,
     wire,
 )
 from optodrive.cli.calibrate import group as calibrate
+from optodrive.cli.exit_status import INTERRUPTED, SUMMARY
 from optodrive.core.errors import OptodriveError
 
-EXIT_INTERRUPTED = 130
 UsageError: Any = typer.BadParameter.__bases__[0]
 """Base class of errors about arguments; typer contains its own copy of click or uses the installed one."""
 
@@ -49,7 +53,7 @@ def _print_version(requested: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(epilog=SUMMARY)
 def _select(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
@@ -61,11 +65,13 @@ def _select(
 for module in (
     serve,
     home,
+    first_light,
     calibrate,
     field,
     service,
     control,
     play,
+    patterns,
     plan,
     simulate,
     helios,
@@ -74,8 +80,10 @@ for module in (
     terms,
     validate,
     config,
+    token,
     wire,
     doctor,
+    docs,
 ):
     module.register(app)
 
@@ -90,9 +98,9 @@ def main(arguments: list[str] | None = None) -> None:
 def run(arguments: list[str]) -> int:
     """Run the command line and return its exit status; print a known error as one line on stderr."""
     try:
-        status = app(args=arguments, prog_name="optodrive", standalone_mode=False)
+        status = app(args=arguments, prog_name="optodrive", standalone_mode=False, obj=tuple(arguments))
         sys.stdout.flush()
-        if status == EXIT_INTERRUPTED:  # some versions of typer convert Ctrl-C to a status
+        if status == INTERRUPTED:  # some versions of typer convert Ctrl-C to a status
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except OptodriveError as error:
@@ -100,7 +108,7 @@ def run(arguments: list[str]) -> int:
         return error.exit_status
     except (typer.Abort, KeyboardInterrupt):
         print("optodrive: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return INTERRUPTED
     except UsageError as error:
         message = " ".join(error.format_message().split())
         if message:  # empty without arguments: typer has printed the help

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from optodrive.cli.exit_status import exit_unless_fits
 from optodrive.cli.options import (
     ConfigOption,
     FieldOption,
@@ -30,7 +31,12 @@ def register(app: typer.Typer) -> None:
 
 def plan(
     frames: FramesArgument,
-    out: Annotated[Path | None, typer.Option("--out", metavar="plan.csv", help="Write one row per pulse.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="plan.csv|.svg", help="Write one row per pulse, or a picture of path and timeline."
+        ),
+    ] = None,
     config: ConfigOption = None,
     model: ModelOption = None,
     field: FieldOption = None,
@@ -42,14 +48,15 @@ def plan(
     json: JsonOption = False,
 ) -> None:
     """Plan and limit frames; report feasibility, pulses, beam time, trimmed pulses and predicted displacement."""
-    from optodrive.core.files import check_output
+    from optodrive.core.files import atomic_write, check_output
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.pipeline import resolve_policy
+    from optodrive.planning.plan_picture import draw_plan
     from optodrive.planning.plan_summary import summarize_plan, write_plan_csv
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
-    check_output("--out", out, ".csv")
+    check_output("--out", out, ".csv", ".svg")
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
     sequence = load_sequence(frames, display.config)
     announce_compilation()
@@ -58,12 +65,17 @@ def plan(
             display, sequence, *display.build_cold_state(), resolve_policy(policy, strict), on_progress, fit
         )
     if out is not None:
-        write_plan_csv(out, planned_sequence, display)
+        if out.suffix.lower() == ".svg":
+            with atomic_write(out) as temporary:
+                temporary.write_text(draw_plan(planned_sequence, display), encoding="utf-8")
+        else:
+            write_plan_csv(out, planned_sequence, display)
     document = summarize_plan(planned_sequence, feasibility)
     if json:
         print_json(document)
-        return
-    for line in format_plan_summary(document):
-        print(line)
-    if out is not None:
-        print(f"written          {out}")
+    else:
+        for line in format_plan_summary(document):
+            print(line)
+        if out is not None:
+            print(f"written          {out}")
+    exit_unless_fits(feasibility)

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from optodrive.core.quantity import format_quantity
+
 if TYPE_CHECKING:
     from optodrive.planning.feasibility.report import FeasibilityReport
     from optodrive.planning.summary_schema import DelaySummary, PlanSummary, ShortfallSummary
@@ -30,7 +32,7 @@ def format_plan_summary(summary: "PlanSummary") -> list[str]:
     trimmed = summary.trimmed
     if trimmed.pulses:
         reasons = ", ".join(f"{count} by {reason}" for reason, count in trimmed.by_reason.items())
-        lines.append(f"trimmed          {trimmed.pulses} pulses, {trimmed.energy_j * 1e3:.2f} mJ: {reasons}")
+        lines.append(f"trimmed          {trimmed.pulses} pulses, {format_quantity(trimmed.energy_j, 'J')}: {reasons}")
         if summary.shortfall is not None:
             lines.append(f"                 {_format_shortfall(summary.shortfall)}")
     else:
@@ -42,7 +44,9 @@ def format_plan_summary(summary: "PlanSummary") -> list[str]:
     if more > 0:
         lines.append(f"late             and {more} more frames")
     if summary.train_lateness_max_s > 0:
-        lines.append(f"trains           settling delays pulses by up to {summary.train_lateness_max_s * 1e3:.2f} ms")
+        lines.append(
+            f"trains           settling delays pulses by up to {format_quantity(summary.train_lateness_max_s, 's')}"
+        )
     if summary.dead.message:
         lines.append(f"dead             {summary.dead.message}")
     if summary.skipped:
@@ -72,7 +76,7 @@ def _format_pixels(pixels: Sequence[int]) -> str:
 
 def _format_shortfall(shortfall: "ShortfallSummary") -> str:
     fits = "never" if shortfall.fits_after_s is None else f"{shortfall.fits_after_s:.3f} s later"
-    return f"first pixel {shortfall.pixel}, {shortfall.margin_j * 1e3:.2f} mJ too much; all of it fits {fits}"
+    return f"first pixel {shortfall.pixel}, {format_quantity(shortfall.margin_j, 'J')} too much; all of it fits {fits}"
 
 
 def _format_delays(delays: "Sequence[DelaySummary]") -> str:

@@ -7,6 +7,7 @@ import typer
 
 from optodrive.cli.options import JsonOption
 from optodrive.cli.output import print_json
+from optodrive.core.quantity import format_number, format_quantity
 
 if TYPE_CHECKING:
     from optodrive.core.types.measurements import Measurement
@@ -131,11 +132,11 @@ def _print_table(runs: list[dict[str, Any]]) -> None:
 
 
 def _format_rows(run: dict[str, Any]) -> list[list[str]]:
-    energy = "" if run["energy_J"] is None else f"{run['energy_J']:.4g} J"
+    energy = "" if run["energy_J"] is None else format_quantity(run["energy_J"], "J", 4)
     first = [run["run"], " ".join((run["group"] or "").split()), str(run["pulses"]), energy]
     rows = [] if run["signals"] else [[*first, "none", "", "", "", ""]]
     for name, signal in run["signals"].items():
-        span = f"{signal['start_s']:g} to {signal['end_s']:g} s"
+        span = f"{format_number(signal['start_s'], 4)} to {format_number(signal['end_s'], 4)} s"
         pixel = "" if name.startswith("mirror") else str(signal["pixel"])
         rows.append([*first, name, pixel, str(signal["samples"]), str(signal["missing"]), span])
         first = ["", "", "", ""]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from optodrive.cli.exit_status import exit_unless_fits
 from optodrive.cli.options import (
     ConfigOption,
     FieldOption,
@@ -17,6 +18,7 @@ from optodrive.cli.options import (
 from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.cli.plan import FramesArgument
 from optodrive.cli.plan_text import format_plan_summary
+from optodrive.cli.simulated_recording import InstrumentSettings, record_traces
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,6 +51,13 @@ def simulate(
         float, typer.Option("--noise", help="Noise of the recording as a factor of the instruments'; 0: none.")
     ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
+    repeats: Annotated[
+        int, typer.Option("--repeats", metavar="N", help="Record the experiment N times, each with its own noise.")
+    ] = 1,
+    group: Annotated[
+        str | None,
+        typer.Option("--group", metavar="NAME", help="Group of the runs; repeats of one experiment share one."),
+    ] = None,
     config: ConfigOption = None,
     model: ModelOption = None,
     field: FieldOption = None,
@@ -86,8 +95,8 @@ def simulate(
 
     if not 1e-6 <= dt <= 1.0:
         raise InputError("--dt", dt, "a time between 1e-6 and 1 s")
-    if not 0.0 <= noise <= 1000.0:
-        raise InputError("--noise", noise, "a factor between 0 and 1000")
+    instruments = InstrumentSettings(noise, seed, repeats, group)
+    instruments.check(out)
     if post_pulse_s is not None and not 1e-3 <= post_pulse_s <= 10.0:
         raise InputError("--post-pulse", post_pulse_s, "a time between 0.001 and 10 s")
     check_output("--out", out, *HDF5_SUFFIXES, folder=True)
@@ -117,38 +126,33 @@ def simulate(
         else [compute_pixel_trace(true_display, incident, pixel, dt, post_pulse_s) for pixel in recorded]
     )
     if out is not None:
-        _write_recording(out, display, executed, traces, noise, seed)
+        record_traces(out, display, executed, traces, instruments)
     report = _build_report(display, planned_sequence, feasibility, incident, traces, true_display)
     report["truth"] = {"terms": true_terms, "ignored_terms": ignored_terms}
-    report["noise"] = None if out is None else noise
+    report |= {"noise": None if out is None else noise, "repeats": repeats, "group": group}
     if json:
         print_json(report)
-        return
+    else:
+        _print_report(report, truth, [] if out is None else [*instruments.describe(), f"written          {out}"])
+    exit_unless_fits(feasibility)
+
+
+def _print_report(report: dict[str, Any], truth: Path | None, recording_lines: list[str]) -> None:
     for line in format_plan_summary(report["summary"]):
         print(line)
     if truth is not None:
-        print(f"truth            {', '.join(true_terms) or 'the nominal pixel, without terms'}")
-        if ignored_terms:
-            print(f"                 not simulated: {', '.join(ignored_terms)} of its base set (not in planner_terms)")
+        terms, ignored = report["truth"]["terms"], report["truth"]["ignored_terms"]
+        print(f"truth            {', '.join(terms) or 'the nominal pixel, without terms'}")
+        if ignored:
+            print(f"                 not simulated: {', '.join(ignored)} of its base set (not in planner_terms)")
     print(f"executed         {report['executed']} of {report['planned']} planned")
     for item in report["pixels"]:
         print(
             f"pixel {item['pixel']:<10} {item['measured_max_um']:.1f} µm measured, {item['predicted_max_um']:.1f} µm "
             f"predicted, absorber up to {item['absorber_max_c']:.1f} °C"
         )
-    if out is not None:
-        print(f"noise            {_describe_noise(noise)}")
-        print(f"written          {out}")
-
-
-def _describe_noise(noise: float) -> str:
-    from optodrive.core.units import m_to_um
-    from optodrive.link.simulator.instruments import INSTRUMENT_SIGMA
-
-    if noise == 0.0:
-        return "none: the recording is exact, as no instrument's is"
-    kelvin, metre, newton = (noise * sigma for sigma in INSTRUMENT_SIGMA.values())
-    return f"{kelvin:.3g} K, {m_to_um(metre):.3g} µm, {newton * 1e3:.3g} mN rms added to the recording; --noise 0: none"
+    for line in recording_lines:
+        print(line)
 
 
 def _select_true_terms(config: "Config", truth: Path | None) -> tuple[list[str], list[str]]:
@@ -202,28 +206,6 @@ def _parse_pixels(pixels: str | None, count: int) -> list[int] | None:
 def _select_highest(planned_sequence: "PlannedSequence") -> list[int]:
     order = planned_sequence.plan.pixel[planned_sequence.predicted_m.argsort()[::-1]]
     return sorted(list(dict.fromkeys(order.tolist()))[:PIXELS_RECORDED_MAX])
-
-
-def _write_recording(
-    out: Path, display: "DisplayModel", executed: "ExecutedPulses", traces: "list[PixelTrace]", noise: float, seed: int
-) -> None:
-    """Write one recording with a run per trace, each with the pulses during the trace."""
-    import numpy as np
-
-    from optodrive.core.types.measurements import Measurement, Run
-    from optodrive.device.pixel_map import load_pixel_map
-    from optodrive.lab.recording import write_recording
-    from optodrive.link.simulator.instruments import measure
-
-    pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
-    pixel_map, rng = load_pixel_map(display.config), np.random.default_rng(seed)
-    aim_m = None if pixel_map is None else np.array([pixel_map.offset_x_m, pixel_map.offset_y_m])
-    width_m = display.config.display.bridge_width_m
-    runs: list[Run] = []
-    for item in traces:
-        within = (pulses[:, 0] + pulses[:, 1] >= item.t_s[0]) & (pulses[:, 0] <= item.t_s[-1])
-        runs += measure(item, pulses[within], display.ambient_k, width_m, noise, rng, aim_m).runs
-    write_recording(out, Measurement(tuple(runs)))
 
 
 def _build_report(

@@ -7,6 +7,7 @@ import typer
 from optodrive.cli.options import JsonOption
 from optodrive.cli.output import print_json
 from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.quantity import format_quantity, format_range
 
 
 def register(app: typer.Typer) -> None:
@@ -38,8 +39,10 @@ def terms(
     about = describe_term(term)
     print(f"{name}: {about['label']}\n\n{about['equation']}\n")
     for item in about["parameters"]:
-        omitted = "required" if item["if_omitted"] is None else f"{item['if_omitted']:g} if omitted"
-        print(f"{item['name']:<18}{item['low']:g} to {item['high']:g} {item['unit']}, {omitted}; {item['source']}")
+        limits = format_range(item["low"], item["high"], item["unit"])
+        default = item["if_omitted"]
+        omitted = "required" if default is None else f"{format_quantity(default, item['unit'])} if omitted"
+        print(f"{item['name']:<18}{limits}, {omitted}; {item['source']}")
     if term.requires:
         print(f"\nneeds {', '.join(term.requires)}")
     print("\nin model.toml:\n\n    " + "\n    ".join(build_example(term)))

@@ -11,7 +11,7 @@ from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
 from optodrive.client.hold import AsyncHold
 from optodrive.client.http import AsyncDaemonClient
-from optodrive.client.operations import DisplayOperations
+from optodrive.client.operations import DisplayOperations, LabelsLike
 from optodrive.client.plan import Plan
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.policy import Policy
@@ -60,8 +60,9 @@ class AsyncDisplay:
         if not hold:
             return await self._client.run(self._operations.arm())
         self._record_emission()
-        self._hold = AsyncHold(self._client.policy.endpoint)
-        await self._hold.open()
+        held = AsyncHold(self._client.policy.endpoint)
+        await held.open()
+        self._hold = held
         return await self.state()
 
     async def disarm(self) -> StateReport:
@@ -71,6 +72,14 @@ class AsyncDisplay:
     async def dim(self, share: float) -> StateReport:
         """See `Display.dim`."""
         return await self._client.run(self._operations.dim(share))
+
+    async def pause(self) -> StateReport:
+        """See `Display.pause`."""
+        return await self._client.run(self._operations.pause())
+
+    async def resume(self) -> StateReport:
+        """See `Display.resume`."""
+        return await self._client.run(self._operations.resume())
 
     async def stop(self) -> StateReport:
         """See `Display.stop`."""
@@ -97,16 +106,23 @@ class AsyncDisplay:
         policy: Policy = "trim",
         fit: FitMode = "as_is",
         wait: bool = True,
+        labels: LabelsLike = None,
     ) -> Plan:
         """See `Display.show`."""
-        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, False, wait)
+        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, False, wait, labels)
         return await self._client.run(operation)
 
     async def push(
-        self, sequence: Mapping[str, Any], *, policy: Policy = "trim", fit: FitMode = "as_is", wait: bool = True
+        self,
+        sequence: Mapping[str, Any],
+        *,
+        policy: Policy = "trim",
+        fit: FitMode = "as_is",
+        wait: bool = True,
+        labels: LabelsLike = None,
     ) -> Plan:
         """See `Display.push`."""
-        return await self._client.run(self._operations.push(sequence, policy, fit, False, wait))
+        return await self._client.run(self._operations.push(sequence, policy, fit, False, wait, labels))
 
     async def play(
         self,
@@ -116,10 +132,11 @@ class AsyncDisplay:
         fit: FitMode = "as_is",
         dry_run: bool = False,
         wait: bool = True,
+        labels: LabelsLike = None,
         **parameters: Any,
     ) -> Plan:
         """See `Display.play`."""
-        return await self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait))
+        return await self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait, labels))
 
     async def preview(
         self,

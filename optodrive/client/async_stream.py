@@ -7,11 +7,12 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Self
 
+import httpx
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import RETRY_S
+from optodrive.client.exchange import RETRY_S, RETRY_TIMEOUT_MIN_S
 from optodrive.client.frame_results import (
     RESULT_TIMEOUT_S,
     ResultBuffer,
@@ -20,7 +21,8 @@ from optodrive.client.frame_results import (
     raise_if_failed,
 )
 from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
-from optodrive.client.socket_connection import open_async_connection
+from optodrive.client.http import PROBE, PROBE_PERIOD_S, PROBE_TIMEOUT_S
+from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_async_connection
 from optodrive.core.errors import LinkError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.stream import FrameResult
@@ -41,10 +43,11 @@ class AsyncStream:
         self._endpoint = endpoint
         self._read_layout = read_layout
         self._path = build_stream_path(policy)
-        self._reconnect_timeout_s = reconnect_timeout_s
         self._on_send = on_send
         self._next_frame = 0
         self._results = ResultBuffer()
+        self._reconnect_timeout_s = reconnect_timeout_s
+        self._was_silent = False
         self._results_changed = asyncio.Condition()
         self._exit_stack = AsyncExitStack()
         self._connection: ClientConnection | None = None
@@ -70,7 +73,7 @@ class AsyncStream:
         number, self._next_frame = self._next_frame, self._next_frame + 1
         frame = encode_frame(number, convert_to_pixels(heights_um, await self._read_layout()))
         self._on_send()
-        deadline_s = time.monotonic() + self._reconnect_timeout_s
+        deadline_s = None
         while True:
             try:
                 if self._connection is not None:
@@ -78,10 +81,15 @@ class AsyncStream:
                     return number
             except ConnectionClosed:
                 self._connection = None
+            if deadline_s is None:
+                was_silent, self._was_silent = self._was_silent, False
+                deadline_s = time.monotonic() + (0.0 if was_silent else self._reconnect_timeout_s)
             try:
-                await self._connect()
+                await self._connect(max(deadline_s - time.monotonic(), RETRY_TIMEOUT_MIN_S))
+                self._endpoint.is_lost = False
             except LinkError:
                 if time.monotonic() >= deadline_s:
+                    self._endpoint.is_lost = True
                     raise
                 await asyncio.sleep(RETRY_S)
 
@@ -101,14 +109,23 @@ class AsyncStream:
             raise build_timeout_error(number, timeout_s) from None
         return raise_if_failed(result)
 
-    async def _connect(self) -> None:
+    async def _connect(self, open_timeout_s: float = OPEN_TIMEOUT_S) -> None:
         await self._exit_stack.aclose()
-        self._connection = await open_async_connection(self._endpoint, self._path, self._exit_stack)
+        self._connection = await open_async_connection(
+            self._endpoint, self._path, self._exit_stack, open_timeout_s=min(open_timeout_s, OPEN_TIMEOUT_S)
+        )
         self._reader_task = asyncio.create_task(self._read(self._connection))
 
     async def _read(self, connection: ClientConnection) -> None:
         try:
-            async for message in connection:
+            while True:
+                try:
+                    async with asyncio.timeout(PROBE_PERIOD_S):
+                        message = await connection.recv()
+                except TimeoutError:
+                    if self._results.is_owed(self._next_frame - 1):
+                        await self._probe(connection)
+                    continue
                 async with self._results_changed:
                     self._results.add(message)
                     self._results_changed.notify_all()
@@ -118,3 +135,12 @@ class AsyncStream:
             async with self._results_changed:
                 self._results.mark_lost_before(self._next_frame)
                 self._results_changed.notify_all()
+
+    async def _probe(self, connection: ClientConnection) -> None:
+        """See `Stream._probe`."""
+        try:
+            async with self._endpoint.open_async_client(PROBE_TIMEOUT_S) as client:
+                await client.request(**PROBE)
+        except httpx.TransportError:
+            self._was_silent = self._endpoint.is_lost = True
+            connection.transport.abort()

@@ -12,7 +12,7 @@ from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
 from optodrive.client.hold import Hold
 from optodrive.client.http import DaemonClient
-from optodrive.client.operations import DisplayOperations
+from optodrive.client.operations import DisplayOperations, LabelsLike
 from optodrive.client.plan import Plan
 from optodrive.client.stream import Stream
 from optodrive.core.errors import OptodriveError
@@ -23,7 +23,7 @@ from optodrive.planning.effective_config import EffectiveConfig
 from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.stimuli.pattern import PatternDescription
 
-RECONNECT_TIMEOUT_S = 5.0
+RECONNECT_TIMEOUT_S = 2.5
 
 
 class Display:
@@ -92,6 +92,20 @@ class Display:
         """
         return self._client.run(self._operations.dim(share))
 
+    def pause(self) -> StateReport:
+        """Switch the gate off and keep the board armed and all plans, for five minutes at most; then it is disarmed.
+
+        Streamed frames are refused meanwhile. NotReadyError if the board is not armed.
+        """
+        return self._client.run(self._operations.pause())
+
+    def resume(self) -> StateReport:
+        """Play what was left of the plan that was paused, limited again, and the plans that wait.
+
+        NotReadyError if the board is not armed.
+        """
+        return self._client.run(self._operations.resume())
+
     def stop(self) -> StateReport:
         """Switch the gate off, drop all plans, disarm the board; LinkError if no answer confirms it."""
         return self._client.run(self._operations.stop())
@@ -120,20 +134,28 @@ class Display:
         policy: Policy = "trim",
         fit: FitMode = "as_is",
         wait: bool = True,
+        labels: LabelsLike = None,
     ) -> Plan:
         """Raise each pixel once to its height within duration_s; wait until that is done unless `wait` is False.
 
         heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
         positions without a pixel are ignored)
+        labels: recorded with the plan: at most 32 of text, numbers and truth values
         """
-        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, False, wait)
+        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, False, wait, labels)
         return self._client.run(operation)
 
     def push(
-        self, sequence: Mapping[str, Any], *, policy: Policy = "trim", fit: FitMode = "as_is", wait: bool = True
+        self,
+        sequence: Mapping[str, Any],
+        *,
+        policy: Policy = "trim",
+        fit: FitMode = "as_is",
+        wait: bool = True,
+        labels: LabelsLike = None,
     ) -> Plan:
         """Show frames and trains in the form of FRAMES.json."""
-        return self._client.run(self._operations.push(sequence, policy, fit, False, wait))
+        return self._client.run(self._operations.push(sequence, policy, fit, False, wait, labels))
 
     def play(
         self,
@@ -143,10 +165,11 @@ class Display:
         fit: FitMode = "as_is",
         dry_run: bool = False,
         wait: bool = True,
+        labels: LabelsLike = None,
         **parameters: Any,
     ) -> Plan:
         """Play a named pattern with its parameters by name; `dry_run` plans only; policy None: that of the pattern."""
-        return self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait))
+        return self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait, labels))
 
     def preview(
         self,

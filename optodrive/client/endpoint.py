@@ -26,6 +26,7 @@ class Endpoint:
     """The daemon's address, and the token: as given, from OPTODRIVE_TOKEN, or from the file that the daemon wrote.
 
     address: as given; url: base of the requests; unix_path: the daemon's Unix socket, None for a TCP address
+    is_lost: whether the last request was given up because nobody answered
     """
 
     def __init__(self, address: str, token: str | None) -> None:
@@ -36,6 +37,7 @@ class Endpoint:
             raise InputError("--url", address, f"an address like {DEFAULT_URL} or unix:/run/optodrive/optodrive.sock")
         self.url = "http://localhost" if self.unix_path else self.address
         self._port = None if self.unix_path else parts.port or (443 if parts.scheme == "https" else 80)
+        self.is_lost = False
         self._explicit_token = token
         self._token = token or self._read_token()
 
@@ -78,7 +80,9 @@ class Endpoint:
             return None
         connection = socket.socket(socket.AF_UNIX)
         try:
+            connection.settimeout(PROBE_TIMEOUT_S)  # a daemon that is suspended accepts until its backlog is full
             connection.connect(self.unix_path)
+            connection.settimeout(None)
         except OSError:
             connection.close()
             raise

@@ -17,16 +17,22 @@ from optodrive.core.errors import LinkError
 from optodrive.daemon.responses.state import StateReport
 
 RETRY_S = 0.1
-STOP_ATTEMPTS = 3
+RETRY_TIMEOUT_MIN_S = 0.3
+"""Shortest time for the answer to a repeated request, however little is left of the time for repetitions."""
+STOP_ATTEMPTS = 2
 NOT_SENT_ERRORS = (httpx.ConnectError, httpx.ConnectTimeout)
 T = TypeVar("T")
 
 
 class Transmission(NamedTuple):
-    """A request to send; `on_new_connection`: a connection of its own with a short timeout."""
+    """A request to send; `on_new_connection`: a connection of its own with a short timeout.
+
+    timeout_s: longest wait for the answer to a request that only reads, None for the client's
+    """
 
     request: ApiRequest[Any]
     on_new_connection: bool = False
+    timeout_s: float | None = None
 
 
 class Pause(NamedTuple):
@@ -56,14 +62,19 @@ class ExchangePolicy:
         A request that is not idempotent is repeated only if it was certainly not received.
         """
         deadline_s = time.monotonic() + (self._reconnect_timeout_s if self._has_responded else 0.0)
+        timeout_s = None
         while True:
             try:
-                response = yield Transmission(request)
+                response = yield Transmission(request, timeout_s=timeout_s)
             except httpx.TransportError as error:
-                if time.monotonic() >= deadline_s or not (request.idempotent or isinstance(error, NOT_SENT_ERRORS)):
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0.0 or not (request.idempotent or isinstance(error, NOT_SENT_ERRORS)):
+                    self.endpoint.is_lost = True
                     raise self.endpoint.build_unreachable_error(error) from None
+                timeout_s = max(left_s, RETRY_TIMEOUT_MIN_S)
                 yield Pause(RETRY_S)
                 continue
+            self.endpoint.is_lost = False
             assert response is not None  # noqa: S101 - the reply to a transmission
             if response.status_code == 401 and self.endpoint.renew_token():
                 continue
@@ -71,9 +82,12 @@ class ExchangePolicy:
             return parse_response(request, response)
 
     def stop(self) -> Exchange[StateReport]:
-        """Stop on new connections, since an open one may be broken unnoticed; three attempts."""
+        """Stop on new connections, since an open one may be broken unnoticed.
+
+        Two attempts, but one at a daemon that has just not answered: the attempts before the stop failed already.
+        """
         error: Exception = LinkError("not attempted")
-        for _ in range(STOP_ATTEMPTS):
+        for _ in range(1 if self.endpoint.is_lost else STOP_ATTEMPTS):
             try:
                 response = yield Transmission(STOP, on_new_connection=True)
                 assert response is not None  # noqa: S101 - the reply to a transmission

@@ -50,6 +50,10 @@ class ResultBuffer:
             raise LinkError(f"the connection broke before the result of frame {frame} arrived")
         return result
 
+    def is_owed(self, frame: int) -> bool:
+        """Return whether the daemon owes the final result of a frame; −1, before the first one: nothing is owed."""
+        return frame >= self._lost_before and frame not in self._final
+
 
 def build_stream_path(policy: Policy) -> str:
     """Build the path of the stream's WebSocket."""

@@ -18,6 +18,8 @@ HOLD_PATH = "/v1/hold"
 BEAT = "beat"
 BEAT_INTERVAL_S = 0.25
 """The daemon waits four times as long for the next beat."""
+SILENCE_MAX_S = 2.5
+"""Longest silence of the daemon; after it nobody can tell whether the board is armed."""
 CONNECTION_LOST = "the connection to the daemon was lost"
 
 
@@ -55,7 +57,7 @@ class Hold:
         self._state = HoldState()
         self._changed = threading.Condition()
         self._exit_stack = ExitStack()
-        self._connection = open_connection(endpoint, HOLD_PATH, self._exit_stack)
+        self._connection = open_connection(endpoint, HOLD_PATH, self._exit_stack, SILENCE_MAX_S)
         threading.Thread(target=self._run, name="hold", daemon=True).start()
         with self._changed:
             self._changed.wait_for(lambda: self._state.is_armed or self._state.error is not None)
@@ -142,7 +144,7 @@ class AsyncHold:
         reason = CONNECTION_LOST
         try:
             async with AsyncExitStack() as stack:
-                connection = await open_async_connection(self._endpoint, HOLD_PATH, stack)
+                connection = await open_async_connection(self._endpoint, HOLD_PATH, stack, SILENCE_MAX_S)
                 while True:
                     with suppress(ConnectionClosed):
                         await connection.send(BEAT)

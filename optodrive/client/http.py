@@ -12,16 +12,16 @@ from typing import Any
 import httpx
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import Exchange, ExchangePolicy, Pause, Step, T
+from optodrive.client.exchange import Exchange, ExchangePolicy, Pause, Step, T, Transmission
 from optodrive.client.requests import ApiRequest, Response
 from optodrive.daemon.responses.state import StateReport
 
-READ_TIMEOUT_S = 3.0
+READ_TIMEOUT_S = 2.5
 """Longest wait for what the daemon only reads."""
 TIMEOUT_S = 60.0
 """Longest wait for an action, while the daemon shows that it is alive."""
-PROBE_PERIOD_S = 1.0
-PROBE_TIMEOUT_S = 2.5
+PROBE_PERIOD_S = 0.5
+PROBE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 1.5
 PROBE: dict[str, Any] = {"method": "GET", "url": "/v1/health", "timeout": PROBE_TIMEOUT_S}
 
@@ -72,7 +72,7 @@ class DaemonClient:
                 return client.request(**_build_arguments(step.request, self.policy.endpoint))
         arguments = _build_arguments(step.request, self.policy.endpoint)
         if step.request.method == "GET":
-            return self._client.request(**arguments, timeout=min(READ_TIMEOUT_S, self._timeout_s))
+            return self._client.request(**arguments, timeout=min(_limit_read_s(step), self._timeout_s))
         return self._request_watched(arguments)
 
     def _request_watched(self, arguments: dict[str, Any]) -> httpx.Response:
@@ -127,7 +127,7 @@ class AsyncDaemonClient:
                 return await client.request(**_build_arguments(step.request, self.policy.endpoint))
         arguments = _build_arguments(step.request, self.policy.endpoint)
         if step.request.method == "GET":
-            return await self._client.request(**arguments, timeout=READ_TIMEOUT_S)
+            return await self._client.request(**arguments, timeout=_limit_read_s(step))
         task = asyncio.ensure_future(self._client.request(**arguments))
         try:
             while not (await asyncio.wait({task}, timeout=PROBE_PERIOD_S))[0]:
@@ -135,6 +135,10 @@ class AsyncDaemonClient:
             return task.result()
         finally:
             task.cancel()
+
+
+def _limit_read_s(step: Transmission) -> float:
+    return READ_TIMEOUT_S if step.timeout_s is None else min(READ_TIMEOUT_S, step.timeout_s)
 
 
 def _build_arguments(request: ApiRequest[Any], endpoint: Endpoint) -> dict[str, Any]:

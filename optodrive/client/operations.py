@@ -5,13 +5,15 @@ from typing import Any
 
 from optodrive.client.exchange import Exchange, ExchangePolicy, Pause
 from optodrive.client.heights import HeightsLike, convert_to_pixels
-from optodrive.client.plan import Plan
+from optodrive.client.plan import Plan, report_loss
 from optodrive.client.requests import (
     ARM,
     DISARM,
     LIST_PATTERNS,
+    PAUSE,
     READ_CONFIG,
     READ_STATE,
+    RESUME,
     ApiRequest,
     build_cancel_request,
     build_dim_request,
@@ -29,6 +31,8 @@ from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.stimuli.pattern import PatternDescription
 
 POLL_PERIOD_S = 0.03
+LabelsLike = Mapping[str, str | int | float | bool] | None
+"""Labels of a plan, None for those of its body."""
 
 
 class DisplayOperations:
@@ -62,6 +66,15 @@ class DisplayOperations:
     def dim(self, share: float) -> Exchange[StateReport]:
         """Cap the power of plans."""
         return (yield from self._policy.call(build_dim_request(share)))
+
+    def pause(self) -> Exchange[StateReport]:
+        """Pause the light."""
+        return (yield from self._policy.call(PAUSE))
+
+    def resume(self) -> Exchange[StateReport]:
+        """Resume the light, which this client must then stop when it leaves."""
+        self.may_emit = True
+        return (yield from self._policy.call(RESUME))
 
     def stop(self) -> Exchange[StateReport]:
         """Stop the board."""
@@ -97,23 +110,39 @@ class DisplayOperations:
         fit: FitMode,
         dry_run: bool,
         wait: bool,
+        labels: LabelsLike = None,
     ) -> Exchange[Plan]:
         """Plan one frame, and show it unless `dry_run`."""
         layout = yield from self.read_layout()
         body = build_frame_body(convert_to_pixels(heights_um, layout), duration_s, simultaneous)
-        return (yield from self.push(body, policy, fit, dry_run, wait))
+        return (yield from self.push(body, policy, fit, dry_run, wait, labels))
 
     def push(
-        self, sequence: Mapping[str, Any] | bytes, policy: Policy, fit: FitMode, dry_run: bool, wait: bool
+        self,
+        sequence: Mapping[str, Any],
+        policy: Policy,
+        fit: FitMode,
+        dry_run: bool,
+        wait: bool,
+        labels: LabelsLike = None,
     ) -> Exchange[Plan]:
         """Plan frames and trains, and show them unless `dry_run`."""
-        return (yield from self._submit(build_push_request(sequence, policy, fit, dry_run), dry_run, wait))
+        body = _add_labels(sequence, labels)
+        return (yield from self._submit(build_push_request(body, policy, fit, dry_run), dry_run, wait))
 
     def play(
-        self, name: str, parameters: Mapping[str, Any], policy: Policy | None, fit: FitMode, dry_run: bool, wait: bool
+        self,
+        name: str,
+        parameters: Mapping[str, Any],
+        policy: Policy | None,
+        fit: FitMode,
+        dry_run: bool,
+        wait: bool,
+        labels: LabelsLike = None,
     ) -> Exchange[Plan]:
         """Plan a named pattern, and show it unless `dry_run`."""
-        return (yield from self._submit(build_play_request(name, parameters, policy, fit, dry_run), dry_run, wait))
+        body = _add_labels(parameters, labels)
+        return (yield from self._submit(build_play_request(name, body, policy, fit, dry_run), dry_run, wait))
 
     def read_plan(self, plan: Plan | str) -> Exchange[Plan]:
         """Read a plan."""
@@ -135,12 +164,20 @@ class DisplayOperations:
             return (yield from self._report(request))
         self.may_emit = True  # before the request: its effect is unknown if the response is lost
         plan = yield from self._report(request)
-        return (yield from self.wait_for_plan(plan)) if wait else plan
+        if not wait:
+            return plan
+        with report_loss(plan.plan):
+            return (yield from self.wait_for_plan(plan))
 
     def _report(self, request: ApiRequest[Plan]) -> Exchange[Plan]:
         plan = yield from self._policy.call(request)
         self.last_plan = plan.place_on((yield from self.read_layout()))
         return self.last_plan
+
+
+def _add_labels(body: Mapping[str, Any], labels: LabelsLike) -> Mapping[str, Any]:
+    """Return the body with labels, which replace its own."""
+    return body if labels is None else {**body, "labels": dict(labels)}
 
 
 def _get_plan_id(plan: Plan | str) -> str:

@@ -1,11 +1,13 @@
 """A plan's report with the display's layout, which gives the heights of its pixels and a picture."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Self
 
 import numpy as np
 from pydantic import PrivateAttr
 
-from optodrive.core.errors import RefusedError
+from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.device.config import PixelLayout
@@ -61,3 +63,14 @@ class Plan(PlanReport):
         from optodrive.client.picture import render_png
 
         return render_png(self._layout, heights_um)
+
+
+@contextmanager
+def report_loss(plan_id: str) -> Iterator[None]:
+    """Raise RefusedError if the daemon no longer knows a plan that it has accepted: its planner process has ended."""
+    try:
+        yield
+    except InputError as error:
+        if error.code != "plan_not_found":
+            raise
+        raise RefusedError(f"plan {plan_id} failed: the planner process has ended, and the board is dark") from None

@@ -39,6 +39,8 @@ READ_CONFIG = ApiRequest("GET", "/v1/config", EffectiveConfig, idempotent=True)
 LIST_PATTERNS = ApiRequest("GET", "/v1/patterns", PatternList, idempotent=True)
 ARM = ApiRequest("POST", "/v1/arm", StateReport)
 DISARM = ApiRequest("POST", "/v1/disarm", StateReport)
+PAUSE = ApiRequest("POST", "/v1/pause", StateReport)
+RESUME = ApiRequest("POST", "/v1/resume", StateReport)
 STOP = ApiRequest("POST", "/v1/stop", StateReport)
 
 

@@ -55,3 +55,8 @@ def request_realtime_scheduling() -> None:
     """
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+
+
+def has_realtime_scheduling() -> bool:
+    """Return whether this thread runs before all programs of usual priority."""
+    return os.sched_getscheduler(0) in (os.SCHED_RR, os.SCHED_FIFO)

@@ -1,9 +1,11 @@
 """Plausible ranges of quantities, and the unit that a value outside its range is probably in."""
 
+from collections.abc import Mapping
 from math import pi
 from typing import NamedTuple
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_range
 from optodrive.core.units import ZERO_CELSIUS_K
 
 
@@ -28,11 +30,27 @@ OTHER_UNITS = {
     "°C": (OtherUnit("K", 1.0, -ZERO_CELSIUS_K),),
     "K": (OtherUnit("°C", 1.0, ZERO_CELSIUS_K), OtherUnit("mK", 1e-3)),
     "1": (OtherUnit("%", 1e-2),),
+    "1/s": (OtherUnit("1/ms", 1e3), OtherUnit("1/min", 1.0 / 60.0)),
+    "1/K": (OtherUnit("%/K", 1e-2), OtherUnit("1/mK", 1e3)),
+    "1/rad²": (OtherUnit("1/degrees²", (180.0 / pi) ** 2),),
+    "1/rad⁴": (OtherUnit("1/degrees⁴", (180.0 / pi) ** 4),),
+    "K/s": (OtherUnit("mK/s", 1e-3), OtherUnit("K/min", 1.0 / 60.0)),
+    "K/W": (OtherUnit("K/mW", 1e3), OtherUnit("mK/W", 1e-3)),
+    "m K/W": (OtherUnit("mm K/W", 1e-3), OtherUnit("µm K/W", 1e-6), OtherUnit("m K/mW", 1e3)),
+    "m^2": (OtherUnit("mm²", 1e-6), OtherUnit("cm²", 1e-4), OtherUnit("µm²", 1e-12)),
+    "m^3": (OtherUnit("mm³ (µl)", 1e-9), OtherUnit("cm³ (ml)", 1e-6)),
+    "mm": (OtherUnit("m", 1e3), OtherUnit("µm", 1e-3)),
+    "mW": (OtherUnit("W", 1e3), OtherUnit("µW", 1e-3)),
+    "µm": (OtherUnit("m", 1e6), OtherUnit("mm", 1e3), OtherUnit("nm", 1e-3)),
     "m/K": (OtherUnit("µm/K", 1e-6), OtherUnit("mm/K", 1e-3)),
     "N/K": (OtherUnit("mN/K", 1e-3), OtherUnit("µN/K", 1e-6)),
     "J/K": (OtherUnit("mJ/K", 1e-3), OtherUnit("µJ/K", 1e-6)),
 }
 """Units in which numbers are given by mistake, likelier first, by the unit that is expected."""
+
+
+LARGEST = 1e300
+"""Larger numbers of a file are left to its schema; an integer of thousands of digits is no float."""
 
 
 class PlausibleRange(NamedTuple):
@@ -59,4 +77,28 @@ def check_plausible(where: str, value: float, plausible: PlausibleRange) -> None
         return
     unit = guess_unit(value, plausible)
     likely = "" if unit is None else f"; this value is likely in {unit}"
-    raise InputError(where, value, f"{plausible.low:g} to {plausible.high:g} {plausible.unit}{likely}", "unit")
+    raise InputError(where, value, f"{format_range(*plausible)}{likely}", "unit")
+
+
+def check_table(where: str, table: Mapping[str, object], ranges: Mapping[str, PlausibleRange]) -> None:
+    """Raise InputError for the first number of a decoded file whose value suits another unit than its own.
+
+    ranges: by dotted key, without the indices of lists. A value that no unit explains is left to the schema.
+    """
+    for key, value in table.items():
+        _check_value(where, key, key, value, ranges)
+
+
+def _check_value(where: str, key: str, place: str, value: object, ranges: Mapping[str, PlausibleRange]) -> None:
+    if not any(known == key or known.startswith(f"{key}.") for known in ranges):
+        return
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            _check_value(where, f"{key}.{name}", f"{place}.{name}", item, ranges)
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            _check_value(where, key, f"{place}[{index}]", item, ranges)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        plausible = ranges.get(key)
+        if plausible is not None and abs(value) < LARGEST and guess_unit(value, plausible) is not None:
+            check_plausible(f"{where}: {place}", value, plausible)

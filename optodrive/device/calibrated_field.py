@@ -35,6 +35,7 @@ class CalibratedField:
 
     surface_m: [2, TERM_COUNT] coefficients of x and y; rad_per_code, focal_length_m: of the configuration that the
     field was calibrated with; sigma_grid_m: [k, k] standard uncertainty per axis over the extent, rows by y
+    display: name of the display that it was calibrated on, "" if unknown
     """
 
     geometry: FieldGeometry
@@ -43,6 +44,7 @@ class CalibratedField:
     rad_per_code: float
     focal_length_m: float
     sigma_grid_m: FloatArray
+    display: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

@@ -193,6 +193,8 @@ class BoardSection(Section):
     """The only board, or name of a Helios, that is accepted; empty: any."""
     lease_s: Annotated[float, Field(ge=0.02, le=1.0)] = 0.1
     """Time after the last lease until the board closes the gate, s."""
+    stream_lead_s: Annotated[float, Field(ge=0.01, le=0.2)] = 0.03
+    """Time for which points of a stream are sent ahead, s; a longer stall of this computer interrupts the stream."""
     vendor_id: UsbId | None = None
     """USB vendor of the board."""
     product_id: UsbId | None = None

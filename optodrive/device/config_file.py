@@ -8,9 +8,11 @@ from pydantic import Field, ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
+from optodrive.core.plausibility import check_table
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.config import FORMAT, VERSION, Config, ServoSection
-from optodrive.device.plausible_config import check_servo_units, check_units
+from optodrive.device.plausible_config import check_units
 
 RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
 """Keys that version 4 renamed, with their new names."""
@@ -87,7 +89,7 @@ def apply_measured_servo(config: Config, path: Path) -> Config:
     """Return the configuration with measured servos and the galvo cap that they leave. Raise InputError."""
     table = read_toml(path)
     check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
-    check_servo_units(path, table)
+    check_table(str(path), table, RANGES["mirrors"])
     try:
         measured = MirrorsFile.model_validate(table)
     except ValidationError as error:

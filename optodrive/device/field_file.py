@@ -9,6 +9,8 @@ from pydantic import ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
+from optodrive.core.plausibility import check_table
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.calibrated_field import CalibratedField
 from optodrive.device.field_geometry import FieldGeometry
@@ -59,6 +61,8 @@ def strip_toml_specials(text: str) -> str:
 def format_field(field: CalibratedField, about: dict[str, str | float | int]) -> str:
     """Return a field as TOML of format optodrive-field, version 2."""
     extent = field.extent
+    if field.display:
+        about = {"display": strip_toml_specials(field.display), **about}
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
     lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]
     lines += ["", "[scanner] # of the configuration that it was calibrated with"]
@@ -78,6 +82,7 @@ def load_field(path: Path) -> CalibratedField:
     """Load field.toml. Raise InputError for another format or version, and for invalid content."""
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
+    check_table(str(path), table, RANGES["field"])
     try:
         content = _FieldFile.model_validate(table)
     except ValidationError as error:
@@ -97,4 +102,5 @@ def load_field(path: Path) -> CalibratedField:
         rad_per_code=content.scanner.rad_per_code,
         focal_length_m=content.scanner.focal_length_m,
         sigma_grid_m=np.array(grid),
+        display=str(content.about.get("display", "")),
     )

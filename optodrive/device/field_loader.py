@@ -41,6 +41,11 @@ def _load_calibrated_field(config: Config) -> CalibratedField | None:
     return field
 
 
+def _describe(field: CalibratedField, config: Config) -> str:
+    """Return the name of the field's file and of the display that it was calibrated on."""
+    return f"{config.scanner.field}, a field of {field.display or 'an unnamed display'}"
+
+
 def _check_scanner(field: CalibratedField, config: Config) -> None:
     scanner = config.scanner
     for name, configured, calibrated in (
@@ -49,7 +54,10 @@ def _check_scanner(field: CalibratedField, config: Config) -> None:
     ):
         if abs(configured / calibrated - 1.0) > 1e-9:
             value = getattr(scanner, name)
-            expected = f"{value * calibrated / configured:.6g}, the value that {scanner.field} was calibrated with"
+            expected = (
+                f"{value * calibrated / configured:.6g}, the value that {_describe(field, config)} was made with; "
+                f"this display is {config.name}"
+            )
             raise InputError(f"scanner.{name}", value, expected)
 
 
@@ -67,11 +75,14 @@ def _check_pixels(field: CalibratedField, config: Config) -> None:
             else f"codes {x_code[pixel]:.0f}, {y_code[pixel]:.0f} outside its extent"
         )
         raise InputError(
-            f"{scanner.field}: pixel {pixel} at {place}", reason, "every pixel within the calibrated field"
+            f"{scanner.field}: pixel {pixel} of {config.name} at {place}",
+            reason,
+            f"every pixel of {config.name} within {_describe(field, config)}",
         )
     required_m = COVERAGE_SIGMAS * float(sigma_m.max())
     if required_m > scanner.aim_error_m:
         expected = (
-            f"at least {required_m:.2g}: {COVERAGE_SIGMAS:g} sigma of {scanner.field} at pixel {int(sigma_m.argmax())}"
+            f"at least {required_m:.2g}: {COVERAGE_SIGMAS:g} sigma at pixel {int(sigma_m.argmax())} of {config.name}, "
+            f"by {_describe(field, config)}"
         )
         raise InputError("scanner.aim_error_m", scanner.aim_error_m, expected)

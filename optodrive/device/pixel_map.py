@@ -11,6 +11,8 @@ from pydantic import ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import atomic_write, read_toml
+from optodrive.core.plausibility import check_table
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.core.types.arrays import BoolArray, FloatArray, StrArray, freeze_arrays
 from optodrive.device.config import Config, DisplaySection, PixelLayout, build_pixel_layout
@@ -171,6 +173,7 @@ def _format_entry(pixel_map: PixelMap, index: int) -> str:
 def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
+    check_table(str(path), table, RANGES["pixels"])
     try:
         return _PixelMapFile.model_validate(table)
     except ValidationError as error:

@@ -192,12 +192,14 @@ class ExtendedThermalState:
         # Membrane terms do not act back on the gas: without them, the displacement is proportional to the gas's rise.
         gas_terms = {key: values for key, values in self._values.items() if not discover_terms()[key].moves_membrane}
         ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
+        delays = [discover_terms()[key].signal_delays(values) for key, values in self._values.items()]
+        late_s = tuple(sum(getattr(item, name) for item in delays) for name in ("temperature", "displacement", "force"))
         columns = []
         for index in pixels:
             acting = pulses[np.isin(pulses[:, 3], [index, *self._neighbours[index].tolist()])]
             experiment = PixelExperiment(acting, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
             one = self.pixels.elements[index]
-            absorber_k, displacement_m, force_n = simulate_signals(experiment, one, self._active)
+            absorber_k, displacement_m, force_n = simulate_signals(experiment, one, self._active, late_s)
             # κ = 1, because a dead pixel's κ is 0.
             gas_k = simulate_signals(experiment, one._replace(kappa_m_per_k=1.0), ActiveTerms.from_values(gas_terms))[1]
             columns.append((absorber_k, gas_k, displacement_m, force_n))

@@ -63,6 +63,11 @@ class NominalThermalState:
         self._theta_k = np.zeros(len(pixels))
         self._gamma_k = np.zeros(len(pixels))
 
+    @property
+    def kernel_state(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Parameters [p, 6], time of the last event and the rises then, each [p], as kernels take them."""
+        return self._columns, self._at_s, self._theta_k, self._gamma_k
+
     def copy(self) -> "NominalThermalState":
         """Return an independent copy."""
         return self.copy_shifted(0.0)
@@ -83,10 +88,11 @@ class NominalThermalState:
         """
         off_s = at_s - self._at_s[pixel]
         if off_s < -TIME_ROUNDING_S:
-            raise self._time_order_error(pixel, at_s)
+            raise self.build_time_order_error(pixel, at_s)
         return advance(self.pixels.elements[pixel], self._theta_k[pixel], self._gamma_k[pixel], 0.0, max(0.0, off_s))
 
-    def _time_order_error(self, pixel: int, at_s: float) -> ValueError:
+    def build_time_order_error(self, pixel: int, at_s: float) -> ValueError:
+        """Build the error of an event before a pixel's last one."""
         return ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")
 
     def apply_pulse(self, pixel: int, start_s: float, width_s: float, power_w: float) -> None:
@@ -110,7 +116,7 @@ class NominalThermalState:
         peaks = PulsePeaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
         done = _apply_pulses(self._columns, self._at_s, self._theta_k, self._gamma_k, *columns, *peaks)
         if done < len(pixel):
-            raise self._time_order_error(int(pixel[done]), float(start_s[done]))
+            raise self.build_time_order_error(int(pixel[done]), float(start_s[done]))
         return peaks
 
     def solve_pulse(
@@ -131,10 +137,11 @@ class NominalThermalState:
         if not 0 <= pixel < len(self._at_s):
             raise IndexError(f"pixel {pixel} of {len(self._at_s)}")
         span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
-        state = (self._columns, self._at_s, self._theta_k, self._gamma_k)
-        periods, duty = _solve_pulse_at(*state, pixel, float(start_s), float(target_m), *span, float(peak_after_s))
+        periods, duty = solve_pulse_at(
+            *self.kernel_state, pixel, float(start_s), float(target_m), *span, float(peak_after_s)
+        )
         if periods < 0:
-            raise self._time_order_error(pixel, start_s)
+            raise self.build_time_order_error(pixel, start_s)
         return (periods, duty) if periods else None
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
@@ -261,7 +268,7 @@ def _compute_snapshot(
 
 
 @kernel
-def _solve_pulse_at(
+def solve_pulse_at(
     columns: FloatArray,
     last_s: FloatArray,
     theta_k: FloatArray,

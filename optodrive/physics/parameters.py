@@ -10,6 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
+from optodrive.core.plausibility import PlausibleRange, check_table, guess_unit
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_model import build_input_error, check_format
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import Config, build_pixel_layout
@@ -64,6 +66,10 @@ class _SiUnits(BaseModel):
                 raise ValueError(f"{name} in {unit}, not in '{parameter.unit}'")
             if parameter.value == 0.0:
                 raise ValueError(f"{name} greater than 0")
+            if parameter.sigma is not None and parameter.sigma > parameter.value:
+                likely = guess_unit(parameter.sigma, PlausibleRange(0.0, parameter.value, parameter.unit))
+                hint = "" if likely is None else f"; its sigma is likely in {likely}"
+                raise ValueError(f"{name} with a sigma of at most its value {parameter.value:g} {unit}{hint}")
         return self
 
 
@@ -132,6 +138,10 @@ class PixelArray:
     def __len__(self) -> int:
         return len(self.r_k_per_w)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle the columns only: `elements` would take longer than the rest of a display's state."""
+        return PixelArray, tuple(getattr(self, name) for name in self.__dataclass_fields__)
+
     @classmethod
     def uniform(cls, pixel: Pixel, count: int) -> "PixelArray":
         """Return `count` equal pixels."""
@@ -153,6 +163,7 @@ def load_parameters(name: str | Path) -> ParameterSet:
             raise InputError("pixel_model.parameters", str(name), "a .toml file, or " + ", ".join(known))
         path = locate_shipped("parameters", f"{name}.toml")
     table = _merge_base(path, read_toml(path))
+    check_table(str(path), table, RANGES["parameters"])
     try:
         parameters = ParameterSet.model_validate(table)
     except ValidationError as error:
@@ -190,7 +201,11 @@ def _complete_term(where: str, key: str, values: dict[str, Parameter]) -> dict[s
         if given.unit != item.unit:
             raise InputError(f"{where}.{item.name}.unit", given.unit, f"'{item.unit}'")
         if not item.low <= given.value <= item.high:
-            raise InputError(f"{where}.{item.name}.value", given.value, f"{item.low:g} to {item.high:g} {item.unit}")
+            sizes = PlausibleRange(max(item.low, 0.0), max(abs(item.low), item.high), item.unit)
+            unit = guess_unit(given.value, sizes)
+            likely = "" if unit is None else f"; this value is likely in {unit}"
+            expected = f"{item.low:g} to {item.high:g} {item.unit}{likely}"
+            raise InputError(f"{where}.{item.name}.value", given.value, expected)
     return completed
 
 

@@ -12,8 +12,10 @@ from optodrive.planning.limiter.limiter import compute_wait_s, galvo_feasible_pr
 from optodrive.planning.planned_sequence import Delay, Shortfall
 from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
 
-PAUSE_FRACTION = 0.1
-"""Length of a galvo pause, as a fraction of the time over which the mirrors' acceleration is averaged."""
+FIRST_PAUSE_FRACTION, PAUSE_FRACTION_MAX = 0.01, 0.1
+"""Length of a plan's first galvo pause, and of the longest, as fractions of the time over which the mirrors'
+acceleration is averaged. Each pause is twice as long as the one before: a newer frame of a stream leaves only the
+beginning of a plan, which must not wait, and every pause costs planning time."""
 COLD_AFTER_AVERAGING_TIMES = 50.0
 """Number of averaging times after which the mirrors' coils are cold."""
 
@@ -31,6 +33,7 @@ class BatchLimiter:
         self.state = state
         self.delays: list[Delay] = []
         self.galvo_pause_s = 0.0
+        self._pause_fraction = FIRST_PAUSE_FRACTION
         self._scheduler = scheduler
         self._budget = budget
         self._frame_count = frame_count
@@ -86,4 +89,6 @@ class BatchLimiter:
         cold_s = COLD_AFTER_AVERAGING_TIMES * averaging_s
         if row == 0 and galvo_feasible_prefix(batch, self.state, self._budget, cold_s) == 0:
             return None
-        return GalvoPause(row, ceil(1e6 * PAUSE_FRACTION * averaging_s))
+        pause_s = self._pause_fraction * averaging_s
+        self._pause_fraction = min(2.0 * self._pause_fraction, PAUSE_FRACTION_MAX)
+        return GalvoPause(row, ceil(1e6 * pause_s))

@@ -1,6 +1,7 @@
 """The pulses of a plan as a report lists them, in few bytes."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -59,7 +60,7 @@ class ListedPulses:
     def __len__(self) -> int:
         return len(self.start_s)
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Size of all columns, bytes."""
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))

@@ -53,7 +53,9 @@ def warm_up(display: DisplayModel) -> None:
         PulseTrain(pixel, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w),
         HeightTrain(pixel, 2.0, 1e-3, 0.1, 1e-6),
     )
-    plan_sequence(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), trains), *display.build_cold_state())
+    frames = (TactileFrame("", 0.0, 1.0, target_m),)
+    for each in (FrameSequence(frames), FrameSequence(frames, trains)):  # a frame alone takes a kernel of its own
+        plan_sequence(display, each, *display.build_cold_state())
     if not display.parameters.planner_terms:
         # The feasibility check simulates traces.
         display.build_cold_heat().simulate_traces(np.zeros((0, 4)), [0], np.zeros(2))
@@ -110,6 +112,7 @@ def plan_sequence(
         done = _compute_progress(sequence, batch)
         report_progress()
     plan = concatenate([*limited, *recent], limiter.state, display.budget)
+    report_progress()
     final_heat = heat.copy()
     peaks = final_heat.apply_pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, report_progress)
     lead_in_s = scheduler.lead_in_us * 1e-6
@@ -119,7 +122,7 @@ def plan_sequence(
         predicted_m=peaks.displacement_m,
         lead_in_s=lead_in_s,
         skipped=tuple(scheduler.skipped),
-        frames=_compute_frame_timings(sequence, plan, lead_in_s),
+        frames=_compute_frame_timings(sequence, plan, lead_in_s, report_progress),
         simultaneous=tuple(scheduler.simultaneous),
         shortfall=limiter.build_shortfall(),
         delays=_merge_delays(limiter.delays),
@@ -148,10 +151,13 @@ def _compute_progress(sequence: FrameSequence, batch: PulsePlan) -> float:
     return min(1.0, float(batch.requested_start_s[-1]) / max(ends))
 
 
-def _compute_frame_timings(sequence: FrameSequence, plan: LimitedPlan, lead_in_s: float) -> tuple[FrameTiming, ...]:
+def _compute_frame_timings(
+    sequence: FrameSequence, plan: LimitedPlan, lead_in_s: float, on_progress: Callable[[], None]
+) -> tuple[FrameTiming, ...]:
     timings = []
     end_s = plan.start_s + plan.width_s
     for source, frame in enumerate(sequence.frames):
+        on_progress()
         rows = np.flatnonzero(plan.source == source)
         if not len(rows):
             continue

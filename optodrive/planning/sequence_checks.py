@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.core.units import m_to_um
 from optodrive.planning.display_model import DisplayModel
@@ -33,7 +34,7 @@ def check_targets_reachable(display: DisplayModel, sequence: FrameSequence) -> N
         f"frame {frame.frame_id}: target_um of pixel {pixel}",
         round(m_to_um(float(frame.target_m[pixel])), 3),
         f"at most {m_to_um(max_m):.0f} µm, the reach of the longest pulse "
-        f"({limits.pulse_width_max_s * 1e3:g} ms at {laser.max_power_w:g} W)",
+        f"({format_quantity(limits.pulse_width_max_s, 's')} at {format_quantity(laser.max_power_w, 'W')})",
         code="target_unreachable",
     )
 

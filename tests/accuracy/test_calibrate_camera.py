@@ -7,6 +7,8 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from pages import read_output
+from shown_output import find_difference
 
 from hidden_field import CONFIG, PRIOR, field_errors_m, grid_codes
 from optodrive.cli.main import run
@@ -91,6 +93,8 @@ def test_spots_within_10_um_and_a_field_as_good_as_from_a_file_of_spots(shared, 
 def test_what_it_wrote_gives_the_same_field_by_spots(shared, tmp_path, capsys):
     assert run(["calibrate", "camera", str(shared), "--out", f"{tmp_path}/a.toml"]) == 0
     output = capsys.readouterr().out
+    shown = read_output("docs/how-to/calibrate-by-camera.md", "optodrive calibrate camera")
+    assert find_difference(shown, output) == ""
     assert f"outlier pictures spot_{CODES[OUTLIER][0]:.0f}_{CODES[OUTLIER][1]:.0f}.png\n" in output
     assert run(["calibrate", "field", f"{shared}/spots.csv", "--out", f"{tmp_path}/b.toml"]) == 0
     a, b = (load_field(tmp_path / name).position_m(*CODES.T) for name in ("a.toml", "b.toml"))
@@ -166,7 +170,7 @@ WRONG = {
     "flipped": (flip_grid, "mirrored in the picture"),
     "marks anywhere": (lambda f: describe(f, marks=np.add(marks_px(), (0, 900))), "origin.marks_px"),
     "marks twice": (lambda f: describe(f, marks=marks_px()[[0, 1, 1]]), "three corners of the grid"),
-    "millimetres": (lambda f: describe(f, GRID | {"pitch_m": 7.5}, marks=marks_px()), "this looks like millimetres"),
+    "millimetres": (lambda f: describe(f, GRID | {"pitch_m": 7.5}, marks=marks_px()), "this value is likely in mm"),
     "another pitch": (lambda f: describe(f, GRID | {"pitch_m": 5e-3}, marks=marks_px()), "× the commanded ones"),
     "no spot": (remove_spot, "spot_32768_32768.png: got 'nothing brighter than"),
     "alike": (two_equal_spots, "spot_32768_32768.png: got 'two similar spots, at"),

@@ -78,7 +78,7 @@ def test_text_units_and_a_display_that_does_not_answer(capsys, tmp_path):
     assert f"dead             1: {dead[0]}\n" in output
     assert "offset x" in output
     assert "aims across both edges" in output
-    for scale, says in ((1e3, "these look like millimetres"), (0.0, "a pixel that responds")):
+    for scale, says in ((1e3, "it is likely in mm"), (0.0, "a pixel that responds")):
         spoiled = tmp_path / f"x{scale:g}.h5"
         spoiled.write_bytes(middle.read_bytes())
         with h5py.File(spoiled, "r+") as file:

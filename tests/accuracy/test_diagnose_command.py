@@ -27,8 +27,13 @@ def test_the_narrative_and_three_files(recording, tmp_path, capsys):
     output = capsys.readouterr().out
     assert output.startswith("The nominal model is wrong because the laser's power falls while it is on.")
     assert sorted(path.name for path in out.iterdir()) == ["diagnosis.json", "model.toml", "report.html"]
-    assert json.loads((out / "diagnosis.json").read_text())["causes"] == ["laser_droop"]
-    assert "<svg" in (out / "report.html").read_text()
+    answer, report = json.loads((out / "diagnosis.json").read_text()), (out / "report.html").read_text()
+    assert answer["causes"] == ["laser_droop"]
+    provenance = answer["provenance"]
+    assert provenance["command"] == f"optodrive diagnose {recording} --out {out}"
+    assert (provenance["recordings"], provenance["configuration"]) == (["droop.h5"], None)
+    assert f"<code>{provenance['created_at']}</code>" in report
+    assert [item["runs"] for item in answer["held_out"]] == [3, 3]
 
 
 def test_json_on_stdout_and_nothing_else(recording, capsys):
@@ -43,6 +48,9 @@ def test_two_recordings_are_one(recording, tmp_path, capsys):
     assert run(["diagnose", str(recording), str(other), "--json", str(target), "--config", "display-16"]) == 0
     answer = json.loads(target.read_text())
     assert answer["causes"] == ["laser_droop"]
+    provenance = answer["provenance"]
+    assert (provenance["configuration"], provenance["recordings"]) == ("display-16", ["droop.h5", "more.h5"])
+    assert len(provenance["configuration_sha256"]) == 64
     names = answer["runs"]["fitted"] + answer["runs"]["held_out"]
     assert any(name.startswith("more/") for name in names)
     assert capsys.readouterr().out
@@ -94,7 +102,7 @@ def test_the_readme_chain_records_the_noise_of_instruments_and_finds_no_error(tm
     frames, out = tmp_path / "frames.json", tmp_path / "recording.h5"
     targets = {str(pixel): 60 + 80 * pixel for pixel in range(4)}
     frames.write_text(json.dumps({"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": targets}]}))
-    for noise, said in (([], "1 K, 0.25 µm, 0.1 mN rms"), (["--noise", "0"], "none: the recording is exact")):
+    for noise, said in (([], "1 K, 250 nm, 100 µN rms"), (["--noise", "0"], "none: the recording is exact")):
         out.unlink(missing_ok=True)
         assert run(["simulate", str(frames), "--out", str(out), *noise]) == 0
         assert said in capsys.readouterr().out

@@ -1,18 +1,24 @@
 """Diagnosis of a small recording: verdict, narrative, JSON, model file, held-out runs."""
 
 import json
+import re
 from dataclasses import replace
+from datetime import datetime, timedelta
+from hashlib import sha256
+from importlib.metadata import version
 
 import numpy as np
 import pytest
 
 from labs import lab
+from optodrive.core.provenance import Provenance
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.held_out_gain import split_runs
 from optodrive.lab.diagnosis.model_file import build_model_toml
-from optodrive.lab.diagnosis.narrative import build_answer, build_narrative, format_quantity
+from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.omnibus_test import assign_bins
 from optodrive.lab.diagnosis.report import build_report
 from optodrive.physics.parameters import load_parameters
@@ -214,6 +220,67 @@ def test_the_report_stands_alone_and_escapes(droop, clean):
         assert "<script>" not in text
         assert "http" not in text
         assert text.count("<svg") == text.count("</svg>") > 3
+        assert not re.search(r"<(script|link|img|iframe|object)|url\(|@import| src=| href=", text)
+
+
+def test_the_report_shows_measured_values_against_both_models_in_units(droop):
+    text = build_report(droop, "droop.h5")
+    for role in ("Worst", "Typical"):
+        assert len(re.findall(f"<figcaption>{role} run of (absorber_temperature_K|displacement_m)", text)) == 2
+    assert {(item.role, item.trace.signal) for item in droop.example_traces} == {
+        (role, signal) for role in ("worst", "typical") for signal in ("absorber_temperature_K", "displacement_m")
+    }
+    for quantity in ("absorber above ambient, K", "displacement, µm", "measured − model, µm", "time, ms"):
+        assert f">{quantity}</text>" in text
+    for item in droop.example_traces:
+        trace, model = item.trace, item.trace.compute_model(item.trace.extended)
+        assert np.abs(trace.measured - model).max() < 8 * trace.sigma < 0.2 * np.ptp(trace.measured)
+    worst, typical = (
+        [item.trace.rms_nominal for item in droop.example_traces if item.role == role] for role in ("worst", "typical")
+    )
+    assert all(a > b for a, b in zip(worst, typical, strict=True))
+
+
+def test_the_report_shows_held_out_groups_before_and_after(droop):
+    text = build_report(droop, "droop.h5")
+    groups = {item.group for item in droop.held_out_errors}
+    assert groups == {trace.group for trace in droop.held_out_traces}
+    assert groups.isdisjoint({"train"})
+    for item in droop.held_out_errors:
+        assert item.runs == 3
+        assert item.nominal > 2 * item.extended > 1.5 * item.noise_floor > 0
+        assert f"<td>{item.group}</td><td>{item.signal}</td>" in text
+    unit = {"absorber_temperature_K": "K", "displacement_m": "m"}
+    for name, rmse in droop.gain.extended.items():
+        assert format_quantity(rmse, unit[name]) in text
+
+
+def test_the_report_has_numbers_of_every_rival_and_the_threshold(droop):
+    text = build_report(droop, "droop.h5")
+    assert len(re.findall("class='threshold'", text)) == len(droop.candidates) > 15
+    assert [item.is_chosen for item in droop.rivals] == [True] + [False] * (len(droop.rivals) - 1)
+    assert droop.rivals[0].chi2 == droop.rivals[0].bic == 0.0
+    for item in droop.rivals[1:]:
+        assert item.bic > 0.0
+        assert f"<td class='n'>{item.bic:+.0f}</td>" in text
+    assert droop.rivals[0].parameters["laser_droop.share"][0] == pytest.approx(0.08, rel=0.2)
+    rows = build_answer(droop)["rivals"]
+    assert [row["bic_above_best"] for row in rows] == [item.bic for item in droop.rivals]
+
+
+def test_the_report_states_its_provenance(droop):
+    digest = sha256(b'{"a": 1}').hexdigest()
+    provenance = Provenance.capture(["diagnose", "my droop.h5"], ["my droop.h5"], ("mine", '{"a": 1}'))
+    text = build_report(droop, "droop.h5", provenance)
+    for entry in (
+        "optodrive diagnose &#x27;my droop.h5&#x27;",
+        version("optodrive"),
+        provenance.created_at,
+        f"mine, SHA-256 {digest}",
+    ):
+        assert f"<code>{entry}</code>" in text
+    assert datetime.fromisoformat(provenance.created_at).utcoffset() == timedelta(0)
+    assert "none: priors" in build_report(droop, "droop.h5", Provenance.capture([], ["r.h5"]))
 
 
 def test_whole_groups_are_held_out_never_the_only_one_of_its_kind():
@@ -233,11 +300,3 @@ def test_bins_do_not_mix_groups_or_signals():
         for label in np.unique(labels[block.part]):
             key = (data.runs[block.run].group, block.kind)
             assert owner.setdefault(int(label), key) == key
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [(2e-6, "m", "2 µm"), (0.05, "s", "50 ms"), (0.3, "1", "0.3"), (0.0, "m", "0 m"), (12.5, "K", "12.5 K")],
-)
-def test_quantities_read_as_people_write_them(value, unit, text):
-    assert format_quantity(value, unit) == text

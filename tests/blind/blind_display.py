@@ -58,6 +58,7 @@ class Physics:
     wall_r: float = 0.0
     wall_c: float = 1.0
     wall_takes_flow: float = 1.0
+    gas_takes_wall: float = 1.0  # share of the wall's rise that the gas follows
     wall2_r: float = 0.0
     wall2_c: float = 1.0
     crosstalk: float = 0.0
@@ -150,6 +151,7 @@ def _pack_parameters(p: Physics, ambient_k: float) -> np.ndarray:
     v[34:36] = p.after_s, p.after_share
     v[36] = ambient_k
     v[37] = len(p.creep)
+    v[38] = p.gas_takes_wall
     v[40 : 40 + len(p.creep)] = p.creep
     v[50 : 50 + len(p.creep)] = p.creep_s
     return v
@@ -242,7 +244,7 @@ def _compute_rates(v, seg, t, s, d):
         d[1] = (v[12] * flow + 0.66 * own * seg[8] - out) / v[11]
         if v[13] > 0.0:
             d[2] = (out - s[2] / v[13]) / v[14]
-    drive = 0.5 * (theta + wall) - s[3]
+    drive = 0.5 * (theta + v[38] * wall) - s[3]
     tau = v[2]
     if drive < 0.0:
         tau *= 1.0 + v[33]

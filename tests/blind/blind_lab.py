@@ -193,13 +193,14 @@ def draw_case(
     *,
     cause: str | None = None,
     mechanism: str | None = None,
+    draw: Draw | None = None,
     name: str = "case.h5",
 ) -> Case:
     """Draw a hidden display and a session with it, write `<folder>/case.h5`, and return it with the ground truth."""
     keys = list(CATALOGUE)
     if block == "single":
         chosen: tuple[str, ...] = (cause or keys[seed % len(keys)],)
-        draws = [CATALOGUE[chosen[0]]]
+        draws = [draw or CATALOGUE[chosen[0]]]
     elif block == "unknown":
         hidden = mechanism or list(MECHANISMS)[seed % len(MECHANISMS)]
         chosen, draws = ("unknown", hidden), [MECHANISMS[hidden]]

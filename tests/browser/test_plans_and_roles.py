@@ -56,7 +56,7 @@ def check_state(daemon, *plans):
 
 
 ROLES = {
-    "viewer": {"Arm …": "armer"} | dict.fromkeys(("Disarm", "Maximum power", "Preview", "End p"), "operator"),
+    "viewer": {"Arm …": "armer"} | dict.fromkeys(("Disarm", "Maximum power", "Pause", "Preview", "End p"), "operator"),
     "operator": {"Arm …": "armer"},
     "armer": {},
 }
@@ -70,7 +70,7 @@ def test_the_role_is_shown_and_what_it_may_not_use_is_disabled(window, page, dae
         window.sign_in(read_role_tokens(daemon)[role])
         expect(page.locator("#caller")).to_have_text(role)
         page.locator("#now").wait_for()
-        for name in ("Disarm", "Preview", "End p"):
+        for name in ("Disarm", "Pause", "Preview", "End p"):
             button = page.get_by_role("button", name=name)
             expect(button).to_be_disabled() if name in refused else expect(button).to_be_enabled()
         reasons = page.locator(".reason").locator("visible=true").all_inner_texts()
@@ -227,6 +227,30 @@ def test_the_power_is_dimmed_by_operators_and_raised_by_armers(window, page, dae
     press_key_and_wait(page, "End")
     expect(mark).to_be_hidden()
     assert daemon.state()["limits"]["power_share"] == 1.0
+
+
+def test_the_light_is_paused_and_resumed_with_one_button(page, daemon, bench, axe):
+    button = page.locator("#pause")
+    expect(button).to_be_disabled()
+    daemon.arm()
+    plan = play_for(daemon, 4.0)
+    wait_for(lambda: len(bench.board.of("pulse")) > 5, "light")
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#board-state")).to_have_text("PAUSED")
+    expect(page.locator("#board-means")).to_have_text(re.compile(r"^dark, armed for (5:00|4:5\d) min$"))
+    expect(page.locator("#said")).to_have_text(re.compile("^(Paused: the laser is off|Board: PAUSED)"))
+    expect(page.locator("#now .left")).to_have_text(re.compile(r"^\d+ of 200 pulses, paused$"))
+    expect(page).to_have_title(re.compile("^PAUSED · "))
+    assert bench.board.of("gate")[-1]["on"] is False
+    assert list_violations(page, axe) == []
+    expect(button).to_have_text("Resume")
+    assert read_focus(page) == "pause"
+    page.keyboard.press("Space")
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
+    expect(button).to_have_text("Pause")
+    assert daemon.finished(plan)["executed"] == 200
 
 
 ANNA = "a-token-for-anna"

@@ -1,12 +1,17 @@
 """Every example of README and docs: commands exist with their options, and run as written."""
 
+import contextlib
+import json
 import re
 import shlex
+import tomllib
 
 import pytest
 import typer
-from pages import ROOT, list_examples, list_pages
+from pages import COMMENT, ROOT, is_command, list_blocks, list_examples, list_pages
+from shown_output import find_difference
 from worlds import (
+    compare_outputs,
     find_obstacle,
     run_script,
     write_calibration,
@@ -29,15 +34,24 @@ ELSEWHERE = {
     "optodrive calibrate board": "a synopsis; tests/system/test_calibrate_loop.py",
     "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
     "optodrive calibrate pixels": "tests/accuracy/test_calibrate_pixels.py records its sweep, which takes minutes",
+    "optodrive calibrate sweep": "tests/system/test_calibrate_sweep.py",
+    "optodrive recording merge sweep/": "tests/unit/lab/commissioning/test_sweep_player.py",
+    "optodrive token": "tests/unit/cli/test_token_command.py",
     "optodrive plan frames.json --pixel-map": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive simulate sweep/": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive diagnose film.h5 --out answer/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
 }
 """Beginnings of examples that are not run here, and where they are."""
 
+COMPARED_ELSEWHERE = {"optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py"}
+"""Beginnings of examples whose output another test compares, and that test."""
+
 SCENARIOS = {
     "readme": (write_checkout, ["README.md:Shell", "README.md:Python"]),
     "readme-rest": (write_checkout, ["README.md:REST"]),
+    "patterns": (write_checkout, ["docs/how-to/show-stimuli.md:Patterns"]),
+    "fits": (write_checkout, ["docs/how-to/show-stimuli.md:Whether it fits"]),
+    "refusals": (write_recordings, ["docs/reference/recordings.md:Refusals"]),
     "quickstart": (write_checkout, ["docs/tutorials/quickstart.md:Quickstart"]),
     "client": (write_checkout, ["docs/how-to/use-the-python-client.md:Python client"]),
     "diagnosis": (
@@ -53,6 +67,13 @@ SCENARIOS = {
         [f"docs/how-to/calibrate-the-field.md:{name}" for name in ("Commands", "Positions to codes", "Mirror servos")],
     ),
 }
+DRAWINGS = {
+    "docs/explanation/architecture.md": ("FrameSequence →", "core < device"),
+    "docs/how-to/wire-a-board.md": ("PC ── USB",),
+    "docs/reference/recordings.md": ("/        ", "recording.toml   "),
+}
+"""Beginnings of indented blocks that are drawings or layouts of files."""
+CSV_HEADER = re.compile(r"[a-z]\w*(,[a-z]\w*)+")
 EVERY_TIME = ("readme", "readme-rest")
 INLINE = re.compile(r"`(optodrive [^`]+)`")
 
@@ -75,8 +96,68 @@ def test_every_example_is_run_here_or_elsewhere():
     places = {place for _, listed in SCENARIOS.values() for place in listed}
     missing = [e for e in list_examples() if f"{e.page}:{e.heading}" not in places and not is_elsewhere(e)]
     assert missing == []
+    for example in list_examples():
+        if example.output and is_elsewhere(example):
+            (test,) = (test for beginning, test in COMPARED_ELSEWHERE.items() if example.text.startswith(beginning))
+            assert f'read_output("{example.page}"' in (ROOT / test).read_text()
     for beginning in ELSEWHERE:
         assert any(not item.is_python and item.text.startswith(beginning) for item in list_examples()), beginning
+
+
+def is_data(block):
+    """Return whether a block is JSON, TOML or CSV."""
+    text = COMMENT.sub("", block.text.splitlines()[0])
+    if CSV_HEADER.fullmatch(text):
+        return True
+    for read in (json.loads, tomllib.loads):
+        with contextlib.suppress(ValueError):
+            read(text if read is json.loads else block.text)
+            return True
+    return False
+
+
+@pytest.mark.parametrize("block", list_blocks(), ids=lambda block: f"{block.page}:{block.line}")
+def test_output_is_shown_only_where_it_is_compared(block):
+    if block.language is not None:
+        assert block.language in ("console", "python", "json", "toml")
+        return
+    first = COMMENT.sub("", block.text.splitlines()[0])
+    drawings = DRAWINGS.get(block.page, ())
+    assert is_command(first) or is_data(block) or block.text.startswith(drawings), "output stands in a console block"
+
+
+@pytest.mark.parametrize(
+    ("shown", "real"),
+    [
+        ("a 1\nb\n", "a 1\nb\n"),
+        ("a …\n", "a 17.3 ms\n"),
+        ("a … ms, b\n", "a 17.3 ms, b   \n"),
+        ("…\nlast\n", "one\ntwo\nlast\n"),
+        ("first\n…\n", "first\n"),
+        ("a 1        # a note\n", "a 1\n"),
+        ("a 1\n", "optodrive: compiling kernels, half a minute, once\na 1\n"),
+        ("", ""),
+    ],
+)
+def test_the_shown_output_is_the_real_one(shown, real):
+    assert find_difference(shown, real) == ""
+
+
+@pytest.mark.parametrize(
+    ("shown", "real"),
+    [
+        ("a 1\n", "a 2\n"),
+        ("a 1.0\n", "a 1\n"),
+        ("a …\n", "a 1\nb\n"),
+        ("a … b\n", "a 1\n b\n"),
+        ("…\nlast\n", "one\nlast\nmore\n"),
+        ("a 1 # no note\n", "a 1\n"),
+        ("", "something\n"),
+        ("a.c\n", "abc\n"),
+    ],
+)
+def test_a_difference_is_found(shown, real):
+    assert find_difference(shown, real)
 
 
 def parse(words):
@@ -131,4 +212,7 @@ def test_the_examples_run_as_written(tmp_path, name):
         pytest.skip(obstacle)
     prepare, places = SCENARIOS[name]
     prepare(tmp_path)
-    run_script(write_script([item for place in places for item in select(place)]), tmp_path)
+    examples = [item for place in places for item in select(place)]
+    run_script(write_script(examples), tmp_path)
+    differences = compare_outputs(examples, tmp_path)
+    assert not differences, differences

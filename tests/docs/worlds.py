@@ -1,12 +1,15 @@
 """Folders with the files that the examples of a page need, and scripts that run the examples in them."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
+from shown_output import find_difference
 
 from display_lab import display_lab
 from hidden_field import CONFIG, grid_codes, measure_spots
@@ -27,8 +30,10 @@ end() {
   [ -z "$daemon" ] || { kill "$daemon"; wait "$daemon"; }
   daemon=
 }"""
+READ_STATUS = "echo $?"
 SANDBOX = ("--dev-bind", "/", "/", "--unshare-net", "--unshare-pid", "--proc", "/proc", "--die-with-parent")
-TIMEOUT_S = 300.0
+TIMEOUT_S = 100.0
+"""Less than the limit of pytest for a test, whose end would tell nothing of the examples."""
 
 
 def find_obstacle():
@@ -47,7 +52,9 @@ def write_script(examples):
     """
     lines, is_served = [HEAD], False
     for number, example in enumerate(examples):
-        lines.append(f"echo {example.page}:{example.line} >&2")
+        reads_status, has_status = example.text == READ_STATUS, is_followed_by_status(examples, number)
+        if not reads_status:
+            lines.append(f"echo {example.page}:{example.line} >&2")
         talks = example.text.startswith("curl") or "Display(" in example.text
         if talks and not is_served:
             lines += [*serve("optodrive serve"), "optodrive arm"]
@@ -59,9 +66,33 @@ def write_script(examples):
             is_served = True
             if "--record-session" in example.text:  # an empty session cannot be merged
                 lines += ["optodrive arm", "optodrive play pixel pixel=200 seconds=0.1", "end"]
+        elif example.output is not None:
+            lines += ["set +e"] if has_status else []
+            lines.append(f"{{ {example.text}; }} > {name_output(number)} 2>&1")
+            lines += ["set -e"] if reads_status else []
         else:
             lines.append(example.text)
     return "\n".join([*lines, "end", ""])
+
+
+def name_output(number):
+    """Return the file with the output of an example."""
+    return f"output-{number}.txt"
+
+
+def is_followed_by_status(examples, number):
+    """Return whether the page shows the exit status of an example, which may then fail."""
+    return number + 1 < len(examples) and examples[number + 1].text == READ_STATUS
+
+
+def compare_outputs(examples, folder):
+    """Return how the outputs of examples that ran in a folder differ from those that their pages show."""
+    differences = []
+    for number, example in enumerate(examples):
+        if example.output is not None:
+            difference = find_difference(example.output, (folder / name_output(number)).read_text())
+            differences += [f"{example.page}:{example.line}: {example.text}\n{difference}"] if difference else []
+    return "\n\n".join(differences)
 
 
 def serve(command):
@@ -73,13 +104,12 @@ def run_script(script, folder):
     """Run a script in a folder with a network, a home and a runtime folder of its own; return what it printed."""
     (folder / "script.sh").write_text(script)
     (folder / "runtime").mkdir(mode=0o700)
-    cache = Path.home() / ".cache"
     ended = subprocess.run(
         ["bwrap", *SANDBOX, "--chdir", str(folder), "bash", "script.sh"],
         env={
             "PATH": f"{PROGRAMS}:/usr/bin:/bin",
             "HOME": str(folder),
-            "XDG_CACHE_HOME": str(cache),
+            "XDG_CACHE_HOME": os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache"),
             "XDG_RUNTIME_DIR": str(folder / "runtime"),
             "PYTHONPATH": str(Path(__file__).parents[2]),
         },
@@ -89,14 +119,17 @@ def run_script(script, folder):
     )
     daemon = folder / "serve.log"
     shown = ended.stderr + (daemon.read_text() if daemon.exists() else "")
-    assert ended.returncode == 0, shown
-    assert "Traceback" not in shown, shown
+    printed = "".join(path.read_text() for path in sorted(folder.glob("output-*.txt")))
+    assert ended.returncode == 0, shown + printed
+    assert "Traceback" not in shown + printed, shown + printed
     return ended.stdout
 
 
 def write_frames(folder):
-    """Write frames.json."""
+    """Write frames.json, and late.json, which does not fit."""
     (folder / "frames.json").write_text(json.dumps(FRAMES))
+    late = {"id": "late", "show_at_s": 0.0, "duration_s": 0.1, "target_um": {str(pixel): 100 for pixel in range(40)}}
+    (folder / "late.json").write_text(json.dumps({"frames": [late]}))
 
 
 def write_checkout(folder):
@@ -113,6 +146,10 @@ def write_recordings(folder):
     for seed, name in enumerate(("recording", "monday", "tuesday")):
         write_recording(folder / f"{name}.h5", lab(seed, creep))
     shutil.copy(locate_shipped("display-437.toml"), folder / "my-display.toml")
+    shutil.copy(folder / "recording.h5", folder / "swapped.h5")
+    with h5py.File(folder / "swapped.h5", "r+") as file:
+        times_s = file["runs/run003/displacement_m/t_s"]
+        times_s[81] = times_s[80] - 5e-4
 
 
 def write_film(folder):
@@ -141,7 +178,7 @@ def write_calibration(folder):
     write_frames(folder)
     random = np.random.default_rng(1)
     truth = GroundTruthGeometry.sample(1, CONFIG)
-    write_spots(folder / "spots.csv", measure_spots(truth, grid_codes(5), random, outlier_fraction=0.0)[0])
+    write_spots(folder / "spots.csv", measure_spots(truth, grid_codes(17), random, outlier_fraction=0.035)[0])
     (folder / "points.csv").write_text("x_m,y_m\n0.0,0.0\n0.01,-0.02\n")
     servo = HiddenServo(900.0, 0.7, 30e-6, 60.0)
     write_recording(folder / "recording.h5", record_servos((servo, servo), random))

@@ -157,7 +157,7 @@ def step(both, what, detail):
         both.raw(b"".join(both.frame(x, ahead) for ahead, x in enumerate(messages(core, what, detail))))
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(BOARDS, EPISODES, st.integers(0, 2**32))
 def test_both_boards_behave_identically(library, board, episodes, seed):
     both = Lockstep(library, board, seed=seed)

@@ -205,7 +205,7 @@ def check_agreement(seed):
     return report
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(SEEDS)
 def test_the_verdict_agrees_with_an_exhaustive_search(seed):
     check_agreement(seed)

@@ -75,7 +75,7 @@ def faults(draw):
     return fault
 
 
-@settings(max_examples=150)
+@settings(max_examples=3 * settings.default.max_examples // 2)
 @given(
     st.lists(st.tuples(faults(), faults()), min_size=5, max_size=80),
     st.sampled_from([1, POINTS, TOTAL]),
@@ -185,7 +185,7 @@ def encode_step(core, what, detail):
     return [(message.TYPE, message.encode_body()) for message in messages]
 
 
-@settings(max_examples=200)
+@settings(max_examples=2 * settings.default.max_examples)
 @given(st.lists(STEPS, min_size=5, max_size=60))
 def test_a_board_survives_a_host_that_sends_anything(steps):
     rig = Rig()

@@ -178,7 +178,7 @@ def move(file, draw):
 CHANGES = [set_attribute, delete_attribute, delete, put_dataset, claim, set_entry, add, link, move]
 
 
-@settings(max_examples=120)
+@settings(max_examples=6 * settings.default.max_examples // 5)
 @given(st.data())
 def test_members_attributes_and_datasets_replaced(valid, path, data):
     shutil.copyfile(valid / "r.h5", path)
@@ -194,7 +194,7 @@ def test_members_attributes_and_datasets_replaced(valid, path, data):
         reads_or_refuses(path)
 
 
-@settings(max_examples=150)
+@settings(max_examples=3 * settings.default.max_examples // 2)
 @given(st.data())
 def test_files_of_the_folder_changed(valid, tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / "damaged-folder"

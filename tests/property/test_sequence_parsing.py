@@ -152,7 +152,7 @@ PICTURES = list(_pictures())
 
 @pytest.mark.parametrize("name", ["image", "animation"])
 @given(data=st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=2 * settings.default.max_examples, deadline=None)
 def test_a_damaged_image_is_decoded_or_refused(name, data):
     file = bytearray(data.draw(st.sampled_from(PICTURES)))
     for _ in range(data.draw(st.integers(1, 6))):

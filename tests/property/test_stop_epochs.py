@@ -3,6 +3,9 @@
 Pushes are accepted at any moment, in the epoch that the web process sees then, and handed over at any later one. Each
 has its own duty, so the board's log tells whose points it emits. Two gates each keep the property alone only in part:
 without either of them the same interleavings break it. Ten thousand interleavings take three minutes of one core.
+
+Nothing is emitted while the light is paused, and nothing after a pause that the planner built before it. The same
+interleavings break without the pause's gate.
 """
 
 import random
@@ -15,6 +18,7 @@ from link_service_rig import OPERATOR, PLANNER, REQUIREMENTS, SUPERVISOR, WEB, S
 from optodrive.core.ipc import IpcError
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.epoch import Epoch
+from optodrive.link.service.pauses import Pauses
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 from optodrive.link.simulator.memory_link import MemoryLink
@@ -26,7 +30,7 @@ PATIENT = replace(REQUIREMENTS, lease_s=LEASE_S, limits=replace(REQUIREMENTS.lim
 LONG_STEP_S = 0.1
 SEND_AHEAD_S = 0.04
 ACTIONS = 40
-IN_EVERY_RUN, MANY = 300, 10_000
+IN_EVERY_RUN, MANY = 150, 10_000
 INPUTS = {"interlock": (False, True), "key": (False, True), "estop": (True, False)}
 """Unsafe and safe value of each input."""
 
@@ -46,13 +50,18 @@ class BreakableLink(MemoryLink):
 
 
 class Interleaving:
-    """One random interleaving. accepted: epoch of each push by its duty; waiting: pushes not yet handed over."""
+    """One random interleaving. accepted: epoch of each push by its duty; waiting: pushes not yet handed over.
+
+    built: number of the latest pause that the planner knew when it built a push's points; pauses: time of each answered
+    pause, and of its end, with the number of the pause and whether it lasts
+    """
 
     def __init__(self, seed):
         self.random = random.Random(seed)
         self.rig = ServiceRig(link_type=BreakableLink, settings=SETTINGS, requirements=PATIENT).hello_all()
         self.accepted, self.waiting, self.last_count = {}, [], 0
         self.epochs = [(0.0, self.rig.epoch)]
+        self.built, self.pauses = {}, [(0.0, 0, False)]
         self.rig.connect()
 
     def run(self):
@@ -62,6 +71,7 @@ class Interleaving:
             self.rig.run(self.random.choice((0.0, 0.0, 0.002, 0.01, 0.05)))
             self._note_epoch()
         self.rig.link.is_cut = False
+        self.resume()
         self.arm()
         self.hand_over()
         self.rig.run(0.3, 0.01)
@@ -70,6 +80,12 @@ class Interleaving:
     def _note_epoch(self):
         if self.epochs[-1][1] != self.rig.epoch:
             self.epochs.append((self.rig.clock.now_s(), self.rig.epoch))
+            self._note_end_of_pause()
+
+    def _note_end_of_pause(self):
+        _, number, lasts = self.pauses[-1]
+        if lasts:
+            self.pauses.append((self.rig.clock.now_s(), number, False))
 
     # --- actions
 
@@ -84,14 +100,21 @@ class Interleaving:
             ahead_s = self.random.choice((None, SEND_AHEAD_S))
             self.last_count = self.random.choice((1, 5, 60))
             points = build_points(self.last_count, duty)
-            self.rig.begin(points, epoch, self.random.choice((0.005, 0.05)), ahead_s)
+            self.rig.begin(points, epoch, self.random.choice((0.005, 0.05)), ahead_s, pause=self.build(duty))
+
+    def build(self, duty):
+        """Return the pause after which the planner has built points, which may be an earlier one."""
+        latest = self.rig.pause_number
+        self.built[duty] = latest if self.random.random() < 0.8 else self.random.randint(0, latest)
+        return self.built[duty]
 
     def splice(self):
         if self.waiting:
             duty, epoch = self.waiting.pop(self.random.randrange(len(self.waiting)))
             kept_points = self.random.randint(0, self.last_count)
             try:
-                _, result = self.rig.splice(build_points(20, duty), kept_points, epoch, SEND_AHEAD_S)
+                points = build_points(20, duty)
+                _, result = self.rig.splice(points, kept_points, epoch, SEND_AHEAD_S, pause=self.build(duty))
             except IpcError:  # more than the last job's points: the process ends such a planner's connection
                 self.lose_planner()
                 return
@@ -102,6 +125,19 @@ class Interleaving:
 
     def flush(self):
         self.rig.send(PLANNER, "flush")
+
+    def pause(self):
+        request_id = self.rig.request(WEB, "pause")
+        for _ in range(self.random.choice((0, 5))):
+            self.rig.run()
+        self._note_epoch()
+        result = self.rig.find_result(WEB, request_id)
+        if result and result["error"] is None and result["epoch"] == self.rig.epoch:
+            self.pauses.append((self.rig.clock.now_s(), self.rig.pause_number, True))
+
+    def resume(self):
+        self.rig.request(WEB, "resume")
+        self._note_end_of_pause()
 
     def stop(self):
         self.rig.request(self.random.choice((PLANNER, WEB, OPERATOR, SUPERVISOR)), "stop")
@@ -167,6 +203,18 @@ class Interleaving:
 
     # --- verdict
 
+    def find_unpaused(self):
+        """Return (duty, built after, emitted at, in) of the pulses that a pause should have kept dark."""
+        unpaused = []
+        for event in self.rig.log:
+            if event["event"] != "pulse":
+                continue
+            on_s, built = event["on_us"] * 1e-6, self.built[event["duty"]]
+            _, number, lasts = next(pause for pause in reversed(self.pauses) if pause[0] <= on_s)
+            if lasts or built < number:
+                unpaused.append((event["duty"], built, on_s, number))
+        return unpaused
+
     def find_epoch(self, at_s):
         return next(epoch for since_s, epoch in reversed(self.epochs) if since_s <= at_s)
 
@@ -191,6 +239,8 @@ WEIGHTS = {
     "splice": 3,
     "truncate": 1,
     "flush": 1,
+    "pause": 3,
+    "resume": 4,
     "stop": 4,
     "disarm": 2,
     "fault": 1,
@@ -209,6 +259,7 @@ def count_pulses(seeds):
     for seed in seeds:
         interleaving = Interleaving(seed).run()
         assert interleaving.find_stale() == [], f"interleaving {seed}"
+        assert interleaving.find_unpaused() == [], f"interleaving {seed}"
         pulses += len(interleaving.rig.list_emitted())
     return pulses
 
@@ -237,3 +288,17 @@ def gate_2_arming_keeps_points(patch):
 def test_the_property_catches_a_missing_gate(mutant, monkeypatch):
     mutant(monkeypatch)
     assert any(Interleaving(seed).run().find_stale() for seed in range(IN_EVERY_RUN))
+
+
+def gate_of_the_pause_is_missing(patch):
+    patch.setattr(Pauses, "permits", lambda pauses, number: True)
+
+
+def gate_of_the_pause_forgets_earlier_ones(patch):
+    patch.setattr(Pauses, "permits", lambda pauses, number: not pauses.is_paused)
+
+
+@pytest.mark.parametrize("mutant", [gate_of_the_pause_is_missing, gate_of_the_pause_forgets_earlier_ones])
+def test_the_property_catches_a_missing_gate_of_the_pause(mutant, monkeypatch):
+    mutant(monkeypatch)
+    assert any(Interleaving(seed).run().find_unpaused() for seed in range(IN_EVERY_RUN))

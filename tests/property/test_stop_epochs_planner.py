@@ -1,7 +1,8 @@
 """Nothing that was accepted before a STOP or a disarm is lit after it, at any time of planning.
 
-Several callers push, stream and plan dry runs with views of the epoch that may be old, while others stop, disarm and
-arm at random times, also between the planning of a request and its commit. All parts are real; time is virtual.
+Several callers push, stream and plan dry runs with views of the epoch that may be old, while others stop, disarm, arm,
+pause and resume at random times, also between the planning of a request and its commit. Nothing is lit in a pause that
+was answered, and no plan is lit beyond its pulses. All parts are real; time is virtual.
 """
 
 import random
@@ -12,15 +13,25 @@ from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.preview.jobs import plan_dry_run
+from optodrive.daemon.preview.jobs import BuiltRequest, plan_dry_run
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from planner_rig import DISPLAY, PlannerRig
 
 SEEDS = range(12)
-OPERATIONS = 80
+OPERATIONS = 100
 DARK_WITHIN_S = 0.004
 """Time from the end of an epoch to the end of the light: one exchange with the board."""
-WEIGHTS = {"accept": 6, "deliver": 6, "run": 8, "stop": 1, "disarm": 1, "arm": 6, "dry_run": 1}
+WEIGHTS = {
+    "accept": 6,
+    "deliver": 6,
+    "run": 14,
+    "stop": 1,
+    "disarm": 1,
+    "arm": 6,
+    "dry_run": 1,
+    "pause": 1.5,
+    "resume": 6,
+}
 
 
 class Push(NamedTuple):
@@ -35,6 +46,7 @@ class Interleaving:
     """A random sequence of operations on a rig.
 
     answered_epoch: epoch when the latest command was answered; pushes of older ones must be refused from then on
+    pauses: (board time, whether a pause lasts) at each answered pause and each end of one
     epochs: (board time, epoch) at each begin of an epoch; epochs_by_duty: of the accepted pushes with such a pulse
     """
 
@@ -44,6 +56,7 @@ class Interleaving:
         self.waiting = []
         self.epochs = [(0.0, self.rig.epoch)]
         self.epochs_by_duty = {}
+        self.pauses = [(0.0, False)]
         self.answered_epoch = 0
         self.accepted = 0
         self.serial = 0
@@ -60,8 +73,10 @@ class Interleaving:
                 self.stop()
                 self.arm()
             self.deliver()
+        self.resume()
         self.rig.run(0.5)
         self.check_light()
+        self.check_counts()
         return self
 
     # --- operations
@@ -106,6 +121,23 @@ class Interleaving:
     def arm(self):
         self.command(WEB, "arm")
 
+    def pause(self):
+        """Pause; mostly, wait for the answer. A board that is not armed refuses."""
+        request = self.rig.request(WEB, "pause")
+        if self.random.random() < 0.8:
+            result = self.rig.await_result(WEB, request)
+            self.note_epoch()
+            if result["error"] is None and result["epoch"] == self.rig.epoch:
+                self.pauses.append((self.rig.session.board_s(), True))
+
+    def resume(self):
+        self.note_pause_end()
+        self.rig.request(WEB, "resume")
+
+    def note_pause_end(self):
+        if self.pauses[-1][1]:
+            self.pauses.append((self.rig.session.board_s(), False))
+
     def command(self, client, kind):
         """Send a command; mostly, wait for its result."""
         request = self.rig.request(client, kind)
@@ -123,13 +155,13 @@ class Interleaving:
         fields = {"name": "dry", "policy": "trim", "fit": "as_is"}
         sequence = build_pattern("all", {"height_um": 20}, DISPLAY.config)
         start = DryRunStart(snapshot.heat, snapshot.budget, 0.1)
-        assert plan_dry_run(DISPLAY, self.rig.remote.scale, sequence, start, fields).status == "planned"
+        assert plan_dry_run(DISPLAY, self.rig.remote.scale, BuiltRequest(sequence), start, fields).status == "planned"
         assert [record.plan_id for record in self.rig.store.list_recent()] == before
 
     def interfere(self):
         """Act between the planning of a request and the loop's action for it."""
         if self.random.random() < 0.15:
-            action = self.random.choice((self.run, self.stop, self.disarm, self.arm))
+            action = self.random.choice((self.run, self.stop, self.disarm, self.arm, self.pause, self.resume))
             self.rig.before_loop_action = lambda: None
             action()
             if self.random.random() < 0.5:
@@ -141,12 +173,22 @@ class Interleaving:
     def note_epoch(self):
         if self.rig.epoch != self.epochs[-1][1]:
             self.epochs.append((self.rig.session.board_s(), self.rig.epoch))
+            self.note_pause_end()
+
+    def check_counts(self):
+        """Compare the executed pulses of all plans with the board's log: paused or not, none is lit twice."""
+        records = self.rig.store.list_recent()
+        assert all(record.executed_count <= record.pulse_count for record in records)
+        done = [record for record in records if record.status == "done"]
+        assert all(record.executed_count + record.dropped == record.pulse_count for record in done)
 
     def check_light(self):
         """Compare every pulse in the board's log with the epochs of the pushes that contain such a pulse."""
         for at_s, duty in self.rig.list_emitted():
             allowed = {self.find_epoch(at_s), self.find_epoch(at_s - DARK_WITHIN_S)}
             assert self.epochs_by_duty[duty] & allowed, f"a push of an older epoch was lit at {at_s} s"
+            is_paused = [lasts for since_s, lasts in self.pauses if since_s <= at_s][-1]
+            assert not is_paused, f"a push was lit while the light was paused, at {at_s} s"
 
     def find_epoch(self, at_s):
         return [epoch for begun_s, epoch in self.epochs if begun_s <= at_s or begun_s == 0.0][-1]
@@ -157,6 +199,7 @@ def test_nothing_of_an_older_epoch_is_accepted_or_lit(monkeypatch):
     assert sum(len(one.rig.list_emitted()) for one in played) > 300
     assert sum(one.accepted for one in played) > 40
     assert sum(len(one.epochs) for one in played) > 60
+    assert sum(len(one.pauses) for one in played) > 40
 
 
 class UncheckedQueue(PlanQueue):

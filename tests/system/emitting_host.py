@@ -1,4 +1,4 @@
-"""Host that arms a board and keeps it emitting until it ends: python emitting_host.py PORT.
+"""Host that arms a board and keeps it emitting until it ends: python emitting_host.py PORT LEASE_S.
 
 It prints lines of JSON: `clock_s`, board time minus this machine's monotonic time, with its uncertainty `within_s`;
 `emitted`, index and tick of an executed point. After a line on stdin it closes the port without a message to the board,
@@ -24,7 +24,8 @@ from optodrive.link.transport.serial_port import SerialPort
 
 PLACES = np.array([(30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500)])
 POINTS, DARK_US, ON_US, DUTY = 4000, 600, 8000, 2000
-AHEAD_S = 0.5
+AHEAD_LEASES = 1.5
+"""Points ahead, in leases: the lease ends the emission of a stopped host. More would delay the LEASE behind them."""
 BAUD = 115_200
 """Rate that an emulated UART receives reliably. On a faster line a burst would delay the LEASE behind it."""
 PATIENCE_S = 4.0
@@ -65,10 +66,10 @@ def train():
     return WirePoints(np.column_stack([PLACES[rows % len(PLACES)], *columns]).astype(np.uint16), rows)
 
 
-def main(name):
+def main(name, lease_s):
     request_realtime_scheduling()  # as the daemon's loop does
     table = load_config("display-16").model_dump()
-    table["board"]["baud"] = BAUD
+    table["board"] |= {"baud": BAUD, "lease_s": lease_s}
     port = RecordingPort(name)
     session = BoardSession(port, MonotonicClock(), build_board_requirements(Config.model_validate(table)))
     session.connect()
@@ -80,8 +81,9 @@ def main(name):
     print_json(
         clock_s=session.board_s() - time.monotonic(), within_s=session.collect_link_stats()["round_trip_ms"] * 0.5e-3
     )
-    session.begin(train(), session.board_s() + 0.05, AHEAD_S)
-    until(session, lambda: port.report is not None)
+    job = session.begin(train(), session.board_s() + 0.05, AHEAD_LEASES * lease_s)
+    ahead = int(AHEAD_LEASES * lease_s / (DARK_US + ON_US) * 1e6)
+    until(session, lambda: port.report is not None and job.next_to_send >= ahead)
     print_json(emitted={"index": port.report.first_index, "tick": port.report.records[0][0]})
     until(session, lambda: select.select([sys.stdin], [], [], 0)[0])
     print_json(closed_s=time.monotonic())
@@ -89,4 +91,4 @@ def main(name):
     sys.stdin.read()
 
 
-main(sys.argv[1])
+main(sys.argv[1], float(sys.argv[2]))

@@ -34,6 +34,7 @@ class WebStandIn:
     def command(self, kind):
         """Send a command, wait for its result and return it; raise its error."""
         with self._lock:
+            self._client.beat()  # as the web process does before it serves; the thread may be late on a busy machine
             request = self._client.request(kind)
 
         def receive():

@@ -33,8 +33,8 @@ TEXT, BINARY, CONTINUED, CLOSE, PING = 0x1, 0x2, 0x0, 0x8, 0x9
 class Target:
     """The daemon: builds requests, exchanges them, counts the outcomes."""
 
-    def __init__(self, host: str, port: int, tokens: dict[str, str], pixels: int) -> None:
-        self.host, self.port, self.tokens, self.pixels = host, port, tokens, pixels
+    def __init__(self, host: str, port: int, tokens: dict[str, str], pixels: int, interval_s: float = 0.0) -> None:
+        self.host, self.port, self.tokens, self.pixels, self.interval_s = host, port, tokens, pixels, interval_s
         self.counts: Counter[str] = Counter()
         self.triggered = asyncio.Event()
 
@@ -293,12 +293,17 @@ async def pipelined_requests(target: Target, number: int) -> None:
 
 @flood(workers=32)
 async def kept_alive_GETs(target: Target, number: int) -> None:
-    """The state, as fast as it is answered."""
+    """The state, as fast as it is answered, or once per interval."""
     reader, writer = await target.connect()
+    loop = asyncio.get_running_loop()
+    due_s = loop.time()
     try:
         for _ in range(500):
             writer.write(target.build_head("GET", "/v1/state", "viewer"))
             await asyncio.wait_for(target.read_answer(reader), 10.0)
+            if target.interval_s:
+                due_s = max(due_s + target.interval_s, loop.time())
+                await asyncio.sleep(due_s - loop.time())
     finally:
         writer.close()
 

@@ -20,8 +20,10 @@ from optodrive.device.config_file import locate_shipped
 TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
 START_S = 60.0
-PATIENT_LEASE_S = 1.0
-"""Maximum lease, for tests that are not about the lease. A busy machine may stall a host for 0.1 s."""
+PATIENT_LEASE_S, PATIENT_LEAD_S = 1.0, 0.06
+"""Maximum lease, and a long lead of streams, for tests that are about neither.
+
+A busy machine may stall a host for 0.1 s, and the bytes on a pseudo-terminal for some 10 ms."""
 ENDED = ("done", "superseded", "failed", "cancelled")
 
 
@@ -106,7 +108,8 @@ class Board:
 def config_text(port, name="display-437", sensor=None, lease_s=PATIENT_LEASE_S):
     """Return the text of a shipped configuration with the ports of a board and a sensor."""
     text = locate_shipped(f"{name}.toml").read_text()
-    text, count = re.subn(r"(?m)^lease_s = \S+", f"lease_s = {lease_s}", text)
+    lead = f"stream_lead_s = {PATIENT_LEAD_S}\n" if lease_s == PATIENT_LEASE_S else ""
+    text, count = re.subn(r"(?m)^lease_s = \S+", f"{lead}lease_s = {lease_s}", text)
     assert count == 1
     text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)
     return text if sensor is None else f'{text}\n[sensor]\nport = "{sensor}"\n'
@@ -200,7 +203,17 @@ class Daemon:
     def list_children(self):
         """Return the process ids of the daemon's processes besides the supervisor."""
         pid = self.process.pid
-        return [int(text) for text in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        return [int(text) for text in read_proc(pid, f"task/{pid}/children").split()]
+
+    def find_process(self, name):
+        """Return the process id of a process by its name in the state, None while there is none."""
+        if name == "supervisor":
+            return self.process.pid
+        for child in self.list_children():
+            is_link = "link.service" in read_proc(child, "cmdline")
+            if is_link if name == "link" else read_proc(child, "comm") == f"opto-{name}\n":
+                return child
+        return None
 
     def finished(self, plan):
         def ended():
@@ -216,6 +229,19 @@ class Daemon:
         self.process.wait(timeout=15)
         self.process.stdout.close()
         self.client.close()
+
+
+def read_proc(pid, name):
+    """Return the text of a file of a process in /proc, empty if the process has ended."""
+    try:
+        return Path(f"/proc/{pid}/{name}").read_text()
+    except OSError:
+        return ""
+
+
+def is_alive(pid):
+    """Return whether a process runs, is suspended or waits; a zombie does not."""
+    return read_proc(pid, "stat").rpartition(")")[2].split()[:1] not in ([], ["Z"])
 
 
 def read_role_tokens(daemon):

@@ -86,13 +86,16 @@ class LogTail:
 
 
 class FloodProcess:
-    """A flood of floods.py in its own process. workers: in place of the flood's own number."""
+    """A flood of floods.py in its own process.
 
-    def __init__(self, name, url, tokens, pixels=PIXELS, workers=None):
+    workers: in place of the flood's own number; interval_s: between two requests of a worker, if the flood knows it
+    """
+
+    def __init__(self, name, url, tokens, pixels=PIXELS, workers=None, interval_s=0.0):
         command = [sys.executable, HERE / "floods.py", name, *(() if workers is None else (str(workers),))]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         base = httpx.URL(url)
-        self._send({"host": base.host, "port": base.port, "tokens": tokens, "pixels": pixels})
+        self._send({"host": base.host, "port": base.port, "tokens": tokens, "pixels": pixels, "interval_s": interval_s})
         assert self.process.stdout.readline() == "ready\n", f"the flood {name} did not begin"
 
     def _send(self, value):

@@ -40,7 +40,7 @@ def test_status_shows_limits_and_the_counters_of_the_link(rig):
     assert lines["board"] == "DISARMED"
     assert re.match(r"\d+ frames retransmitted, \d+ refused, \d+ damaged on arrival here, ", lines["counters"])
     assert "absorber temperature 400 °C" in lines["limits"]
-    assert "energy of a pulse 0.125 J" in lines["limits"]
+    assert "energy of a pulse 125 mJ" in lines["limits"]
 
 
 def test_arming_an_armed_board_does_nothing(rig):

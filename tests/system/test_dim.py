@@ -2,7 +2,6 @@
 
 import os
 import signal
-from pathlib import Path
 
 import pytest
 
@@ -31,8 +30,7 @@ def find_max_share(board):
 
 def kill_planner(daemon):
     """Kill the planner process and wait until another one serves."""
-    (planner,) = (pid for pid in daemon.list_children() if Path(f"/proc/{pid}/comm").read_text() == "opto-planner\n")
-    os.kill(planner, signal.SIGKILL)
+    os.kill(daemon.find_process("planner"), signal.SIGKILL)
     wait_for(lambda: daemon.state()["limits"]["power_share"] is None, "the planner's end")
     return wait_for(lambda: daemon.state()["limits"]["power_share"], "the next planner")
 

@@ -3,7 +3,6 @@
 import os
 import signal
 import time
-from pathlib import Path
 
 import pytest
 
@@ -18,11 +17,9 @@ PATIENCE_S = 10.0
 
 def find_others(daemon):
     """Return the process ids of the daemon without its link process, the supervisor first, so that it restarts none."""
-    pid = daemon.process.pid
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    link = [child for child in children if "link.service" in Path(f"/proc/{child}/cmdline").read_text()]
-    assert len(link) == 1
-    return [pid, *(int(child) for child in children if child not in link)]
+    link = daemon.find_process("link")
+    assert link is not None
+    return [daemon.process.pid, *(child for child in daemon.list_children() if child != link)]
 
 
 @pytest.fixture

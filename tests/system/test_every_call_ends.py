@@ -1,38 +1,72 @@
-"""Every command ends within seconds, in one line, when a process is killed or suspended; nothing is lit afterwards."""
+"""Every call ends within seconds, in one line, when a process is killed or suspended; nothing is lit afterwards.
 
+The cases are the product of call, stage, process and signal. A process that a call does not need does not end it.
+"""
+
+import asyncio
 import json
 import os
-import signal
 import subprocess
+import threading
 import time
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
-from rig import OPTODRIVE, TOKEN, Board, Daemon, wait_for
+from forked_process import OPTODRIVE, start_process
+from optodrive.client import AsyncDisplay, Display
+from optodrive.core.errors import OptodriveError
+from rig import TOKEN, running, wait_for
+from signalled_processes import (
+    END_S,
+    GIVE_UP_S,
+    SIGNALS,
+    assert_one_line,
+    assert_stays_dark,
+    resume,
+    signalling,
+    wait_for_end,
+)
 
-END_S = 5.0
-"""Maximum time from the loss to the end of the command."""
-FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 30.0, "target_um": {str(k): 300 for k in range(200, 400)}}]}
+PROCESSES = ("board", "link", "planner", "web", "acceptor", "preview", "supervisor", "daemon")
+SHOWN = {"frames": [{"show_at_s": 0.0, "duration_s": 30.0, "target_um": {str(k): 300 for k in range(200, 400)}}]}
+TRAIN = {"duration_s": 1800.0, "pulse_width_s": 0.0004, "gap_s": 0.1, "power_w": 0.02}
+LONG_TO_PLAN = {"trains": [TRAIN | {"pixel": pixel, "start_s": 0.0025 * pixel} for pixel in range(40)]}
+"""700,000 pulses: several seconds of planning."""
 COMMANDS = {
     "play": ("play", "all", "height_um=150", "seconds=30"),
-    "push": ("push", "frames.json"),
+    "push": ("push", "shown.json"),
+    "push-long": ("push", "long.json"),
+    "hold": ("arm", "--hold"),
 }
-PROCESSES = ("board", "link", "planner", "web", "daemon")
-SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
+STAGES = {
+    "play": ("showing",),
+    "push": ("showing",),
+    "push-long": ("planning",),
+    "hold": ("arming", "held"),
+    "stream": ("before", "frames", "closing"),
+    "async-stream": ("before", "frames", "closing"),
+}
+UNNEEDED = ("preview-SIGKILL", "preview-SIGSTOP", "supervisor-SIGSTOP")
+"""Faults that end no call."""
+EVERY_TIME = {
+    "play-showing-board-SIGSTOP",
+    "push-showing-link-SIGKILL",
+    "push-long-planning-planner-SIGKILL",
+    "stream-frames-daemon-SIGSTOP",
+    "play-showing-acceptor-SIGKILL",
+}
 
 
 def matrix():
-    """Return all cases, of which one per process runs every time."""
+    """Return all cases, of which five run every time."""
     cases = []
-    for row, process in enumerate(PROCESSES):
-        for column, number in enumerate(SIGNALS):
-            for place, command in enumerate(COMMANDS):
-                is_every_time = column == (row + 1) % 2 and place == row // 2 % 2
-                marks = [] if is_every_time else [pytest.mark.slow]
-                name = f"{process}-{number.name}-{command}"
-                cases.append(pytest.param(process, number, command, marks=marks, id=name))
+    for call, stages in STAGES.items():
+        for stage in stages:
+            for process in PROCESSES:
+                for number in SIGNALS:
+                    name = f"{call}-{stage}-{process}-{number.name}"
+                    marks = [] if name in EVERY_TIME else [pytest.mark.slow]
+                    cases.append(pytest.param(call, stage, process, number, marks=marks, id=name))
     return cases
 
 
@@ -40,74 +74,157 @@ def find_pids(board, daemon, name):
     """Return the process ids of the board, of a process of the daemon, or of the whole daemon."""
     if name == "board":
         return [board.process.pid]
-    children = daemon.list_children()
     if name == "daemon":
-        return [daemon.process.pid, *children]
-    titles = {pid: Path(f"/proc/{pid}/cmdline" if name == "link" else f"/proc/{pid}/comm") for pid in children}
-    return [
-        pid for pid in children if ("link.service" if name == "link" else f"opto-{name}") in titles[pid].read_text()
-    ]
-
-
-@pytest.fixture
-def signalled():
-    """Return a function that sends a signal to processes, which continue at the end of the test."""
-    pids = []
-
-    def send(number, found):
-        pids.extend(found)
-        for pid in found:
-            os.kill(pid, number)
-
-    yield send
-    for pid in reversed(pids):
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGCONT)
+        return [daemon.process.pid, *daemon.list_children()]
+    return [daemon.find_process(name)]
 
 
 @pytest.fixture
 def rig(tmp_path):
-    board = Board(tmp_path)
-    try:
-        daemon = Daemon(tmp_path, board.port)
+    (tmp_path / "shown.json").write_text(json.dumps(SHOWN))
+    (tmp_path / "long.json").write_text(json.dumps(LONG_TO_PLAN))
+    with running(tmp_path) as board_and_daemon:
+        yield board_and_daemon
+
+
+class CommandCall:
+    """A call that is an `optodrive` command."""
+
+    def __init__(self, folder, daemon, call):
+        self._process = start_process(
+            [OPTODRIVE, *COMMANDS[call]],
+            cwd=folder,
+            env=os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    @property
+    def is_running(self):
+        return self._process.poll() is None
+
+    def wait(self):
+        """Return the time until the call ends, s, and its line."""
+        took_s, errors = wait_for_end(self._process)
+        assert self._process.returncode == 1
+        return took_s, assert_one_line(errors)
+
+    def stop(self):
+        self._process.kill()
+        self._process.communicate()
+
+
+class StreamCall:
+    """A call of the Python client that streams frames until it fails; in a thread. stage: at which it waits for go."""
+
+    def __init__(self, daemon, is_async, stage):
+        self.frames, self.error, self._stage = 0, None, stage
+        self.go, self.is_waiting = threading.Event(), threading.Event()
+        self._ending = False
+        run = (lambda: asyncio.run(self._run_async(daemon))) if is_async else (lambda: self._run(daemon))
+        self._thread = threading.Thread(target=self._catch, args=(run,), daemon=True)
+        self._thread.start()
+
+    @property
+    def is_running(self):
+        return self._thread.is_alive()
+
+    def _catch(self, run):
         try:
-            yield board, daemon
-        finally:
-            daemon.stop()
-    finally:
-        board.stop()
+            run()
+        except OptodriveError as error:
+            self.error = error
+
+    def _pause(self, stage):
+        if stage == self._stage:
+            self.is_waiting.set()
+            self.go.wait(GIVE_UP_S)
+
+    def _heights(self):
+        return {100 + self.frames % 50: 100.0}
+
+    def _run(self, daemon):
+        with Display(daemon.url, TOKEN) as display:
+            display.state()
+            self._pause("before")
+            with display.stream() as stream:
+                while not self._ending and (self._stage != "closing" or self.frames < 5):
+                    stream.send(self._heights())
+                    stream.wait()
+                    self.frames += 1
+                self._pause("closing")
+
+    async def _run_async(self, daemon):
+        async with AsyncDisplay(daemon.url, TOKEN) as display:
+            await display.state()
+            self._pause("before")
+            async with display.stream() as stream:
+                while not self._ending and (self._stage != "closing" or self.frames < 5):
+                    await stream.send(self._heights())
+                    await stream.wait()
+                    self.frames += 1
+                self._pause("closing")
+
+    def wait(self):
+        began_s = time.monotonic()
+        self._thread.join(GIVE_UP_S)
+        assert not self._thread.is_alive()
+        if self.error is not None:
+            assert "\n" not in str(self.error)
+            assert len(str(self.error)) > 20
+        return time.monotonic() - began_s, self.error
+
+    def stop(self):
+        self._ending = True
+        self.go.set()
+        self._thread.join(GIVE_UP_S)
 
 
-@pytest.mark.parametrize(("process", "number", "command"), matrix())
-def test_a_command_that_shows_ends(rig, signalled, tmp_path, process, number, command):
-    board, daemon = rig
-    (tmp_path / "frames.json").write_text(json.dumps(FRAMES))
-    daemon.arm()
-    with subprocess.Popen(
-        [OPTODRIVE, *COMMANDS[command]],
-        cwd=tmp_path,
-        env=os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as shown:
+def start_call(call, stage, board, daemon, folder):
+    """Start a call and return it when it has reached the stage."""
+    if call != "hold":
+        daemon.arm()
+    if call.endswith("stream"):
+        started = StreamCall(daemon, call == "async-stream", stage)
+        wait_for(lambda: started.frames > 5 if stage == "frames" else started.is_waiting.is_set(), stage)
+        return started
+    started = CommandCall(folder, daemon, call)
+    if stage == "showing":
         wait_for(lambda: len(board.of("pulse")) > 10, "pulses")
-        pids = find_pids(board, daemon, process)
-        signalled(number, pids)
-        lost_s = time.monotonic()
-        try:
-            _, errors = shown.communicate(timeout=30.0)
-        except subprocess.TimeoutExpired:
-            shown.kill()
-            raise
-        took_s = time.monotonic() - lost_s
-    print(f"\n{process} {number.name} {command}: {took_s:.2f} s: {errors.strip()}")
-    assert errors.count("\n") == 1
-    assert errors.startswith("optodrive: ")
-    assert shown.returncode == 1
-    assert took_s <= END_S
-    if process != "board":
-        wait_for(lambda: not board.of("gate")[-1]["on"], "dark")
-        pulses = len(board.of("pulse"))
-        time.sleep(0.3)
-        assert len(board.of("pulse")) == pulses
+    elif stage == "planning":
+        wait_for(lambda: daemon.state()["planner"]["busy"], "a busy planner")
+        time.sleep(0.2)
+    else:
+        state = "ARMING" if stage == "arming" else "ARMED"
+        wait_for(lambda: any(event["state"] == state for event in board.of("state")), state)
+        time.sleep(0.1)
+    return started
+
+
+@pytest.mark.parametrize(("call", "stage", "process", "number"), matrix())
+def test_a_call_ends(rig, tmp_path, call, stage, process, number):
+    board, daemon = rig
+    started = start_call(call, stage, board, daemon, tmp_path)
+    try:
+        with signalling() as send:
+            pids = find_pids(board, daemon, process)
+            began_s = time.monotonic()
+            send(number, pids)
+            if stage in ("before", "closing"):
+                started.go.set()
+            if f"{process}-{number.name}" in UNNEEDED:
+                time.sleep(1.0)
+                assert started.is_running or stage == "closing"
+                assert getattr(started, "error", None) is None
+                return
+            _, line = started.wait()
+            took_s = time.monotonic() - began_s
+            print(f"\n{took_s:.2f} s: {line}")
+            assert took_s <= END_S
+            assert line or stage == "closing"
+            if process == "board":
+                resume(pids)
+            assert_stays_dark(board)
+    finally:
+        started.stop()

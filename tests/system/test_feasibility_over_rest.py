@@ -4,8 +4,10 @@ import json
 import os
 
 import pytest
+from PIL import Image
 
 from forked_process import run_process
+from optodrive.cli.exit_status import DOES_NOT_FIT
 from rig import OPTODRIVE, TOKEN, running
 
 PIXELS = [str(pixel) for pixel in range(40)]
@@ -102,7 +104,24 @@ def test_the_command_line_reports_it_in_one_line(armed, tmp_path):
     refused = run("plan", path, "--strict")
     assert refused.returncode == 1
     assert "nearest feasible: " in refused.stderr
-    pushed = run("push", path, "--fit", "priority", "--dry-run", "--url", armed.url).stdout
-    assert "omitted          late: pixels " in pushed
+    pushed = run("push", path, "--fit", "priority", "--dry-run", "--url", armed.url)
+    assert "omitted          late: pixels " in pushed.stdout
+    assert (pushed.returncode, pushed.stderr) == (DOES_NOT_FIT, "")
     simulated = run("simulate", path, "--pixels", "0").stdout
     assert simulated.splitlines()[0] == late
+
+
+def test_what_does_not_fit_is_shown_and_has_its_own_exit_status(armed, tmp_path):
+    path, film = tmp_path / "frames.json", tmp_path / "film.gif"
+    path.write_text(json.dumps(LATE))
+    white, grey = (Image.new("L", (32, 32), level) for level in (255, 200))
+    white.save(film, save_all=True, append_images=[grey])
+    shown = run("push", path, "--url", armed.url)
+    assert shown.stdout.startswith("fits: no, ")
+    assert "executed         40 of 40 sent" in shown.stdout
+    assert (shown.returncode, shown.stderr) == (DOES_NOT_FIT, "")
+    fast = run("play", "animation", film, "rate_hz=50", "--dry-run", "--url", armed.url)
+    assert fast.stdout.startswith("fits: no, ")
+    assert (fast.returncode, fast.stderr) == (DOES_NOT_FIT, "")
+    easy = run("play", "pixel", "pixel=17", "height_um=50", "seconds=0.1", "--dry-run", "--url", armed.url)
+    assert (easy.stdout[:9], easy.returncode) == ("fits: yes", 0)

@@ -4,17 +4,21 @@ import json
 import pickle
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 
 from engine_rig import RiggedEngine
 from optodrive.core.clock import MonotonicClock
+from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import planner_server
 from optodrive.daemon.engine.dry_run import DryRunStart
+from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.planner_server import PlannerServer
+from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState
 from optodrive.daemon.responses.telemetry import BudgetEvent, DisplayEvent, PulseBatch
@@ -51,7 +55,7 @@ class Web:
 
     def submit(self, sequence, epoch=None, streamed=False, fit="as_is"):
         fields = {"name": "push", "policy": "trim", "fit": fit, "streamed": streamed, "caller": "token"}
-        fields["lists_pulses"] = not streamed
+        fields |= {"lists_pulses": not streamed, "labels": {}, "parameters": {}}
         epoch = self.engine.web.status["epoch"] if epoch is None else epoch
         return self.request("submit", encode_sequence(sequence), arrived_s=time.monotonic(), epoch=epoch, **fields)
 
@@ -252,3 +256,15 @@ def test_telemetry_is_sent_while_there_are_readers_and_pulses_once(web):
     count = len(web.of_kind("telemetry"))
     time.sleep(0.3)
     assert len(web.of_kind("telemetry")) == count
+
+
+def test_an_error_of_the_telemetry_is_raised_in_the_loop_which_ends_the_process(rig, monkeypatch):
+    errors, commands = [], LoopCommands()
+    producer = TelemetryProducer(rig[0], MonotonicClock(), pytest.fail, errors.append)
+    monkeypatch.setattr(producer, "produce", lambda: np.zeros(1)[2])
+    producer.start()
+    wait_for(lambda: errors, "the error")
+    commands.post(partial(planner_server._fail, errors[0]))
+    with pytest.raises(OptodriveError, match="the telemetry failed: IndexError: index 2 is out of bounds"):
+        commands.run_pending()
+    commands.close()

@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from optodrive.daemon.supervisor.child import HANG_S
-from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
+from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, wait_for
 
 PROCESSES = ("link", "planner", "preview", "acceptor", "web", "supervisor")
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM)
@@ -67,17 +67,6 @@ class Rig:
         text = f'lease_s = {PATIENT_LEASE_S}\n[daemon]\naudit = "{self.audit}"\n{daemon_keys}#'
         self.daemon = Daemon(folder, self.board.port, replace=[(f"lease_s = {PATIENT_LEASE_S}", text)])
 
-    def find(self, name):
-        """Return the process id of a process of the daemon."""
-        pid = self.daemon.process.pid
-        if name == "supervisor":
-            return pid
-        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-            is_link = "link.service" in read_proc(child, "cmdline")
-            if is_link if name == "link" else read_proc(child, "comm").strip() == f"opto-{name}":
-                return int(child)
-        return None
-
     def bring_to(self, situation):
         """Bring the board to a situation, from any other."""
         wait_for(lambda: ask(self.daemon)["link"]["state"] == "up", "the link")
@@ -103,13 +92,6 @@ class Rig:
             self.daemon.stop()
         finally:
             self.board.stop()
-
-
-def read_proc(pid, name):
-    try:
-        return Path(f"/proc/{pid}/{name}").read_text()
-    except OSError:
-        return ""
 
 
 def board_now_us(board):
@@ -160,11 +142,11 @@ def own(tmp_path):
 def test_a_child_that_ends_leaves_the_board_dark_and_starts_again_disarmed(shared, process, number, situation):
     rig, daemon, board = shared, shared.daemon, shared.board
     rig.bring_to(situation)
-    first, (entries, lines) = rig.find(process), rig.restarts()
+    first, (entries, lines) = rig.daemon.find_process(process), rig.restarts()
     since_us, since_s = board_now_us(board), time.monotonic()
     os.kill(first, number)
     patience_s = RESTART_S + (HANG_S if number == signal.SIGSTOP else 0.0)
-    wait_for(lambda: rig.find(process) not in (None, first), f"another {process} process", patience_s)
+    wait_for(lambda: rig.daemon.find_process(process) not in (None, first), f"another {process} process", patience_s)
     bound_s = DARK_S.get((process, number))
     state = wait_for(
         lambda: (
@@ -180,7 +162,8 @@ def test_a_child_that_ends_leaves_the_board_dark_and_starts_again_disarmed(share
     if bound_s is None:
         expected = {"idle": "DISARMED", "armed": "ARMED", "streaming": "RUNNING"}[situation]
         assert state["board"]["state"] == expected
-        assert situation != "streaming" or board.of("gate")[-1]["t_us"] > since_us + 1e6 * HANG_S / 4
+        if situation == "streaming":  # the plan goes on; the new process may serve sooner than this shows
+            wait_for(lambda: board.of("gate")[-1]["t_us"] > since_us + 1e6 * HANG_S / 4, "the plan's later pulses")
     else:
         assert state["board"]["state"] in ("DISARMED", "FAULT")
         assert_dark_within(board, since_us, bound_s)
@@ -200,7 +183,7 @@ EMITTING_STATES = ("ARMED", "RUNNING", "ARMING")
 def test_the_end_of_the_supervisor_leaves_the_board_dark_and_no_process(own, process, number, situation):
     rig, daemon, board = own, own.daemon, own.board
     rig.bring_to(situation)
-    pids = [rig.find(name) for name in PROCESSES[:-1]]
+    pids = [rig.daemon.find_process(name) for name in PROCESSES[:-1]]
     since_us = board_now_us(board)
     os.kill(daemon.process.pid, number)
     if number == signal.SIGSTOP:
@@ -208,12 +191,13 @@ def test_the_end_of_the_supervisor_leaves_the_board_dark_and_no_process(own, pro
             ask(daemon)["board"]["state"] == {"idle": "DISARMED", "armed": "ARMED", "streaming": "RUNNING"}[situation]
         )
         time.sleep(HANG_S * 1.5)
-        since_us = board_now_us(board)
         daemon.call("POST", "/v1/stop")
-        assert_dark_within(board, since_us, AT_ONCE_S)
+        assert_dark_within(board, board_now_us(board), 0.0)  # by the answer, however late the request arrived
         os.kill(daemon.process.pid, signal.SIGCONT)
         time.sleep(0.5)
-        assert [rig.find(name) for name in PROCESSES[:-1]] == pids  # the beats of the meantime were not lost
+        assert [
+            rig.daemon.find_process(name) for name in PROCESSES[:-1]
+        ] == pids  # the beats of the meantime were not lost
         return
     assert daemon.process.wait(15) == (0 if number == signal.SIGTERM else -number)
     wait_for(lambda: not any(is_alive(pid) for pid in pids), "the end of the children", 1.0)
@@ -222,10 +206,6 @@ def test_the_end_of_the_supervisor_leaves_the_board_dark_and_no_process(own, pro
     )
     assert_dark_within(board, since_us, DARK_S[process, number])
     assert "Traceback" not in daemon.errors.read_text()
-
-
-def is_alive(pid):
-    return read_proc(pid, "stat").rpartition(")")[2].split()[:1] not in ([], ["Z"])
 
 
 @pytest.mark.parametrize(
@@ -244,9 +224,9 @@ def test_a_plan_finishes_without_the_web_process_if_that_is_configured(tmp_path,
         rig.bring_to("armed")
         plan = rig.daemon.call("POST", "/v1/plans", json=long_train(seconds=5.0))
         wait_for(lambda: len(rig.board.of("pulse")) > 20, "pulses")
-        first = rig.find(name)
+        first = rig.daemon.find_process(name)
         os.kill(first, number)
-        wait_for(lambda: rig.find(name) not in (None, first), f"another {name} process")
+        wait_for(lambda: rig.daemon.find_process(name) not in (None, first), f"another {name} process")
         wait_for(lambda: len(rig.board.of("pulse")) == plan["planned"], "the plan's last pulse")
         assert rig.board.of("fault") == []
     finally:
@@ -256,17 +236,17 @@ def test_a_plan_finishes_without_the_web_process_if_that_is_configured(tmp_path,
 @pytest.mark.parametrize("name", ["acceptor", "web"])
 def test_callers_are_not_refused_while_the_acceptor_or_the_web_process_is_away(shared, name):
     rig = shared
-    first = rig.find(name)
+    first = rig.daemon.find_process(name)
     os.kill(first, signal.SIGKILL)
     assert ask(rig.daemon)["display"]
-    assert rig.find(name) != first
+    assert rig.daemon.find_process(name) != first
 
 
 def test_the_supervisor_has_one_thread_and_children_hold_only_their_descriptors(shared):
-    pid = shared.find("supervisor")
+    pid = shared.daemon.find_process("supervisor")
     assert len(list(Path(f"/proc/{pid}/task").iterdir())) == 1
     port = int(shared.daemon.url.rsplit(":")[-1])
-    assert {name for name in PROCESSES if listens(shared.find(name), port)} == {"supervisor", "acceptor"}
+    assert {name for name in PROCESSES if listens(shared.daemon.find_process(name), port)} == {"supervisor", "acceptor"}
 
 
 def listens(pid, port):

@@ -8,6 +8,8 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from optodrive.cli.main import run
+from optodrive.daemon.web.tokens import read_private_tokens
 from rig import TOKEN, long_train, wait_for
 from service_manager import Manager, reload
 
@@ -104,3 +106,20 @@ def test_a_reload_while_armed_ends_what_a_removed_token_has_begun(manager, board
     of_cara.join(5)
     assert not of_cara.is_alive()
     assert daemon.state()["control"] is None
+
+
+def test_a_running_daemon_takes_tokens_of_the_command_by_reload(manager, board, make_daemon, tmp_path):
+    path, out = tmp_path / "tokens.toml", tmp_path / "dora.toml"
+    write_tokens(path, "rig")
+    daemon = make_daemon(board, replace=[("lease_s = 1.0", f'lease_s = 1.0\n[daemon]\ntokens = "{path}"\n#')])
+    assert run(["token", "add", "dora", "--role", "operator", "--out", str(out), "--config", str(daemon.config)]) == 0
+    (token,) = read_private_tokens(out).all
+    headers = {"Authorization": f"Bearer {token.secret}"}
+    assert httpx.get(f"{daemon.url}/v1/me", headers=headers).status_code == 401
+    said = reload(daemon, manager, lambda text: text)
+    assert token.secret not in said
+    assert httpx.get(f"{daemon.url}/v1/me", headers=headers).json()["role"] == "operator"
+    assert run(["token", "revoke", "dora", "--config", str(daemon.config)]) == 0
+    assert "tokens revoked: dora" in reload(daemon, manager, lambda text: text)
+    assert httpx.get(f"{daemon.url}/v1/me", headers=headers).status_code == 401
+    assert token.secret not in daemon.errors.read_text()

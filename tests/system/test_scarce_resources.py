@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from optodrive.daemon.supervisor.child import HANG_S
-from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
+from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, wait_for
 from test_processes import (
     EMITTING_STATES,
     PROCESSES,
@@ -25,7 +25,6 @@ from test_processes import (
     ask,
     assert_dark_within,
     board_now_us,
-    is_alive,
     rigs,
     shared,
 )
@@ -83,7 +82,7 @@ def await_restart(rig, process, first, entries, lines):
 
     `test_processes` measures how long that takes.
     """
-    wait_for(lambda: rig.find(process) not in (None, first), f"another {process} process")
+    wait_for(lambda: rig.daemon.find_process(process) not in (None, first), f"another {process} process")
     wait_for(lambda: (s := ask(rig.daemon))["link"]["state"] == "up" and s["planner"]["alive"], "the daemon to serve")
     wait_for(lambda: len(rig.restarts()[0]) > len(entries), "the audit entry")
     now_entries, now_lines = rig.restarts()
@@ -123,7 +122,7 @@ def slow_unless(chosen, *names):
 def test_a_process_without_memory_leaves_the_board_dark_and_starts_again(shared, process, situation):
     rig = shared
     bring(rig, situation)
-    first, (entries, lines) = rig.find(process), rig.restarts()
+    first, (entries, lines) = rig.daemon.find_process(process), rig.restarts()
     log_bytes = rig.daemon.errors.stat().st_size
     starve(first)
     since_us = board_now_us(rig.board)
@@ -143,7 +142,7 @@ def test_a_process_without_memory_leaves_the_board_dark_and_starts_again(shared,
 def test_a_request_that_takes_the_planners_memory_is_refused_or_ends_it_dark(shared):
     rig = shared
     bring(rig, "armed")
-    first = rig.find("planner")
+    first = rig.daemon.find_process("planner")
     starve(first)
     response = rig.daemon.client.post("/v1/plans", json=long_train(seconds=200.0))
     assert response.status_code in (500, 503)
@@ -159,8 +158,8 @@ def test_a_supervisor_without_memory_keeps_the_board_under_control(tmp_path, sit
     rig = Rig(tmp_path)
     try:
         bring(rig, situation)
-        starve(rig.find("supervisor"))
-        os.kill(rig.find("preview"), signal.SIGKILL)
+        starve(rig.daemon.find_process("supervisor"))
+        os.kill(rig.daemon.find_process("preview"), signal.SIGKILL)
         time.sleep(RESTART_S)
         if rig.daemon.process.poll() is None:
             assert httpx.post(f"{rig.daemon.url}/v1/stop", headers={"Authorization": f"Bearer {TOKEN}"}).is_success
@@ -177,13 +176,13 @@ def test_a_supervisor_without_memory_keeps_the_board_under_control(tmp_path, sit
 @contextmanager
 def full_disk(rig):
     """Let no process of the daemon write to any file, as on a full disk; what was open before is limited, too."""
-    pids = [rig.find(name) for name in PROCESSES]
+    pids = [rig.daemon.find_process(name) for name in PROCESSES]
     for pid in pids:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
     try:
         yield
     finally:
-        for pid in {rig.find(name) for name in PROCESSES} | {pid for pid in pids if is_alive(pid)}:
+        for pid in {rig.daemon.find_process(name) for name in PROCESSES} | {pid for pid in pids if is_alive(pid)}:
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
 
@@ -197,9 +196,9 @@ def test_a_full_disk_behind_everything_costs_lines_and_arming_only(tmp_path, pro
         with full_disk(rig):
             pulses = len(board.of("pulse"))
             wait_for(lambda: len(board.of("pulse")) > pulses + 10, "further pulses")
-            first, since_us = rig.find(process), board_now_us(board)
+            first, since_us = rig.daemon.find_process(process), board_now_us(board)
             os.kill(first, signal.SIGKILL)
-            wait_for(lambda: rig.find(process) not in (None, first), "another process")
+            wait_for(lambda: rig.daemon.find_process(process) not in (None, first), "another process")
             wait_for(lambda: ask(daemon)["link"]["state"] == "up", "the link")
             if process != "preview":
                 assert_dark_within(board, since_us, PATIENT_LEASE_S)
@@ -223,7 +222,7 @@ def test_a_log_that_nobody_reads_keeps_no_process_from_its_work(tmp_path):
     fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096)
     board = Board(tmp_path)
     daemon = Daemon(tmp_path, board.port)
-    find = partial(Rig.find, type("Running", (), {"daemon": daemon})())
+    find = daemon.find_process
     try:
         with (tmp_path / "daemon.err").open("wb", buffering=0) as pipe:
             os.set_blocking(pipe.fileno(), False)
@@ -256,7 +255,7 @@ def test_a_process_that_reads_nothing_costs_only_its_own_requests(shared):
     """The preview process is stopped while callers send it more than its socket holds."""
     rig = shared
     bring(rig, "streaming")
-    first = rig.find("preview")
+    first = rig.daemon.find_process("preview")
     os.kill(first, signal.SIGSTOP)
     statuses = []
 
@@ -271,7 +270,7 @@ def test_a_process_that_reads_nothing_costs_only_its_own_requests(shared):
         caller.start()
     pulses = len(rig.board.of("pulse"))
     wait_for(lambda: len(rig.board.of("pulse")) > pulses + 20, "pulses all the time")
-    wait_for(lambda: rig.find("preview") not in (None, first), "another preview process")
+    wait_for(lambda: rig.daemon.find_process("preview") not in (None, first), "another preview process")
     for caller in callers:
         caller.join()
     assert {answer.status_code for answer in statuses} <= {422, 429, 503}
@@ -298,7 +297,7 @@ def test_a_process_that_ends_in_between_leaves_nothing_to_be_lit_later(shared, p
     bring(rig, "streaming" if moment == "stopping" else "armed")
     if moment == "arming":
         daemon.call("POST", "/v1/disarm")
-    first, (entries, lines) = rig.find(process), rig.restarts()
+    first, (entries, lines) = rig.daemon.find_process(process), rig.restarts()
     path, body = {
         "arming": ("/v1/arm", None),
         "planning": ("/v1/plans", long_train(seconds=600.0)),

@@ -335,8 +335,7 @@ def test_without_an_audit_file_arming_fails_and_stop_works(make_board, tmp_path)
         daemon.arm()
         plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
         wait_for(lambda: len(board.of("pulse")) > 5, "pulses")
-        (web,) = (pid for pid in daemon.list_children() if Path(f"/proc/{pid}/comm").read_text() == "opto-web\n")
-        full = partial(resource.prlimit, web, resource.RLIMIT_FSIZE)
+        full = partial(resource.prlimit, daemon.find_process("web"), resource.RLIMIT_FSIZE)
         before = full()
         full((audit.stat().st_size, before[1]))
         # The running plan continues until STOP.

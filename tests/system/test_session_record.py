@@ -1,5 +1,6 @@
 """`optodrive serve --record-session`: the file compared with the daemon's responses and the board's log."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import read_recording, write_recording
 from rig import long_train, wait_for
 
+LABELS = {"subject": "S07 µ", "trial": 12, "practice": False}
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 
 
@@ -34,7 +36,9 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
     daemon = make_daemon(board, options=("--record-session", str(path)))
     daemon.arm()
     frames = {"frames": [{"show_at_s": 0, "duration_s": 1, "target_um": {"17": 90, "18": 60}}]}
-    answers = [daemon.finished(daemon.call("POST", "/v1/plans", json=body)["plan"]) for body in (frames, frames)]
+    requests = (("plans", frames | {"labels": LABELS}), ("patterns/pixel", {"pixel": 17, "labels": LABELS}))
+    answers = [daemon.finished(daemon.call("POST", f"/v1/{path}", json=body)["plan"]) for path, body in requests]
+    assert [answer["labels"] for answer in answers] == [LABELS, LABELS]
     daemon.call("POST", "/v1/plans", json=long_train())
     wait_for(lambda: len(board.of("pulse")) > 15, "pulses")
     daemon.call("POST", "/v1/stop")
@@ -45,6 +49,9 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
         runs, plans = file["runs"], file["plans"]
         assert [plans[f"p{k}"].attrs["status"] for k in (1, 2, 3)] == ["done", "done", "failed"]
         np.testing.assert_allclose(plans["p1/target_um"][0, [17, 18]], [90, 60])
+        assert [json.loads(plans[f"p{k}/labels"][()]) for k in (1, 2, 3)] == [LABELS, LABELS, {}]
+        parameters = [json.loads(plans[f"p{k}/parameters"][()]) for k in (1, 2, 3)]
+        assert parameters == [{}, {"pixel": 17, "height_um": 100.0, "seconds": 1.0}, {}]
         for answer in answers:
             kept, columns = plans[answer["plan"]], answer["executed_pulses"]
             np.testing.assert_allclose(1e6 * kept["simulated_m"][:], columns["simulated_um"])

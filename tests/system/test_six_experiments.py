@@ -8,6 +8,7 @@ import pytest
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
+from optodrive.planning.stimuli.experiments import build_two_fingers
 from rig import running
 
 PWM_S = 2e-4
@@ -145,5 +146,9 @@ def test_experiment_6_two_fingers_interleaved(executed):
     assert pulses["pixel"].tolist() == pulses["pixel"][:8].tolist() * 5
     gaps_s = np.diff(pulses["start_s"]) - pulses["width_s"][:-1]
     assert gaps_s == pytest.approx(gaps_s.mean(), abs=PWM_S)
-    assert pulses["total_s"] == pytest.approx(0.600 + gaps_s.sum(), abs=PWM_S)
+    trains = build_two_fingers(load_config(), "digits", "2-3", None).trains
+    requested = sorted((start_s, train.pixel) for train in trains for start_s in train.pulse_starts_s())
+    requested_s, pixels = zip(*requested, strict=True)
+    assert pulses["pixel"].tolist() == list(pixels)
+    assert pulses["first_s"] == pytest.approx(requested_s, abs=PWM_S)
     assert pulses["settling_s"] <= gaps_s.sum() + PWM_S < 0.04

@@ -83,7 +83,7 @@ def test_a_wrong_frame_is_refused_and_the_stream_continues(daemon):
         stream.send('{"target_um": {"9999": 1}}')
         (refused,) = until(stream, {"status": "refused"})
         assert refused["problem"]["code"] == "unknown_pixel"
-        stream.send('{"frame": 1, "target_um": {"17": 9000}}')
+        stream.send('{"frame": 1, "target_um": {"17": 900}}')
         (refused,) = until(stream, {"status": "refused"})
         assert refused["problem"]["code"] == "target_unreachable"
         stream.send(binary(2, [3]))

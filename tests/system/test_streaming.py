@@ -8,11 +8,12 @@ import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import plan_making
-from optodrive.daemon.engine.planner import PLANNING_TIME_FACTOR, SPLICE_TRIES
+from optodrive.daemon.engine.planner import SPLICE_TRIES
+from optodrive.daemon.engine.planning_time import FACTOR
 from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 
-RESERVED_S = 0.5
+RESERVED_S = 1.0
 """Time reserved for planning, so that no plan is late on a busy machine, which would make a pause."""
 
 
@@ -32,7 +33,8 @@ def test_the_newest_frame_wins_without_a_pause(armed, board, reserved_s):
     answers = []
     for k in range(5):
         if reserved_s is not None:
-            armed._planner._last_planning_s = reserved_s / PLANNING_TIME_FACTOR
+            for _ in range(2):
+                armed._planner._planning_time.record(reserved_s / FACTOR)
         answers.append(stream(armed, frame(range(85 * k, 85 * k + 85), 300.0 if k < 4 else 60.0)))
         wait_for(lambda: armed.get_plan(answers[-1].plan).executed >= 12, "a part of the frame")
     records = [ended(armed, answer) for answer in answers]
@@ -60,7 +62,7 @@ def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
 
     def slowly(*arguments, **more):
         """Take longer than the time reserved from the plan before."""
-        tries.append(0.05 + PLANNING_TIME_FACTOR * (1 + len(tries)) * armed._planner._last_planning_s)
+        tries.append(0.05 + armed._planner._planning_time.compute_reserved_s(len(tries)))
         time.sleep(tries[-1] if len(tries) <= SPLICE_TRIES else 0.0)
         return plan_sequence(*arguments, **more)
 

@@ -15,6 +15,7 @@ import pytest
 
 from optodrive.daemon.supervisor.child import HANG_S, RESTART_DELAYS_S
 from optodrive.daemon.supervisor.supervisor import END_GRACE_S
+from rig import is_alive
 from tiny_daemon import LIFE_S
 
 PROGRAM = Path(__file__).with_name("tiny_daemon.py")
@@ -256,10 +257,3 @@ def test_the_board_is_stopped_before_the_end_and_the_absence_of_the_stop_is_noti
 def test_a_hung_child_ends_with_the_supervisor_and_the_absence_of_the_check_is_noticed(start):
     assert takes_a_hung_child_with_it(start, {})
     assert not takes_a_hung_child_with_it(start, {"MUTANT": "no death with the supervisor"})
-
-
-def is_alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")")[1].split()[0] != "Z"
-    except OSError:
-        return False

@@ -5,7 +5,6 @@ import os
 import signal
 import socket
 import time
-from pathlib import Path
 
 import httpx
 import pytest
@@ -61,16 +60,11 @@ def test_a_push_that_began_before_a_stop_is_never_lit(armed, command):
     assert board.of("pulse")
 
 
-def find_process(daemon, name):
-    (pid,) = (pid for pid in daemon.list_children() if Path(f"/proc/{pid}/comm").read_text() == f"opto-{name}\n")
-    return pid
-
-
 def test_stop_answers_while_the_planner_is_suspended(armed):
     board, daemon = armed
     daemon.call("POST", "/v1/plans", json=long_train())
     wait_for(lambda: len(board.of("pulse")) > 5, "pulses")
-    planner = find_process(daemon, "planner")
+    planner = daemon.find_process("planner")
     os.kill(planner, signal.SIGSTOP)
     try:
         assert daemon.call("POST", "/v1/stop")["board"]["state"] == "DISARMED"
@@ -83,7 +77,7 @@ def test_stop_takes_effect_while_the_web_process_is_suspended_and_is_answered_af
     board, daemon = armed
     daemon.call("POST", "/v1/plans", json=long_train())
     wait_for(lambda: len(board.of("pulse")) > 5, "pulses")
-    web = find_process(daemon, "web")
+    web = daemon.find_process("web")
     os.kill(web, signal.SIGSTOP)
     try:
         with socket.create_connection(("127.0.0.1", daemon.client.base_url.port), timeout=20) as link:
@@ -101,7 +95,7 @@ def test_stop_takes_effect_while_the_web_process_is_suspended_and_is_answered_af
 @pytest.mark.parametrize("name", ["planner", "preview"])
 def test_a_push_to_a_process_that_has_died_is_refused_in_one_line_and_the_next_is_served(armed, name):
     _, daemon = armed
-    os.kill(find_process(daemon, name), signal.SIGKILL)
+    os.kill(daemon.find_process(name), signal.SIGKILL)
     seen = set()
 
     def is_served():

@@ -117,9 +117,13 @@ def application():
 
 
 @pytest.fixture
-def acceptor_port(tmp_path):
+def policy():
+    return AccessPolicy(Tokens([Token("viewer", "viewer", SECRET)]), DaemonSection())
+
+
+@pytest.fixture
+def acceptor_port(tmp_path, policy):
     """Keep an acceptor in a thread and return the port that it listens on."""
-    policy = AccessPolicy(Tokens([Token("viewer", "viewer", SECRET)]), DaemonSection())
     supervisor, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     beat = BeatWriter(channel.detach())
     with supervisor, open_tcp_listener("127.0.0.1", 0) as listener:
@@ -135,8 +139,8 @@ def acceptor_port(tmp_path):
 
 
 @pytest.fixture
-def port(application, acceptor_port, tmp_path):
-    server = Server(application, AcceptorClient(tmp_path / "acceptor"))
+def port(application, acceptor_port, tmp_path, policy):
+    server = Server(application, AcceptorClient(tmp_path / "acceptor"), policy)
     ready = threading.Event()
     server.on_ready = ready.set
     thread = threading.Thread(target=server.run)

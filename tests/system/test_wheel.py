@@ -25,7 +25,10 @@ def made(tmp_path, *options):
 def test_everything_is_inside(tmp_path):
     with zipfile.ZipFile(build_wheel(tmp_path)) as wheel:
         inside = set(wheel.namelist())
-    shipped = {path.relative_to(ROOT).as_posix() for path in (ROOT / "configs").rglob("*") if path.is_file()}
+    folders = ("configs", "docs", "firmware_protocol")
+    files = (path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file())
+    shipped = {path.relative_to(ROOT).as_posix() for path in files if "__pycache__" not in path.parts}
+    assert {"docs/how-to/wire-a-board.md", "firmware_protocol/ports/rp2040/main.c"} <= shipped
     assert {f"optodrive/_shipped/{path}" for path in shipped} <= inside
     own = {path.relative_to(ROOT).as_posix() for path in (ROOT / "optodrive").rglob("*") if path.is_file()}
     assert {path for path in own if "__pycache__" not in path} <= inside  # modules, the page, py.typed

@@ -84,7 +84,8 @@ def format_camera_stats(measured: "CameraMeasurement", outliers: list[str], spot
     sigma_um = sorted(m_to_um(sigma_m) for sigma_m in measured.sigma_m.tolist())
     lines = [
         f"camera           {m_to_um(measured.pixel_scale_m):.0f} µm per pixel; grid corners "
-        f"{measured.plane.residual_px:.2f} px rms per axis, from {measured.view_count} pictures",
+        f"{measured.plane.residual_px:.2f} px rms per axis, "
+        f"from {measured.view_count} picture{'s' if measured.view_count > 1 else ''}",
         f"centroids        sigma {median(sigma_um):.1f} µm per axis, {sigma_um[-1]:.1f} µm max",
     ]
     saturated, outside = (_select_names(measured, mask) for mask in (measured.is_saturated, measured.is_outside))

@@ -101,7 +101,7 @@ def _write_report(path: Path, fit: "FieldFit", source: str, lines: list[str]) ->
         f"<figure>{draw_sigma_map(fit)}<figcaption>Sigma of the beam position per axis</figcaption></figure>",
         "</div>",
         "<h2>Parameters</h2><p>Parameters are correlated: the field is better determined than its parameters.</p>",
-        render_table(("", "value", "sigma"), rows, frozenset({1, 2})),
+        render_table(("parameter", "value", "sigma"), rows, frozenset({1, 2}), "Parameters"),
     ]
     with atomic_write(path) as temporary:
         temporary.write_text(

@@ -1,4 +1,4 @@
-"""The command group `optodrive calibrate field | camera | board | servo | pixels`."""
+"""The command group `optodrive calibrate field | camera | board | steps | servo | sweep | pixels`."""
 
 import typer
 
@@ -7,11 +7,13 @@ from optodrive.cli.calibrate.camera import camera
 from optodrive.cli.calibrate.field import field
 from optodrive.cli.calibrate.pixels import pixels
 from optodrive.cli.calibrate.servo import servo
+from optodrive.cli.calibrate.steps import steps
+from optodrive.cli.calibrate.sweep import sweep
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = typer.Typer(help="Calibrate the scan field, the galvo servos or the pixels.", no_args_is_help=True)
-    for command in (field, camera, board, servo, pixels):
+    for command in (field, camera, board, steps, servo, sweep, pixels):
         group.command()(command)
     app.add_typer(group, name="calibrate")

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 from optodrive.cli.options import load_run_config
 from optodrive.cli.output import print_json
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
+    from optodrive.device.config import Config
     from optodrive.lab.calibration.pixels.sweep import Aim
 
 PULSE_FIELDS = ("pulse_width_s", "power_w")
@@ -15,20 +17,44 @@ README = "README.txt"
 
 
 def write_sweep(folder: Path, config: str | None, json: bool) -> None:
-    """Write, for each aim, its pulses and the pixel map that offsets the beam by it, and a README.
+    """Write the files of the sweep and a README, and print what they contain.
+
+    Raises InputError where a cell is too small for the offsets or the folder cannot be created.
+    """
+    from optodrive.core.files import atomic_write, check_output
+    from optodrive.device.config import build_pixel_layout
+    from optodrive.lab.calibration.pixels.sweep import compute_pulse
+
+    check_output("--sweep", folder, folder=True)
+    loaded, aims = write_sweep_files(folder, config)
+    pixel_count = len(build_pixel_layout(loaded.display))
+    with atomic_write(folder / README) as temporary:
+        temporary.write_text("\n".join(_format_instructions(aims, loaded.name)) + "\n", encoding="utf-8")
+    pulses = [dict(zip(PULSE_FIELDS, compute_pulse(loaded, aim), strict=True)) for aim in aims]
+    if json:
+        described = [aim._asdict() | pulse for aim, pulse in zip(aims, pulses, strict=True)]
+        print_json({"folder": str(folder), "aims": described, "pulses": pixel_count})
+        return
+    print(f"aims             {len(aims)}, one file per aim, {pixel_count} pulses per file")
+    for pulse, label in zip(pulses[:2], ("centre", "across edges"), strict=True):
+        print(f"{label:<17}{format_quantity(pulse['pulse_width_s'], 's')} at {format_quantity(pulse['power_w'], 'W')}")
+    print(f"written          {folder}; {README} lists what to play and what to record")
+
+
+def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[Aim]]":
+    """Write, for each aim, its pulses and the pixel map that offsets the beam by it; return the configuration and aims.
 
     Raises InputError where a cell is too small for the offsets or the folder cannot be created.
     """
     from json import dumps
 
-    from optodrive.core.files import atomic_write, check_output
+    from optodrive.core.files import atomic_write
     from optodrive.core.types.stimuli import FrameSequence
     from optodrive.device.config import build_pixel_layout
     from optodrive.device.pixel_map import PixelMap, max_aim_offset_m, remove_pixel_map, write_pixel_map
-    from optodrive.lab.calibration.pixels.sweep import build_sweep, compute_pulse, list_aims
+    from optodrive.lab.calibration.pixels.sweep import build_sweep, list_aims
     from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
-    check_output("--sweep", folder, folder=True)
     loaded = remove_pixel_map(load_run_config(config, None))
     offset_max_m, pixel_count = max_aim_offset_m(loaded), len(build_pixel_layout(loaded.display))
     aims = list_aims(loaded)
@@ -48,17 +74,7 @@ def write_sweep(folder: Path, config: str | None, json: bool) -> None:
             temporary.write_text(text, encoding="utf-8")
         pixel_map = PixelMap.uniform(pixel_count, aim.x_m, aim.y_m)
         write_pixel_map(folder / f"{aim.name}.pixels.toml", pixel_map, loaded, {"source": f"sweep, aim {aim.name}"})
-    with atomic_write(folder / README) as temporary:
-        temporary.write_text("\n".join(_format_instructions(aims, loaded.name)) + "\n", encoding="utf-8")
-    pulses = [dict(zip(PULSE_FIELDS, compute_pulse(loaded, aim), strict=True)) for aim in aims]
-    if json:
-        described = [aim._asdict() | pulse for aim, pulse in zip(aims, pulses, strict=True)]
-        print_json({"folder": str(folder), "aims": described, "pulses": pixel_count})
-        return
-    print(f"aims             {len(aims)}, one file per aim, {pixel_count} pulses per file")
-    for pulse, label in zip(pulses[:2], ("centre", "across edges"), strict=True):
-        print(f"{label:<17}{pulse['pulse_width_s'] * 1e3:g} ms at {pulse['power_w']:.3f} W")
-    print(f"written          {folder}; {README} lists what to play and what to record")
+    return loaded, aims
 
 
 def _format_instructions(aims: "list[Aim]", display_name: str) -> list[str]:

@@ -45,6 +45,7 @@ def fit_pixel_map(recordings: list[Path], out: Path | None, config: str | None, 
     from optodrive.device.field_file import strip_toml_specials
     from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
     from optodrive.lab.calibration.pixels.map_fit import PixelMapFitter, compute_stats
+    from optodrive.lab.diagnosis.plausible_units import check_recording_units
     from optodrive.lab.recording import read_recording
     from optodrive.physics.parameters import load_parameters
     from optodrive.physics.thermal_state import build_cold_state
@@ -53,11 +54,14 @@ def fit_pixel_map(recordings: list[Path], out: Path | None, config: str | None, 
     # Gains are relative to the model without a map, also where the configuration names one.
     loaded = remove_pixel_map(load_run_config(config, model))
     parameters = load_parameters(loaded.pixel_model.parameters)
+    reference = parameters.build_pixel(loaded.display.bridge_width_m)
     announce_compilation()
     fitter = PixelMapFitter(loaded, build_cold_state(loaded, parameters).simulate_displacement_m)
     with show_progress("reading") as on_progress:
         for index, recording in enumerate(recordings):
-            for run in read_recording(recording).runs:
+            measurement = read_recording(recording)
+            check_recording_units(measurement, reference, str(recording))
+            for run in measurement.runs:
                 fitter.add_run(str(recording), run)
             on_progress((index + 1) / len(recordings))
     source = str(recordings[0]) if len(recordings) == 1 else f"{recordings[0]} and {len(recordings) - 1} more"

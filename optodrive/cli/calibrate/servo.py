@@ -22,16 +22,20 @@ def servo(
         raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
     from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
+    from optodrive.lab.diagnosis.plausible_units import check_recording_units
     from optodrive.lab.recording import read_recording
     from optodrive.lab.servo_identification.common_servo import find_common_servo
     from optodrive.lab.servo_identification.identify import identify
     from optodrive.lab.servo_identification.report import build_report, format_report_lines, write_mirrors
     from optodrive.lab.servo_identification.step_trace import extract_trace
+    from optodrive.physics.parameters import load_parameters
 
     check_output("--out", out, ".toml")
     # Servos measured before are not loaded: an invalid mirrors.toml must not prevent a new identification.
     loaded, source = load_config(config, measured_servo=False), str(recording)
     measurement = read_recording(recording)
+    reference = load_parameters(loaded.pixel_model.parameters).build_pixel(loaded.display.bridge_width_m)
+    check_recording_units(measurement, reference, source)
     x_trace, y_trace = (extract_trace(source, measurement, axis) for axis in range(2))
     slew_rad_per_s = loaded.scanner.slew_rad_per_s
     servos = identify(source, x_trace, slew_rad_per_s), identify(source, y_trace, slew_rad_per_s)

@@ -67,13 +67,43 @@ class NextExperiment:
     lab_time_s: float
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualTrace:
-    """One signal of one group: measured values and residuals, [m].
+@dataclass(frozen=True)
+class RivalModel:
+    """One or two hypotheses, refitted to the runs that are not held out.
 
-    nominal, extended: residuals in units of sigma, the noise of one sample
+    chi2, bic: above those of the best rival; heldout_gain: as `HeldOutGain.reduction`, None if not measured;
+    parameters: value and unit by name
     """
 
+    label: str
+    causes: tuple[str, ...]
+    chi2: float
+    bic: float
+    heldout_gain: float | None
+    is_chosen: bool
+    parameters: dict[str, tuple[float, str]]
+
+
+@dataclass(frozen=True)
+class HeldOutError:
+    """RMSE of both models in one signal of one held-out group, and the expected noise; SI."""
+
+    group: str
+    signal: str
+    runs: int
+    nominal: float
+    extended: float
+    noise_floor: float
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualTrace:
+    """One signal of one run: measured values and residuals, [m].
+
+    nominal, extended: residuals in units of sigma, the noise of one sample; rms_nominal: of all samples, not thinned
+    """
+
+    run: str
     group: str
     signal: str
     sigma: float
@@ -81,6 +111,19 @@ class ResidualTrace:
     measured: FloatArray
     nominal: FloatArray
     extended: FloatArray
+    rms_nominal: float
+
+    def compute_model(self, residual: FloatArray) -> FloatArray:
+        """Return the values of the model with this residual, SI."""
+        return self.measured - self.sigma * residual
+
+
+@dataclass(frozen=True, eq=False)
+class ExampleTrace:
+    """The run with the largest or the median error of the nominal model in one signal; role: "worst" or "typical"."""
+
+    role: str
+    trace: ResidualTrace
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +131,9 @@ class Discrepancy:
     """Diagnosis of a recording.
 
     verdict: "cause", "none", "unexplained" or "ambiguous"; terms: the extension, term → parameter → value; base:
-    nominal parameters as refitted with it; explained_fraction: share of the detected excess
+    nominal parameters as refitted with it; residual_traces: the first run of every group, with the models fitted to all
+    runs; held_out_traces, held_out_errors: with the models fitted to the other runs; explained_fraction: share of the
+    detected excess
     """
 
     verdict: str
@@ -103,6 +148,10 @@ class Discrepancy:
     fitted_runs: tuple[str, ...]
     held_out_runs: tuple[str, ...]
     residual_traces: tuple[ResidualTrace, ...]
+    example_traces: tuple[ExampleTrace, ...]
+    held_out_traces: tuple[ResidualTrace, ...]
+    held_out_errors: tuple[HeldOutError, ...]
+    rivals: tuple[RivalModel, ...]
     remarks: tuple[str, ...]
     explained_fraction: float
     elapsed_s: float

@@ -1,6 +1,6 @@
 """Pulse plans, the limiter's state between plans, and pulses that the board reports as executed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -136,3 +136,10 @@ class ExecutedPulses:
 
     def __len__(self) -> int:
         return len(self.index)
+
+
+def concatenate_executed(first: ExecutedPulses, second: ExecutedPulses) -> ExecutedPulses:
+    """Concatenate the pulses of two parts of a plan; they are complete if those of both are."""
+    columns = {item.name: getattr(first, item.name) for item in fields(ExecutedPulses) if item.name != "complete"}
+    joined = {name: np.concatenate([column, getattr(second, name)]) for name, column in columns.items()}
+    return ExecutedPulses(**joined, complete=first.complete and second.complete)

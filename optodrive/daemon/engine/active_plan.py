@@ -1,10 +1,12 @@
 """A plan that waits or runs, with its record, thermal states and points."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.core.types.plans import BudgetState, ExecutedPulses
+from optodrive.core.types.plans import BudgetState, ExecutedPulses, concatenate_executed
 from optodrive.daemon.engine.plan_record import Execution, PlanRecord
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.quantisation import WirePoints
@@ -20,6 +22,9 @@ class ActivePlan:
     epoch: in which the request arrived; the board executes nothing of an older one
     crc: CRC-32 of the verified bytes of the points
     refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
+    first_row: first row that was not executed when the plan was interrupted last
+    zero_s: time of the plan at which its points begin; origin_s: the same, or when the light went off meanwhile
+    is_interrupted: whether the rows from first_row on were dropped, and are not yet planned again
     executed, executed_rows, simulated_m: what the board reports, [n executed] plan rows, and displacements computed
     from it
     on_end: called with the plan at its end; must neither block nor raise
@@ -33,10 +38,56 @@ class ActivePlan:
     epoch: int
     crc: int
     refreshed: BoolArray | None = None
+    first_row: int = 0
+    zero_s: float = 0.0
+    origin_s: float = 0.0
+    is_interrupted: bool = False
     executed: ExecutedPulses | None = None
     executed_rows: IntArray | None = None
     simulated_m: FloatArray | None = None
     on_end: "Callable[[ActivePlan], None]" = field(default=lambda plan: None)
+
+    @property
+    def executed_before(self) -> int:
+        """Number of pulses that were executed before the plan was interrupted last."""
+        return 0 if self.executed_rows is None else len(self.executed_rows)
+
+    @property
+    def rest_count(self) -> int:
+        """Number of rows from first_row on."""
+        return len(self.planned.plan) - self.first_row
+
+    def add_executed(self, executed: ExecutedPulses, rows: IntArray) -> None:
+        """Add what the board reports of the points since the last interruption."""
+        executed = replace(executed, start_s=executed.start_s + self.zero_s)
+        if self.executed is not None and self.executed_rows is not None:
+            executed = concatenate_executed(self.executed, executed)
+            rows = np.concatenate([self.executed_rows, rows])
+        self.executed, self.executed_rows = executed, rows
+
+    def interrupt(self, off_s: float) -> None:
+        """Keep the rows behind the last executed one for later. off_s: board time at which the light went off.
+
+        The rows before it count as executed, also one that was cut short.
+        """
+        if self.executed is None or self.executed_rows is None:
+            return
+        if len(self.executed_rows):
+            self.first_row = int(self.executed_rows[-1]) + 1
+            is_complete = len(self.executed_rows) == self.first_row
+            self.executed = replace(self.executed, complete=is_complete)
+        self._fold_delay()
+        self.is_interrupted = True
+        self.origin_s = max(self.zero_s, off_s - self.record.start_s)
+        self.record.status = "paused"
+        self.record.sent = self.executed_before
+
+    def _fold_delay(self) -> None:
+        """Shift the plan's zero by the delay of what was executed, so that the rows that are left are as late."""
+        delay_s, self.record.delay_s = max(0.0, self.record.delay_s), 0.0
+        self.record.start_s += delay_s
+        if self.executed is not None:
+            self.executed = replace(self.executed, start_s=self.executed.start_s - delay_s)
 
     def update_execution(self) -> None:
         """Write to the record what was executed and simulated so far."""

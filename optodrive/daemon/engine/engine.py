@@ -21,7 +21,7 @@ from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
-from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
+from optodrive.daemon.engine.plan_making import NEVER, NO_LABELS, LabelValues, ParameterValues, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
@@ -35,6 +35,7 @@ from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.states import ARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
+from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.planning.display_model import DisplayModel
@@ -123,6 +124,7 @@ class Engine:
         self._connection.exchange(wait_s)
         self._follow_link()
         self._plan_queue.update_jobs(self._session.pop_refusal())
+        self._planner.follow_pause()
         self._save_thermal_state()  # before a plan starts, so that a successor of this process knows its heat
         self._plan_queue.start_next()
         self._beat()
@@ -191,6 +193,8 @@ class Engine:
         caller: str = "",
         caller_left: threading.Event = NEVER,
         lists_pulses: bool = True,
+        labels: LabelValues = NO_LABELS,
+        parameters: ParameterValues = NO_LABELS,
     ) -> "Future[PlanReport]":
         """Plan the sequence that `build` returns, and queue the plan. Raise BusyError if too many requests wait.
 
@@ -199,6 +203,7 @@ class Engine:
         caller: name of the token that submitted it
         caller_left: set when the caller no longer waits, which ends the planning
         lists_pulses: whether the answer lists the pulses one by one
+        labels, parameters: of the caller and of the pattern, for report and recording
         """
         if streamed and fit != "as_is":
             raise InputError("fit", fit, "as_is for streamed plans: a stream has no time for a feasibility check")
@@ -206,7 +211,20 @@ class Engine:
         ago_s = 0.0 if arrived_s is None else self._clock.now_s() - arrived_s
         board_s = self.board_s() - ago_s
         return self._planner.submit(
-            PlanningRequest(build, name, policy, fit, streamed, board_s, epoch, caller, caller_left, lists_pulses)
+            PlanningRequest(
+                build,
+                name,
+                policy,
+                fit,
+                streamed,
+                board_s,
+                epoch,
+                caller,
+                caller_left,
+                lists_pulses,
+                labels,
+                parameters,
+            )
         )
 
     def _require_armed(self) -> None:
@@ -233,7 +251,7 @@ class Engine:
 
     def get_plan(self, plan_id: str, pulses: bool = True) -> PlanReport:
         """Report a plan. Raise InputError (plan_not_found) for an unknown plan."""
-        return self._plan_store.find(plan_id).build_report(self.board_s(), pulses)
+        return self._plan_store.find(plan_id).build_report(self.board_s(), pulses, self.read_clocks())
 
     def cancel(self, plan_id: str) -> "Future[PlanReport]":
         """Remove a waiting plan, or turn the gate off and end a running one. The board stays armed."""
@@ -241,7 +259,7 @@ class Engine:
         def end() -> PlanReport:
             record = self._plan_store.find(plan_id)
             self._plan_queue.cancel(record)
-            return record.build_report(self.board_s())
+            return record.build_report(self.board_s(), clocks=self.read_clocks())
 
         return self.commands.submit(end)
 
@@ -258,6 +276,10 @@ class Engine:
     def board_s(self) -> float:
         """Return the present board time, s."""
         return self._session.board_s()
+
+    def read_clocks(self) -> ClockReading | None:
+        """Return the present time on the clocks of board and host, None while they are not synchronised."""
+        return self._session.read_clocks()
 
     @property
     def dimmer(self) -> Dimmer:
@@ -281,15 +303,15 @@ class Engine:
 
     def drain_events(self) -> list[PlanProgress | ClockShift]:
         """Return and remove the events since the last call, in order. Only one reader may call it."""
-        events, drained = self._plan_queue.events, []
+        events, drained = self._plan_queue.accounts.events, []
         while events:
             drained.append(events.popleft())
         return drained
 
     def list_upcoming(self) -> list[ActivePlan]:
-        """Return the running plans and the first waiting one."""
+        """Return the running plans and the first waiting one, whose time is known unless the light is paused."""
         plan_queue = self._plan_queue
-        waiting = plan_queue.waiting.copy()
+        waiting = [] if plan_queue.pause.off_s is not None else plan_queue.waiting.copy()
         return [run.plan for run in plan_queue.running.copy()] + ([waiting[0]] if waiting else [])
 
     @property
@@ -301,7 +323,7 @@ class Engine:
         """Return a value that changes with everything in the planner's state but the totals."""
         plans = tuple((record.plan_id, record.status) for record in self._plan_store.list_recent())
         planner = self._planner.is_busy, self._planner.is_alive, self._dimmer.power_share
-        return plans, len(self._plan_queue.waiting), planner
+        return plans, len(self._plan_queue.waiting), self._plan_queue.pause.is_held, planner
 
     def build_planner_state(self) -> PlannerState:
         """Report queue and planner."""

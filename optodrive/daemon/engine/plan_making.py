@@ -2,8 +2,9 @@
 
 import threading
 import zlib
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import NamedTuple, Never
 
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
@@ -25,6 +26,11 @@ NEVER = threading.Event()
 """Event of a caller that does not leave."""
 
 
+LabelValues = Mapping[str, str | int | float | bool]
+ParameterValues = Mapping[str, str | float | bool | None]
+NO_LABELS: Mapping[str, Never] = MappingProxyType({})
+
+
 class PlanningRequest(NamedTuple):
     """Request for a plan.
 
@@ -33,6 +39,7 @@ class PlanningRequest(NamedTuple):
     arrived_s: board time of the request's arrival; epoch: in which it arrived
     caller: name of the token that submitted it; caller_left: set when the caller no longer waits
     lists_pulses: whether the answer lists the pulses one by one
+    labels, parameters: of the caller and of the pattern, for report and recording
     """
 
     build: Callable[[], FrameSequence]
@@ -45,6 +52,8 @@ class PlanningRequest(NamedTuple):
     caller: str = ""
     caller_left: threading.Event = NEVER
     lists_pulses: bool = True
+    labels: LabelValues = NO_LABELS
+    parameters: ParameterValues = NO_LABELS
 
 
 def make_plan(
@@ -79,7 +88,10 @@ def make_plan(
         start_s=snapshot.start_s,
         arrived_s=request.arrived_s,
         caller=request.caller,
+        labels=dict(request.labels),
+        parameters=dict(request.parameters),
         streamed=request.streamed,
+        first_pulse_s=float(decoded.start_s[0]) if len(decoded.start_s) else None,
     )
     return ActivePlan(
         record=record,

@@ -20,27 +20,23 @@ from optodrive.daemon.engine.planning_snapshot import (
     build_cut_snapshot,
     mark_refreshed,
 )
-from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
+from optodrive.daemon.engine.progress import ClockShift, PlanRun
+from optodrive.daemon.engine.pulse_accounts import PulseAccounts
+from optodrive.daemon.engine.queue_pause import START_LEAD_S, QueuePause
+from optodrive.daemon.engine.queue_thermal import QueueThermal
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
-from optodrive.daemon.engine.thermal_estimate import EndedPlan, ThermalEstimate, rewind_estimate
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.fault_hints import get_fault_hint
-from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
 from optodrive.planning.display_model import DisplayModel
 
-START_LEAD_S = 0.05
-"""Minimum time from now, and from the end of the queue, to a plan's zero. Its first points must arrive in time."""
-STREAM_LEAD_S = 0.02
-STREAM_SEND_AHEAD_S = 0.04
-"""Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
+STREAM_START_LEAD_S = 0.02
+SHARED_STREAM_LEAD_S = 0.04
+"""Least lead of a stream if the link process has no real-time scheduling."""
 MIN_DELAY_S = 1e-5
-HOLD_MAX_S = 1.0
-"""Longest time for which the board waits for points before it ends a plan."""
-EVENTS_MAX = 4000
-"""Maximum number of events without a reader, 20 s at least. An event keeps its plan in memory."""
 
 
 class PlanQueue:
@@ -49,7 +45,8 @@ class PlanQueue:
     Any thread may call make_snapshot() and read is_busy and must_preempt. Everything else belongs to the loop that owns
     the session.
     on_progress: called during long computations in the loop's thread
-    events: executed pulses and clock shifts, newest last, for one reader in another thread that removes them
+    accounts: what has become of the pulses
+    pause: keeps plans from starting while the light is paused
     """
 
     def __init__(
@@ -59,15 +56,13 @@ class PlanQueue:
         self.on_progress: Callable[[], None] = lambda: None
         self.running: deque[PlanRun] = deque()
         self.waiting: deque[ActivePlan] = deque()
-        self.totals = {"planned": 0, "sent": 0, "executed": 0}
-        self.timing = TimingTotals()
-        self.events: deque[PlanProgress | ClockShift] = deque(maxlen=EVENTS_MAX)
+        self.accounts = PulseAccounts(session)
         self._display = display
         self._session = session
         self._plan_store = plan_store
         self._executor = executor
-        self._thermal = ThermalEstimate(*display.build_cold_state())
-        self._queue_end_s = 0.0
+        self._thermal = QueueThermal(display, session, lambda: self.on_progress())
+        self.pause = QueuePause(self.lock, self.waiting, self._thermal, session)
         self._refresh_cycle: RefreshCycle | None = None
         self._revoked_callers = RevokedCallers()
 
@@ -89,7 +84,7 @@ class PlanQueue:
         A streamed plan truncates the running stream at the first pulse that is still unsent after planning_time_s.
         """
         with self.lock:
-            thermal = self._thermal
+            thermal = self._thermal.estimate
             start_s = self._earliest_start_s(streamed, planning_time_s if streamed else 0.0)
             last = self._find_running_stream() if streamed else None
         if last is not None:
@@ -108,13 +103,19 @@ class PlanQueue:
         return plan if plan.record.streamed and not plan.record.dropped else None
 
     def _earliest_start_s(self, streamed: bool, planning_time_s: float = 0.0) -> float:
-        lead_s = STREAM_LEAD_S if streamed else START_LEAD_S
-        return max(self._queue_end_s, self._session.board_s() + planning_time_s) + lead_s
+        lead_s = STREAM_START_LEAD_S if streamed else START_LEAD_S
+        return max(self._thermal.end_s, self._session.board_s() + planning_time_s) + lead_s
+
+    @property
+    def _stream_lead_s(self) -> float:
+        """Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
+        lead_s = self._display.config.board.stream_lead_s
+        return lead_s if self._session.is_realtime else max(lead_s, SHARED_STREAM_LEAD_S)
 
     def _build_cut_snapshot(
         self, running: ActivePlan, thermal: ThermalEstimate, planning_time_s: float
     ) -> PlanningSnapshot | None:
-        min_start_s = self._session.board_s() + STREAM_SEND_AHEAD_S + planning_time_s
+        min_start_s = self._session.board_s() + self._stream_lead_s + planning_time_s
         return build_cut_snapshot(running, thermal, min_start_s, self._display.budget)
 
     # --- accepting plans ----------------------------------------------------------------------------------------
@@ -128,18 +129,19 @@ class PlanQueue:
         record = plan.record
         with self.lock:
             self.require_epoch(plan.epoch)
+            if record.streamed:
+                self.pause.require_no_pause()
             self._revoked_callers.require_valid(record.caller, record.arrived_s)
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
-            if self._thermal is not snapshot.thermal:
+            if self._thermal.estimate is not snapshot.thermal:
                 return False
             if snapshot.predecessor is None:
                 record.start_s = max(record.start_s, self._earliest_start_s(record.streamed))
                 self.waiting.append(plan)
             elif not self._splice(plan, snapshot.predecessor, snapshot.cut_row):
                 return False
-            self._thermal = ThermalEstimate.from_plan(plan.planned.heat, plan.planned.budget, record.start_s)
-            self._queue_end_s = record.start_s + record.duration_s
-            self.totals["planned"] += record.pulse_count
+            self._thermal.append(plan)
+            self.accounts.totals["planned"] += record.pulse_count
             record.status = "queued" if snapshot.predecessor is None else "running"
             record.planned_after_s = self._session.board_s() - record.arrived_s
             self._plan_store.add(plan)
@@ -154,7 +156,7 @@ class PlanQueue:
         if not self.running or self.running[-1].plan is not predecessor:
             return False
         kept_points = predecessor.points.count_before(cut_row)
-        job = self._session.splice(plan.points, kept_points, plan.epoch, STREAM_SEND_AHEAD_S, plan.crc)
+        job = self._session.splice(plan.points, kept_points, plan.epoch, self._stream_lead_s, plan.crc)
         if job is None:
             return False
         predecessor.record.dropped = predecessor.record.pulse_count - cut_row
@@ -171,9 +173,7 @@ class PlanQueue:
         """Supersede the waiting plans, and end a running plan that is not streamed, for a newer plan."""
         with self.lock:
             if self.waiting:
-                first = self.waiting[0]
-                self._thermal = ThermalEstimate.from_plan(first.heat_before, first.budget_before, first.record.start_s)
-                self._queue_end_s = self._thermal.budget.at_s
+                self._thermal.set(self._thermal.estimate_before(self.waiting[0]))
             while self.waiting:
                 self._supersede(self.waiting.popleft())
             if self.running and not self.running[-1].plan.record.streamed:
@@ -191,17 +191,23 @@ class PlanQueue:
             last = self._find_running_stream()
             if last is None:
                 return
-            snapshot = self._build_cut_snapshot(last, self._thermal, planning_time_s=0.0)
+            snapshot = self._build_cut_snapshot(last, self._thermal.estimate, planning_time_s=0.0)
             if snapshot is None or not self._session.truncate(last.points.count_before(snapshot.cut_row)):
                 return
             last.record.dropped = last.record.pulse_count - snapshot.cut_row
-            self._thermal = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
-            self._queue_end_s = snapshot.start_s
-            self._refresh_cycle = RefreshCycle(self._thermal, mark_refreshed(last, snapshot.cut_row))
+            estimate = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
+            self._thermal.set(estimate, snapshot.start_s)
+            self._refresh_cycle = RefreshCycle(estimate, mark_refreshed(last, snapshot.cut_row))
 
     def _supersede(self, plan: ActivePlan) -> None:
-        plan.record.dropped = plan.record.pulse_count
-        plan.end("superseded", "replaced by a newer plan")
+        plan.record.dropped = plan.rest_count
+        self._end_waiting(plan, "superseded", "replaced by a newer plan")
+
+    def _end_waiting(self, plan: ActivePlan, status: PlanStatus, error: str | None) -> None:
+        plan.update_execution()
+        plan.end(status, error)
+        if plan.executed is not None:
+            self._executor.submit(simulate_plan, plan, status, error)
 
     def cancel(self, record: PlanRecord, reason: str = "") -> None:
         """Remove a waiting plan, or turn the gate off and end a running plan with its splices. reason: for people."""
@@ -209,7 +215,12 @@ class PlanQueue:
         if plan is not None:
             with self.lock:
                 self.waiting.remove(plan)
-            plan.end("cancelled", reason or "removed from the queue")
+                if plan.is_interrupted and self.waiting:
+                    first, estimate = self.waiting[0], self._thermal.estimate_before(plan)
+                    first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
+                elif plan.is_interrupted:
+                    self._thermal.rewind([plan])
+            self._end_waiting(plan, "cancelled", reason or "removed from the queue")
         elif any(run.plan.record is record for run in self.running):
             self._session.flush()
             self.end_running("cancelled", reason or "cancelled while running")
@@ -225,40 +236,34 @@ class PlanQueue:
 
     def start_next(self) -> None:
         """Start the next plan if the board is ready for it."""
-        if self.running or not self.waiting or not self._session.is_ready:
+        if self.running or not self.waiting or not self._session.is_ready or self.pause.off_s is not None:
             return
         with self.lock:
             plan = self.waiting.popleft()
             record = plan.record
-            if not record.pulse_count:
-                plan.end("done", None)
+            if not plan.rest_count:
+                self._end_waiting(plan, "done", None)
                 return
             record.status = "running"
-            ahead_s = STREAM_SEND_AHEAD_S if record.streamed else inf
-            job = self._session.begin(plan.points, record.start_s, plan.epoch, ahead_s, plan.crc)
+            ahead_s = self._stream_lead_s if record.streamed else inf
+            job = self._session.begin(plan.points, record.start_s + plan.zero_s, plan.epoch, ahead_s, plan.crc)
             self.running.append(PlanRun(plan, job))
 
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
         if self._session.board.state in UNARMED_STATES and self.is_busy:
             self.fail_all(self._describe_unarmed())
+        off_s = self._session.pop_drained()
+        if off_s is not None:
+            self._interrupt(off_s)
+        self.pause.end_if_idle()
         for run in self.running:
-            self._count_progress(run)
+            self.accounts.count_progress(run)
         while self.running and self.running[0].job.is_finished:
             self._finish_first()
         if self.running and refusal is not None:
             self._session.flush()
             self.end_running("failed", f"the board refused a part of the plan ({refusal})")
-
-    def _count_progress(self, run: PlanRun) -> None:
-        """Count the pulses of a running plan that were sent and executed since the last call."""
-        record, job = run.plan.record, run.job
-        sent, executed = job.sent_count, job.executed_count
-        if executed > record.executed_count:
-            self.events.append(PlanProgress(run, record.executed_count, executed))
-        self.totals["sent"] += sent - record.sent
-        self.totals["executed"] += executed - record.executed_count
-        record.sent, record.executed_count = sent, executed
 
     def _describe_unarmed(self) -> str:
         """Return why the board no longer executes plans, in one sentence."""
@@ -277,32 +282,46 @@ class PlanQueue:
             if record.delay_s > MIN_DELAY_S:
                 self._delay_all(record.delay_s)
 
+    def _interrupt(self, off_s: float) -> None:
+        """Let what ran when the light was paused wait for the rest of its pulses; drop that of a stream.
+
+        off_s: board time at which the light went off
+        """
+        with self.lock:
+            self.pause.begin(off_s)
+            streams = [run.plan for run in self.running if run.plan.record.streamed]
+            while self.running:
+                run = self.running.popleft()
+                self.accounts.count_progress(run)
+                plan, record = run.plan, run.plan.record
+                left = record.pulse_count - record.executed_count
+                if record.streamed or not left:
+                    record.dropped = left
+                    error = "the light was paused, and a stream shows the present" if left else None
+                    self._conclude(run, "superseded" if left else "done", error)
+                    continue
+                self.accounts.collect_executed(run)
+                delay_s = record.delay_s
+                plan.interrupt(off_s)
+                if delay_s > MIN_DELAY_S:
+                    self._delay_all(delay_s)
+                self.waiting.appendleft(plan)
+            if streams and not self.waiting:
+                self._thermal.rewind(streams)
+
     def _conclude(self, run: PlanRun, status: PlanStatus, error: str | None) -> None:
-        self._count_progress(run)  # reports may have arrived with what ends the plan
-        plan, job = run
-        record, start_s, scale = plan.record, plan.planned.plan.start_s, self._session.scale
-        executed = job.build_executed(plan.planned.plan, scale.full_power_w, scale.tick_s)
-        rows = job.list_executed_rows()
-        plan.executed, plan.executed_rows = executed, rows
+        plan, record = run.plan, run.plan.record
+        self.accounts.collect_executed(run)
         plan.update_execution()
-        if record.executed_count < job.pulse_count:
-            self.events.append(PlanProgress(run, record.executed_count, job.pulse_count))
-        if job.first_sent_tick is not None:
-            record.first_byte_after_s = job.first_sent_tick * scale.tick_s - record.arrived_s
-        if len(executed):
-            record.first_light_after_s = record.start_s + float(executed.start_s[0]) - record.arrived_s
-            record.delay_s = float(executed.start_s[-1] - start_s[rows[-1]])
-            record.timing_error = compute_timing_error(start_s[rows], executed.start_s)
-            if record.timing_error is not None:
-                self.timing.add(record.timing_error)
+        if record.timing_error is not None:
+            self.accounts.timing.add(record.timing_error)
         if status in ("failed", "cancelled"):
             plan.end(status, error)
         self._executor.submit(simulate_plan, plan, status, error)
 
     def _delay_all(self, delay_s: float) -> None:
         with self.lock:
-            self._thermal = self._thermal.with_delay(delay_s)
-            self._queue_end_s += delay_s
+            self._thermal.delay(delay_s)
             for plan in (*(run.plan for run in self.running), *self.waiting):
                 plan.record.start_s += delay_s
             for run in self.running:
@@ -319,13 +338,7 @@ class PlanQueue:
             if delay_s > MIN_DELAY_S:
                 self._delay_all(delay_s)
             if ended and not self.waiting:
-                self._rewind_thermal_state([run.plan for run in ended], clock_shift_s)
-
-    def _rewind_thermal_state(self, ended: list[ActivePlan], clock_shift_s: float) -> None:
-        gate_off_s = self._session.board_s() - clock_shift_s + self._display.config.board.lease_s
-        plans = [EndedPlan.from_plan(plan) for plan in ended]
-        self._thermal = rewind_estimate(plans, gate_off_s, self._display.budget, self.on_progress)
-        self._queue_end_s = max(gate_off_s, self._thermal.budget.at_s)
+                self._thermal.rewind([run.plan for run in ended], clock_shift_s)
 
     def fail_all(self, reason: str, clock_shift_s: float = 0.0) -> None:
         """Fail all running and waiting plans.
@@ -338,45 +351,32 @@ class PlanQueue:
             if self.running:
                 self.end_running("failed", reason, clock_shift_s)
             elif waiting:
-                self._rewind_thermal_state(waiting[:1], clock_shift_s)
+                self._thermal.rewind(waiting[:1], clock_shift_s)
         for plan in waiting:
-            plan.end("failed", reason)
+            self._end_waiting(plan, "failed", reason)
 
     def on_board_restarted(self, delay_s: float) -> None:
         """Shift heat and budget to the restarted clock of the board."""
-        self.events.append(ClockShift(delay_s))
+        self.accounts.events.append(ClockShift(delay_s))
         with self.lock:
-            self._thermal = self._thermal.with_delay(delay_s)
-            self._queue_end_s = self._thermal.budget.at_s
+            self._thermal.shift_clock(delay_s)
 
     # --- restarts of the planner --------------------------------------------------------------------------------
+
+    def _list_active(self) -> list[ActivePlan]:
+        return [run.plan for run in self.running] or list(self.waiting)[:1]
 
     def build_saved_state(self, host_s: float) -> SavedThermalState:
         """Return the state from which a successor of this process continues. host_s: present host time."""
         with self.lock:
-            active = [run.plan for run in self.running] or list(self.waiting)[:1]
-            plans = tuple(EndedPlan.from_plan(plan) for plan in active)
-            return SavedThermalState(host_s, self._session.board_s(), self._thermal, plans)
+            return self._thermal.build_saved_state(self._list_active(), host_s)
 
     @property
     def saved_key(self) -> object:
         """A value that changes whenever build_saved_state() would return another state."""
-        active = [run.plan for run in self.running] or list(self.waiting)[:1]
-        records = [plan.record for plan in active]
-        return id(self._thermal), tuple((record.plan_id, record.dropped, record.start_s) for record in records)
+        return self._thermal.build_saved_key(self._list_active())
 
     def restore(self, saved: SavedThermalState, host_s: float) -> None:
-        """Continue from the state of an earlier planner, whose plans the link process has ended.
-
-        Every pulse that may have started before now counts, up to the longest time late that the board permits. The
-        board's clock may have restarted meanwhile.
-        """
-        board_s = self._session.board_s()
-        expected_s = saved.board_s + host_s - saved.host_s
-        gate_off_s = expected_s + self._display.config.board.lease_s
-        estimate = saved.estimate
-        if saved.plans:
-            estimate = rewind_estimate(saved.plans, gate_off_s, self._display.budget, self.on_progress)
+        """Continue from the state of an earlier planner, whose plans the link process has ended."""
         with self.lock:
-            self._thermal = estimate.with_delay(board_s - expected_s + HOLD_MAX_S)
-            self._queue_end_s = self._thermal.budget.at_s
+            self._thermal.restore(saved, host_s)

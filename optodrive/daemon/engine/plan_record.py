@@ -1,6 +1,7 @@
 """Records of submitted plans, from queued to done, superseded, failed or cancelled."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -8,7 +9,8 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.core.units import m_to_um
-from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanReport, PlanStatus
+from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport, PlanStatus
+from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.timing_error import TimingError
 from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses
 from optodrive.planning.planned_sequence import PlannedSequence
@@ -82,7 +84,7 @@ class Execution:
             simulated_target_m=target_m,
         )
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Size of all columns, bytes."""
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
@@ -109,8 +111,10 @@ class PlanRecord:
     start_s: board time of the plan's zero
     arrived_s: board time of the request; *_after_s: time from the request to an event
     caller: name of the token that submitted it
+    labels, parameters: of the caller, and of the pattern
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
     execution: None until execution has ended
+    first_pulse_s: first gate on from the plan's zero, None without a pulse; onset: the executed one
     """
 
     plan_id: str
@@ -123,6 +127,8 @@ class PlanRecord:
     start_s: float
     arrived_s: float
     caller: str = ""
+    labels: dict[str, str | int | float | bool] = field(default_factory=dict)
+    parameters: dict[str, str | float | bool | None] = field(default_factory=dict)
     streamed: bool = False
     status: PlanStatus = "planned"
     error: str | None = None
@@ -135,6 +141,8 @@ class PlanRecord:
     planned_after_s: float | None = None
     first_byte_after_s: float | None = None
     first_light_after_s: float | None = None
+    first_pulse_s: float | None = None
+    onset: ClockReading | None = None
 
     @property
     def has_ended(self) -> bool:
@@ -147,13 +155,15 @@ class PlanRecord:
         columns = (self.pulses, self.execution)
         return len(self.summary_json) + sum(item.nbytes for item in columns if item is not None)
 
-    def build_report(self, board_now_s: float, pulses: bool = True) -> PlanReport:
-        """Report the plan; `pulses` lists them one by one."""
+    def build_report(self, board_now_s: float, pulses: bool = True, clocks: ClockReading | None = None) -> PlanReport:
+        """Report the plan; `pulses` lists them one by one, and clocks give the onset of a plan that has not begun."""
         execution = self.execution
         return PlanReport(
             plan=self.plan_id,
             name=self.name,
             caller=self.caller,
+            labels=self.labels,
+            parameters=self.parameters,
             status=self.status,
             error=self.error,
             starts_in_s=self.start_s + self.delay_s - board_now_s,
@@ -166,6 +176,7 @@ class PlanRecord:
                 first_byte_s=self.first_byte_after_s,
                 first_light_s=self.first_light_after_s,
             ),
+            onset=self._report_onset(clocks),
             timing_error=self.timing_error,
             summary=PlanSummary.model_validate_json(self.summary_json),
             pulses=self.pulses.to_columns() if pulses and self.pulses is not None else None,
@@ -175,6 +186,14 @@ class PlanRecord:
             executed_complete=None if execution is None else execution.complete,
             delay_s=None if execution is None else self.delay_s,
         )
+
+    def _report_onset(self, clocks: ClockReading | None) -> PlanOnset | None:
+        if self.onset is not None:
+            return PlanOnset(**self.onset._asdict(), executed=True)
+        if clocks is None or self.first_pulse_s is None or self.has_ended:
+            return None
+        planned = clocks.convert(self.start_s + self.delay_s + self.first_pulse_s)
+        return PlanOnset(**planned._asdict(), executed=False)
 
     def _report_max_target(self, execution: Execution | None) -> MaxTarget | None:
         largest = self.largest_target

@@ -3,25 +3,24 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from itertools import count
 from time import thread_time
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import BusyError, InputError, StoppedError
+from optodrive.core.errors import BusyError, InputError, LinkError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.plan_queue import PlanQueue
+from optodrive.daemon.engine.planning_time import PlanningTime
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.service.remote_session import RemoteSession
 
 STALL_TIMEOUT_S = 2.0
 """A planner without progress for this time counts as stalled, and the lease is no longer renewed."""
-INITIAL_PLANNING_S = 0.01
-PLANNING_TIME_FACTOR = 1.5
-"""Planning time reserved for a streamed plan, as a multiple of the last one."""
 SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
 PLANNING_MAX_S = 60.0
@@ -68,7 +67,8 @@ class Planner:
         self._ids = count(1)
         self._pending_count = 0
         self._progress_at_s = clock.now_s()
-        self._last_planning_s = INITIAL_PLANNING_S
+        self._planning_time, self._restart_time = PlanningTime(), PlanningTime()
+        self._restarting: Future[None] | None = None
 
     @property
     def is_busy(self) -> bool:
@@ -96,9 +96,50 @@ class Planner:
         future.add_done_callback(self._on_done)
         return future
 
-    def _on_done(self, _future: "Future[PlanReport]") -> None:
+    def _on_done(self, _future: "Future[Any]") -> None:
         with self._lock:
             self._pending_count -= 1
+
+    def follow_pause(self) -> None:
+        """Let the queue go on when a pause has ended. The loop calls it in every iteration."""
+        if self._plan_queue.pause.can_restart and (self._restarting is None or self._restarting.done()):
+            with self._lock:
+                if self._pending_count == 0:
+                    self._progress_at_s = self._clock.now_s()
+                self._pending_count += 1
+            self._restarting = self._executor.submit(self._restart)
+            self._restarting.add_done_callback(self._on_done)
+
+    def _restart(self) -> None:
+        """Limit and prove the waiting plans again, until that holds or the light is paused or stopped again."""
+
+        def on_progress() -> None:
+            self._progress_at_s = self._clock.now_s()
+
+        try:
+            while not self._restart_once(on_progress):
+                pass
+        except Exception as error:  # of any kind: what cannot be proven is not played
+            reason = f"what was left after a pause could not be planned again: {error}"
+            with suppress(LinkError):
+                self._run_in_loop(lambda: self._plan_queue.fail_all(reason))
+        finally:
+            on_progress()
+
+    def _restart_once(self, on_progress: Callable[[], None]) -> bool:
+        """Restart once. Return False if the queue was changed, or the display was dimmed, meanwhile."""
+        began_s, display = self._clock.now_s(), self._dimmer.display
+        on_progress()
+        reserved_s = self._restart_time.compute_reserved_s(0)
+        restart = self._plan_queue.pause.build_restart(display, reserved_s, on_progress)
+        if restart is None:
+            return True
+        self._restart_time.record(self._clock.now_s() - began_s)
+
+        def commit() -> bool:
+            return self._dimmer.display is display and self._plan_queue.pause.commit_restart(restart)
+
+        return self._run_in_loop(commit)
 
     def _process(self, request: PlanningRequest) -> PlanReport:
         began_s = thread_time()
@@ -116,31 +157,34 @@ class Planner:
         try:
             check(0.0)
             plan = self._plan_until_committed(request.build(), request, check)
-            return plan.record.build_report(self._session.board_s(), request.lists_pulses)
+            clocks = self._session.read_clocks()
+            return plan.record.build_report(self._session.board_s(), request.lists_pulses, clocks)
         finally:
             self._progress_at_s = self._clock.now_s()
 
     def _plan_until_committed(
         self, sequence: FrameSequence, request: PlanningRequest, check: Callable[[float], None]
     ) -> ActivePlan:
-        planning_time_s, late_count = PLANNING_TIME_FACTOR * self._last_planning_s, 0
+        late_count = 0
         while True:
             check(0.0)
             self._require_armed()
+            if request.streamed and self._plan_queue.pause.is_held:  # unless it was resumed a moment ago
+                self._run_in_loop(self._plan_queue.pause.require_no_pause)
             if request.streamed and self._plan_queue.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
-            plan = self._plan_once(sequence, request, planning_time_s, check)
+            plan = self._plan_once(sequence, request, self._planning_time.compute_reserved_s(late_count), check)
             if plan is not None:
                 return plan
             # The snapshot is stale: a predecessor was late, or has sent points beyond the splice.
             late_count += 1
-            planning_time_s = PLANNING_TIME_FACTOR * (1 + late_count) * self._last_planning_s
             if request.streamed and late_count == SPLICE_TRIES:
                 self._run_in_loop(self._plan_queue.truncate_stream)
 
     def _preempt(self, request: PlanningRequest) -> None:
         """Make room for a streamed plan, unless its epoch has passed."""
         self._plan_queue.require_epoch(request.epoch)
+        self._plan_queue.pause.require_no_pause()
         self._plan_queue.preempt()
 
     def _plan_once(
@@ -155,7 +199,7 @@ class Planner:
         snapshot = self._plan_queue.make_snapshot(request.streamed, planning_time_s)
         plan_id = f"p{next(self._ids)}"
         plan = make_plan(display, self._session.scale, request, sequence, snapshot, plan_id, check)
-        self._last_planning_s = self._clock.now_s() - began_s
+        self._planning_time.record(self._clock.now_s() - began_s)
 
         def commit() -> bool:
             return self._dimmer.display is display and self._plan_queue.commit(plan, snapshot)

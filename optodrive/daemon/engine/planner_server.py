@@ -5,6 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from optodrive.daemon.responses.problem import build_problem
 from optodrive.planning.stimuli.sequence_codec import decode_sequence
 
 STATE_PERIOD_S = 0.5
+STATE_CHANGE_PERIOD_S = 0.02
+"""Least time between two states, unless a reply follows: a streamed plan changes the state five times."""
 
 
 @dataclass
@@ -44,10 +47,13 @@ class PlannerServer:
         self._clients: dict[MessageSocket, _Client] = {}
         self._report_executor = ThreadPoolExecutor(1, thread_name_prefix="reports")
         self._state_key: object = None
-        self._state_due_s = 0.0
+        self._state_sent_s = -inf
         self._server = MessageServer(engine.message_loop, path, self._on_message, self._on_lost)
         self._telemetry = TelemetryProducer(
-            engine, clock, lambda message: engine.commands.post(partial(self._send_telemetry, message))
+            engine,
+            clock,
+            lambda message: engine.commands.post(partial(self._send_telemetry, message)),
+            lambda error: engine.commands.post(partial(_fail, error)),
         )
         self._telemetry.start()
         engine.add_plan_end_callback(lambda plan: engine.commands.post(partial(self._report_end, plan.record)))
@@ -101,6 +107,8 @@ class PlannerServer:
             fields["caller"],
             caller_left,
             fields["lists_pulses"],
+            fields["labels"],
+            fields["parameters"],
         )
         client.requests[request_id] = caller_left, future
 
@@ -164,7 +172,7 @@ class PlannerServer:
         audit: dict[str, object] | None = None,
     ) -> None:
         """Send a result, after the state that explains it."""
-        self.publish_state()
+        self._publish_state(0.0)
         fields = {"id": request_id, "status": status, "audit": audit or {}}
         self._engine.message_loop.send(connection, Message("result", fields, payload))
 
@@ -172,18 +180,24 @@ class PlannerServer:
 
     def publish_state(self) -> None:
         """Send the state to all clients if it has changed or is due. Call it in every loop iteration."""
-        key = self._engine.compute_state_key(), len(self._server.clients)
-        now_s = self._clock.now_s()
-        if key == self._state_key and now_s < self._state_due_s:
+        self._publish_state(STATE_CHANGE_PERIOD_S)
+
+    def _publish_state(self, change_period_s: float) -> None:
+        """Send the state if it has changed and the last one is that old, or if it is due."""
+        age_s = self._clock.now_s() - self._state_sent_s
+        if age_s < change_period_s:
             return
-        self._state_key, self._state_due_s = key, now_s + STATE_PERIOD_S
+        key = self._engine.compute_state_key(), len(self._server.clients)
+        if key == self._state_key and age_s < STATE_PERIOD_S:
+            return
+        self._state_key, self._state_sent_s = key, self._clock.now_s()
         self._server.broadcast(Message("state", self._engine.build_planner_state().model_dump(mode="json")))
 
     def _report_end(self, record: PlanRecord) -> None:
         if not record.streamed:
             return
-        self.publish_state()
-        report = record.build_report(self._engine.board_s(), pulses=False)
+        self._publish_state(0.0)
+        report = record.build_report(self._engine.board_s(), False, self._engine.read_clocks())
         self._server.broadcast(Message("ended", {"plan": record.plan_id}, report.model_dump_json().encode()))
 
     # --- telemetry ----------------------------------------------------------------------------------------------
@@ -216,6 +230,11 @@ class PlannerServer:
         if number > client.batch_number:
             client.batch_number = number
             self._engine.message_loop.send(connection, message)
+
+
+def _fail(error: BaseException) -> None:
+    """Raise the error of a thread in the loop, which ends the process and with it all light."""
+    raise OptodriveError(f"the telemetry failed: {type(error).__name__}: {error}") from error
 
 
 def _encode(get_report: Callable[[], PlanReport], status: int) -> tuple[int, bytes, dict[str, object]]:

@@ -49,12 +49,13 @@ class RefreshCycle(NamedTuple):
 def build_cut_snapshot(
     running: ActivePlan, thermal: ThermalEstimate, min_start_s: float, budget: Budget
 ) -> PlanningSnapshot | None:
-    """Build the snapshot for truncating a running plan before its first pulse after board time min_start_s.
+    """Build the snapshot for truncating a running plan before its first point after board time min_start_s.
 
     Return None if no pulse would be left, or none would be dropped.
     """
     plan, zero_s = running.planned.plan, running.record.start_s
-    cut_row = int(np.searchsorted(plan.start_s, min_start_s - zero_s))
+    # A pulse's point begins at the end of the pulse before it, and may hold a long pause of the mirrors.
+    cut_row = 1 + int(np.searchsorted(plan.start_s + plan.width_s, min_start_s - zero_s))
     # The mirrors point at the last pulse's pixel only if that pulse emits.
     while 0 < cut_row < len(plan) and plan.power_w[cut_row - 1] == 0.0:
         cut_row += 1

@@ -9,10 +9,16 @@ def build_queue_report(plan_queue: PlanQueue, recent: list[PlanRecord], board_no
     """Report the running and waiting plans with their progress at a board time, s, and the recent ones."""
     running = [run.plan.record for run in plan_queue.running.copy()]
     waiting = [plan.record for plan in plan_queue.waiting.copy()]
+    if waiting and waiting[0].status == "paused":
+        running.append(waiting.pop(0))
+    pause = plan_queue.pause
+    times_at_s = board_now_s if pause.off_s is None else pause.off_s  # as if the queue went on now
     return QueueReport(
         waiting=len(waiting),
         running=running[0].plan_id if running else None,
-        active=[_build_queued(record, board_now_s) for record in (*running, *waiting)],
+        paused=pause.ends_in_s is not None,
+        pause_ends_in_s=pause.ends_in_s,
+        active=[_build_queued(record, times_at_s) for record in (*running, *waiting)],
         plans=[_build_recent(record) for record in recent],
     )
 
@@ -35,5 +41,5 @@ def _build_queued(record: PlanRecord, board_now_s: float) -> QueuedPlan:
         **dict(_build_recent(record)),
         duration_s=record.duration_s,
         starts_in_s=starts_in_s,
-        ends_in_s=max(0.0, starts_in_s + record.duration_s),
+        ends_in_s=None if record.status == "paused" else max(0.0, starts_in_s + record.duration_s),
     )

@@ -50,6 +50,8 @@ def build_plan_entry(active: ActivePlan, tick_s: float, board_now_s: float) -> P
         "start_s": record.start_s,
         "summary": record.summary_json.decode(),
         "trains": json.dumps(trains),
+        "labels": json.dumps(record.labels, ensure_ascii=False),
+        "parameters": json.dumps(record.parameters, ensure_ascii=False),
     }
     arrays = {
         "requested_frames": np.array([(f.show_at_s, f.duration_s, f.simultaneous, f.priority) for f in frames]).reshape(

@@ -24,7 +24,7 @@ def build_planner_state(
     """Report the state of queue and planner."""
     return PlannerState(
         queue=build_queue_report(plan_queue, recent, board_now_s),
-        totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
+        totals=PulseTotals(**plan_queue.accounts.totals, timing_error=plan_queue.accounts.timing.worst),
         planner=PlannerReport(busy=planner.is_busy, alive=planner.is_alive),
         limits=LimitsReport(power_share=power_share),
     )

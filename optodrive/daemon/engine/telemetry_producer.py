@@ -38,13 +38,21 @@ class TelemetryProducer:
     """Thread that produces events at the highest rate of the readers.
 
     publish: called in the thread with each message, see `TelemetryHub`; must not block
+    on_failure: called in the thread with the error that ends it
     """
 
-    def __init__(self, engine: Engine, clock: Clock, publish: Callable[[Message], None]) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        clock: Clock,
+        publish: Callable[[Message], None],
+        on_failure: Callable[[BaseException], None],
+    ) -> None:
         self._engine = engine
         self._config = engine.display.config
         self._clock = clock
         self._publish_message = publish
+        self._on_failure = on_failure
         self._executed_state = LiveThermalState(engine.display)
         self._batches: deque[Message] = deque(maxlen=BATCHES_MAX)
         self._batch_number = 0
@@ -78,6 +86,12 @@ class TelemetryProducer:
         return list(self._batches)
 
     def _run(self) -> None:
+        try:
+            self._produce_periodically()
+        except BaseException as error:  # of the process: without this thread, pages would show a display of the past
+            self._on_failure(error)
+
+    def _produce_periodically(self) -> None:
         next_s = self._clock.now_s()
         while not self._is_closing:
             self._wake.clear()
@@ -150,7 +164,7 @@ class TelemetryProducer:
         self._announced_rows = {plan_id: self._announced_rows.get(plan_id, 0) for plan_id in plan_ids}
         for active in upcoming:
             record, plan = active.record, active.planned.plan
-            begin = self._announced_rows[record.plan_id]
+            begin = max(self._announced_rows[record.plan_id], active.first_row)
             end = int(np.searchsorted(plan.start_s, board_s + ANNOUNCE_LEAD_S - record.start_s))
             if end > begin:
                 row = np.arange(begin, end)

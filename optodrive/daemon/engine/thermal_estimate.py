@@ -64,7 +64,7 @@ class EndedPlan(NamedTuple):
             plan.budget_before,
             plan.record.start_s,
             PulsePlan(**{item.name: getattr(plan.planned.plan, item.name) for item in fields(PulsePlan)}),
-            plan.record.dropped,
+            plan.rest_count if plan.is_interrupted else plan.record.dropped,
             plan.executed,
         )
 
@@ -90,3 +90,11 @@ def rewind_estimate(
         if record.executed is not None:
             heat = apply_executed(heat, record.executed)
     return ThermalEstimate.from_plan(heat, state, zero_s)
+
+
+def estimate_before_rest(plan: ActivePlan, budget: Budget, on_progress: Callable[[], None]) -> ThermalEstimate:
+    """Build the estimate before a plan that waits, or before the rest of one that was interrupted."""
+    if plan.first_row:
+        ended = EndedPlan.from_plan(plan)._replace(dropped=plan.rest_count)
+        return rewind_estimate([ended], inf, budget, on_progress)
+    return ThermalEstimate.from_plan(plan.heat_before, plan.budget_before, plan.record.start_s)

@@ -4,6 +4,7 @@ import mmap
 import pickle
 import struct
 import zlib
+from functools import reduce
 from typing import NamedTuple
 
 from optodrive.daemon.engine.thermal_estimate import EndedPlan, ThermalEstimate
@@ -12,6 +13,7 @@ SLOT_BYTES = 256 * 2**20
 """Room for one state. Memory that was never written costs nothing."""
 HEADER = struct.Struct("<QQI")
 """Sequence number, length and CRC-32 of a state; sequence number 0: none."""
+LENGTH = struct.Struct("<Q")
 SHARE = struct.Struct("<d")
 
 
@@ -50,14 +52,22 @@ class ThermalMemory:
 
     def save(self, state: SavedThermalState) -> None:
         """Save a state. Raise ValueError if it exceeds its room."""
-        data = pickle.dumps(state, pickle.HIGHEST_PROTOCOL)
-        if len(data) > SLOT_BYTES - HEADER.size:
-            raise ValueError(f"a thermal state of {len(data)} bytes exceeds its room")
+        arrays: list[pickle.PickleBuffer] = []
+        frame = pickle.dumps(state, pickle.HIGHEST_PROTOCOL, buffer_callback=arrays.append)
+        parts = [memoryview(frame), *(array.raw() for array in arrays)]  # the arrays are copied once, to their place
+        total_bytes = sum(LENGTH.size + part.nbytes for part in parts)
+        if total_bytes > SLOT_BYTES - HEADER.size:
+            raise ValueError(f"a thermal state of {total_bytes} bytes exceeds its room")
         self._sequence += 1
         begin = self._sequence % 2 * SLOT_BYTES
         HEADER.pack_into(self._map, begin, 0, 0, 0)
-        self._map[begin + HEADER.size : begin + HEADER.size + len(data)] = data
-        HEADER.pack_into(self._map, begin, self._sequence, len(data), zlib.crc32(data))
+        position, crc = begin + HEADER.size, 0
+        for part in parts:
+            LENGTH.pack_into(self._map, position, part.nbytes)
+            position += LENGTH.size
+            self._map[position : position + part.nbytes] = part
+            position, crc = position + part.nbytes, zlib.crc32(part, crc)
+        HEADER.pack_into(self._map, begin, self._sequence, total_bytes, crc)
 
     def load(self) -> SavedThermalState | None:
         """Return the newest state, None if none was saved, and continue after it."""
@@ -66,8 +76,18 @@ class ThermalMemory:
             if not sequence:
                 continue
             self._sequence = max(self._sequence, sequence)
-            data = self._map[begin + HEADER.size : begin + HEADER.size + length]
-            if zlib.crc32(data) == crc:
-                state: SavedThermalState = pickle.loads(data)  # noqa: S301 - written by this program's planner
+            parts = self._read_parts(begin + HEADER.size, length)
+            if reduce(lambda total, part: zlib.crc32(part, total), parts, 0) == crc:
+                state: SavedThermalState = pickle.loads(parts[0], buffers=parts[1:])  # noqa: S301 - this program wrote it
                 return state
         return None
+
+    def _read_parts(self, begin: int, length: int) -> list[bytearray]:
+        """Return copies of the parts of a state, the pickled frame first."""
+        parts, position = [], begin
+        while position < begin + length:
+            (part_bytes,) = LENGTH.unpack_from(self._map, position)
+            position += LENGTH.size
+            parts.append(bytearray(self._map[position : position + part_bytes]))
+            position += part_bytes
+        return parts

@@ -9,6 +9,7 @@ const SIGNS = {
   armed: "M12 1 24 22H0zM12 6 4 19.5h16zM11 10h2v5h-2zm0 6h2v2h-2z",
   emitting:
     "M12 0 14.2 5.3 19.1 2.3 17.7 7.9 23.4 8.3 19 12 23.4 15.7 17.7 16.1 19.1 21.7 14.2 18.7 12 24 9.8 18.7 4.9 21.7 6.3 16.1 .6 15.7 5 12 .6 8.3 6.3 7.9 4.9 2.3 9.8 5.3z",
+  paused: "M3 2h18v20H3zM7 6h4v12H7zm6 0h4v12h-4z",
   hold: "M12 1a11 11 0 1 0 0 22 11 11 0 0 0 0-22zM8 7h3v10H8zm5 0h3v10h-3z",
   fault: "M7 1h10l6 6v10l-6 6H7l-6-6V7zM8 6 6 8l4 4-4 4 2 2 4-4 4 4 2-2-4-4 4-4-2-2-4 4z",
   unknown: "M12 0 24 12 12 24 0 12zM11 16h2v2h-2zM8 10a4 4 0 1 1 5 4v1h-2v-3a2 2 0 1 0-1-2z",
@@ -51,13 +52,17 @@ export class Header {
     return this.word.textContent;
   }
 
-  showState({ board, link }) {
+  showState({ board, link, queue }) {
     const look = LOOKS[board.state];
     if (link.state !== "up" || !look) {
       this.showUnknown(link.state === "up" ? "no data yet" : "no link to the board");
       return;
     }
-    this.#show(look[0], board.state, board.fault ?? look[1]);
+    if (queue.paused && board.state === BoardState.ARMED) {
+      this.#show("paused", "PAUSED", `dark, armed for ${formatTime(queue.pause_ends_in_s)}`);
+    } else {
+      this.#show(look[0], board.state, board.fault ?? look[1]);
+    }
     if (board.temperature_c === null) {
       this.#showInputs(null); // the board has not reported them yet
     } else {
@@ -97,6 +102,11 @@ export class Header {
       setText(text, `${name} ${inputs === null ? "unknown" : words[value]}`);
     });
   }
+}
+
+function formatTime(seconds) {
+  const whole = Math.max(0, Math.round(seconds));
+  return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")} min`;
 }
 
 function setText(item, text) {

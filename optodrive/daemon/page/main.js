@@ -15,6 +15,7 @@ import { Header } from "./header.js";
 import { History } from "./history.js";
 import { HoldControl } from "./hold.js";
 import { PatternLibrary } from "./patterns.js";
+import { PauseControl } from "./pause.js";
 import { Permissions } from "./permissions.js";
 import { buildFrames, PlanControl } from "./plans.js";
 import { QueueView } from "./queue.js";
@@ -74,6 +75,7 @@ const showError = (error) => {
 };
 const arm = new ArmControl(find, announce, showError);
 const hold = new HoldControl(find, announce, () => plans.playPreviewed());
+const pause = new PauseControl(find, announce, showError);
 const header = new Header(find, announce);
 const permissions = new Permissions(find);
 const dim = new DimControl(find, config.limits.power_share, () => permissions.caller, announce, showError);
@@ -241,6 +243,7 @@ function showNothingKnown(reason) {
   queue.clear(`Unknown: ${reason}.`);
   arm.show("");
   hold.show("");
+  pause.show("", null);
   arm.showControl(null);
   dim.show(null);
   showTitle();
@@ -291,6 +294,7 @@ telemetry.addEventListener("state", ({ detail }) => {
   arm.show(isLinked ? detail.board.state : "");
   dim.show(detail.limits.power_share);
   hold.show(isLinked ? detail.board.state : "");
+  pause.show(isLinked ? detail.board.state : "", detail.queue);
   arm.showControl(isLinked ? detail.control : null, permissions.caller?.name);
   hasLink = isLinked;
   freshness.see("state");

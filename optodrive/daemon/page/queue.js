@@ -56,7 +56,8 @@ export class QueueView {
     const plan = this.running;
     if (plan) {
       const leftS = Math.max(0, plan.ends_in_s - (performance.now() - this.at) / 1000);
-      this.now.querySelector(".left").textContent = `${plan.executed} of ${plan.planned} pulses, ${leftS.toFixed(1)} s left`;
+      const left = plan.ends_in_s === null ? "paused" : `${leftS.toFixed(1)} s left`;
+      this.now.querySelector(".left").textContent = `${plan.executed} of ${plan.planned} pulses, ${left}`;
     }
   }
 

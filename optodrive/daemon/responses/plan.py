@@ -6,7 +6,7 @@ from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel
 from optodrive.link.session.timing_error import TimingError
 from optodrive.planning.summary_schema import PlanSummary, PulseColumns
 
-PlanStatus = Literal["planned", "queued", "running", "done", "superseded", "failed", "cancelled"]
+PlanStatus = Literal["planned", "queued", "running", "paused", "done", "superseded", "failed", "cancelled"]
 
 
 class PlanLatency(JsonModel):
@@ -15,6 +15,18 @@ class PlanLatency(JsonModel):
     planned_s: float | None
     first_byte_s: float | None
     first_light_s: float | None
+
+
+class PlanOnset(JsonModel):
+    """Gate on of a plan's first pulse: on the board's clock, on the host's CLOCK_MONOTONIC and in Unix time, s.
+
+    executed: whether the board has reported the pulse; before, the time is that of the plan
+    """
+
+    board_s: float
+    monotonic_s: float
+    unix_s: float
+    executed: bool
 
 
 class MaxTarget(JsonModel):
@@ -39,14 +51,17 @@ class ExecutedColumns(JsonModel):
 class PlanReport(JsonModel):
     """A plan: what was planned, sent and executed.
 
-    caller: name of the token that submitted it
+    caller: name of the token that submitted it; labels: its own; parameters: all of the pattern, a file as its digest
     pulses, executed_pulses: None if they were not requested or are too many
     executed_complete, delay_s: None before the plan has ended
+    onset: None without a pulse, for a dry run, and without a synchronised clock
     """
 
     plan: str
     name: str
     caller: str
+    labels: dict[str, str | int | float | bool]
+    parameters: dict[str, str | int | float | bool | None]
     status: PlanStatus
     error: str | None
     starts_in_s: float
@@ -55,6 +70,7 @@ class PlanReport(JsonModel):
     executed: int
     dropped: int
     latency: PlanLatency
+    onset: PlanOnset | None
     timing_error: TimingError | None
     summary: PlanSummary
     pulses: PulseColumns | None
@@ -67,7 +83,7 @@ class PlanReport(JsonModel):
     @property
     def has_ended(self) -> bool:
         """Whether the plan's status is final."""
-        return self.status not in ("queued", "running")
+        return self.status not in ("queued", "running", "paused")
 
     @property
     def fits(self) -> bool | None:

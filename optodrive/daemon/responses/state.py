@@ -72,18 +72,23 @@ class RecentPlan(JsonModel):
 
 
 class QueuedPlan(RecentPlan):
-    """A plan that runs or waits; starts_in_s is negative once it has started."""
+    """A plan that runs or waits; starts_in_s is negative once it has started, ends_in_s is None while it is paused."""
 
     duration_s: float
     starts_in_s: float
-    ends_in_s: float
+    ends_in_s: float | None
 
 
 class QueueReport(JsonModel):
-    """Plans: how many wait, which one runs, both as a list in the order of the beam, and the latest 20."""
+    """Plans: how many wait, which one runs or is paused, both as a list in the order of the beam, and the latest 20.
+
+    paused: whether the light is paused; pause_ends_in_s: time until that ends disarmed, None if it is not
+    """
 
     waiting: int
     running: str | None
+    paused: bool
+    pause_ends_in_s: float | None
     active: list[QueuedPlan]
     plans: list[RecentPlan]
 

@@ -82,8 +82,9 @@ def run(
             supervisor.on_reload, supervisor.on_web_message = handler.request, handler.on_web_message
         *others, web = (Child(name, start, clock) for name, start in starts.items())
         if supervisor.start_others(others, web):
-            _announce(config, port, unix, tokens, tokens_path)
-            supervisor.on_board_seen = partial(_announce_board, tcp_port=port)
+            address = f"http://{config.daemon.host}:{port}"
+            _announce(config, address, unix, tokens, tokens_path)
+            supervisor.on_board_seen = partial(_announce_board, address=address)
             supervisor.record_audit({"event": "started", "display": config.name})
             supervisor.serve()
 
@@ -162,17 +163,17 @@ def number_path(path: Path, number: int) -> Path:
     return path if number == 1 else path.with_stem(f"{path.stem}-{number}")
 
 
-def _announce(config: Config, port: int, unix: Path | None, tokens: Tokens, tokens_path: Path) -> None:
+def _announce(config: Config, address: str, unix: Path | None, tokens: Tokens, tokens_path: Path) -> None:
     socket_text = f" and {unix}" if unix else ""
-    address = f"http://{config.daemon.host}:{port}"
     print(f"optodrive: {config.name} on {address}{socket_text}, token in {tokens_path}", flush=True)
     if sys.stdout.isatty():  # a secret: only on a terminal, never in a log
         print(f"optodrive: personal link to the page: {address}/#token={tokens.highest_role.secret}", flush=True)
 
 
-def _announce_board(link_view: LinkView, tcp_port: int) -> None:
-    """Print the state of the board, or that it is awaited."""
-    url = "" if tcp_port == DaemonSection.model_fields["port"].default else f" --url http://127.0.0.1:{tcp_port}"
+def _announce_board(link_view: LinkView, address: str) -> None:
+    """Print the state of the board, or that it is awaited. address: of the daemon, which the default one needs not."""
+    default = DaemonSection()
+    url = "" if address == f"http://{default.host}:{default.port}" else f" --url {address}"
     port = link_view.status.get("port", "")
     if link_view.status.get("connected"):
         print(f"optodrive: board at {port}, {link_view.board_state}; arm with `optodrive arm{url}`", flush=True)

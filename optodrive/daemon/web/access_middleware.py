@@ -48,7 +48,7 @@ class AccessMiddleware:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        request = _read_request(scope)
+        request = read_request(scope)
         problem = self._policy.check(request, self._table)
         if problem is None and request.route is not None and request.route.key in ARMING:
             problem = await self._record_intent(request)
@@ -142,7 +142,8 @@ class CallerLoad:
                         del counter[caller]
 
 
-def _read_request(scope: Scope) -> RequestContext:
+def read_request(scope: Scope) -> RequestContext:
+    """Read the request that an ASGI scope describes."""
     headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
     client = scope.get("client")
     # A caller on the Unix socket has no address.

@@ -22,7 +22,7 @@ from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE
 from optodrive.daemon.responses.state import StateReport
-from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware
+from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware, read_request
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.daemon_client import NO_EPOCH, DaemonClient, PushFields
 from optodrive.daemon.web.dim_request import DIM_EXAMPLE, DIM_SCHEMA, parse_dim_request
@@ -139,6 +139,18 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         await daemon.link.command("disarm")
         return _send_state(daemon)
 
+    @routes.post("/v1/pause", "operator", response_model=StateReport)
+    async def pause() -> Response:
+        """Switch the gate off; the board stays armed and plans wait, for five minutes at most."""
+        await daemon.link.command("pause")
+        return _send_state(daemon)
+
+    @routes.post("/v1/resume", "operator", response_model=StateReport)
+    async def resume() -> Response:
+        """Play what was left at the pause, limited again from the heat that is left, and what waits."""
+        await daemon.link.command("resume")
+        return _send_state(daemon)
+
     @routes.post("/v1/stop", "viewer", response_model=StateReport)
     async def stop() -> Response:
         """Switch the gate off, drop everything queued, disarm the board."""
@@ -225,7 +237,7 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     extend_openapi(app, table)
     # The one that is added last is the outermost; both run in front of every route.
     app.add_middleware(AccessMiddleware, policy=policy, table=table)
-    app.add_middleware(StopPriorityMiddleware)
+    app.add_middleware(StopPriorityMiddleware, permits_stop=lambda scope: policy.permits_stop(read_request(scope)))
     return app
 
 

@@ -8,6 +8,7 @@ import time
 from bisect import bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from optodrive.core.ipc import Message
@@ -35,6 +36,7 @@ class PushFields(NamedTuple):
     """Fields of a push. arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token.
 
     lists_pulses: whether the answer lists the pulses one by one
+    labels: of the caller; parameters: of the pattern, all of them
     """
 
     name: str
@@ -45,6 +47,8 @@ class PushFields(NamedTuple):
     epoch: int
     caller: str
     lists_pulses: bool = True
+    labels: Mapping[str, str | int | float | bool] = MappingProxyType({})
+    parameters: Mapping[str, str | float | bool | None] = MappingProxyType({})
 
 
 class LinkClient:
@@ -63,7 +67,7 @@ class LinkClient:
             self.status = message.fields
             self._end_armings(message.fields["control"], message.fields["epoch_reason"])
         elif message.kind == "result" and self.status is not None and "board" in message.fields:
-            self.status = {**self.status, "board": message.fields["board"]}
+            self.status = {**self.status, "board": message.fields["board"], "pause": message.fields["pause"]}
         if "epoch" in message.fields:
             self._record_epoch(message.fields["epoch"])
 
@@ -115,7 +119,10 @@ class LinkClient:
                 future.set_result(reason)
 
     async def command(self, kind: str, **fields: object) -> None:
-        """Carry out `stop`, `arm` or `disarm`; return when the board has done it. Raise the error of a refusal."""
+        """Carry out `stop`, `arm`, `disarm`, `pause` or `resume`; return when the board has done it.
+
+        Raise the error of a refusal.
+        """
         call = asyncio.ensure_future(self.peer.call(Message(kind, fields)))
         call.add_done_callback(lambda done: done.cancelled() or done.exception())  # retrieved if the caller has left
         result = await asyncio.shield(call)
@@ -157,7 +164,8 @@ class PlannerClient:
 
     async def submit(self, sequence: bytes, push: PushFields) -> Message:
         """Plan an encoded sequence and return the result."""
-        return await self.peer.call(Message("submit", push._asdict(), sequence))
+        fields = push._asdict() | {"labels": dict(push.labels), "parameters": dict(push.parameters)}
+        return await self.peer.call(Message("submit", fields, sequence))
 
     async def wait_for_end(self, plan: str) -> PlanReport:
         """Return the report of a streamed plan once it has ended."""
@@ -194,7 +202,7 @@ class DaemonClient:
         link.on_message, planner.on_message = self._on_link_message, self._on_planner_message
         link.on_lost, planner.on_lost = self._on_link_lost, self._on_planner_lost
         planner.on_connected = self._send_readers
-        self.hub.on_readers = lambda readers, rate_hz: self._send_readers()
+        self.hub.on_readers = lambda readers, rate_hz: self._on_readers()
 
     def start(self) -> None:
         """Connect to all, in the running event loop."""
@@ -261,12 +269,18 @@ class DaemonClient:
         built = await self.build(source, push.name, body, push.caller)
         if built.fields["status"] != 200:
             return built
-        return await self.planner.submit(built.payload, push)
+        labels, parameters = built.fields["labels"], built.fields["parameters"]
+        return await self.planner.submit(built.payload, push._replace(labels=labels, parameters=parameters))
 
     def revoke(self, caller: str) -> None:
         """End the plans of a caller whose token is no longer valid, and the arming if it has armed the board."""
         for peer in (self.link.peer, self.planner.peer):
             peer.send(Message("revoke", {"caller": caller}))
+
+    def _on_readers(self) -> None:
+        """Tell the planner process of the readers of the telemetry, and a new reader of the state."""
+        self._send_readers()
+        self._publish_state()
 
     def _send_readers(self) -> None:
         readers, rate_hz = self.hub.readers
@@ -294,4 +308,5 @@ class DaemonClient:
 
     def _publish_state(self) -> None:
         self._state, self._state_json = None, b""
-        self.hub.publish_state(self.build_state())
+        if self.hub.readers[0]:
+            self.hub.publish_state(self.build_state())

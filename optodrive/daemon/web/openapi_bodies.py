@@ -4,6 +4,7 @@ from typing import Any
 
 from optodrive.planning.stimuli.frame_json import ID_MAX
 from optodrive.planning.stimuli.json_values import PRIORITY_MAX, TIME_MAX_S
+from optodrive.planning.stimuli.labels import KEY_MAX, LABELS_MAX, NUMBER_MAX, TEXT_MAX
 from optodrive.planning.stimuli.pattern_registry import describe_patterns
 from optodrive.planning.stimuli.sequence_file import FRAMES_MAX, TRAINS_MAX
 
@@ -65,8 +66,21 @@ _TRAINS_SCHEMA: Schema = {
     "items": {"oneOf": [_PULSE_TRAIN_SCHEMA, _HEIGHT_TRAIN_SCHEMA]},
     "maxItems": TRAINS_MAX,
 }
+_LABELS_SCHEMA: Schema = {
+    "type": "object",
+    "maxProperties": LABELS_MAX,
+    "propertyNames": {"minLength": 1, "maxLength": KEY_MAX},
+    "additionalProperties": {
+        "oneOf": [
+            {"type": "string", "maxLength": TEXT_MAX},
+            {"type": "number", "minimum": -NUMBER_MAX, "maximum": NUMBER_MAX},
+            {"type": "boolean"},
+        ]
+    },
+    "description": "recorded with the plan and never interpreted",
+}
 SEQUENCE_SCHEMA: Schema = {
-    **_object_schema({}, {"frames": _FRAMES_SCHEMA, "trains": _TRAINS_SCHEMA}),
+    **_object_schema({}, {"frames": _FRAMES_SCHEMA, "trains": _TRAINS_SCHEMA, "labels": _LABELS_SCHEMA}),
     "anyOf": [
         {"required": ["frames"], "properties": {"frames": {"minItems": 1}}},
         {"required": ["trains"], "properties": {"trains": {"minItems": 1}}},
@@ -82,7 +96,11 @@ SEQUENCE_EXAMPLE: Schema = {
 }
 """An example that every shipped display can show."""
 PATTERN_NAME_EXAMPLES: Schema = {"examples": [item.name for item in describe_patterns()]}
-PARAMETERS_SCHEMA: Schema = {"type": "object", "description": "as listed by GET /v1/patterns; a file in base64"}
+PARAMETERS_SCHEMA: Schema = {
+    "type": "object",
+    "properties": {"labels": _LABELS_SCHEMA},
+    "description": "as listed by GET /v1/patterns; a file in base64",
+}
 
 
 def build_request_body(description: str, schema: Schema, example: Schema, required: bool) -> Schema:

@@ -29,7 +29,7 @@ NO_STATS: Mapping[str, Any] = {
     "likely_cause_age_s": None,
 }
 NO_PLANNER = PlannerState(
-    queue=QueueReport(waiting=0, running=None, active=[], plans=[]),
+    queue=QueueReport(waiting=0, running=None, paused=False, pause_ends_in_s=None, active=[], plans=[]),
     totals=PulseTotals(planned=0, sent=0, executed=0, timing_error=None),
     planner=PlannerReport(busy=False, alive=False),
     limits=LimitsReport(power_share=None),
@@ -56,6 +56,7 @@ def merge_state(
             **status["stats"],
         )
         board = status["board"] if status["connected"] else {**status["board"], **UNKNOWN_BOARD}
+    ends_in_s = status["pause"]["ends_in_s"] if status is not None and status["connected"] else None
     control = status["control"] if status is not None and status["connected"] else None
     planner = planner or NO_PLANNER
     return StateReport(
@@ -64,8 +65,18 @@ def merge_state(
         link=link,
         board=BoardReport(**board),
         control=build_control_report(control),
-        queue=planner.queue,
+        queue=_merge_queue(planner.queue, ends_in_s),
         totals=planner.totals,
         planner=planner.planner,
         limits=planner.limits,
     )
+
+
+def _merge_queue(queue: QueueReport, pause_ends_in_s: float | None) -> QueueReport:
+    """Merge a pause, as the link process states it, into the planner's queue, which may not know of it yet."""
+    active = queue.active
+    if pause_ends_in_s is not None:
+        paused = {"status": "paused", "ends_in_s": None}
+        active = [plan.model_copy(update=paused) if plan.status == "running" else plan for plan in active]
+    update = {"paused": pause_ends_in_s is not None, "pause_ends_in_s": pause_ends_in_s, "active": active}
+    return queue.model_copy(update=update)

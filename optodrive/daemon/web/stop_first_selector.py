@@ -7,25 +7,23 @@ takes a tenth of a second, for which a STOP that has just arrived would wait.
 import selectors
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+
+from optodrive.daemon.web.request_head import peek_head
 
 CLIENTS_PER_TURN = 6
 STOP_LINE = b"POST /v1/stop"
 
 
-def is_stop(sock: socket.socket) -> bool:
-    """Return whether the bytes that wait in a socket begin with a request for STOP. They stay there."""
-    try:
-        return sock.recv(len(STOP_LINE), socket.MSG_PEEK | socket.MSG_DONTWAIT) == STOP_LINE
-    except OSError:
-        return False
-
-
 class StopFirstSelector(selectors.EpollSelector):
-    """A selector that defers clients beyond the first of a turn; their sockets stay ready for the next turn."""
+    """A selector that defers clients beyond the first of a turn; their sockets stay ready for the next turn.
 
-    def __init__(self) -> None:
+    permits_stop: whether the head of a request for STOP has what STOP needs; another one takes no precedence
+    """
+
+    def __init__(self, permits_stop: Callable[[bytes], bool]) -> None:
         super().__init__()
+        self._permits_stop = permits_stop
         self._clients: dict[int, socket.socket] = {}
         self._deferred: dict[int, None] = {}
         self._arrived_s: dict[int, float] = {}
@@ -58,10 +56,15 @@ class StopFirstSelector(selectors.EpollSelector):
     def _is_input(self, fileno: int, events: int) -> bool:
         return fileno in self._clients and events == selectors.EVENT_READ
 
+    def _is_stop(self, sock: socket.socket) -> bool:
+        """Return whether a permitted request for STOP waits in a socket. It stays there."""
+        head = peek_head(sock) or b""
+        return head.startswith(STOP_LINE) and self._permits_stop(head)
+
     def _choose(self, filenos: Iterable[int]) -> list[int]:
         ready = dict.fromkeys(filenos)
         queue = dict.fromkeys([fd for fd in self._deferred if fd in ready]) | ready
-        stops = dict.fromkeys(fd for fd in queue if is_stop(self._clients[fd]))
+        stops = dict.fromkeys(fd for fd in queue if self._is_stop(self._clients[fd]))
         chosen = list(stops | queue)[:CLIENTS_PER_TURN]
         self._deferred = {fd: None for fd in queue if fd not in chosen}
         now_s = time.monotonic()

@@ -4,6 +4,7 @@ Requests start one at a time, and none starts while STOP is being answered.
 """
 
 import asyncio
+from collections.abc import Callable
 from contextlib import suppress
 
 from optodrive.daemon.web.request_limits import App, Receive, Scope, Send
@@ -16,12 +17,15 @@ HOLD_MAX_S = 0.1
 class StopPriorityMiddleware:
     """ASGI middleware that starts one request per iteration of the loop, and none while STOP is being answered.
 
+    permits_stop: whether a request for STOP has what STOP needs; another one waits for its turn like any request
+
     Without it, the loop starts all requests that have arrived before it polls its sockets again, and STOP's response
     waits behind all of them.
     """
 
-    def __init__(self, app: App) -> None:
+    def __init__(self, app: App, permits_stop: Callable[[Scope], bool]) -> None:
         self._app = app
+        self._permits_stop = permits_stop
         self._start_lock = asyncio.Lock()
         self._stops_in_progress = 0
         self._hold_deadline_s = 0.0
@@ -31,7 +35,7 @@ class StopPriorityMiddleware:
         """Forward the request when its turn comes; forward STOP at once."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
-        elif scope["path"] == STOP_PATH:
+        elif scope["path"] == STOP_PATH and self._permits_stop(scope):
             await self._serve_stop(scope, receive, send)
         else:
             async with self._start_lock:

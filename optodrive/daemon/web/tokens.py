@@ -20,6 +20,7 @@ from optodrive.daemon.web.roles import ROLES, Role
 ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
 FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"
 ALLOWED_PATTERN = r"^[!-~]{16,200}$"
+NAME_PATTERN = r"^[\w.@ -]{1,40}$"
 SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
 FORMAT = "optodrive-tokens"
 VERSION = 1
@@ -65,7 +66,7 @@ class Tokens:
 
 
 class _TokenEntry(Section):
-    name: Annotated[str, Field(pattern=r"^[\w.@ -]{1,40}$")]
+    name: Annotated[str, Field(pattern=NAME_PATTERN)]
     role: Role
     secret: Annotated[str, Field(pattern=ALLOWED_PATTERN)]
 

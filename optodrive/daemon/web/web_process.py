@@ -85,7 +85,7 @@ class WebProcess:
         self._revocations: list[asyncio.Task[None]] = []
         app = build_app(client, policy)
         app.router.lifespan_context = self._run_connections
-        self.server = Server(app, acceptor)
+        self.server = Server(app, acceptor, policy)
 
     def end(self) -> None:
         """Go dark, end all streams and let the server finish. Also called by a signal handler."""

@@ -9,11 +9,13 @@ from contextlib import contextmanager
 import uvicorn
 
 from optodrive.daemon.web.acceptor_client import AcceptorClient
+from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.bounded_http import BoundedHttp
 from optodrive.daemon.web.bounded_websocket import MESSAGE_MAX_BYTES, BoundedWebSocket
 from optodrive.daemon.web.connection_opener import ConnectionOpener
 from optodrive.daemon.web.connections import PHASE_MAX_S, Connections
 from optodrive.daemon.web.listeners import raise_descriptor_limit
+from optodrive.daemon.web.request_head import Rank, parse_head, rank_request
 from optodrive.daemon.web.request_limits import App
 from optodrive.daemon.web.server_state import ServerState
 from optodrive.daemon.web.stop_first_selector import StopFirstSelector
@@ -26,13 +28,13 @@ REVOKED_MAX_S = 1.0
 class Server(uvicorn.Server):
     """Captures no signals: uvicorn would raise them again and end the process before the board receives ABORT.
 
-    acceptor: hands over the connections
+    acceptor: hands over the connections; policy: decides which requests for STOP precede others
     """
 
     on_ready: Callable[[], None] = staticmethod(lambda: None)
     loop: asyncio.AbstractEventLoop | None = None
 
-    def __init__(self, app: App, acceptor: AcceptorClient) -> None:
+    def __init__(self, app: App, acceptor: AcceptorClient, policy: AccessPolicy) -> None:
         super().__init__(
             uvicorn.Config(
                 app,
@@ -49,7 +51,7 @@ class Server(uvicorn.Server):
             )
         )
         self._acceptor = acceptor
-        self._selector = StopFirstSelector()
+        self._selector = StopFirstSelector(lambda head: rank_request(parse_head(head), policy) is Rank.STOP)
         self._connections = Connections(time.monotonic)
         self.server_state: ServerState = ServerState(self._connections, self._selector)
         self._opener: ConnectionOpener | None = None

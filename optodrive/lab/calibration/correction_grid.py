@@ -7,6 +7,7 @@ interpolated between the nodes. The row order has not been verified with the sof
 """
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,9 +89,7 @@ def fit_correction_grid(path: Path, prior: FieldPrior) -> CalibratedField:
         found = f"corrections from which the best field deviates by {residual_max_m / code_m:.1f} codes"
         raise InputError(str(path), found, f"{RESIDUAL_MAX_CODES:g} code")
     field, sigma_m = fit.field, np.full_like(fit.field.sigma_grid_m, residual_max_m)
-    return CalibratedField(
-        field.geometry, field.surface_m, field.extent, field.rad_per_code, field.focal_length_m, np.array(sigma_m)
-    )
+    return replace(field, sigma_grid_m=np.array(sigma_m))
 
 
 def _node_codes() -> tuple[FloatArray, FloatArray]:

@@ -223,6 +223,7 @@ class _FieldFitter:
             rad_per_code=self.prior.rad_per_code,
             focal_length_m=self.prior.focal_length_m,
             sigma_grid_m=_sigma_m(jacobian, covariance).reshape(SIGMA_GRID_NODES, SIGMA_GRID_NODES),
+            display=self.prior.display,
         )
         return FieldFit(
             field=field,

@@ -26,7 +26,7 @@ class FieldPrior:
 
     mean, sigma: of each parameter of the geometry; extent: codes of the field; display_extent: codes of the display
     rad_per_code, focal_length_m: of the configuration; noise_m, surface_m: expected rms per axis
-    field_area_m2: area over which outliers are uniformly distributed
+    field_area_m2: area over which outliers are uniformly distributed; display: name of the display
     """
 
     mean: FieldGeometry
@@ -38,6 +38,7 @@ class FieldPrior:
     field_area_m2: float
     noise_m: float = SPOT_NOISE_M
     surface_m: float = SURFACE_RMS_M
+    display: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -80,4 +81,5 @@ class FieldPrior:
             extent=Extent(float(CENTRE_CODE), float(CENTRE_CODE), x_half, y_half),
             display_extent=Extent(float(CENTRE_CODE), float(CENTRE_CODE), display_m[0] / code_m, display_m[1] / code_m),
             field_area_m2=4.0 * half_m[0] * half_m[1],
+            display=config.name,
         )

@@ -62,12 +62,13 @@ def draw_residuals(fit: FieldFit) -> str:
         if true
     ]
     crosses = [
-        f"<text x='{a:.1f}' y='{b + 4:.1f}' text-anchor='middle' fill='#c2571a'>×<title>row {row}</title></text>"
+        f"<text x='{a:.1f}' y='{b + 4:.1f}' text-anchor='middle' style='fill: var(--nominal)'>×"
+        f"<title>row {row}</title></text>"
         for row, (a, b, true) in enumerate(zip(x, y, is_inlier, strict=True))
         if not true
     ]
     caption = f"longest arrow {1e6 * longest_m:.1f} µm; × outlier"
-    return _wrap_svg("".join([*arrows, *crosses, _draw_caption(caption)]))
+    return _wrap_svg("Residuals", "".join([*arrows, *crosses, _draw_caption(caption)]))
 
 
 def draw_sigma_map(fit: FieldFit) -> str:
@@ -83,7 +84,9 @@ def draw_sigma_map(fit: FieldFit) -> str:
         for row, line in enumerate(grid_um.tolist())
         for column, value in enumerate(line)
     ]
-    return _wrap_svg("".join([*cells, _draw_caption(f"{low:.1f} (light) to {high:.1f} µm (dark)")]))
+    return _wrap_svg(
+        "Sigma over the field", "".join([*cells, _draw_caption(f"{low:.1f} (light) to {high:.1f} µm (dark)")])
+    )
 
 
 def _draw_caption(text: str) -> str:
@@ -97,5 +100,5 @@ def _to_picture(fit: FieldFit, x_code: FloatArray, y_code: FloatArray) -> tuple[
     return 0.5 * PICTURE_SIDE + half_side * x_share, 0.5 * PICTURE_SIDE - half_side * y_share
 
 
-def _wrap_svg(content: str) -> str:
-    return f"<svg viewBox='0 0 {PICTURE_SIDE} {PICTURE_SIDE}' role='img'>{content}</svg>"
+def _wrap_svg(label: str, content: str) -> str:
+    return f"<svg viewBox='0 0 {PICTURE_SIDE} {PICTURE_SIDE}' role='img' aria-label='{label}'>{content}</svg>"

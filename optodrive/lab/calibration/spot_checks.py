@@ -9,6 +9,7 @@ from math import degrees
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.field_geometry import CENTRE_CODE
 from optodrive.lab.calibration.field_fit import FieldFit
@@ -23,6 +24,8 @@ MOTION_RATIO_MIN = 0.02
 """Smallest ratio of measured to commanded motion; below it the beam does not move."""
 LMEDS_DRAWS = 500
 """Random samples of three spots for the least median of squares."""
+COLUMNS_RATIO_MIN = 15.0
+"""Smallest ratio of the two columns' scales for them to be in different units."""
 AFFINE_RESIDUAL_MAX_M = 3e-3
 """Largest median residual of an affine map through inliers, m."""
 SCALE_TOLERANCE = 0.1
@@ -61,6 +64,7 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
     commanded_m = 2.0 * prior.focal_length_m * prior.rad_per_code * (codes - CENTRE_CODE)
     measured_m = np.column_stack([spots.x_m, spots.y_m])
     _check_beam_moves(where, commanded_m, measured_m)
+    _check_single_columns(where, commanded_m, measured_m)
     matrix, shift, residual_m = _fit_affine(commanded_m, measured_m)
     scale = float(np.sqrt(abs(np.linalg.det(matrix))))
     if residual_m > AFFINE_RESIDUAL_MAX_M * max(scale, 1.0):
@@ -71,7 +75,7 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
     if float(np.hypot(*shift)) > SHIFT_MAX_M:
         found = f"{shift[0] * 1e3:.1f}, {shift[1] * 1e3:.1f} mm with both mirrors in the middle position"
         raise InputError(
-            f"{where}: x_m, y_m", found, f"the display's middle within {SHIFT_MAX_M * 1e3:g} mm of the beam"
+            f"{where}: x_m, y_m", found, f"the display's middle within {format_quantity(SHIFT_MAX_M, 'm')} of the beam"
         )
 
 
@@ -117,6 +121,19 @@ def _fit_affine(commanded_m: FloatArray, measured_m: FloatArray) -> tuple[FloatA
         if residual / scale < best:
             best, chosen = residual / scale, affine
     return chosen[:2].T, chosen[2], best * max(1e-12, float(np.linalg.norm(chosen[:2])))
+
+
+def _check_single_columns(where: str, commanded_m: FloatArray, measured_m: FloatArray) -> None:
+    """Raise InputError for one column in another unit, beside another one in metres or not."""
+    commanded, measured = (
+        np.median(np.abs(places - np.median(places, axis=0)), axis=0) for places in (commanded_m, measured_m)
+    )
+    scales = np.divide(measured, commanded, out=np.ones(2), where=commanded > 0.0)
+    row = int(scales.argmax())
+    if scales[row] < COLUMNS_RATIO_MIN * scales[1 - row]:
+        return
+    unit = min(UNIT_FACTORS, key=lambda name: float(abs(np.log(scales[row] / UNIT_FACTORS[name]))))
+    raise InputError(f"{where}: {'xy'[row]}_m", f"values that look like {unit}", "metres")
 
 
 def _check_scale(where: str, scale: float) -> None:

@@ -1,10 +1,11 @@
-"""Exclusive access to a board for one task: it is armed once and executes single points that the limiter has passed.
+"""Exclusive access to a board for one task: it is armed once and executes points and plans that the limiter has passed.
 
 `close` sends ABORT. If the board does not receive it, the closed port and the lease turn the gate off.
 """
 
 import gc
 import sys
+from collections.abc import Callable
 from math import ceil, inf, pi
 from types import TracebackType
 from typing import Self
@@ -20,13 +21,15 @@ from optodrive.core.errors import (
     NotReadyError,
     OverBudgetError,
 )
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.quantity import format_quantity
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import DUTY_MAX, WirePoints, decode, quantise
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
 from optodrive.planning.display_model import DisplayModel
@@ -45,9 +48,14 @@ SPOT_WIDTH_S = 0.02
 START_LEAD_S = 0.03
 SETTLING_TIME_CONSTANTS = 15.0
 """Settling time after a move in time constants of the servo."""
-ARM_TIMEOUT_S = 6.0
+ARM_TIMEOUT_S = 4.0
+STATUS_TIMEOUT_S = 2.0
 POINT_TIMEOUT_S = 3.0
 FAULT_NAME_TIMEOUT_S = 0.5
+
+
+def _ignore_reports(job: PlanJob) -> None:
+    pass
 
 
 class ExclusiveBoard:
@@ -75,6 +83,11 @@ class ExclusiveBoard:
         self.close()
 
     @property
+    def display(self) -> DisplayModel:
+        """The display that the limiter computes with."""
+        return self._display
+
+    @property
     def config(self) -> Config:
         """Configuration of the display."""
         return self._display.config
@@ -83,12 +96,15 @@ class ExclusiveBoard:
         """Open the link and begin a session. Kernels are loaded first, because compilation would delay the lease."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         request_realtime_scheduling()
-        limit(self._plan(0.0, 0.0, self._zero_duty_power_w), self._state, self._display.budget)
+        limit(self._plan(0.0, 0.0, self.zero_duty_power_w), self._state, self._display.budget)
         gc.collect()
         gc.freeze()
         self.session.connect()
+        until_s = self._clock.now_s() + STATUS_TIMEOUT_S
         while self.session.board.temperature_c is None:  # until the first STATUS, which has faults and inputs
             self.session.step(LOOP_STEP_S, renew_lease=False)
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"{self.session.port}: the board sent no STATUS within {STATUS_TIMEOUT_S:g} s")
 
     def close(self) -> None:
         """Send ABORT and close the link."""
@@ -152,15 +168,54 @@ class ExclusiveBoard:
 
     def move_to(self, x_code: int, y_code: int) -> None:
         """Move the mirrors with the gate off and wait until they have settled."""
-        self._execute_point(x_code, y_code, self._zero_duty_power_w, gate_on=False)
+        self._execute_point(x_code, y_code, self.zero_duty_power_w, gate_on=False)
 
     def fire_spot(self, x_code: int, y_code: int, power_w: float) -> None:
         """Emit one short pulse with settled mirrors and wait until the board has reported it in full."""
         check_spot_power(self.config, power_w)
         self._execute_point(x_code, y_code, power_w, gate_on=True)
 
+    def play(self, plan: PulsePlan, on_reported: Callable[[PlanJob], None]) -> None:
+        """Play a plan once it fits all caps without trimming, and wait until the board has reported it in full.
+
+        on_reported: called with the job when further pulses are reported; it must not block. Raises OverBudgetError if
+        the plan never fits, and BoardFaultError if the board kept the gate on for another time than planned.
+        """
+        self._require_ready()
+        limited, before, after, start_s = self._limit_when_feasible(plan)
+        points = quantise(limited, self.session.scale)
+        self._verify_encoded(points, limited, before, len(limited))
+        self._state, self._timeline_zero_s = after, start_s
+        self._timeline_zero_s += self._stream(points, limited, start_s, gate_on=True, on_reported=on_reported)
+
+    def _require_ready(self) -> None:
+        if not self._armed:
+            raise NotReadyError(f"the board is not armed: {self.session.board.state}")
+        until_s = self._clock.now_s() + POINT_TIMEOUT_S
+        while not self.session.is_ready:
+            self.step()
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"{self.session.port}: the board was not ready within {POINT_TIMEOUT_S:g} s")
+
+    def play_gate_off(self, plan: PulsePlan, points: WirePoints) -> IntArray:
+        """Play points that never turn the gate on, and return the board tick at the end of each point, [n].
+
+        plan: the mirrors' moves as pulses of no power, for the limiter; points: the same moves on the wire, each with a
+        row of its own. Raises LocalProtocolError, before anything is sent, if a point would turn the gate on, and
+        OverBudgetError if the moves never fit the galvo cap.
+        """
+        self._require_ready()
+        limited, before, after, start_s = self._limit_when_feasible(plan)
+        self._verify_encoded(points, limited, before, 0)
+        self._state, self._timeline_zero_s = after, start_s
+        job = self._run_job(points, start_s)
+        end_tick: IntArray = job.read_reported(0, len(points)).on_tick
+        planned_end = job.start_tick + points.compute_end_ticks()
+        self._timeline_zero_s += max(0.0, float(end_tick[-1] - planned_end[-1]) * self.session.scale.tick_s)
+        return end_tick
+
     @property
-    def _zero_duty_power_w(self) -> float:
+    def zero_duty_power_w(self) -> float:
         """Power that rounds to duty 0: the gate stays off, while the limiter still counts the move."""
         return 0.5 * self.config.laser.max_power_w / DUTY_MAX
 
@@ -181,16 +236,13 @@ class ExclusiveBoard:
 
     def _execute_point(self, x_code: int, y_code: int, power_w: float, gate_on: bool) -> None:
         self.check_range(x_code, y_code)
-        if not self._armed:
-            raise NotReadyError(f"the board is not armed: {self.session.board.state}")
-        while not self.session.is_ready:
-            self.step()
+        self._require_ready()
         scale = self.session.scale
         x_rad, y_rad = scale.to_angles_rad(np.array([x_code, y_code]))
         plan = self._plan(x_rad, y_rad, power_w)
         limited, before, after, start_s = self._limit_when_feasible(plan)
         points = quantise(limited, scale)
-        self._verify_encoded(points, limited, before, gate_on)
+        self._verify_encoded(points, limited, before, int(gate_on))
         self._state, self._timeline_zero_s = after, start_s
         self._timeline_zero_s += self._stream(points, limited, start_s, gate_on)
 
@@ -201,7 +253,9 @@ class ExclusiveBoard:
             low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
             if not low <= code <= high:
                 raise InputError(
-                    f"{axis}_code", code, f"{low} to {high}, the display and {FIELD_MARGIN_M * 1e3:g} mm more"
+                    f"{axis}_code",
+                    code,
+                    f"{low} to {high}, the display and {format_quantity(FIELD_MARGIN_M, 'm')} more",
                 )
 
     def clip_codes(self, codes: FloatArray) -> FloatArray:
@@ -225,28 +279,47 @@ class ExclusiveBoard:
                 continue
             return limited, before, after, start_s
 
-    def _verify_encoded(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, gate_on: bool) -> None:
+    def _verify_encoded(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, pulses: int) -> None:
         """Decode the encoded points and verify them against the budget."""
         decoded = decode(points.encode_payload(), self.session.scale)
-        if len(decoded.index) != int(gate_on):
-            raise LocalProtocolError(f"{len(decoded.index)} points with the gate on, expected {int(gate_on)}")
+        if len(decoded.index) != pulses:
+            raise LocalProtocolError(f"{len(decoded.index)} points with the gate on, expected {pulses}")
         verify(plan, points.row[decoded.index], decoded, before, self._display.budget)
 
-    def _stream(self, points: WirePoints, plan: LimitedPlan, start_s: float, gate_on: bool) -> float:
+    def _stream(
+        self,
+        points: WirePoints,
+        plan: LimitedPlan,
+        start_s: float,
+        gate_on: bool,
+        on_reported: Callable[[PlanJob], None] = _ignore_reports,
+    ) -> float:
         """Stream points, wait for their reports, and return their delay, s."""
-        job = self.session.begin(points, start_s)
-        until_s = self._clock.now_s() + POINT_TIMEOUT_S
-        while not job.is_finished:
-            self.step()
-            if self._clock.now_s() > until_s:
-                raise LinkError(f"{self.session.port}: a point was not reported within {POINT_TIMEOUT_S:g} s")
+        job = self._run_job(points, start_s, on_reported)
         executed = job.build_executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
         if gate_on and not np.allclose(executed.width_s, plan.width_s):
             raise BoardFaultError(
-                f"the board kept the gate on for {executed.width_s.sum():g} s; expected {plan.width_s[0]:g} s"
+                f"the board kept the gate on for {executed.width_s.sum():g} s; expected {plan.width_s.sum():g} s"
             )
         ended_s = float(executed.start_s[-1] + executed.width_s[-1])
-        return max(0.0, ended_s - float(plan.start_s[0] + plan.width_s[0]))
+        return max(0.0, ended_s - float(plan.start_s[-1] + plan.width_s[-1]))
+
+    def _run_job(
+        self, points: WirePoints, start_s: float, on_reported: Callable[[PlanJob], None] = _ignore_reports
+    ) -> PlanJob:
+        """Stream points and wait until the board has reported all of them."""
+        job = self.session.begin(points, start_s)
+        duration_s = float(points.compute_end_ticks()[-1]) * self.session.scale.tick_s
+        until_s = self._clock.now_s() + duration_s + POINT_TIMEOUT_S
+        reported = 0
+        while not job.is_finished:
+            self.step()
+            if job.executed_count > reported:
+                reported = job.executed_count
+                on_reported(job)
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"{self.session.port}: a point was not reported within {POINT_TIMEOUT_S:g} s")
+        return job
 
 
 def find_weakest_pixel(display: DisplayModel) -> int:
@@ -279,4 +352,6 @@ def check_spot_power(config: Config, power_w: float, option: str = "--spot-power
     """Raise InputError, naming the option, for a power outside the range of a spot."""
     max_w = max_spot_power_w(config)
     if not 0.0 < power_w <= max_w:
-        raise InputError(option, f"{power_w * 1e3:g} mW", f"more than 0 and at most {max_w * 1e3:g} mW")
+        raise InputError(
+            option, format_quantity(power_w, "W"), f"more than 0 and at most {format_quantity(max_w, 'W')}"
+        )

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.errors import RefusedError
+from optodrive.core.quantity import format_quantity
 from optodrive.device.config import build_pixel_layout
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.commissioning.spot_reader import SpotReader
@@ -68,9 +69,9 @@ class Homing:
         self._zero: HomingPosition | None = None
         self._ends: dict[int, tuple[HomingPosition, HomingPosition]] = {}
 
-    def run(self, on_step: Callable[[HomingResult], None]) -> None:
-        """Run each step in order and report its result to on_step. Raise OptodriveError if a step fails."""
-        for name, step in STEPS:
+    def run(self, on_step: Callable[[HomingResult], None], steps: "tuple[Step, ...] | None" = None) -> None:
+        """Run each step in order, by default all, and report its result. Raise OptodriveError if a step fails."""
+        for name, step in STEPS if steps is None else steps:
             on_step(step(self, name))
 
     # --- the steps ----------------------------------------------------------------------------------------------
@@ -126,9 +127,9 @@ class Homing:
             for axis in range(2):
                 output_rad = position.output_rad[axis]
                 if abs(output_rad) > ZERO_TOLERANCE_RAD:
-                    expected = f"0 ± {ZERO_TOLERANCE_RAD:g} rad at the centre"
+                    expected = f"0 ± {format_quantity(ZERO_TOLERANCE_RAD, 'rad')} at the centre"
                     raise _build_refusal(
-                        name, f"position output of mirror {AXES[axis]}", f"{output_rad:.5f} rad", expected
+                        name, f"position output of mirror {AXES[axis]}", format_quantity(output_rad, "rad"), expected
                     )
         return HomingResult(name, _describe_position(position), _position_details(position))
 
@@ -253,11 +254,18 @@ def _position_details(position: HomingPosition) -> dict[str, object]:
     return {"commanded_rad": position.commanded_rad, "output_rad": position.output_rad, "spot_m": position.spot_m}
 
 
-STEPS: tuple[tuple[str, Callable[[Homing, str], HomingResult]], ...] = (
+Step = tuple[str, Callable[[Homing, str], HomingResult]]
+
+DARK_STEPS: tuple[Step, ...] = (
     ("link", Homing.check_link),
     ("status", Homing.check_status),
     ("inputs", Homing.check_inputs),
     ("indicator", Homing.check_indicator),
+)
+"""The first steps, without light in any case; they end with an armed board."""
+
+STEPS: tuple[Step, ...] = (
+    *DARK_STEPS,
     ("zero", Homing.move_to_zero),
     ("travel x", Homing.check_travel_x),
     ("travel y", Homing.check_travel_y),

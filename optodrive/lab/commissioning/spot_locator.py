@@ -6,6 +6,7 @@ from queue import Empty, SimpleQueue
 import numpy as np
 
 from optodrive.core.errors import InputError, RefusedError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.units import um_to_m
 from optodrive.device.config import build_pixel_layout
@@ -33,7 +34,7 @@ class SensorLocator:
         self._codes = np.rint(board.clip_codes(build_code_grid(board.config, GRID_MARGIN_M, GRID_SIDE)))
         self.name = f"sensor at {spot_reader.port}"
         self.not_found_message = (
-            f"{self.name} sees no spot, expected one: is it covered, or is {power_w * 1e3:g} mW too dim?"
+            f"{self.name} sees no spot, expected one: is it covered, or is {format_quantity(power_w, 'W')} too dim?"
         )
 
     def candidate_codes(self, fit: FieldFit) -> FloatArray:

@@ -3,16 +3,25 @@
 A thread would share the interpreter's lock, which would delay the lease on a busy machine.
 """
 
+import ctypes
 import multiprocessing as mp
 import os
+import signal
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any, Self
 
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
+from optodrive.core.processes import is_suspended
 
 NICE = 5
+LOOK_PERIOD_S = 0.1
+SUSPENDED_MAX_S = 2.0
+"""A worker that a signal has stopped for this time is given up."""
+PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
@@ -24,6 +33,7 @@ class WorkerProcess:
         self._process = context.Process(target=_serve, args=(child_end,), name="aside", daemon=True)
         self._process.start()
         child_end.close()
+        self._look_at_s = self._ran_s = time.monotonic()
 
     def __enter__(self) -> Self:
         return self
@@ -32,7 +42,7 @@ class WorkerProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._pipe.close()
-        self._process.terminate()
+        self._process.kill()  # SIGTERM would wait in a worker that is suspended
         self._process.join()
 
     def submit(self, function: Callable[..., Any], *arguments: object) -> None:
@@ -43,21 +53,40 @@ class WorkerProcess:
             raise self._build_exit_error() from None
 
     def is_ready(self) -> bool:
-        """Return whether the result is available."""
-        return self._pipe.poll()
+        """Return whether the result is available. Raise OptodriveError if the worker is suspended."""
+        if self._pipe.poll():
+            return True
+        self._check_runs()
+        return False
 
     def result(self) -> Any:
         """Wait for the result and return it.
 
-        Raise RefusedError if the function raised InputError, OptodriveError for any other error.
+        Raise RefusedError if the function raised InputError, OptodriveError for any other error, and if the worker has
+        ended or is suspended.
         """
         try:
+            while not self._pipe.poll(LOOK_PERIOD_S):
+                self._check_runs()
             outcome = self._pipe.recv()
         except (EOFError, OSError):
             raise self._build_exit_error() from None
         if isinstance(outcome, OptodriveError):
             raise outcome
         return outcome
+
+    def _check_runs(self) -> None:
+        """Raise OptodriveError if a signal has stopped the worker, which then would not end its computation."""
+        now_s = time.monotonic()
+        if now_s < self._look_at_s:
+            return
+        if now_s > self._look_at_s + SUSPENDED_MAX_S:
+            self._ran_s = now_s  # this process was suspended itself
+        self._look_at_s = now_s + LOOK_PERIOD_S
+        if not is_suspended(self._process.pid):
+            self._ran_s = now_s
+        elif now_s - self._ran_s > SUSPENDED_MAX_S:
+            raise OptodriveError(f"the worker process {self._process.pid} is suspended: stopped by a signal")
 
     def _build_exit_error(self) -> OptodriveError:
         return OptodriveError("the worker process has ended: out of memory, or killed?")
@@ -66,6 +95,7 @@ class WorkerProcess:
 def _serve(pipe: Connection) -> None:
     # A new session: Ctrl-C at the terminal then reaches only the parent, and Linux schedules the processor by session.
     os.setsid()
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # also while it is suspended
     os.setpriority(os.PRIO_PROCESS, 0, NICE)
     while True:
         try:
@@ -78,4 +108,5 @@ def _serve(pipe: Connection) -> None:
             outcome = RefusedError(str(error))
         except Exception as error:
             outcome = OptodriveError(f"{function.__name__}: {type(error).__name__}: {error}")
-        pipe.send(outcome)
+        with suppress(OSError):  # the parent has ended, which the next recv() shows
+            pipe.send(outcome)

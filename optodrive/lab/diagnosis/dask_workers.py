@@ -3,20 +3,27 @@
 import logging
 import re
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 from uuid import uuid4
 
 from optodrive.core.errors import InputError, OptodriveError
+from optodrive.lab.diagnosis.local_workers import LocalWorkers
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 SCHEDULER_TIMEOUT_S = 3.0
 """Time within which a scheduler must answer."""
+CHECK_PERIOD_S, CHECK_TIMEOUT_S, IMPORT_TIMEOUT_S = 0.5, 2.5, 30.0
+"""Interval of the questions whether a scheduler is alive, and time for its answer: the first one comes after it has
+imported what the tasks need."""
+POLL_S = 0.02
+CLOSE_TIMEOUT_S = 0.5
 WORKER_TIMEOUT_S = 30.0
 """Time within which a scheduler must have a worker."""
 DASK_SETTINGS = {
@@ -39,8 +46,9 @@ def open_client(
 ) -> Iterator[Any]:
     """Yield a Dask client of the scheduler at an address, or of local processes, by default one per core.
 
-    max_workers: upper limit of useful processes. Local processes listen on loopback only. Raises InputError if the
-    address is invalid or no scheduler answers there.
+    max_workers: upper limit of useful processes. Local processes listen on loopback only; an exception, also Ctrl-C,
+    kills them. Raises InputError if the address is invalid or no scheduler answers there, OptodriveError if the local
+    processes do not start.
     """
     try:
         import dask
@@ -52,13 +60,16 @@ def open_client(
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         if address is not None:
-            yield stack.enter_context(_connect(distributed, address))
+            yield _connect(distributed, address, stack)
             return
         stack.enter_context(dask.config.set(DASK_SETTINGS))
         count = workers or dask.system.CPU_COUNT
         scratch = stack.enter_context(TemporaryDirectory(prefix="optodrive-"))
         with _block_sigint():
+            local = stack.enter_context(LocalWorkers())
+        try:
             cluster = distributed.LocalCluster(
+                loop=local.loop,
                 n_workers=min(count, max_workers or count),
                 threads_per_worker=1,
                 processes=True,
@@ -68,13 +79,22 @@ def open_client(
                 local_directory=scratch,
                 silence_logs=logging.CRITICAL,
             )
-        stack.enter_context(cluster)
-        yield stack.enter_context(distributed.Client(cluster, set_as_default=False))
+        except RuntimeError as error:
+            raise OptodriveError(f"the worker processes of Dask did not start: {_format_error(error)}") from None
+        local.has_started = True
+        client = distributed.Client(cluster, set_as_default=False)
+        try:
+            yield client
+        except BaseException:
+            client.status = "closed"  # closing it would need the loop, which now ends
+            raise
+        client.close()
+        cluster.close()
 
 
 @contextmanager
 def _block_sigint() -> Iterator[None]:
-    """Block SIGINT in processes started within the block; this process ends them."""
+    """Block SIGINT in threads started within the block and in their processes; this process ends them."""
     resource_tracker.ensure_running()  # a later start would unblock SIGINT in the calling thread
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -83,7 +103,8 @@ def _block_sigint() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _connect(distributed: Any, address: str) -> Any:
+def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
+    """Connect to a scheduler. The stack disconnects."""
     expected = "a Dask scheduler's address, as tcp://host:8786"
     if not re.fullmatch(r"(tcp|tls)://([^\s/:\[\]]+|\[[0-9a-fA-F:]+\]):[0-9]{1,5}", address):
         raise InputError("--dask", address, expected)
@@ -94,10 +115,10 @@ def _connect(distributed: Any, address: str) -> Any:
         client = distributed.Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, OverflowError):
         raise InputError("--dask", address, f"{expected}, that answers within {SCHEDULER_TIMEOUT_S:g} s") from None
+    stack.callback(client.close, timeout=CLOSE_TIMEOUT_S)
     try:
         client.wait_for_workers(1, timeout=WORKER_TIMEOUT_S)
     except TimeoutError:
-        client.close()
         raise InputError("--dask", address, f"a scheduler with a worker within {WORKER_TIMEOUT_S:g} s") from None
     return client
 
@@ -109,13 +130,13 @@ def run_tasks(
 
     A task whose worker was lost runs again alone after all others; if that costs another worker, the task is at fault.
     """
-    from distributed import KilledWorker, as_completed
+    from distributed import KilledWorker
 
     run = uuid4().hex[:12]
     futures = {client.submit(function, task, key=f"{run}-{number}"): task for number, task in enumerate(tasks)}
     lost: list[Task] = []
     try:
-        for future in as_completed(list(futures), loop=client.loop):
+        for future in _iterate_completed(client, futures):
             task = futures.pop(future)
             error = _wait_for_error(future)
             if isinstance(error, KilledWorker):
@@ -125,6 +146,7 @@ def run_tasks(
         for number, task in enumerate(lost):
             future = client.submit(function, task, key=f"{run}-again-{number}")
             futures[future] = task
+            (future,) = _iterate_completed(client, [future])
             error = _wait_for_error(future)
             del futures[future]
             if isinstance(error, KilledWorker):
@@ -134,6 +156,34 @@ def run_tasks(
     finally:
         if futures:
             client.cancel(list(futures), force=True)
+
+
+def _iterate_completed(client: Any, futures: Iterable[Any]) -> Iterator[Any]:
+    """Yield futures as they end. Raise OptodriveError if the scheduler is suspended or hangs."""
+    from distributed import as_completed
+
+    completed, check_at_s = as_completed(list(futures), loop=client.loop), time.monotonic() + CHECK_PERIOD_S
+    timeout_s = IMPORT_TIMEOUT_S
+    while not completed.is_empty():
+        while not completed.has_ready():
+            time.sleep(POLL_S)
+            if time.monotonic() > check_at_s:
+                _check_scheduler(client, timeout_s)
+                timeout_s = CHECK_TIMEOUT_S
+                check_at_s = time.monotonic() + CHECK_PERIOD_S
+        yield next(completed)
+
+
+def _check_scheduler(client: Any, timeout_s: float) -> None:
+    if client.cluster is not None:  # the scheduler is in this process
+        return
+    with suppress(OSError):  # a closed connection, of which the futures tell
+        try:
+            client.sync(client.scheduler.identity, callback_timeout=timeout_s)
+        except TimeoutError:
+            raise OptodriveError(
+                f"the Dask scheduler did not answer within {timeout_s:g} s; no file is written"
+            ) from None
 
 
 def _wait_for_error(future: Any) -> Exception | None:

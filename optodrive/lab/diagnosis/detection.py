@@ -14,7 +14,13 @@ from scipy.stats import f as fisher
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
-from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.fitting import (
+    FitProblem,
+    JitterSensitivity,
+    ModelFit,
+    compute_jacobian,
+    compute_jitter_sensitivity,
+)
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
@@ -59,27 +65,49 @@ class Detection:
     residual_chi2: float
 
 
-def detect(
-    problem: FitProblem,
-    base: ModelFit,
-    hypotheses: list[Hypothesis],
-    seed: int,
-    extra_columns: FloatArray | None = None,
-) -> Detection:
-    """Score every hypothesis beside a fit, nominal or extended; extra_columns [m, k] are marginalised too."""
-    data = problem.data
-    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+@dataclass(frozen=True, eq=False)
+class SimulatedEffects:
+    """The columns of a detection beside one fit.
+
+    starts: each start of each hypothesis; effects: [m, starts] change of the prediction; fitted_columns: [m, k] of the
+    fitted parameters
+    """
+
+    starts: tuple[tuple[Hypothesis, dict[str, float]], ...]
+    effects: FloatArray
+    fitted_columns: FloatArray
+    sensitivity: JitterSensitivity
+
+
+def simulate_effects(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis]) -> SimulatedEffects:
+    """Simulate every start of every hypothesis beside a fit, nominal or extended."""
+    sensitivity = compute_jitter_sensitivity(problem.data, base.point, problem.epsilon, base.prediction)
     fitted_columns = compute_jacobian(problem, base.point, base.free, base.prediction)
+    starts = tuple((item, start) for item in hypotheses for start in _select_starts(item))
+    terms = [{**base.point.terms, item.key: start} for item, start in starts]
+    effects = [
+        predict(problem.data, ParameterPoint(base.point.base, values), problem.epsilon) - base.prediction
+        for values in terms
+    ]
+    stacked = np.stack(effects, axis=1) if effects else np.zeros((len(problem.data.value), 0))
+    return SimulatedEffects(starts, stacked, fitted_columns, sensitivity)
+
+
+def detect(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int) -> Detection:
+    """Score every hypothesis beside a fit, nominal or extended."""
+    return score_effects(problem, base, simulate_effects(problem, base, hypotheses), seed)
+
+
+def score_effects(
+    problem: FitProblem, base: ModelFit, simulated: SimulatedEffects, seed: int, extra_columns: FloatArray | None = None
+) -> Detection:
+    """Score the effects beside the fit that they were computed for; extra_columns [m, k] are marginalised too."""
+    data, sensitivity = problem.data, simulated.sensitivity
+    fitted_columns, candidates = simulated.fitted_columns, simulated.effects
     if extra_columns is not None:
         fitted_columns = np.column_stack(
             [fitted_columns, extra_columns / np.abs(extra_columns).max(axis=0, initial=1e-300)]
         )
-    trials = [(item, start) for item in hypotheses for start in _select_starts(item)]
-    terms = [{**base.point.terms, item.key: start} for item, start in trials]
-    effects = [
-        predict(data, ParameterPoint(base.point.base, values), problem.epsilon) - base.prediction for values in terms
-    ]
-    candidates = np.stack(effects, axis=1) if effects else np.zeros((len(data.value), 0))
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
     columns = np.column_stack([fitted_columns, candidates / scale, residual])
@@ -89,7 +117,7 @@ def detect(
     projected = project_out(total, list(range(width)), list(range(width, len(total))))
     independent = np.diag(projected) / np.maximum(np.diag(total)[width:], 1e-300)
     omnibus = compute_omnibus(problem, np.column_stack([fitted_columns, residual]), sensitivity)
-    scores, p_score = _compute_scores(trials, projected, scale, independent, seed, count_noise_degrees(data))
+    scores, p_score = _compute_scores(simulated.starts, projected, scale, independent, seed, count_noise_degrees(data))
     residual_chi2 = float(projected[-1, -1])
     return Detection(tuple(scores), p_score, omnibus.chi2, omnibus.degrees, omnibus.p_value, residual_chi2)
 
@@ -105,7 +133,7 @@ def _select_starts(item: Hypothesis) -> tuple[dict[str, float], ...]:
 
 
 def _compute_scores(
-    trials: list[tuple[Hypothesis, dict[str, float]]],
+    trials: tuple[tuple[Hypothesis, dict[str, float]], ...],
     projected: FloatArray,
     scale: FloatArray,
     independent: FloatArray,

@@ -6,24 +6,27 @@ from math import exp
 from time import perf_counter
 
 import numpy as np
-from scipy.stats import chi2 as chi_squared
 from scipy.stats import t as student
 
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import (
     CandidateCause,
     Discrepancy,
     Estimate,
+    HeldOutError,
     HeldOutGain,
     NextExperiment,
     ResidualTrace,
+    RivalModel,
 )
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS, Dataset, build_dataset
-from optodrive.lab.diagnosis.detection import Score, count_noise_degrees
+from optodrive.lab.diagnosis.candidate_judgement import judge_candidates, list_rivals
+from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset
+from optodrive.lab.diagnosis.detection import count_noise_degrees
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, fit
-from optodrive.lab.diagnosis.held_out_gain import compute_held_out_gain, split_runs
+from optodrive.lab.diagnosis.held_out_gain import compute_held_out_errors, compute_held_out_gain, split_runs
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_selection import (
     BIC_INDISTINGUISHABLE,
@@ -39,15 +42,11 @@ from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
-from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, ParameterPoint, predict
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, ParameterPoint
+from optodrive.lab.diagnosis.signal_traces import ModelComparison
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 from optodrive.physics.terms import discover_terms
 
-DETECTABLE_RATIO = 30.0
-"""Likelihood ratio of an effect that is detected nine times in ten."""
-MIN_INDEPENDENT_FRACTION = 1e-4
-"""Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
-TRACE_POINTS = 300
 LIMIT_SHARE = 1e-3
 """A fitted number within this share of a limit of its range counts as at the limit."""
 
@@ -67,7 +66,19 @@ class _SubsystemFit:
     covariance: FloatArray
     gain: HeldOutGain | None
     candidates: tuple[CandidateCause, ...]
+    rivals: tuple[RivalModel, ...]
     next_experiment: NextExperiment | None
+
+    @property
+    def comparison(self) -> ModelComparison:
+        """Both models on all runs: the nominal one without the held-out runs, the extended one as fitted to all."""
+        return ModelComparison(self.data, self.problem, self.base.point, self.final.point)
+
+    @property
+    def blind_points(self) -> tuple[ParameterPoint, ParameterPoint]:
+        """The nominal and the extended model, both fitted without the held-out runs."""
+        chosen = self.verdict.chosen
+        return self.base.point, self.base.point if chosen is None else chosen.fit.point
 
 
 def diagnose(
@@ -111,6 +122,7 @@ def diagnose(
     explained_fractions = [
         subsystem.verdict.explained_fraction for subsystem in subsystems if subsystem.verdict.verdict != "none"
     ]
+    comparisons = [subsystem.comparison for subsystem in subsystems]
     return Discrepancy(
         verdict=verdict,
         causes=causes,
@@ -130,7 +142,11 @@ def diagnose(
         ),
         fitted_runs=fitted,
         held_out_runs=held_out,
-        residual_traces=tuple(trace for subsystem in subsystems for trace in _compute_residual_traces(subsystem)),
+        residual_traces=tuple(trace for comparison in comparisons for trace in comparison.trace_groups()),
+        example_traces=tuple(example for comparison in comparisons for example in comparison.trace_examples()),
+        held_out_traces=tuple(trace for subsystem in subsystems for trace in _trace_held_out(subsystem)),
+        held_out_errors=tuple(error for subsystem in subsystems for error in _compute_held_out_errors(subsystem)),
+        rivals=tuple(rival for subsystem in subsystems for rival in subsystem.rivals),
         remarks=_build_remarks(subsystems),
         explained_fraction=min(explained_fractions, default=0.0),
         elapsed_s=perf_counter() - began_s,
@@ -188,8 +204,30 @@ def _diagnose_subsystem(
     named = () if verdict.chosen is None else verdict.chosen.hypotheses
     covariance = compute_covariance(all_data, final, named, hypotheses)
     return _SubsystemFit(
-        data, held_out, problem, base, verdict, final, covariance, gain, _judge_candidates(verdict, gains), experiment
+        data,
+        held_out,
+        problem,
+        base,
+        verdict,
+        final,
+        covariance,
+        gain,
+        judge_candidates(verdict, gains),
+        list_rivals(verdict, gains),
+        experiment,
     )
+
+
+def _trace_held_out(subsystem: _SubsystemFit) -> tuple[ResidualTrace, ...]:
+    if not subsystem.held_out.runs:
+        return ()
+    return ModelComparison(subsystem.held_out, subsystem.problem, *subsystem.blind_points).trace_groups()
+
+
+def _compute_held_out_errors(subsystem: _SubsystemFit) -> list[HeldOutError]:
+    if not subsystem.held_out.runs:
+        return []
+    return compute_held_out_errors(subsystem.problem, subsystem.held_out, *subsystem.blind_points)
 
 
 def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
@@ -236,50 +274,6 @@ def _compute_estimates(subsystem: _SubsystemFit) -> dict[str, Estimate]:
     return out
 
 
-def _judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[CandidateCause, ...]:
-    chosen = verdict.chosen
-    tests = max(len(verdict.nominal_detection.scores), 1)
-    out = []
-    for score in verdict.nominal_detection.scores:
-        item = score.hypothesis
-        if chosen is not None and item.label in {part.label for part in chosen.hypotheses}:
-            judgement = "identified" if verdict.verdict == "cause" else "indistinguishable"
-        elif item.key in verdict.causes:
-            judgement = "indistinguishable" if verdict.verdict == "ambiguous" else "alternative form"
-        elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
-            judgement = "not observable"
-        else:
-            judgement = "not detected" if score.ratio < DETECTABLE_RATIO else "ruled out"
-        p_value = min(1.0, tests * float(chi_squared.sf(score.ratio, len(score.columns))))
-        out.append(
-            CandidateCause(
-                item.key,
-                item.label,
-                score.ratio,
-                p_value,
-                gains.get(item.label),
-                judgement,
-                _describe_detection_limit(score),
-            )
-        )
-    return tuple(out)
-
-
-def _describe_detection_limit(score: Score) -> str:
-    """Return the smallest detectable size as text."""
-    stated_limit = discover_terms()[score.hypothesis.key].detection_limit
-    if stated_limit:
-        return stated_limit
-    free = score.hypothesis.free[-1 if score.hypothesis.is_linear else 0]
-    start = score.start.get(free.names[0], 0.0) or 1.0
-    if score.start_ratio <= 0.0 or score.independent_fraction < MIN_INDEPENDENT_FRACTION:
-        return "not observable"
-    size = abs(start) * float(np.sqrt(DETECTABLE_RATIO / score.start_ratio))
-    if size > 3.0 * free.parameter.high:
-        return f"more than {free.parameter.high:g} {free.parameter.unit}"
-    return f"{'all' if len(free.names) > 1 else free.names[0]} {size:.2g} {free.parameter.unit}".removesuffix(" 1")
-
-
 def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: ProgressCallback) -> NextExperiment | None:
     """Return the experiment that separates the best candidate from its first rival, if the verdict is ambiguous."""
     if verdict.verdict != "ambiguous" or not verdict.candidates:
@@ -294,29 +288,6 @@ def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: Prog
         return None
     on_progress("the next experiment")
     return propose_experiment(problem, best.fit, rivals[0].fit, (best.label, rivals[0].label))
-
-
-def _compute_residual_traces(subsystem: _SubsystemFit) -> list[ResidualTrace]:
-    """Return each group's mean residuals per signal, thinned, in units of the white noise."""
-    data = subsystem.data
-    nominal = predict(data, subsystem.base.point, subsystem.problem.epsilon)
-    extended = predict(data, subsystem.final.point, subsystem.problem.epsilon)
-    done: set[tuple[str, int]] = set()
-    out = []
-    for block in data.blocks:
-        group = data.runs[block.run].group
-        if (group, block.kind) in done:
-            continue
-        done.add((group, block.kind))
-        stride = max(1, len(block.t_s) // TRACE_POINTS)
-        edges = np.arange(0, len(block.t_s), stride)
-        count = np.diff(np.append(edges, len(block.t_s)))
-        means = [np.add.reduceat(values[block.part], edges) / count for values in (data.value, nominal, extended)]
-        t_s = np.add.reduceat(block.t_s, edges) / count
-        scale = subsystem.problem.noise.coloured[block.kind].white
-        nominal_residual, extended_residual = ((means[0] - part) / scale for part in means[1:])
-        out.append(ResidualTrace(group, SIGNALS[block.kind], scale, t_s, means[0], nominal_residual, extended_residual))
-    return out
 
 
 def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
@@ -357,7 +328,9 @@ def _describe_range_limits(final: ModelFit) -> list[str]:
     for free in final.free:
         value = final.point.terms[free.key][free.names[0]]
         if _is_at_limit(final, free):
-            out.append(f"{free.label} is at the limit of its plausible range, {value:g} {free.parameter.unit}.")
+            out.append(
+                f"{free.label} is at the limit of its plausible range, {format_quantity(value, free.parameter.unit)}."
+            )
     return out
 
 

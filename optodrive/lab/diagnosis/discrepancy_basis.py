@@ -1,9 +1,10 @@
 """Basis functions for the deviation of a real cause from its term's functional form.
 
 A real droop need not follow the power, ageing need not be uniform, a rise need not be exponential, an emissivity may
-depend on temperature. The residuals of a fitted cause are therefore first compared with the cause's own effect,
-modulated by power, temperature, dose and session time, with its term at other time constants and with its other
-hypotheses, before a second cause is considered.
+depend on temperature, a gas need not follow the warmth of a wall. The residuals of a fitted cause are therefore first
+compared with the cause's own effect, modulated by power, temperature, dose and session time, with another share of it
+in each signal, with its term at other time constants and with its other hypotheses; only then is a second cause
+considered.
 """
 
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
+from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
@@ -20,12 +22,21 @@ MIN_POWER_FRACTION = 0.02
 """Lower limit of the relative power in the modulation by its inverse."""
 DISCREPANCY_SIGMA = 0.2
 """Prior standard deviation of the coefficients of the basis, relative to the effect of the cause."""
+SIZE_ITERATIONS = 3
+"""Number of times that the size of the discrepancy is estimated from its coefficients."""
 
 
 def compute_discrepancy_basis(
-    problem: FitProblem, fitted: ModelFit, hypotheses: Sequence[Hypothesis], all_hypotheses: Sequence[Hypothesis]
+    problem: FitProblem,
+    fitted: ModelFit,
+    hypotheses: Sequence[Hypothesis],
+    all_hypotheses: Sequence[Hypothesis],
+    separate_signals: bool = True,
 ) -> FloatArray:
-    """Compute basis columns [m, k] for a fit with these hypotheses."""
+    """Compute basis columns [m, k] for a fit with these hypotheses.
+
+    separate_signals: include another share of the effect in each signal
+    """
     data, terms = problem.data, fitted.point.terms
     power, dose, session, heat = (np.zeros(len(data.value)) for _ in range(4))
     for block in data.blocks:
@@ -49,6 +60,7 @@ def compute_discrepancy_basis(
             effect * dose,
             effect * session,
             effect * heat,
+            *(_separate_signals(data, effect) if separate_signals else ()),
         ]
         for other in all_hypotheses:
             if other.key == item.key and other.label != item.label:
@@ -62,10 +74,27 @@ def compute_discrepancy_basis(
     return np.stack(nonzero, axis=1) if nonzero else np.zeros((len(data.value), 0))
 
 
+def _separate_signals(data: Dataset, effect: FloatArray) -> list[FloatArray]:
+    """Return the effect [m] in each signal that shows it but the first, which the amplitude of the effect covers."""
+    parts = []
+    for kind in data.kinds:
+        part = np.zeros(len(effect))
+        for block in data.blocks:
+            if block.kind == kind:
+                part[block.part] = effect[block.part]
+        if part.any():
+            parts.append(part)
+    return parts[1:]
+
+
 def compute_covariance(
     problem: FitProblem, fitted: ModelFit, hypotheses: Sequence[Hypothesis], all_hypotheses: Sequence[Hypothesis]
 ) -> FloatArray:
-    """Compute the covariance [k, k] of fitted parameters, marginalised over a discrepancy of `DISCREPANCY_SIGMA`."""
+    """Compute the covariance [k, k] of fitted parameters, marginalised over a discrepancy.
+
+    Its coefficients have the standard deviation `DISCREPANCY_SIGMA`, or their own size where the residuals show more.
+    The change of the parameters beside that discrepancy counts as one standard deviation of their own.
+    """
     basis_columns = compute_discrepancy_basis(problem, fitted, hypotheses, all_hypotheses)
     if not basis_columns.shape[1]:
         return fitted.covariance
@@ -76,16 +105,24 @@ def compute_covariance(
     basis_columns = basis_columns - np.outer(effect, effect @ basis_columns / max(float(effect @ effect), 1e-300))
     sensitivity = compute_jitter_sensitivity(data, fitted.point, problem.epsilon, fitted.prediction)
     jacobian = compute_jacobian(problem, fitted.point, fitted.free, fitted.prediction)
-    count, basis_size = jacobian.shape[1], basis_columns.shape[1]
+    residual = (data.value - fitted.prediction)[:, None]
     total = compute_normal_equations(
-        data, np.hstack([jacobian, basis_columns]), problem.noise, sensitivity.power, sensitivity.timing
+        data, np.hstack([jacobian, basis_columns, residual]), problem.noise, sensitivity.power, sensitivity.timing
     ).total
-    base_count = len(problem.prior.sigma)
-    weights = np.concatenate(
-        [
-            1.0 / np.square(problem.prior.sigma),
-            np.zeros(count - base_count),
-            np.full(basis_size, 1.0 / DISCREPANCY_SIGMA**2),
-        ]
-    )
-    return solve(total + np.diag(weights), np.eye(count + basis_size))[:count, :count]
+    return _marginalise(total[:-1, :-1], total[:-1, -1], problem.prior.sigma, jacobian.shape[1])
+
+
+def _marginalise(gram: FloatArray, right: FloatArray, prior_sigma: Sequence[float], count: int) -> FloatArray:
+    """Return the covariance of the first `count` columns, the others being a discrepancy; right: columns × residual."""
+    weights = np.zeros(len(gram))
+    weights[: len(prior_sigma)] = 1.0 / np.square(prior_sigma)
+    alone = solve(gram[:count, :count] + np.diag(weights[:count]), right[:count])
+    sigma = np.full(len(gram) - count, DISCREPANCY_SIGMA)
+    for _ in range(SIZE_ITERATIONS):
+        weights[count:] = 1.0 / np.square(sigma)
+        both = solve(gram + np.diag(weights), right)
+        sigma = np.maximum(DISCREPANCY_SIGMA, np.abs(both[count:]))
+    weights[count:] = 1.0 / np.square(sigma)
+    covariance = solve(gram + np.diag(weights), np.eye(len(gram)))[:count, :count]
+    change = solve(gram + np.diag(weights), right)[:count] - alone
+    return np.asarray(covariance + np.outer(change, change))

@@ -130,7 +130,8 @@ def diagnose_pixel(task: PixelTask) -> PixelAnswer:
         discrepancy = diagnose(measurement, task.seed, prior, epsilon)
     except InputError as error:
         return PixelAnswer(task.pixel, None, str(error))
-    return PixelAnswer(task.pixel, replace(discrepancy, residual_traces=()), width_m=width_m)
+    bare = replace(discrepancy, residual_traces=(), example_traces=(), held_out_traces=())
+    return PixelAnswer(task.pixel, bare, width_m=width_m)
 
 
 def compile_kernels() -> None:

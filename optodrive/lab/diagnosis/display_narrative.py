@@ -4,8 +4,9 @@ from importlib.metadata import version
 from itertools import pairwise
 from typing import Any
 
+from optodrive.core.quantity import format_quantity
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer, PixelGroup, PixelSpread
-from optodrive.lab.diagnosis.narrative import build_answer, build_narrative, format_quantity
+from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.physics.terms import discover_terms
 
 MAX_ERRORS = 6

@@ -6,6 +6,8 @@ from html import escape
 from math import ceil, sqrt
 
 from optodrive.core.html_page import render_page, render_table
+from optodrive.core.provenance import Provenance
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.discrepancy import Discrepancy
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer, PixelGroup
@@ -15,7 +17,6 @@ from optodrive.lab.diagnosis.display_narrative import (
     describe_group,
     format_ranges,
 )
-from optodrive.lab.diagnosis.narrative import format_quantity
 
 COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#5e9bd6", "#d55e00", "#cc79a7", "#b39ddb")
 """Palette of Okabe and Ito, distinguishable by colour-blind readers, lightened for the letters on it."""
@@ -33,7 +34,9 @@ class PixelMark:
     meaning: str
 
 
-def build_display_report(answer: DisplayAnswer, title: str, config: Config | None) -> str:
+def build_display_report(
+    answer: DisplayAnswer, title: str, config: Config | None, provenance: Provenance | None = None
+) -> str:
     """Return the report as HTML; config: provides the pixel layout."""
     columns = ("pixel", "verdict", "parameters, 95 %", "gain")
     marks = _assign_marks(answer)
@@ -41,11 +44,11 @@ def build_display_report(answer: DisplayAnswer, title: str, config: Config | Non
     body = [
         f"<h2>Map</h2><p>{escape(caption)} Hover over a mark for the pixel's answer.</p>",
         _draw_map(answer, marks, positions),
-        render_table(("", "pixels", "meaning", "indices"), _build_legend(answer, marks), frozenset({1})),
+        render_table(("mark", "pixels", "meaning", "indices"), _build_legend(answer, marks), frozenset({1}), "Legend"),
         "<h2>Pixels</h2>",
-        render_table(columns, (_build_row(item) for item in answer.pixels), frozenset({0})),
+        render_table(columns, (_build_row(item) for item in answer.pixels), frozenset({0}), "Pixels"),
     ]
-    return render_page(title, build_headline(answer), build_display_narrative(answer), body)
+    return render_page(title, build_headline(answer), build_display_narrative(answer), body, provenance)
 
 
 def _assign_marks(answer: DisplayAnswer) -> dict[int, PixelMark]:
@@ -100,10 +103,12 @@ def _draw_map(answer: DisplayAnswer, marks: dict[int, PixelMark], positions: dic
             continue
         elements.append(
             f"<g><title>{escape(_build_tooltip(by_pixel[pixel], mark))}</title>{box} fill='{mark.colour}'/>"
-            f"<text x='{x + CELL_PX / 2:g}' y='{y + CELL_PX / 2 + 4:g}' text-anchor='middle'>{mark.letter}</text></g>"
+            f"<text x='{x + CELL_PX / 2:g}' y='{y + CELL_PX / 2 + 4:g}' text-anchor='middle' "
+            f"class='on-colour'>{mark.letter}</text></g>"
         )
     size = f"max-width:{max(12, 1.6 * wide / CELL_PX):g}rem"
-    return f"<svg viewBox='0 0 {wide} {high}' style='{size}' role='img'>{''.join(elements)}</svg>"
+    head = f"<svg viewBox='0 0 {wide} {high}' style='{size}' role='img' aria-label='Map of the pixels'>"
+    return f"{head}{''.join(elements)}</svg>"
 
 
 def _build_tooltip(item: PixelAnswer, mark: PixelMark) -> str:
@@ -118,9 +123,9 @@ def _build_legend(answer: DisplayAnswer, marks: dict[int, PixelMark]) -> Iterato
         if pixels:
             mark = marks[pixels[0]]
             sample = (
-                "<svg viewBox='0 0 20 20' style='width:20px;border:0'>"
+                "<svg class='mark' viewBox='0 0 20 20' style='width:20px' role='img' aria-label='" + mark.letter + "'>"
                 f"<rect x='1' y='1' width='18' height='18' rx='3' stroke='#999' fill='{mark.colour}'/>"
-                f"<text x='10' y='14' text-anchor='middle'>{mark.letter}</text></svg>"
+                f"<text x='10' y='14' text-anchor='middle' class='on-colour'>{mark.letter}</text></svg>"
             )
             yield sample, str(len(pixels)), escape(mark.meaning), format_ranges(pixels)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.types.discrepancy import HeldOutGain
+from optodrive.core.types.discrepancy import HeldOutError, HeldOutGain
 from optodrive.lab.diagnosis.dataset import SIGNALS, Dataset
 from optodrive.lab.diagnosis.fitting import FitProblem, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus_by_group
@@ -87,6 +87,23 @@ def compute_held_out_gain(
     return HeldOutGain(
         columns[0], columns[1], columns[2], _compute_reduction(chi2_pairs), _draw_interval(chi2_pairs, seed)
     )
+
+
+def compute_held_out_errors(
+    problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint
+) -> list[HeldOutError]:
+    """Return the RMSE of both models in every signal of every held-out group."""
+    problem = replace(problem, data=data)
+    squares = [(data.value - predict(data, point, problem.epsilon)) ** 2 for point in (nominal, extended)]
+    squares.append(_compute_noise_floor2(problem, extended))
+    errors = []
+    for group, runs in data.groups.items():
+        for kind in data.kinds:
+            parts = [block.part for block in data.blocks if block.run in runs and block.kind == kind]
+            if parts:
+                rmse = [float(np.sqrt(np.concatenate([item[part] for part in parts]).mean())) for item in squares]
+                errors.append(HeldOutError(group, SIGNALS[kind], len(parts), rmse[0], rmse[1], rmse[2]))
+    return errors
 
 
 def _draw_interval(chi2_pairs: FloatArray, seed: int) -> tuple[float, float] | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.lab.diagnosis.detection import Detection, Score, detect
+from optodrive.lab.diagnosis.detection import Detection, Score, detect, score_effects, simulate_effects
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity, fit
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
@@ -31,6 +31,11 @@ CHI2_EQUIVALENT = 9.0
 """Predictions that differ by less χ² than this are equivalent."""
 MIN_EXPLAINED, MIN_EXPLAINED_BY_TERM = 0.9, 0.5
 """Share of the excess that a named cause explains; the share that suffices if its discrepancy basis takes the rest."""
+MIN_EXPLAINED_BY_SHARES = 0.93
+"""Share of the excess that a cause explains before its effect may have another share in each signal.
+
+A second node behind the absorber would otherwise pass for a wall that the gas follows in part.
+"""
 MIN_EXPLAINED_OTHER_FORM = 0.985
 """A cause with significant residuals is still named if it explains this share of the excess."""
 MAX_STARTS, MAX_RESTARTS = 6, 6
@@ -113,12 +118,14 @@ def select_causes(
     best = singles[0]
     on_progress(f"testing the residuals of {best.label}")
     others = [item for item in hypotheses if item.key not in best.causes]
-    residual_detection = detect(problem, best.fit, others, seed)
+    simulated = simulate_effects(problem, best.fit, others)
+    residual_detection = score_effects(problem, best.fit, simulated, seed)
     single_explained = _compute_explained_fraction(residual_detection, base, best)
     if not is_rejected(residual_detection) and single_explained >= MIN_EXPLAINED:
         return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
-    basis_columns = compute_discrepancy_basis(problem, best.fit, best.hypotheses, hypotheses)
-    basis_detection = detect(problem, best.fit, others, seed, basis_columns)
+    separate = single_explained >= MIN_EXPLAINED_BY_SHARES
+    basis_columns = compute_discrepancy_basis(problem, best.fit, best.hypotheses, hypotheses, separate)
+    basis_detection = score_effects(problem, best.fit, simulated, seed, basis_columns)
     if (
         not is_rejected(basis_detection)
         and single_explained >= MIN_EXPLAINED_BY_TERM
@@ -136,18 +143,21 @@ def select_causes(
         pair = pairs[0]
         on_progress(f"testing the residuals of {pair.label}")
         others = [item for item in hypotheses if item.key not in pair.causes]
-        pair_detection = detect(problem, pair.fit, others, seed)
+        simulated = simulate_effects(problem, pair.fit, others)
+        pair_detection = score_effects(problem, pair.fit, simulated, seed)
         pair_explained = _compute_explained_fraction(pair_detection, base, pair)
         # A second cause may only correct the first one's form; it is named if the residuals are insignificant.
         if not is_rejected(pair_detection) or (pair_explained >= MIN_EXPLAINED_OTHER_FORM > single_explained):
             return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)
         if pair_explained >= MIN_EXPLAINED and not is_rejected(
-            detect(
+            score_effects(
                 problem,
                 pair.fit,
-                others,
+                simulated,
                 seed,
-                compute_discrepancy_basis(problem, pair.fit, pair.hypotheses, hypotheses),
+                compute_discrepancy_basis(
+                    problem, pair.fit, pair.hypotheses, hypotheses, pair_explained >= MIN_EXPLAINED_BY_SHARES
+                ),
             )
         ):
             return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)

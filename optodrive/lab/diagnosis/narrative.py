@@ -4,22 +4,11 @@ from importlib.metadata import version
 from math import isfinite
 from typing import Any
 
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate
 from optodrive.physics.terms import discover_terms
 
-UNIT_PREFIXES = ((1e-6, 1e6, "µ"), (1e-3, 1e3, "m"), (1.0, 1.0, ""))
-UNPREFIXED_UNITS = ("", "1", "1/K", "1/s", "m^2", "Hz", "K", "K/W")
 MAX_RULED_OUT = 6
-
-
-def format_quantity(value: float, unit: str) -> str:
-    """Return a value with three digits and an SI prefix where the unit takes one."""
-    if unit in UNPREFIXED_UNITS or value == 0.0:
-        return f"{value:.3g} {unit}".removesuffix(" 1").rstrip()
-    for limit, scale, prefix in UNIT_PREFIXES:
-        if abs(value) < 1e3 * limit:
-            return f"{value * scale:.3g} {prefix}{unit}"
-    return f"{value:.3g} {unit}"
 
 
 def _format_interval(item: Estimate) -> str:
@@ -167,6 +156,29 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
                 "detection_limit": item.detection_limit,
             }
             for item in discrepancy.candidates
+        ],
+        "rivals": [
+            {
+                "causes": list(item.causes),
+                "hypothesis": item.label,
+                "chi2_above_best": item.chi2,
+                "bic_above_best": item.bic,
+                "heldout_gain": item.heldout_gain,
+                "chosen": item.is_chosen,
+                "parameters": {name: {"value": value, "unit": unit} for name, (value, unit) in item.parameters.items()},
+            }
+            for item in discrepancy.rivals
+        ],
+        "held_out": [
+            {
+                "group": item.group,
+                "signal": item.signal,
+                "runs": item.runs,
+                "rmse_nominal": item.nominal,
+                "rmse_extended": item.extended,
+                "noise_floor": item.noise_floor,
+            }
+            for item in discrepancy.held_out_errors
         ],
         "next_experiment": None
         if experiment is None

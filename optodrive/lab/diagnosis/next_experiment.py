@@ -7,6 +7,7 @@ from math import ceil
 
 import numpy as np
 
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import NextExperiment
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Block, Dataset, DriveGroup, RunInfo
@@ -89,12 +90,18 @@ def _generate_grid(data: Dataset, pixel: int) -> Iterator[tuple[str, FloatArray,
             for pulsed in (pixel, neighbour):
                 location = "" if pulsed == pixel else f" on neighbouring pixel {pulsed}"
                 pulses = np.array([[0.02, width_s, power_w, pulsed]])
-                description = f"one pulse of {width_s * 1e3:g} ms at {power_w:.2f} W{location}"
+                description = (
+                    f"one pulse of {format_quantity(width_s, 's')} at {format_quantity(power_w, 'W')}{location}"
+                )
                 yield description, pulses, 0.02 + width_s + 0.25
         for gap_s in (0.02, 0.06):
             starts = 0.02 + np.arange(0.0, 3.0, 0.02 + gap_s)
             pulses = np.array([[start, 0.02, power_w, pixel] for start in starts])
-            yield f"3 s of 20 ms pulses, {gap_s * 1e3:g} ms apart, at {power_w:.2f} W", pulses, 4.0
+            yield (
+                f"3 s of 20 ms pulses, {format_quantity(gap_s, 's')} apart, at {format_quantity(power_w, 'W')}",
+                pulses,
+                4.0,
+            )
 
 
 def _list_pulsed_pixels(data: Dataset) -> list[int]:

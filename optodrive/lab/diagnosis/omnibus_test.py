@@ -4,6 +4,7 @@ The same bins of the differences between repeats hold noise only and set the sca
 """
 
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -22,6 +23,7 @@ EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)
 RUN_BINS = 4
 """Number of bins over a whole run, for slow effects."""
 RIDGE = 1e-4
+_known_bins: "WeakKeyDictionary[Dataset, IntArray]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class OmnibusStatistic:
 def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: JitterSensitivity) -> OmnibusStatistic:
     """Compute the statistic of the last of the columns [m, k], with the others projected out."""
     data, noise, kinds = problem.data, problem.noise, problem.data.kinds
-    labels, width = assign_bins(data), columns.shape[1]
+    labels, width = _find_bins(data), columns.shape[1]
     count = int(labels.max()) + 1
     total = np.zeros((width + count, width + count))
     if width > len(BASE_PARAMETERS):
@@ -130,6 +132,13 @@ def compute_omnibus_by_group(problem: FitProblem, residual: FloatArray, sensitiv
 
 def _list_bins(labels: IntArray) -> IntArray:
     return np.asarray(np.unique(labels[labels >= 0]))
+
+
+def _find_bins(data: Dataset) -> IntArray:
+    """Return the bins of `assign_bins`, computed once for a dataset: every detection asks for them."""
+    if data not in _known_bins:
+        _known_bins[data] = assign_bins(data)
+    return _known_bins[data]
 
 
 def assign_bins(data: Dataset) -> IntArray:

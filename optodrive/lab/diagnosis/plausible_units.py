@@ -11,7 +11,9 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.plausibility import PlausibleRange, check_plausible
+from optodrive.core.plausibility import check_plausible
+from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.core.units import ZERO_CELSIUS_K
@@ -20,21 +22,16 @@ from optodrive.physics.pixel import Pixel
 
 MIRROR_SIGNALS = tuple(SIGNALS[kind] for kind in MIRROR_KINDS)
 UNITS = {name: name.rpartition("_")[2] for name in SIGNALS}
-POWER = PlausibleRange(0.0, 60.0, "W")
+PLAUSIBLE = RANGES["recording"]
 WEAK_POWER_W = 5.0
 """Powers that respond a hundred times too weakly are taken for mW above this value."""
-LENGTHS = {
-    "bridge_width_m": PlausibleRange(1e-5, 5e-3, "m"),
-    "aim_x_m": PlausibleRange(0.0, 5e-3, "m"),
-    "aim_y_m": PlausibleRange(0.0, 5e-3, "m"),
-}
-LARGEST = {"displacement_m": PlausibleRange(1e-8, 5e-3, "m"), "force_N": PlausibleRange(1e-5, 5.0, "N")}
-"""Largest change of a signal, with or without a drive of its own pixel, and the smallest resolved one."""
-MIRROR_ANGLE = PlausibleRange(0.0, 0.9, "rad")
+LENGTHS = ("bridge_width_m", "aim_x_m", "aim_y_m")
+CHANGES = ("displacement_m", "force_N")
+"""Signals whose change is judged by its size, with or without a drive of their own pixel."""
 MIRROR_SAMPLING_MAX_S = 5e-3
 """Longest median time between samples of a mirror; slower ones show nothing of a servo."""
-AMBIENT_TOLERANCE_K, HOT_K = 100.0, 3000.0
-"""A baseline this far below ambient is in another unit; temperatures above the second are in mK."""
+AMBIENT_TOLERANCE_K = 100.0
+"""A baseline this far below ambient is in another unit."""
 MAX_RATIO, MAX_WEAKNESS = 25.0, 100.0
 """Largest ratio of a response to that of the reference pixel, and of the reference pixel to a response."""
 SHAPE_AGREES, SHAPE_DISAGREES, SHAPE_CERTAIN = 0.8, 0.3, 0.97
@@ -82,12 +79,12 @@ def check_recording_units(measurement: Measurement, pixel: Pixel, place: str = "
     """
     for run in measurement.runs:
         where = f"{place}: {run.name}"
-        for name, plausible in LENGTHS.items():
+        for name in LENGTHS:
             length = run.attributes.get(name)
             if isinstance(length, int | float):
-                check_plausible(f"{where}: {name}", float(length), plausible)
+                check_plausible(f"{where}: {name}", float(length), PLAUSIBLE[name])
         if len(run.pulses):
-            check_plausible(f"{where}/pulses: power_W", float(run.pulses[:, 2].max()), POWER)
+            check_plausible(f"{where}/pulses: power_W", float(run.pulses[:, 2].max()), PLAUSIBLE["pulses.power_W"])
         ratios: list[float] = []
         for name, signal in run.signals.items():
             finite = np.isfinite(signal.value)
@@ -127,11 +124,11 @@ def _check_pixel_signal(
             _refuse_size(f"{where}/{name}", f"a response {ratio:.3g} times too large", ratio, UNITS[name])
         if stated <= SHAPE_AGREES:
             ratio = None
-    if name in LARGEST:
+    if name in CHANGES:
         low, median, high = np.quantile(value, [0.01, 0.5, 0.99])
         change = float(max(high - median, median - low))
-        if change > LARGEST[name].high:
-            check_plausible(f"{where}/{name}", change, LARGEST[name])
+        if change > PLAUSIBLE[name].high:
+            check_plausible(f"{where}/{name}", change, PLAUSIBLE[name])
     return ratio
 
 
@@ -140,7 +137,7 @@ def _check_temperature(where: str, run: Run, t_s: FloatArray, value: FloatArray)
     first_s = float(run.pulses[:, 0].min()) if len(run.pulses) else np.inf
     before = value[t_s < first_s]
     baseline = float(np.median(before)) if len(before) >= 5 else float(np.quantile(value, 0.02))
-    if float(np.median(value)) > HOT_K:
+    if float(np.median(value)) > PLAUSIBLE["absorber_temperature_K"].high:
         _refuse(where, f"{baseline:.6g} in the dark", "K", "mK")
     if baseline > run.ambient_k - AMBIENT_TOLERANCE_K:
         return
@@ -156,10 +153,11 @@ def _check_mirror(where: str, run: Run, name: str, t_s: FloatArray, value: Float
         return
     column = 1 + MIRROR_SIGNALS.index(name)
     command_s, command = run.commands[:, 0], run.commands[:, column]
-    commanded = f"commands: {('x_rad', 'y_rad')[column - 1]}"
+    angle = ("x_rad", "y_rad")[column - 1]
+    commanded = f"commands: {angle}"
     interval_s = float(np.median(np.diff(run.signals[name].t_s)))
-    check_plausible(f"{where}/{commanded}", float(np.abs(command).max()), MIRROR_ANGLE)
-    check_plausible(f"{where}/{name}", float(np.quantile(np.abs(value), 0.99)), MIRROR_ANGLE)
+    check_plausible(f"{where}/{commanded}", float(np.abs(command).max()), PLAUSIBLE[f"commands.{angle}"])
+    check_plausible(f"{where}/{name}", float(np.quantile(np.abs(value), 0.99)), PLAUSIBLE[name])
     stated, ratio = _explain(value, _hold(command_s, command, t_s))
     trials = [
         (_explain(value, _hold(command_s * commands, command, t_s * samples))[0], quantity, unit)
@@ -170,7 +168,7 @@ def _check_mirror(where: str, run: Run, name: str, t_s: FloatArray, value: Float
     if explained > MOVEMENT_AGREES and 1.0 - explained < SHAPE_DISAGREES * (1.0 - stated):
         _refuse(f"{where}/{quantity}", "times that do not suit the movement", "s", unit)
     if interval_s > MIRROR_SAMPLING_MAX_S:
-        _refuse(f"{where}/{name}/t_s", f"a sample every {interval_s:.3g}", "s", "ms")
+        _refuse(f"{where}/{name}/t_s", f"a sample every {format_quantity(interval_s, 's')}", "s", "ms")
     if stated > SHAPE_AGREES and not 0.2 < ratio < 5.0:
         size = max(ratio, 1.0 / ratio)
         quantity = name if ratio > 1.0 else commanded

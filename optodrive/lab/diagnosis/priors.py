@@ -3,11 +3,11 @@
 from math import log
 
 from optodrive.core.plausibility import check_plausible
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.types.measurements import Measurement
 from optodrive.device.config import Config
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON
-from optodrive.lab.diagnosis.plausible_units import LENGTHS
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pixel import Pixel
 
@@ -24,7 +24,9 @@ def build_prior(measurement: Measurement, config: Config | None) -> tuple[BasePa
     for run in measurement.runs:
         width = run.attributes.get("bridge_width_m")
         if isinstance(width, (int, float)):
-            check_plausible(f"recording: {run.name}: bridge_width_m", float(width), LENGTHS["bridge_width_m"])
+            check_plausible(
+                f"recording: {run.name}: bridge_width_m", float(width), RANGES["recording"]["bridge_width_m"]
+            )
     widths_m = [run.attributes.get("bridge_width_m") for run in measurement.runs]
     stated_m = next((float(width) for width in widths_m if isinstance(width, (int, float))), None)
     if config is not None:

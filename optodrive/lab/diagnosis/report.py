@@ -1,111 +1,125 @@
 """Diagnosis report: one self-contained HTML file built from the same data as the answer."""
 
+from collections.abc import Iterator
 from html import escape
-
-import numpy as np
+from math import isfinite
 
 from optodrive.core.html_page import render_page, render_table
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.provenance import Provenance
+from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.types.discrepancy import Discrepancy, ResidualTrace
-from optodrive.lab.diagnosis.narrative import build_narrative, format_quantity
+from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
+from optodrive.lab.diagnosis.narrative import build_narrative
+from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_residuals
 
-FIGURE_WIDTH, FIGURE_HEIGHT, MARGIN = 320, 150, 26
-MAX_TRACES = 24
-MAX_BARS = 14
+MAX_TRACES = 12
+NAMED = ("identified", "indistinguishable")
+MEASURED = "<span class='key measured'>measured</span>"
+NOMINAL, EXTENDED = "<span class='key nominal'>nominal model</span>", "<span class='key extended'>extended model</span>"
 
 
-def build_report(discrepancy: Discrepancy, title: str) -> str:
+def build_report(discrepancy: Discrepancy, title: str, provenance: Provenance | None = None) -> str:
     """Return the report as HTML."""
-    nominal = "<span style='color:#c2571a'>nominal model</span>"
-    legend, name = (
-        (f"{nominal}, <span style='color:#1a6fc2'>extended model</span>", "extended model")
-        if discrepancy.terms
-        else (nominal, "nominal model")
-    )
+    has_extension = bool(discrepancy.terms)
+    models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     parts = [
+        "<h2>Measured against model</h2>",
+        f"<p>{MEASURED}, {models}. Of each signal the run in which the nominal model is worst, and the median one; "
+        "below, measured minus model. The band is the noise of one sample, ± σ.</p>",
+        "<div class='grid'>",
+        *(draw_example(example, has_extension) for example in discrepancy.example_traces),
+        "</div>",
+        *_build_held_out(discrepancy, models, has_extension),
         "<h2>Evidence for each cause</h2>",
-        _draw_bars(discrepancy),
+        f"<p>Likelihood ratio against the nominal model, on a logarithmic scale. The dashed line is at "
+        f"{DETECTABLE_RATIO:g}: an effect of this ratio is detected nine times in ten.</p>",
+        _build_evidence_table(discrepancy),
+        *_build_rivals(discrepancy),
         "<h2>Parameters</h2>",
         _build_parameter_table(discrepancy),
-        "<h2>Residuals by experiment, in units of the noise of one sample</h2>",
-        f"<p>{legend}</p>",
+        "<h2>Residuals by experiment</h2>",
+        f"<p>{models}; measured minus model in the first run of the groups with the largest residuals.</p>",
         "<div class='grid'>",
-        *(_draw_residuals(trace, bool(discrepancy.terms)) for trace in _select_traces(discrepancy.residual_traces)),
-        "</div>",
-        f"<h2>Predicted against measured, {name}</h2><div class='grid'>",
-        *(
-            _draw_scatter(signal, discrepancy.residual_traces)
-            for signal in dict.fromkeys(trace.signal for trace in discrepancy.residual_traces)
-        ),
+        *(draw_residuals(trace, has_extension) for trace in _select_traces(discrepancy.residual_traces)),
         "</div>",
     ]
-    return render_page(title, discrepancy.verdict, build_narrative(discrepancy), parts)
+    return render_page(title, discrepancy.verdict, build_narrative(discrepancy), parts, provenance)
 
 
 def _select_traces(traces: tuple[ResidualTrace, ...]) -> list[ResidualTrace]:
     return sorted(traces, key=lambda item: -float((item.nominal**2).mean()))[:MAX_TRACES]
 
 
-def _draw_polyline(x: FloatArray, y: FloatArray, limits: tuple[float, float, float, float], css_class: str) -> str:
-    left, right, low, high = limits
-    across = MARGIN + (x - left) / max(right - left, 1e-12) * (FIGURE_WIDTH - MARGIN - 6)
-    up = FIGURE_HEIGHT - 18 - (y - low) / max(high - low, 1e-12) * (FIGURE_HEIGHT - 26)
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, up, strict=True))
-    return f"<polyline class='{css_class}' points='{points}'/>"
-
-
-def _draw_residuals(trace: ResidualTrace, extended: bool) -> str:
-    max_residual = float(max(np.abs(trace.nominal).max(), np.abs(trace.extended).max(), 1.0))
-    limits = (float(trace.t_s[0]), float(trace.t_s[-1]), -max_residual, max_residual)
-    end = format_quantity(float(trace.t_s[-1]), "s")
-    lines = _draw_polyline(trace.t_s, trace.nominal, limits, "nominal")
-    lines += _draw_polyline(trace.t_s, trace.extended, limits, "extended") if extended else ""
-    return (
-        f"<figure><svg viewBox='0 0 {FIGURE_WIDTH} {FIGURE_HEIGHT}' role='img'>{lines}"
-        f"<text x='2' y='14'>{max_residual:.1f} σ</text><text x='2' y='{FIGURE_HEIGHT - 20}'>−{max_residual:.1f}</text>"
-        f"<text x='{FIGURE_WIDTH - 60}' y='{FIGURE_HEIGHT - 4}'>{end}</text></svg>"
-        f"<figcaption>{escape(trace.signal)}, {escape(trace.group)}</figcaption></figure>"
-    )
-
-
-def _draw_scatter(signal: str, traces: tuple[ResidualTrace, ...]) -> str:
-    signal_traces = [trace for trace in traces if trace.signal == signal]
-    measured = np.concatenate([trace.measured for trace in signal_traces])
-    scale = float(np.ptp(measured)) or 1.0
-    noise = np.concatenate([trace.extended for trace in signal_traces])
-    unit = signal.rsplit("_", 1)[1]
-    # Residuals are in units of sigma.
-    sigma = float(signal_traces[0].sigma)
-    predicted = measured - noise * sigma
-    low, high = float(measured.min()), float(measured.max())
-    x = MARGIN + (predicted - low) / scale * (FIGURE_WIDTH - MARGIN - 6)
-    y = FIGURE_HEIGHT - 18 - (measured - low) / scale * (FIGURE_HEIGHT - 26)
-    dots = "".join(
-        f"<circle cx='{a:.1f}' cy='{b:.1f}' r='1' class='bar'/>" for a, b in zip(x[::3], y[::3], strict=True)
-    )
-    ends = np.array([low, high])
-    return (
-        f"<figure><svg viewBox='0 0 {FIGURE_WIDTH} {FIGURE_HEIGHT}' role='img'>"
-        f"{_draw_polyline(ends, ends, (low, high, low, high), 'nominal')}{dots}"
-        f"<text x='{MARGIN}' y='{FIGURE_HEIGHT - 4}'>{format_quantity(low, unit)}</text>"
-        f"<text x='{FIGURE_WIDTH - 70}' y='{FIGURE_HEIGHT - 4}'>{format_quantity(high, unit)}</text></svg>"
-        f"<figcaption>{escape(signal)}: measured (vertical) against predicted</figcaption></figure>"
-    )
-
-
-def _draw_bars(discrepancy: Discrepancy) -> str:
-    strongest = sorted(discrepancy.candidates, key=lambda item: -item.statistic)[:MAX_BARS]
-    max_log_ratio = max([np.log10(1.0 + item.statistic) for item in strongest], default=1.0) or 1.0
-    rows = []
-    for item in strongest:
-        width = 260 * np.log10(1.0 + item.statistic) / max_log_ratio
-        css_class = "bar" if item.verdict in ("identified", "indistinguishable") else "other"
-        bar = (
-            "<svg viewBox='0 0 262 14' style='width:262px;border:0'>"
-            f"<rect class='{css_class}' x='0' y='2' width='{width:.1f}' height='10'/></svg>"
+def _build_held_out(discrepancy: Discrepancy, models: str, has_extension: bool) -> Iterator[str]:
+    """Return the section on held-out groups: the errors of both models, which did not see them, and the residuals."""
+    yield "<h2>Held-out groups</h2>"
+    if not discrepancy.held_out_errors:
+        yield (
+            "<p>No group was held out: every kind of experiment has fewer than three groups, or the effect shows in "
+            "the held-out ones alone, which were then fitted too.</p>"
         )
-        rows.append((escape(item.label), bar, f"{item.statistic:.0f}", escape(item.verdict)))
-    return render_table(("cause", "likelihood ratio (log scale)", "", ""), rows, frozenset({2}))
+        return
+    yield "<p>RMSE of models that were fitted without these groups, and the RMSE that noise alone would give.</p>"
+    rows = []
+    for item in discrepancy.held_out_errors:
+        unit = item.signal.rsplit("_", 1)[1]
+        values = [item.nominal, *([item.extended] if has_extension else []), item.noise_floor]
+        cells = (format_quantity(value, unit) for value in values)
+        rows.append((escape(item.group), escape(item.signal), str(item.runs), *cells))
+    header = ("group", "signal", "runs", "before", *(["after the extension"] if has_extension else []), "noise")
+    yield render_table(header, rows, frozenset(range(2, len(header))), "Held-out groups")
+    yield f"<p>{models}</p><div class='grid'>"
+    yield from (draw_residuals(trace, has_extension) for trace in _select_traces(discrepancy.held_out_traces))
+    yield "</div>"
+
+
+def _build_evidence_table(discrepancy: Discrepancy) -> str:
+    strongest = sorted(discrepancy.candidates, key=lambda item: -item.statistic)
+    max_ratio = max((item.statistic for item in strongest if isfinite(item.statistic)), default=0.0)
+    rows = (
+        (
+            escape(item.label),
+            draw_bar(min(item.statistic, max_ratio), max_ratio, DETECTABLE_RATIO, item.verdict in NAMED),
+            format_number(item.statistic),
+            "< 10⁻³⁰⁰" if item.p_value < 1e-300 else format_number(item.p_value, 2),
+            _format_gain(item.heldout_gain),
+            f"<span class='nowrap'>{escape(item.verdict)}</span>",
+            f"<span class='nowrap'>{escape(item.detection_limit)}</span>",
+        )
+        for item in strongest
+    )
+    header = ("cause", "likelihood ratio", "ratio", "p", "held-out gain", "verdict", "smallest visible effect")
+    return render_table(header, rows, frozenset({2, 3, 4}), "Evidence for each cause")
+
+
+def _build_rivals(discrepancy: Discrepancy) -> list[str]:
+    if not discrepancy.rivals:
+        return []
+    rows = (
+        (
+            escape(item.label),
+            f"{item.chi2:+.0f}",
+            f"{item.bic:+.0f}",
+            _format_gain(item.heldout_gain),
+            "<br>".join(
+                f"{escape(name)} = {escape(format_quantity(value, unit))}"
+                for name, (value, unit) in item.parameters.items()
+            ),
+        )
+        for item in discrepancy.rivals
+    )
+    chosen = frozenset(number for number, item in enumerate(discrepancy.rivals) if item.is_chosen)
+    return [
+        "<h3>Rivals, refitted</h3>",
+        "<p>χ² and BIC above the best rival's, best first; bold: the model of the later steps.</p>",
+        render_table(
+            ("causes", "χ²", "BIC", "held-out gain", "parameters"), rows, frozenset({1, 2, 3}), "Rivals", chosen
+        ),
+    ]
+
+
+def _format_gain(gain: float | None) -> str:
+    return "" if gain is None else f"{gain:.0%}".replace("-", "−")
 
 
 def _build_parameter_table(discrepancy: Discrepancy) -> str:
@@ -115,4 +129,4 @@ def _build_parameter_table(discrepancy: Discrepancy) -> str:
         else (escape(name), *(format_quantity(value, item.unit) for value in (item.value, item.low, item.high)))
         for name, item in discrepancy.parameters.items()
     )
-    return render_table(("parameter", "value", "95 % from", "to"), rows, frozenset({1, 2, 3}))
+    return render_table(("parameter", "value", "95 % from", "to"), rows, frozenset({1, 2, 3}), "Parameters")

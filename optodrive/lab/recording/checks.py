@@ -3,6 +3,8 @@
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted, suggest_nearest
+from optodrive.core.plausibility import guess_unit
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.storage import (
     COMMANDS,
@@ -18,7 +20,7 @@ from optodrive.lab.recording.storage import (
     format_name,
 )
 
-AMBIENT_MIN_K, AMBIENT_MAX_K = 150.0, 600.0
+AMBIENT = RANGES["recording"]["ambient_K"]
 PIXEL_MAX = 10**6
 LONG_PULSE_S = 0.1
 """Overlapping pulses above this width, s, that would not overlap a thousand times shorter, are taken to be in ms."""
@@ -44,9 +46,10 @@ def pop_ambient_k(place: str, attributes: Attributes) -> float:
         near = [name for name in attributes if name.lower().startswith("ambient")]
         hint = f" (there is {format_name(near[0])!r})" if near else ""
         raise InputError(f"{place}: ambient_K", None, f"the ambient temperature in K{hint}")
-    if isinstance(value, str) or not AMBIENT_MIN_K <= value <= AMBIENT_MAX_K:
-        likely = "" if isinstance(value, str) or not -100.0 < value < AMBIENT_MIN_K else "; this value is likely in °C"
-        expected = f"a temperature between {AMBIENT_MIN_K:g} and {AMBIENT_MAX_K:g} K{likely}"
+    if isinstance(value, str) or not AMBIENT.low <= value <= AMBIENT.high:
+        unit = None if isinstance(value, str) else guess_unit(value, AMBIENT)
+        likely = "" if unit is None else f"; this value is likely in {unit}"
+        expected = f"a temperature between {AMBIENT.low:g} and {AMBIENT.high:g} K{likely}"
         raise InputError(f"{place}: ambient_K", value, expected)
     return float(value)
 

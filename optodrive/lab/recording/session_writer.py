@@ -80,7 +80,7 @@ class SessionRecordingFile:
 
     def _write_plan(self, group: Any, metadata: dict[str, Any], arrays: Arrays) -> None:
         for key, value in metadata.items():
-            if key in ("summary", "trains"):  # too long for an HDF5 attribute
+            if key in ("summary", "trains", "labels", "parameters"):  # too long for an HDF5 attribute
                 group.create_dataset(key, data=value)
             elif value is not None:
                 group.attrs[key] = value

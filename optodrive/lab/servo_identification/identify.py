@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
@@ -109,7 +110,8 @@ def identify(where: str, trace: StepTrace, assumed_slew_rad_per_s: float) -> Ide
 def _check_identifiable(where: str, found: IdentifiedServo) -> None:
     spacing_s, servo = found.trace.spacing_s, found.servo
     if servo.frequency * spacing_s > SAMPLE_SPACING_MAX or 2.0 * found.sigma[0] > FREQUENCY_UNCERTAINTY_MAX:
-        sampled = f"{1e6 * spacing_s:.3g} µs a sample, {servo.frequency:.3g} Hz ± {2 * found.sigma[0]:.1%}"
+        spacing, frequency = format_quantity(spacing_s, "s"), format_quantity(servo.frequency, "Hz")
+        sampled = f"{spacing} a sample, {frequency} ± {2 * found.sigma[0]:.1%}"
         expected = "finer sampling or more steps: the sampling is too coarse, or the noise too high, for this servo"
         raise InputError(where, sampled, expected)
 

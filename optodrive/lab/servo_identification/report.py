@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from optodrive.core.files import atomic_write
+from optodrive.core.quantity import format_quantity
 from optodrive.device.config import Config
 from optodrive.device.config_file import MIRRORS_FORMAT, MIRRORS_VERSION
 from optodrive.device.gate_timing import build_servo, settling_s
@@ -191,7 +192,7 @@ def _axis_remarks(mirror: IdentifiedServo, config: Config) -> list[str]:
         low_s, high_s = row["share"]["interval_s"]
         if high_s - low_s > 2.0 * SETTLING_TOLERANCE * row["share"]["measured_s"]:
             remarks.append(
-                f"{name}: a step of {1e3 * row['step_rad']:.3g} mrad settles within {STEP_TOLERANCE:.0%} "
+                f"{name}: a step of {format_quantity(row['step_rad'], 'rad')} settles within {STEP_TOLERANCE:.0%} "
                 f"after {1e3 * low_s:.3f} to {1e3 * high_s:.3f} ms: an overshoot near the tolerance, or too few steps"
             )
     return remarks

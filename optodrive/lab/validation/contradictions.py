@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 
+from optodrive.core.quantity import format_quantity
 from optodrive.lab.validation.extended_outcomes import AMBIENT_K
 from optodrive.physics.paper_facts import PaperFact
 from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
@@ -39,7 +40,7 @@ def _check_constant_volume(facts: Mapping[str, PaperFact]) -> Contradiction | No
     if volume_rise_k < MIN_RATIO * force_rise_k:
         return None
     description = (
-        f"the gas is not at constant volume on the whole aperture: a membrane at {height_m * 1e3:.3g} mm adds "
+        f"the gas is not at constant volume on the whole aperture: a membrane at {format_quantity(height_m, 'm')} adds "
         f"{100 * volume_increase:.0f} % to the cavity's volume, which requires a gas rise of at least "
         f"{volume_rise_k:.0f} K, but the blocked force implies {force_rise_k:.0f} K"
     )

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from optodrive.lab.diagnosis.narrative import format_quantity
+from optodrive.core.quantity import format_quantity
 from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
 from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST
 from optodrive.lab.validation.measured_facts import EXCLUDED, READING_ERROR

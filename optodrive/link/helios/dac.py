@@ -13,6 +13,7 @@ import usb.util
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError
+from optodrive.core.quantity import format_quantity
 from optodrive.device.config import BoardSection
 from optodrive.link.helios.frames import HOST_LOSS_EMISSION_MAX_S, HeliosFrame
 from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
@@ -123,7 +124,7 @@ class Helios:
         failures = [self._command_with_retries(STOP, 0), self._command_with_retries(SHUTTER, 0)]
         for failure in failures:
             if failure is not None:
-                bound = f"it plays for at most {HOST_LOSS_EMISSION_MAX_S * 1e3:g} ms more"
+                bound = f"it plays for at most {format_quantity(HOST_LOSS_EMISSION_MAX_S, 's')} more"
                 raise LinkError(f"the Helios may not have received the stop and shutter commands, {bound}: {failure}")
         self._clock.sleep(STOP_DELAY_S)
 

@@ -92,19 +92,17 @@ def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
     gate_off = start - np.concatenate([[0], (start + width)[:-1]])
     if len(plan) and gate_off.min() < 0:
         raise LocalProtocolError("pulses overlap, or the first begins before the plan")
-    table: list[tuple[int, int, int, int, int]] = []
-    rows: list[int] = []
-    columns = (x.tolist(), y.tolist(), gate_off.tolist(), width.tolist(), duty.tolist())
-    for row, (x_code, y_code, off_ticks, on_ticks, duty_code) in enumerate(zip(*columns, strict=True)):
-        if duty_code == 0:
-            off_ticks, on_ticks = off_ticks + on_ticks, 0
-        while off_ticks > TICKS_MAX:
-            table.append((x_code, y_code, GATE_OFF_STEP_TICKS, 0, 0))
-            rows.append(-1)
-            off_ticks -= GATE_OFF_STEP_TICKS
-        table.append((x_code, y_code, off_ticks, on_ticks, duty_code))
-        rows.append(row)
-    return WirePoints(np.array(table, dtype=np.uint16).reshape(-1, 5), np.array(rows, dtype=np.int64))
+    off_ticks, on_ticks = np.where(duty == 0, gate_off + width, gate_off), np.where(duty == 0, 0, width)
+    pauses = np.maximum(0, -(-(off_ticks - TICKS_MAX) // GATE_OFF_STEP_TICKS))  # points inserted before each pulse
+    last = np.cumsum(pauses + 1) - 1
+    point_row = np.repeat(np.arange(len(plan)), pauses + 1)
+    table = np.zeros((len(point_row), 5), dtype=np.uint16)
+    table[:, 0], table[:, 1], table[:, 2] = x[point_row], y[point_row], GATE_OFF_STEP_TICKS
+    table[last, 2] = off_ticks - pauses * GATE_OFF_STEP_TICKS
+    table[last, 3], table[last, 4] = on_ticks, duty
+    row = np.full(len(point_row), -1, dtype=np.int64)
+    row[last] = np.arange(len(plan))
+    return WirePoints(table, row)
 
 
 def _find_next_gate_on(duty: IntArray) -> IntArray:

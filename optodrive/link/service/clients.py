@@ -11,7 +11,7 @@ BEAT_AGE_MAX_S = 1.0
 """Age of a beat beyond which its sender counts as stalled."""
 PERMISSIONS = {
     "planner": {"stop", "beat", "begin", "splice", "truncate", "flush", "delay"},
-    "web": {"stop", "beat", "arm", "disarm", "revoke", "hold", "release"},
+    "web": {"stop", "beat", "arm", "disarm", "pause", "resume", "revoke", "hold", "release"},
     "acceptor": {"stop"},
     "supervisor": {"stop", "disarm"},
     "operator": {"stop"},

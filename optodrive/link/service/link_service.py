@@ -16,6 +16,7 @@ from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, UNARMED_
 from optodrive.link.service.clients import Clients
 from optodrive.link.service.control import Control
 from optodrive.link.service.epoch import Epoch
+from optodrive.link.service.pauses import PAUSE_MAX_S, Pauses
 from optodrive.link.service.point_handover import PointHandover
 from optodrive.link.service.results import build_result
 from optodrive.link.service.settings import OnWebLoss
@@ -65,7 +66,8 @@ class LinkService:
         self._clients = Clients(on_web_loss, clock)
         self._waiters = StateWaiters()
         self._status = StatusPublisher(session, clock)
-        self._handover = PointHandover(session, clock, self.epoch, self._send_to_planner)
+        self.pauses = Pauses(clock)
+        self._handover = PointHandover(session, clock, self.epoch, self.pauses, self._send_to_planner)
         self._connecting: Iterator[float] | None = None
         self._connecting_wait_s = 0.0
         self._retry_at_s = -inf
@@ -89,7 +91,7 @@ class LinkService:
             self._clients.require_permission(client, message.kind)
             if message.kind == "beat":
                 self._clients.record_beat(client, bool(message.fields["alive"]))
-            elif message.kind in ("stop", "arm", "disarm"):
+            elif message.kind in ("stop", "arm", "disarm", "pause", "resume"):
                 self._command(client, message)
             elif message.kind == "revoke":
                 self._revoke(str(message.fields["caller"]))
@@ -153,10 +155,29 @@ class LinkService:
                 self._session.arm()
                 self._arm_requested = True
                 self._control = self._build_control(message.fields)
+            elif command == "pause":
+                self._pause()
+            elif command == "resume":
+                self._require_armed("resumed")
+                self.pauses.end()
+                self._reply(client, request_id, None)
+                return
         except OptodriveError as error:
             self._reply(client, request_id, error)
             return
         self._waiters.add(client, request_id, command, self._clock.now_s())
+
+    def _pause(self) -> None:
+        """Turn the gate off, and permit no points until the light is resumed."""
+        self._require_armed("paused")
+        if not self.pauses.is_paused:
+            self.pauses.begin(self._session.board_s())
+            self._handover.pause()
+
+    def _require_armed(self, purpose: str) -> None:
+        board = self._session.board
+        if board.state not in ARMED_STATES:
+            raise NotReadyError(f"the board is {board.state}; only an armed board can be {purpose}")
 
     def _build_control(self, fields: dict[str, Any]) -> Control:
         """Build the control of an arming that is requested now; `hold`: whether it needs beats from now on."""
@@ -188,6 +209,7 @@ class LinkService:
 
     def _reply(self, client: int, request_id: int, error: OptodriveError | None) -> None:
         fields: dict[str, Any] = {"board": self._session.board.to_dict(), "epoch": self.epoch.number}
+        fields["pause"] = self.pauses.to_dict()
         self._outgoing.append(Outgoing((client,), build_result(request_id, error, fields)))
 
     def go_dark(self, reason: str) -> None:
@@ -200,10 +222,11 @@ class LinkService:
         self.epoch.end(reason)
         self._arm_requested = self._was_armed = False
         self._control = None
+        self.pauses.end()
         self._session.hold_points()
         self._handover.clear()
-        for waiter in self._waiters.pop_arming():
-            self._reply(waiter.client, waiter.request_id, NotReadyError(f"the board was not armed: {reason}"))
+        for waiter in self._waiters.pop_ended():
+            self._reply(waiter.client, waiter.request_id, NotReadyError(f"the board is not armed: {reason}"))
 
     # --- loop ---------------------------------------------------------------------------------------------------
 
@@ -222,7 +245,7 @@ class LinkService:
         stalled = self._clients.find_stalled()
         control = self._control if self._session.board.state in LEASED_STATES else None
         commands = self._handover.commands
-        status = self._status.build_if_due(self.epoch, self.link_error, control, commands, stalled)
+        status = self._status.build_if_due(self.epoch, self.link_error, control, self.pauses, commands, stalled)
         if status is not None:  # before the results: who knows of ARMED from one may push to the planner at once
             self._outgoing.append(Outgoing(self._clients.list_observers(), status))
         refusal = self._session.pop_refusal()
@@ -232,6 +255,7 @@ class LinkService:
         if refusal is not None:
             self._send_to_planner(Message("refusal", {"reason": refusal}))
         self._handover.report_progress()
+        self._handover.finish_pause()
 
     def _step_session(self, wait_s: float) -> None:
         stalled = self._clients.find_stalled()
@@ -240,6 +264,7 @@ class LinkService:
             self._watch_board()
             self._end_unattended()
             self._end_abandoned()
+            self._end_long_pause()
         except (LinkError, InputError) as error:
             message = self._session.on_lost(error)
             self.link_error = LinkError(message) if isinstance(error, LinkError) else error
@@ -271,6 +296,10 @@ class LinkService:
         """Go dark when the client that holds the arming has stopped to beat."""
         if self._control is not None and self._control.is_abandoned(self._clock.now_s()):
             self.go_dark(f"the client of {self._control.caller!r} that held the board armed does not beat")
+
+    def _end_long_pause(self) -> None:
+        if self.pauses.is_too_long:
+            self.go_dark(f"the light was paused for {PAUSE_MAX_S:g} s")
 
     def _step_connecting(self, wait_s: float) -> None:
         if self._connecting is None:

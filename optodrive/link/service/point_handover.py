@@ -15,6 +15,7 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.protocol.states import ARMED_STATES
 from optodrive.link.service.epoch import Epoch
+from optodrive.link.service.pauses import Pauses
 from optodrive.link.service.results import build_result
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
@@ -22,7 +23,7 @@ from optodrive.link.session.session import BoardSession
 EXECUTED = struct.Struct("<QIH")
 """Executed point in a message: tick of gate on, gate-on time in ticks, duty."""
 POINT_COLUMNS = 5
-REPORT_INTERVAL_S = 0.005
+REPORT_INTERVAL_S = 0.01
 """Interval of the reports to the planner, so that it need not process a message per pulse."""
 
 
@@ -44,11 +45,20 @@ class PointHandover:
     send: sends a message to the planner; commands: number of commands since the planner connected
     """
 
-    def __init__(self, session: BoardSession, clock: Clock, epoch: Epoch, send: Callable[[Message], None]) -> None:
+    def __init__(
+        self,
+        session: BoardSession,
+        clock: Clock,
+        epoch: Epoch,
+        pauses: Pauses,
+        send: Callable[[Message], None],
+    ) -> None:
         self.commands = 0
         self._session = session
         self._clock = clock
         self._epoch = epoch
+        self._pauses = pauses
+        self._is_draining = False
         self._send = send
         self._jobs: dict[int, PlanJob] = {}
         self._progress: dict[int, tuple[int, float | None, bool]] = {}
@@ -61,6 +71,18 @@ class PointHandover:
         self._send_executed()
         self._jobs.clear()
         self._progress.clear()
+
+    def pause(self) -> None:
+        """Turn the gate off and drop the queue. The planner is told when all is reported that was executed."""
+        self._is_draining = True
+        self._session.drain()
+
+    def finish_pause(self) -> None:
+        """Tell the planner, once, that a pause has no more reports."""
+        if self._is_draining and not self._session.is_draining:
+            self._is_draining = False
+            self.clear()
+            self._send(Message("drained", {"pause": self._pauses.number, "board_s": self._pauses.began_s}))
 
     def carry_out(self, message: Message) -> None:
         """Carry out a command of the planner. Raise KeyError, TypeError or ValueError if it is malformed."""
@@ -81,7 +103,8 @@ class PointHandover:
             if self._session.has_points:
                 raise NotReadyError("the board still executes an earlier job")
         except OptodriveError as error:
-            self._send(Message("job_refused", {"job": number, "reason": str(error)}))
+            paused = not self._permits(message)
+            self._send(Message("job_refused", {"job": number, "reason": str(error), "paused": paused}))
             return
         self._jobs[number] = self._session.begin(points, start_s, _parse_ahead_s(fields))
 
@@ -104,10 +127,15 @@ class PointHandover:
         epoch, crc = int(message.fields["epoch"]), int(message.fields["crc"])
         if not self._epoch.is_current(epoch):
             raise NotReadyError(f"the plan is of epoch {epoch}, now is {self._epoch.number}: {self._epoch.reason}")
+        if not self._permits(message):
+            raise NotReadyError("the light is paused, or was since the plan was made")
         if not self._session.connected or self._session.board.state not in ARMED_STATES:
             raise NotReadyError(f"the board is {self._session.board.state}; arm it first")
         if crc != zlib.crc32(message.payload):
             raise NotReadyError("the points differ from those that were verified (CRC-32)")
+
+    def _permits(self, message: Message) -> bool:
+        return self._pauses.permits(int(message.fields["pause"]))
 
     def _truncate(self, message: Message) -> None:
         done = bool(self._jobs) and self._session.truncate(int(message.fields["kept_points"]))

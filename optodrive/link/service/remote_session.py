@@ -4,6 +4,7 @@ Names follow `BoardSession`. One thread calls everything but `board_s`, which an
 """
 
 import select
+import time
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
 from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.quantisation import WirePoints, WireScale
 from optodrive.link.session.board_view import BoardView
+from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.lease_renewal import AGE_BUCKETS_S
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.plan_job import PlanJob
@@ -62,6 +64,8 @@ class RemoteSession:
     connected: whether the link process is reached and its link to the board is up
     port: name of the board's port; board: latest reported state of the board; stats: link statistics
     control: who armed the board, None while it is not armed
+    pause_ends_in_s: time until the pause ends disarmed, None if the light is not paused
+    is_realtime: whether the link process runs before all programs of usual priority
     """
 
     def __init__(self, scale: WireScale, clock: Clock) -> None:
@@ -76,8 +80,9 @@ class RemoteSession:
         self.stats: dict[str, Any] = {}
         self.faults: Counter[str] = Counter()
         self.lease = LeaseStats()
-        self.is_acknowledged = False
+        self.is_acknowledged = self.is_realtime = False
         self.control: dict[str, Any] | None = None
+        self.pause_ends_in_s: float | None = None
         self.last_event_reason = ""
         self.likely_cause: LinkCause | None = None
         self._clock = clock
@@ -87,6 +92,8 @@ class RemoteSession:
         self._reported_ready = False
         self._commands_sent = self._commands_seen = 0
         self._refusal: str | None = None
+        self._pause_number = self._drained_number = 0
+        self._drained_s: float | None = None
         self._jobs: dict[int, RemoteJob] = {}
         self._job_number = self._request_id = 0
         self._on_result: Callable[[dict[str, Any]], None] | None = None
@@ -143,6 +150,7 @@ class RemoteSession:
             self._socket.close()
         self._socket = None
         self.connected = self.is_acknowledged = self._reported_ready = False
+        self.pause_ends_in_s = None
         self.epoch, self.epoch_reason = NO_EPOCH, message
         self.link_error, self.link_error_code = message, "link"
         self._jobs.clear()
@@ -197,7 +205,10 @@ class RemoteSession:
             self._on_progress(fields)
         elif message.kind == "job_refused":
             self._jobs.pop(fields["job"], None)
-            self._keep_refusal(fields["reason"])
+            if not fields["paused"]:  # else the planner hands the plan over again, see pop_drained()
+                self._keep_refusal(fields["reason"])
+        elif message.kind == "drained":
+            self._on_drained(fields["pause"], fields["board_s"])
         elif message.kind == "refusal":
             self._keep_refusal(fields["reason"])
         elif message.kind == "result" and fields["id"] == self._request_id and self._on_result is not None:
@@ -209,8 +220,11 @@ class RemoteSession:
             self._refusal = reason
 
     def _on_status(self, fields: dict[str, Any]) -> None:
+        pause = fields["pause"]
+        self._pause_number, self.pause_ends_in_s = pause["number"], pause["ends_in_s"]
         if fields["epoch"] != self.epoch:
             self._jobs.clear()
+            self._drained_number, self._drained_s = pause["number"], None
         self.epoch, self.epoch_reason = fields["epoch"], fields["epoch_reason"]
         self._update_clock(fields["clock"], fields["connected"])
         self.connected, self.port = fields["connected"], fields["port"]
@@ -222,6 +236,7 @@ class RemoteSession:
         self.lease.slack_s = fields["lease"]["slack_s"]
         self.is_acknowledged, self._reported_ready = fields["is_acknowledged"], fields["is_ready"]
         self.control, self._commands_seen = fields["control"], fields["commands"]
+        self.is_realtime = fields["is_realtime"]
         self.last_event_reason = fields["last_event_reason"]
         self.likely_cause = None if fields["cause"] is None else LinkCause(*fields["cause"])
 
@@ -244,6 +259,12 @@ class RemoteSession:
         if fields["finished"]:
             del self._jobs[fields["job"]]
 
+    def _on_drained(self, number: int, board_s: float) -> None:
+        self._jobs.clear()
+        self._drained_number = number
+        if self._drained_s is None:
+            self._drained_s = board_s
+
     def _on_executed(self, fields: dict[str, Any], payload: bytes) -> None:
         job = self._jobs.get(fields["job"])
         if job is not None:
@@ -251,6 +272,13 @@ class RemoteSession:
             job.record_executed(Executed(job.first_index + fields["first_point"], records))
 
     # --- state --------------------------------------------------------------------------------------------------
+
+    def read_clocks(self) -> ClockReading | None:
+        """Return the present time on all clocks, None before the first status with a synchronised clock."""
+        sample, now_s = self._clock_sample, self._clock.now_s()
+        if sample is None:
+            return None
+        return ClockReading(sample[1] + (now_s - sample[0]), now_s, time.time())
 
     def board_s(self) -> float:
         """Return the present board time, s, or 0 before the first status with a synchronised clock."""
@@ -260,7 +288,21 @@ class RemoteSession:
     @property
     def is_ready(self) -> bool:
         """Whether a job may start now. False until the link process has carried out all commands sent."""
-        return self.connected and self._reported_ready and self._commands_seen == self._commands_sent
+        all_seen = self._commands_seen == self._commands_sent
+        return self.connected and self._reported_ready and all_seen and not self.is_held
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the light is paused, or reports of what ran before a pause may still arrive."""
+        return self.pause_ends_in_s is not None or self._drained_number != self._pause_number
+
+    def pop_drained(self) -> float | None:
+        """Return and clear the board time at which a pause began, s, when all is reported that was executed before it.
+
+        The link process has dropped all jobs; it refuses points that were handed over before.
+        """
+        drained_s, self._drained_s = self._drained_s, None
+        return drained_s
 
     def pop_refusal(self) -> str | None:
         """Return and clear the reason for which link process or board refused a command."""
@@ -287,6 +329,7 @@ class RemoteSession:
         fields = {
             "job": job.number,
             "epoch": epoch,
+            "pause": self._drained_number,
             "start_s": start_s,
             **_build_points_fields(payload, send_ahead_s, crc),
         }
@@ -308,7 +351,7 @@ class RemoteSession:
             return None
         self._job_number += 1
         number = self._job_number
-        fields = {"job": number, "epoch": epoch, "kept_points": kept_points}
+        fields = {"job": number, "epoch": epoch, "pause": self._drained_number, "kept_points": kept_points}
 
         added: list[RemoteJob] = []
 

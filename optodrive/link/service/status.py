@@ -2,11 +2,12 @@
 
 from math import inf
 
-from optodrive.core.clock import Clock
+from optodrive.core.clock import Clock, has_realtime_scheduling
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message
 from optodrive.link.service.control import Control
 from optodrive.link.service.epoch import Epoch
+from optodrive.link.service.pauses import Pauses
 from optodrive.link.session.session import BoardSession
 
 INTERVAL_S = 0.1
@@ -30,6 +31,7 @@ class StatusPublisher:
         epoch: Epoch,
         link_error: OptodriveError | None,
         control: Control | None,
+        pauses: Pauses,
         commands: int,
         stalled: str,
     ) -> Message | None:
@@ -41,7 +43,8 @@ class StatusPublisher:
         session, board = self._session, self._session.board
         outcome = session.is_ready, session.last_event_reason, session.likely_cause
         causes = None if control is None else control.arming, commands, stalled, *outcome
-        key = (epoch.number, session.connected, link_error, board.state, board.fault, *causes)
+        pause = pauses.number, pauses.is_paused
+        key = (epoch.number, pause, session.connected, link_error, board.state, board.fault, *causes)
         now_s = self._clock.now_s()
         if key == self._published and now_s < self._due_s:
             return None
@@ -63,12 +66,14 @@ class StatusPublisher:
                 "slack_s": session.lease.slack_s,
             },
             "clock": None if sample is None else list(sample),
-            "is_ready": session.connected and session.is_ready,
+            "is_ready": session.connected and session.is_ready and not pauses.is_paused,
             "is_acknowledged": session.is_acknowledged,
             "last_event_reason": session.last_event_reason,
             "cause": None if cause is None else list(cause),
+            "pause": pauses.to_dict(),
             "control": None if control is None else control.to_dict(now_s),
             "commands": commands,
             "stalled": stalled,
+            "is_realtime": has_realtime_scheduling(),
         }
         return Message("status", fields)

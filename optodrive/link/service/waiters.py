@@ -9,7 +9,12 @@ from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 
 TIMEOUT_S = 5.0
-AWAITED_STATES = {"arm": (BoardState.ARMED,), "disarm": (BoardState.DISARMED,), "stop": IDLE_STATES}
+AWAITED_STATES = {
+    "arm": (BoardState.ARMED,),
+    "disarm": (BoardState.DISARMED,),
+    "pause": (BoardState.ARMED,),
+    "stop": IDLE_STATES,
+}
 """States that fulfil each command."""
 
 
@@ -37,11 +42,11 @@ class StateWaiters:
         """Forget a client that has left."""
         self._waiters = [waiter for waiter in self._waiters if waiter.client != client]
 
-    def pop_arming(self) -> list[Waiter]:
-        """Remove and return the clients that wait for arming, which something has ended."""
-        arming = [waiter for waiter in self._waiters if waiter.command == "arm"]
-        self._waiters = [waiter for waiter in self._waiters if waiter.command != "arm"]
-        return arming
+    def pop_ended(self) -> list[Waiter]:
+        """Remove and return the clients that wait for an armed board, when something has ended the epoch."""
+        ended = [waiter for waiter in self._waiters if BoardState.ARMED in AWAITED_STATES[waiter.command]]
+        self._waiters = [waiter for waiter in self._waiters if waiter not in ended]
+        return ended
 
     def pop_results(
         self, session: BoardSession, refusal: str | None, link_error: str | None, now_s: float

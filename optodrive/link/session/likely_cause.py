@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from optodrive.core.quantity import format_quantity
 from optodrive.link.protocol.describe import describe_reset_cause
 from optodrive.link.transport.port_state import PortState
 
@@ -87,8 +88,9 @@ def diagnose_lease_expiry(evidence: LinkEvidence) -> str:
 def _diagnose_host_stall(evidence: LinkEvidence) -> str | None:
     if evidence.stall_s < STALL_LEASE_FRACTION * evidence.lease_s:
         return None
+    stall, lease = format_quantity(evidence.stall_s, "s"), format_quantity(evidence.lease_s, "s")
     return (
-        f"this computer stalled for {evidence.stall_s * 1e3:.0f} ms, the lease is {evidence.lease_s * 1e3:.0f} ms: "
+        f"this computer stalled for {stall}, the lease is {lease}: "
         "suspended, swapping or overloaded; end other work on it, and run `optodrive doctor`"
     )
 

@@ -81,6 +81,17 @@ class PointStream:
         self._next_index = self._sent_index
         self._jobs.clear()
 
+    def drop_unsent(self) -> None:
+        """Drop all points not yet sent. The jobs stay, for the reports of those that were sent."""
+        for job in self._jobs:
+            job.truncate(job.next_to_send - job.first_index)
+        self._next_index = self._sent_index
+
+    @property
+    def first_unreported(self) -> int | None:
+        """First index not yet reported, None if all are."""
+        return next((job.first_unreported for job in self._jobs if job.first_unreported is not None), None)
+
     def record_executed(self, message: m.Executed) -> None:
         """Record the board's report of executed points."""
         for job in self._jobs:
@@ -118,7 +129,7 @@ class PointStream:
 
     def request_missing_reports(self, link: HostConnection, done_index: int, now_s: float) -> None:
         """Request lost reports again if the board has executed more points than it reported."""
-        missing = next((job.first_unreported for job in self._jobs if job.first_unreported is not None), None)
+        missing = self.first_unreported
         if missing is None or missing >= done_index or now_s - self._reports_requested_s < MISSING_REPORT_RETRY_S:
             return
         self._reports_requested_s = now_s

@@ -21,6 +21,8 @@ READ_MAX_S = 0.05
 SLEEP_BELOW_S = 0.999_999e-4
 """Remaining waits below this time are slept, because a read would take longer."""
 HELLO_TIMEOUT_S = 1.0
+SILENCE_TIMEOUT_S = 2.5
+"""A board that sends nothing for this time, in which the captured one sent, is lost."""
 DRAIN_S = 0.5
 
 
@@ -94,21 +96,26 @@ class Replay:
         self._shift_s = shift_s
         self._may_arm = may_arm
         self._open = False
+        self._owed_s: float | None = None
 
     def run(self, entries: Iterable[CaptureEntry]) -> None:
-        """Replay all entries. Raise LinkError if the link fails."""
+        """Replay all entries. Raise LinkError if the link fails or the board falls silent."""
         try:
             for entry in entries:
                 self.recorded.feed(entry)
                 if entry.kind != FROM_BOARD:
                     self._wait_until(entry.host_s + self._shift_s)
                     self._apply(entry)
+                elif self._owed_s is None:
+                    self._owed_s = entry.host_s + self._shift_s
             if self._open:
                 self._wait_until(self._clock.now_s() + DRAIN_S)
         finally:
             self._transport.release()
 
     def _apply(self, entry: CaptureEntry) -> None:
+        if entry.kind in (OPENED, CLOSED):
+            self._owed_s = None
         if entry.kind == OPENED:
             self._transport.open()
             self._open = True
@@ -133,7 +140,10 @@ class Replay:
     def _receive(self, wait_s: float) -> None:
         data = self._transport.read(wait_s)
         if data:
+            self._owed_s = None
             self.replayed.feed(CaptureEntry(FROM_BOARD, self._clock.now_s(), data))
+        elif self._owed_s is not None and self._clock.now_s() - self._owed_s > SILENCE_TIMEOUT_S:
+            raise LinkError(f"{self._transport.name}: the board sent nothing for {SILENCE_TIMEOUT_S:g} s")
 
     def _translate_frames(self, data: bytes) -> bytes:
         """Return the host's frames with the session number of this board. Drop everything else."""

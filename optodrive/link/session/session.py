@@ -23,11 +23,14 @@ from optodrive.link.session.clock_sync import ClockSync
 from optodrive.link.session.lease_renewal import RENEWAL_FRACTION, LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.point_drain import PointDrain
 from optodrive.link.session.point_stream import PointStream
 from optodrive.link.transport.base import Transport
 
 HELLO_RETRY_S = 0.25
-CONNECT_TIMEOUT_S = 6.0
+CONNECT_TIMEOUT_S = 3.5
+HANDSHAKE_INTERVAL_S = 0.02
+"""Interval between two requests of the handshake; a board that answers only some of them is not polled faster."""
 STATUS_INTERVAL_S = 0.2
 CLOCK_INTERVAL_S = 1.0
 CLOCK_INITIAL_SAMPLES = 8
@@ -36,7 +39,7 @@ SILENCE_TIMEOUT_S = 2.0
 WAIT_MIN_S, WAIT_MAX_S = 0.001, 0.01
 RETRANSMISSION_WAIT_S = BATCH_WAIT_S = 0.002
 """Shortest wait for a retransmission, and for further points to become due, so that frames hold several."""
-SPLICE_LEAD_S = 0.01
+SPLICE_LEAD_S = 0.005
 """Minimum time between a splice and the end of the points before it."""
 
 
@@ -57,6 +60,7 @@ class BoardSession:
         self._clock_sync = ClockSync()
         self._points = PointStream()
         self._points_held = False
+        self._drain: PointDrain | None = None
         self.on_executed: Callable[[m.Executed], None] = lambda message: None
         self._hello_sent_s = 0.0
         self._refusal: str | None = None
@@ -94,7 +98,9 @@ class BoardSession:
     @property
     def is_ready(self) -> bool:
         """Whether a job may start now."""
-        return self.board.state == BoardState.ARMED and not self._points and self.is_acknowledged
+        return (
+            self.board.state == BoardState.ARMED and not self._points and not self.is_draining and self.is_acknowledged
+        )
 
     @property
     def is_acknowledged(self) -> bool:
@@ -147,15 +153,16 @@ class BoardSession:
         deadline_s = self._clock.now_s() + CONNECT_TIMEOUT_S
         while self._connection.peer is None:
             self._retry_hello()
-            yield 0.02
+            yield HANDSHAKE_INTERVAL_S
             if self._clock.now_s() > deadline_s:
                 raise LinkError(
                     f"{self.port} is open, but no board answers: check its power, the port and the baud rate"
                 )
         while not (self.is_acknowledged and self._clock_sync.is_synchronised and self.board.state != "UNKNOWN"):
-            self._request_clock()
-            self._request_status()
-            yield 0.02
+            if self._clock.now_s() - self._clock_requested_s >= HANDSHAKE_INTERVAL_S:
+                self._request_clock()
+                self._request_status()
+            yield HANDSHAKE_INTERVAL_S
             if self._clock.now_s() > deadline_s:
                 raise LinkError(f"{self.port}: the board answers HELLO but nothing else; {self._describe_errors()}")
         for _ in range(CLOCK_INITIAL_SAMPLES):
@@ -188,6 +195,7 @@ class BoardSession:
         self._refusal = None
         self.board = BoardView()
         self._last_received_s = self._clock.now_s()
+        self._clock_requested_s = -inf
         self._watch.on_opened()
 
     def disconnect(self) -> None:
@@ -268,10 +276,11 @@ class BoardSession:
         self._status_requested_s = self._clock.now_s()
         self._connection.send(m.Get())
 
-    def _request_clock(self) -> None:
+    def _request_clock(self) -> int:
         self._clock_requested_s = self._clock.now_s()
         stamp = self._clock_sync.start_exchange(self._clock_requested_s)
         self._connection.send(m.ClockRequest(host_t=stamp))
+        return stamp
 
     def _on_message(self, message: m.Message, now_s: float) -> None:
         handlers: dict[type[m.Message], Callable[[Any, float], None]] = {
@@ -317,6 +326,8 @@ class BoardSession:
 
     def _on_clock_reply(self, message: m.ClockReply, now_s: float) -> None:
         self._clock_sync.finish_exchange(message.host_t, now_s, message.tick * self.scale.tick_s)
+        if self._drain is not None:
+            self._drain.on_clock_reply(message.host_t, self._count_errors().host_bad_frames)
 
     def _on_arm_challenge(self, message: m.ArmChallenge, now_s: float) -> None:
         if message.host_nonce == self._arm_nonce:
@@ -328,6 +339,8 @@ class BoardSession:
         self.board.done_index = max(self.board.done_index, message.first_index + len(message.records))
         self._points.record_executed(message)
         self.on_executed(message)
+        if self._drain is not None:
+            self._drain.on_report()
 
     # --- commands -----------------------------------------------------------------------------------------------
 
@@ -360,6 +373,7 @@ class BoardSession:
         """Send nothing of the points handed over so far, and do not confirm an arming. The next arming drops them."""
         self._points_held = True
         self._arm_nonce = None
+        self._drain = None
 
     def _drop_held_points(self) -> None:
         self._points.clear()
@@ -368,6 +382,28 @@ class BoardSession:
         """Turn the gate off and drop the queue. The board stays armed."""
         self._points.clear()
         self._connection.send(m.Flush())
+
+    def drain(self) -> None:
+        """Turn the gate off, drop the queue and collect the last reports. The board stays armed."""
+        self._points.drop_unsent()
+        self._connection.send(m.Flush())
+        self._drain = PointDrain()
+
+    @property
+    def is_draining(self) -> bool:
+        """Whether reports of points that were sent before drain() may still arrive."""
+        return self._drain is not None
+
+    def _step_drain(self, drain: PointDrain) -> None:
+        if not self.is_acknowledged:
+            return
+        missing, now_s = self._points.first_unreported, self._clock.now_s()
+        if missing is None or drain.is_complete:
+            self._points.clear()
+            self._drain = None
+        elif drain.is_due(now_s):
+            self._connection.send(m.GetExecuted(first_index=missing))
+            drain.begin_exchange(self._request_clock(), now_s, self._count_errors().host_bad_frames)
 
     def pop_refusal(self) -> str | None:
         """Return and clear the reason for which the board refused the last command."""
@@ -395,9 +431,12 @@ class BoardSession:
 
     def truncate(self, kept_points: int) -> bool:
         """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
-        return self._points.truncate(kept_points)
+        return not self.is_draining and self._points.truncate(kept_points)
 
     def _stream_points(self) -> None:
+        if self._drain is not None:
+            self._step_drain(self._drain)
+            return
         if not self._points or self._points_held:
             return
         if self.board.state in ARMED_STATES:  # else the board has ended the job: only collect its reports
@@ -418,7 +457,7 @@ class BoardSession:
         wait_s = WAIT_MAX_S
         if self.board.state in LEASED_STATES:
             wait_s = min(wait_s, 0.5 * RENEWAL_FRACTION * self._requirements.lease_s)
-        if self._connection.outstanding:
+        if self._connection.outstanding or self.is_draining:
             wait_s = min(wait_s, RETRANSMISSION_WAIT_S)
         if not self._points_held and self.board.state in ARMED_STATES:
             due_tick = self._points.find_due_tick()

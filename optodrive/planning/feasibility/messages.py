@@ -1,5 +1,6 @@
 """One-line messages about the first violation and the nearest feasible variants."""
 
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.core.units import m_to_um
 from optodrive.planning.feasibility.report import NearestFeasible, SequenceReduction
@@ -29,7 +30,7 @@ def describe_violation(sequence: FrameSequence, plan: PlannedSequence | None, vi
         return next(describe_lateness(timing) for timing in plan.frames if timing.source == violation.source)
     late_s = float((plan.plan.start_s - plan.plan.requested_start_s)[plan.plan.source == violation.source].max())
     return (
-        f"{subject} starts a pulse {late_s * 1e3:.2f} ms late, more than one settling time: "
+        f"{subject} starts a pulse {format_quantity(late_s, 's')} late, more than one settling time: "
         f"the settling times between trains add up"
     )
 

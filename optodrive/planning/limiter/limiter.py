@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import EMPTY_PLAN, BudgetState, LimitedPlan, PulsePlan
 from optodrive.core.types.policy import Policy
@@ -226,7 +227,9 @@ def verify(
     The wall-exchange bound depends on its evaluation times. It is therefore evaluated at the plan's own times,
     including those of pulses that were trimmed to zero power.
     """
-    omitted = np.setdiff1d(np.arange(len(plan)), row)
+    is_sent = np.zeros(len(plan), dtype=np.bool)
+    is_sent[row] = True
+    omitted = np.flatnonzero(~is_sent)
     order = np.argsort(np.concatenate([pulses.start_s, plan.start_s[omitted]]), kind="stable")
     columns = [
         np.concatenate([getattr(pulses, name), getattr(plan, name)[omitted]]) for name in _EncodedPulses._fields[:-1]
@@ -289,8 +292,8 @@ def _build_refusal(
     if cap == REASONS[WRONG_ORDER]:
         return RefusedError(f"a pulse at {start_s:.6f} s starts before the budget's time {state.at_s:.6f} s")
     if cap == "pulse_width" and width_s > budget.caps.pulse_width_s:
-        max_ms = budget.caps.pulse_width_s * 1e3
-        return RefusedError(f"pulse {row} on pixel {pixel} is {width_s * 1e3:.3f} ms wide, the cap is {max_ms:.3f} ms")
+        width, max_width = (format_quantity(value_s, "s", 6) for value_s in (width_s, budget.caps.pulse_width_s))
+        return RefusedError(f"pulse {row} on pixel {pixel} is {width} wide, the cap is {max_width}")
     requested_j, allowed_j, delay_s = (
         plan.power_w[row] * width_s,
         allowed_w * width_s,
@@ -298,8 +301,8 @@ def _build_refusal(
     )
     fits = f"the whole fits {delay_s:.3f} s later" if delay_s < inf else "the whole does not fit at any later time"
     return OverBudgetError(
-        f"pulse {row} on pixel {pixel} at {start_s:.4f} s requests {requested_j * 1e3:.2f} mJ, "
-        f"the {CAPS_BY_KEY[cap].message} allows {allowed_j * 1e3:.2f} mJ; {fits}",
+        f"pulse {row} on pixel {pixel} at {start_s:.4f} s requests {format_quantity(requested_j, 'J')}, "
+        f"the {CAPS_BY_KEY[cap].message} allows {format_quantity(allowed_j, 'J')}; {fits}",
         pixel=pixel,
         cap=cap,
         margin_j=float(requested_j - allowed_j),

@@ -11,6 +11,7 @@ from math import e, inf, log
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.planning.limiter.budget import HeatBound
 from optodrive.planning.limiter.caps import CapValues
@@ -212,8 +213,8 @@ def _build_wall_bound(
     if min(retained_fraction, lag_retained_fraction) < 0.5:
         raise InputError(
             "terms.wall_heating",
-            f"a wall time constant of {c_low / float(max_w_per_k.max()):.3g} s",
-            f"more than twice the absorber's {max(tau_max_s, lag_max_s):.3g} s",
+            f"a wall time constant of {format_quantity(c_low / float(max_w_per_k.max()), 's')}",
+            f"more than twice the absorber's {format_quantity(max(tau_max_s, lag_max_s), 's')}",
         )
     # The absorber follows a cooling wall and adds its own heat capacity.
     carried_j_per_k = float(c_absorber_j_per_k.max()) / retained_fraction
@@ -269,7 +270,9 @@ def _build_touch_bound(
     tau_g_s = model.tau_g_s * (1 + uncertainty.gas_lag)
     retained_fraction = (1.0 - tau_max_s / lags_s[0]) * (1.0 - tau_g_s / lags_s[0])
     if retained_fraction < 0.5 or lags_s[0] < tau_max_s:
-        raise InputError("terms.touch_surface.lag", touch.lag_s, f"well above the absorber's {tau_max_s:.3g} s")
+        raise InputError(
+            "terms.touch_surface.lag", touch.lag_s, f"well above the absorber's {format_quantity(tau_max_s, 's')}"
+        )
     gas_s = gas_share * tau_g_s / (1.0 - tau_g_s / float(lags_s[0]))
     absorber_s = 0.5 * gas_share * tau_max_s / retained_fraction
     return _TouchBound(

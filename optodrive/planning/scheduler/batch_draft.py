@@ -18,6 +18,13 @@ class SkippedPulse:
     target_m: float
 
 
+class PulseStart(NamedTuple):
+    """Gate-on time of a pulse, and the settling time of the move before it, µs."""
+
+    start_us: int
+    settling_us: int
+
+
 class PlannedPulse(NamedTuple):
     """One row of a plan, in whole microseconds."""
 
@@ -64,17 +71,24 @@ class BatchDraft:
         """Return an empty draft that starts at `beam`."""
         return cls(path, replace(beam))
 
-    def compute_start_us(self, pixel: int, requested_us: int) -> int:
-        """Return the earliest gate-on time of a pulse on `pixel` that is requested for `requested_us`."""
+    def compute_start(self, pixel: int, requested_us: int) -> PulseStart:
+        """Return the earliest start of a pulse on `pixel` that is requested for `requested_us`."""
         beam = self.beam
         settling_us = self.path.compute_settling_us(beam.pixel, pixel, beam.dwell_us)
-        return max(requested_us + beam.delay_us, beam.free_us + settling_us)
+        return PulseStart(max(requested_us + beam.delay_us, beam.free_us + settling_us), settling_us)
 
-    def add(self, pixel: int, width_us: int, power_w: float, requested_us: int, target_m: float, source: int) -> None:
-        """Append a pulse at its earliest gate-on time."""
-        beam = self.beam
-        settling_us = self.path.compute_settling_us(beam.pixel, pixel, beam.dwell_us)
-        start_us = self.compute_start_us(pixel, requested_us)
+    def add(
+        self,
+        pixel: int,
+        start: PulseStart,
+        width_us: int,
+        power_w: float,
+        requested_us: int,
+        target_m: float,
+        source: int,
+    ) -> None:
+        """Append a pulse at its earliest start, as `compute_start` returned it for the present state of the beam."""
+        beam, (start_us, settling_us) = self.beam, start
         if pixel != beam.pixel:
             beam.arrival_us = start_us
         beam.free_us, beam.pixel = start_us + width_us, pixel

@@ -4,11 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 
+import numpy as np
+
 from optodrive.core.types.stimuli import FrameSequence
+from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.scheduler.batch_draft import BatchDraft, BeamState
 from optodrive.planning.scheduler.interleaving import PeriodsByPixel
+from optodrive.planning.scheduler.nominal_round import draft_round
 from optodrive.planning.scheduler.scan_head import BeamPath
 from optodrive.planning.scheduler.train_pulses import TrainPulses
 
@@ -68,14 +72,19 @@ class BatchPlanner:
         draft = BatchDraft.begin(self._path, beam)
         frame, source, drive = self._sequence.frames[each.source], each.source, self._drive
         requested_us = self.compute_requested_us(frame.show_at_s)
+        if isinstance(heat, NominalThermalState) and each.periods is None and beam.next_train >= len(self._trains):
+            self._on_progress()
+            pixels = np.array(each.order[beam.position :], dtype=np.int64)
+            draft_round(draft, heat, pixels, frame.target_m[pixels], requested_us, source, drive, max_rows)
+            return draft
         while draft.beam.position < len(each.order) and len(draft.rows) < (inf if max_rows is None else max_rows):
             pixel = each.order[draft.beam.position]
             target_m = float(frame.target_m[pixel])
-            start_us = draft.compute_start_us(pixel, requested_us)
+            start = draft.compute_start(pixel, requested_us)
             if draft.beam.position % PROGRESS_INTERVAL == 0:
                 self._on_progress()
             if each.periods is None:
-                pulse = heat.solve_pulse(pixel, start_us * 1e-6, target_m, drive)
+                pulse = heat.solve_pulse(pixel, start.start_us * 1e-6, target_m, drive)
             else:
                 pulse, target_m = (each.periods[pixel], 1.0), float("nan")
             if pulse is None:
@@ -83,14 +92,14 @@ class BatchPlanner:
                 draft.beam.position += 1
                 continue
             width_us = round(pulse[0] * drive.period_s * 1e6)
-            if self._is_train_due(draft, start_us + width_us, pixel, width_us):
+            if self._is_train_due(draft, start.start_us + width_us, pixel, width_us):
                 if not self._is_heat_known(draft):
                     break
                 self._draft_train_pulse(draft, heat)
                 if draft.rows:
                     break
                 continue
-            draft.add(pixel, width_us, pulse[1] * drive.max_power_w, requested_us, target_m, source)
+            draft.add(pixel, start, width_us, pulse[1] * drive.max_power_w, requested_us, target_m, source)
             draft.beam.position += 1
         return draft
 
@@ -100,16 +109,16 @@ class BatchPlanner:
         pulse = self._trains[index]
         requested_us = self._path.lead_in_us + pulse.requested_start_us
         beam.next_train += 1
+        start = draft.compute_start(pulse.pixel, requested_us)
         if not pulse.is_by_height:
-            draft.add(pulse.pixel, pulse.width_us, pulse.power_w, requested_us, float("nan"), pulse.source)
+            draft.add(pulse.pixel, start, pulse.width_us, pulse.power_w, requested_us, float("nan"), pulse.source)
             return
-        start_us = draft.compute_start_us(pulse.pixel, requested_us)
-        shape = self._trains.plan_pulse(index, heat, start_us, start_us - requested_us - beam.delay_us)
+        shape = self._trains.plan_pulse(index, heat, start.start_us, start.start_us - requested_us - beam.delay_us)
         target_m = self._trains.get_target_m(pulse.source)
         if shape is None:
             draft.skip(pulse.source, pulse.pixel, target_m)
         else:
-            draft.add(pulse.pixel, *shape, requested_us, target_m, pulse.source)
+            draft.add(pulse.pixel, start, *shape, requested_us, target_m, pulse.source)
 
     def _is_heat_known(self, draft: BatchDraft) -> bool:
         """Return whether the next train pulse is independent of the drafted pulses, which the limiter may trim."""

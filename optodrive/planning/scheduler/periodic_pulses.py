@@ -16,6 +16,7 @@ from math import ceil
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import HeightTrain
 from optodrive.core.units import m_to_um
@@ -165,8 +166,9 @@ def _find_min_periods(train: HeightTrain, cold_heat: ThermalState, drive: DriveR
         raise InputError(
             f"{where}.target_um",
             round(m_to_um(train.target_m), 3),
-            f"at most {m_to_um(max_m):.0f} µm, the height of pulses of {high * drive.period_s * 1e3:.4g} ms at "
-            f"{drive.max_power_w:g} W every {train.period_s * 1e3:.4g} ms",
+            f"at most {m_to_um(max_m):.0f} µm, the height of pulses of "
+            f"{format_quantity(high * drive.period_s, 's', 4)} at {format_quantity(drive.max_power_w, 'W')} "
+            f"every {format_quantity(train.period_s, 's', 4)}",
             code="target_unreachable",
         )
     while high - low > 1:
@@ -199,7 +201,7 @@ def _find_peak_to_peak_shape(
                 f"{where}.peak_to_peak_um",
                 round(m_to_um(target_m), 3),
                 f"{word} {m_to_um(bound_m):.4g} µm, the value of the {kind} pulses to {m_to_um(train.target_m):.4g} µm "
-                f"every {train.period_s * 1e3:.4g} ms",
+                f"every {format_quantity(train.period_s, 's', 4)}",
                 code="bad_train",
             )
     while high - low > 1:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 from optodrive.core.types.stimuli import HeightTrain, Train
 from optodrive.physics.nominal_display import ignore_progress
 from optodrive.physics.pulse_for_height import DriveRange
@@ -19,6 +20,8 @@ from optodrive.planning.scheduler.periodic_pulses import (
 
 SettlingTime = Callable[[int, int], int]
 """Returns the settling time of a move from one pixel to another, µs."""
+PROGRESS_PULSES = 20_000
+"""Pulses between two progress reports: tens of milliseconds."""
 
 
 class TrainPulse(NamedTuple):
@@ -36,17 +39,30 @@ class TrainPulse(NamedTuple):
         return not self.width_us
 
 
-def list_train_pulses(trains: tuple[Train, ...], first_source: int) -> list[TrainPulse]:
-    """List the pulses of all trains in order of time; first_source: source index of the first train."""
-    pulses = []
-    for source, train in enumerate(trains, start=first_source):
+def list_train_pulses(
+    trains: tuple[Train, ...], first_source: int, on_progress: Callable[[], None] = ignore_progress
+) -> list[TrainPulse]:
+    """List the pulses of all trains in order of time, at equal times in that of the trains.
+
+    first_source: source index of the first train; on_progress: called repeatedly
+    """
+    starts_us, shapes = [], []
+    for train in trains:
+        starts_us.append(np.rint(train.pulse_starts_s() * 1e6).astype(np.int64))
         width_s, power_w = (0.0, 0.0) if isinstance(train, HeightTrain) else (train.pulse_width_s, train.power_w)
-        width_us = round(width_s * 1e6)
-        pulses += [
-            TrainPulse(round(start_s * 1e6), source, train.pixel, width_us, power_w)
-            for start_s in train.pulse_starts_s()
-        ]
-    return sorted(pulses)
+        shapes.append((train.pixel, round(width_s * 1e6), power_w))
+        on_progress()
+    if not trains:
+        return []
+    start_us, number = np.concatenate(starts_us), np.repeat(np.arange(len(trains)), [len(each) for each in starts_us])
+    order = np.argsort(start_us, kind="stable")
+    pulses: list[TrainPulse] = []
+    for first in range(0, len(order), PROGRESS_PULSES):
+        chunk = order[first : first + PROGRESS_PULSES]
+        for at_us, train_number in zip(start_us[chunk].tolist(), number[chunk].tolist(), strict=True):
+            pulses.append(TrainPulse(at_us, first_source + train_number, *shapes[train_number]))
+        on_progress()
+    return pulses
 
 
 def compute_free_us(pulses: list[TrainPulse], index: int, gap_us: int, settling_us: SettlingTime) -> int:
@@ -62,11 +78,13 @@ def compute_free_us(pulses: list[TrainPulse], index: int, gap_us: int, settling_
 
 
 def compute_free_us_by_source(
-    pulses: list[TrainPulse], sources: set[int], gap_us: int, settling_us: SettlingTime
+    pulses: list[TrainPulse], sources: set[int], gap_us: int, settling_us: SettlingTime, on_progress: Callable[[], None]
 ) -> dict[int, tuple[int, int]]:
     """Return the minimum and the median beam time of the pulses of the given trains, µs, by source."""
     free: dict[int, list[int]] = {source: [] for source in sources}
     for k, pulse in enumerate(pulses):
+        if k % PROGRESS_PULSES == 0:
+            on_progress()
         if pulse.source in free:
             free[pulse.source].append(compute_free_us(pulses, k, gap_us, settling_us))
     return {source: (min(each), int(np.median(each))) for source, each in free.items()}
@@ -78,6 +96,7 @@ def add_lead_periods(
     lead_period_us: int,
     gap_us: int,
     settling_us: SettlingTime,
+    on_progress: Callable[[], None],
 ) -> list[TrainPulse]:
     """Put a lead period before each pulse of the given sources, where the beam time suffices for both.
 
@@ -85,6 +104,8 @@ def add_lead_periods(
     """
     result = []
     for k, pulse in enumerate(pulses):
+        if k % PROGRESS_PULSES == 0:
+            on_progress()
         if pulse.source in lead_periods_w and compute_free_us(pulses, k, gap_us, settling_us) >= 2 * lead_period_us:
             result.append(pulse._replace(width_us=lead_period_us, power_w=lead_periods_w[pulse.source]))
             pulse = pulse._replace(requested_start_us=pulse.requested_start_us + lead_period_us)
@@ -115,14 +136,16 @@ class TrainPulses:
         self._settling_us = settling_us
         self._period_us = round(drive.period_s * 1e6)
         self._trains = {k: t for k, t in enumerate(trains, first_source) if isinstance(t, HeightTrain)}
-        self._pulses = list_train_pulses(trains, first_source)
+        self._pulses = list_train_pulses(trains, first_source, on_progress)
         self._recipes: dict[int, PulseRecipe] = {}
         if self._trains:
             self._build_recipes(first_source, build_cold_heat(), on_progress)
             lead_periods_w = {
                 source: cycle.lead_period_w for source, cycle in self._recipes.items() if cycle.lead_period_w
             }
-            self._pulses = add_lead_periods(self._pulses, lead_periods_w, self._period_us, gap_us, settling_us)
+            self._pulses = add_lead_periods(
+                self._pulses, lead_periods_w, self._period_us, gap_us, settling_us, on_progress
+            )
 
     def __len__(self) -> int:
         return len(self._pulses)
@@ -152,7 +175,7 @@ class TrainPulses:
         return round(train.period_s * 1e6) - self._gap_us
 
     def _build_recipes(self, first_source: int, cold_heat: ThermalState, on_progress: Callable[[], None]) -> None:
-        free = compute_free_us_by_source(self._pulses, set(self._trains), self._gap_us, self._settling_us)
+        free = compute_free_us_by_source(self._pulses, set(self._trains), self._gap_us, self._settling_us, on_progress)
         for source, train in self._trains.items():
             on_progress()
             self._recipes[source] = self._build_recipe(
@@ -165,8 +188,9 @@ class TrainPulses:
         room_us = min(median_free_us, self._compute_max_width_us(train))
         if min(min_free_us, room_us) < self._drive.period_s * 1e6:
             expected = (
-                f"time for a PWM period of {self._drive.period_s * 1e3:g} ms from a pulse's start to the next pulse of "
-                f"any train, with a move of the mirrors or a gap of {self._gap_us * 1e-3:g} ms"
+                f"time for a PWM period of {format_quantity(self._drive.period_s, 's')} from a pulse's start to the "
+                f"next pulse of any train, with a move of the mirrors or "
+                f"a gap of {format_quantity(self._gap_us * 1e-6, 's')}"
             )
             raise InputError(f"{where}.period_s", train.period_s, expected, code="overlapping_trains")
         return build_pulse_recipe(train, cold_heat, limit_pulse_width(self._drive, room_us), where)

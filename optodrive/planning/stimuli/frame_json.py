@@ -4,12 +4,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.plausibility import guess_unit
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import TactileFrame
-from optodrive.core.units import um_to_m
+from optodrive.core.units import m_to_um, um_to_m
 from optodrive.planning.stimuli.json_values import require_number, require_object, require_priority, require_time
 
+FRAME_QUANTITIES = ("show_at_s", "duration_s", "target_um")
+"""Required keys of a frame."""
+HEIGHT = RANGES["frames"]["frames.target_um"]
 ID_MAX = 100
 """Largest length of a frame's identifier, characters."""
 HEIGHT_MIN_UM = 0.01
@@ -27,12 +32,20 @@ def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[T
         if frames:
             _check_order(frames[-1], frame, f"{where}[{k}]", f"frames[{k - 1}]")
         frames.append(frame)
+    _check_heights(where, frames)
     return tuple(frames)
 
 
+def _check_heights(where: str, frames: list[TactileFrame]) -> None:
+    """Raise InputError if the highest pixel of all frames is too low for a finger by far: mm were stated for µm."""
+    highest_um = max((m_to_um(float(frame.target_m.max(initial=0.0))) for frame in frames), default=0.0)
+    if 0.0 < highest_um < HEIGHT.low * (1.0 - 1e-9):
+        expected = f"a highest pixel of at least {HEIGHT.low:g} µm; these values are likely in mm"
+        raise InputError(f"{where}: target_um", Unquoted(f"at most {highest_um:g}"), expected, code="bad_target")
+
+
 def _parse_frame(entry: object, where: str, position: int, pixel_by_name: dict[str, int]) -> TactileFrame:
-    required = ("show_at_s", "duration_s", "target_um")
-    table = require_object(entry, where, ("id", *required, "simultaneous", "priority"), required)
+    table = require_object(entry, where, ("id", *FRAME_QUANTITIES, "simultaneous", "priority"), FRAME_QUANTITIES)
     expected = "a time ≥ 0 in s"
     show_at_s = require_time(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
     duration_s = require_time(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
@@ -91,7 +104,8 @@ def _parse_heights_m(values: list[object], pixels: list[int] | range, where: str
     if set(map(type, values)) <= {int, float}:
         try:
             heights_um = np.array(values, dtype=np.float64)
-            if bool(np.all(np.isfinite(heights_um) & ((heights_um >= HEIGHT_MIN_UM) | (heights_um == 0)))):
+            is_plausible = (heights_um >= HEIGHT_MIN_UM) & (heights_um <= HEIGHT.high)
+            if bool(np.all(is_plausible | (heights_um == 0))):
                 return um_to_m(heights_um)
         except OverflowError:
             pass
@@ -101,6 +115,11 @@ def _parse_heights_m(values: list[object], pixels: list[int] | range, where: str
         if height_um < 0:
             raise InputError(place, value, expected, code="bad_target")
         if 0 < height_um < HEIGHT_MIN_UM:
-            expected = f"0 or at least {HEIGHT_MIN_UM:g} µm; this value is likely in m"
+            expected = (
+                f"0 or at least {HEIGHT_MIN_UM:g} µm; this value is likely in {guess_unit(height_um, HEIGHT) or 'm'}"
+            )
+            raise InputError(place, value, expected, code="bad_target")
+        if height_um > HEIGHT.high:
+            expected = f"at most {HEIGHT.high:.0f} µm; this value is likely in nm"
             raise InputError(place, value, expected, code="bad_target")
     raise AssertionError("no invalid height found after validation failed")

@@ -6,7 +6,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config
-from optodrive.planning.batch_limiter import PAUSE_FRACTION
+from optodrive.planning.batch_limiter import PAUSE_FRACTION_MAX
 from optodrive.planning.budget_setup import build_galvo_model
 from optodrive.planning.limiter.galvo_load import move_energy, ringing_envelope_factor
 
@@ -30,7 +30,7 @@ class GalvoTimeEstimator:
         envelope = ringing_envelope_factor(self._galvo, beam_time_s / max(1, len(dx_rad)))
         load_rad2_per_s3 = max(self._sum_energy(dx_rad, envelope), self._sum_energy(dy_rad, envelope))
         time_s = load_rad2_per_s3 / self._available_rad2_per_s4
-        return time_s + PAUSE_FRACTION * self._galvo.averaging_s if time_s > beam_time_s else beam_time_s
+        return time_s + PAUSE_FRACTION_MAX * self._galvo.averaging_s if time_s > beam_time_s else beam_time_s
 
     def _sum_energy(self, moves_rad: FloatArray, envelope: float) -> float:
         """Return an upper bound on the integral of a² over moves of one mirror, of which each adds to a ringing one."""

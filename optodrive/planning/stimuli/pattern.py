@@ -3,10 +3,12 @@
 from base64 import b64decode
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from math import isfinite
 from typing import Literal
 
 from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.plausibility import PlausibleRange, guess_unit
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config, build_pixel_layout
@@ -15,7 +17,7 @@ ParameterKind = Literal["number", "integer", "choice", "pixel", "flag", "text", 
 """Kind of a pattern parameter, which selects its conversion."""
 ParameterValue = str | int | float | bytes | bool | None
 
-SI_SUFFIXES = {"_um": ("_m", 1e-6), "_mm": ("_m", 1e-3)}
+SI_SUFFIXES = {"_um": ("_m", 1e-6), "_mm": ("_m", 1e-3), "_mw": ("_w", 1e-3)}
 """Unit suffix of a parameter's name to the suffix and factor of its builder's argument in SI."""
 
 TEXT_MAX = 2_000
@@ -61,6 +63,22 @@ class Pattern:
     build: Callable[..., FrameSequence]
     notes: str = ""
     policy: Policy = "trim"
+
+    def describe_arguments(self, given: Mapping[str, object], config: Config) -> dict[str, str | float | bool | None]:
+        """Return all parameters in their own units, also those by default; a file by the digest of its bytes.
+
+        Raises InputError as `resolve_arguments`.
+        """
+        described: dict[str, str | float | bool | None] = {}
+        for parameter in self.parameters:
+            value: ParameterValue = parameter.default
+            if parameter.name in given:
+                place = f"pattern {self.name}: {parameter.name}"
+                value = convert_value(given[parameter.name], parameter, place, config)
+            if isinstance(value, bytes):
+                value = f"sha256:{sha256(value).hexdigest()}, {len(value)} bytes"
+            described[parameter.name] = value
+        return described
 
     def resolve_arguments(self, given: object, config: Config) -> dict[str, ParameterValue]:
         """Return the builder's arguments from the given parameters and the defaults.
@@ -114,8 +132,11 @@ def _convert_number(value: object, parameter: PatternParameter, where: str) -> f
         number = float(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else float("nan")
     except (ValueError, OverflowError):
         number = float("nan")
-    inside = isfinite(number) and (parameter.min or 0.0) <= number <= (parameter.max or 0.0)
+    low, high = parameter.min or 0.0, parameter.max or 0.0
+    inside = isfinite(number) and low <= number <= high
     if not inside:
+        likely = guess_unit(number, PlausibleRange(low, high, parameter.unit)) if isfinite(number) else None
+        expected += "" if likely is None else f"; this value is likely in {likely}"
         raise InputError(where, value, expected, code="bad_parameter")
     return number
 

@@ -3,7 +3,7 @@
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
-from optodrive.planning.stimuli import experiments, images, shapes
+from optodrive.planning.stimuli import bring_up, experiments, images, shapes
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
 from optodrive.planning.stimuli.sequence_file import validate_sequence
 from optodrive.planning.stimuli.showcase import build_showcase
@@ -21,7 +21,7 @@ _DIRECTION_PARAMETER = PatternParameter(
 
 
 def _height_parameter(default_um: float, description: str = "peak height of a raised pixel") -> PatternParameter:
-    return PatternParameter("height_um", "number", default_um, description, "µm", min=0.1, max=1000.0)
+    return PatternParameter("height_um", "number", default_um, description, "µm", min=1.0, max=1000.0)
 
 
 def _size_parameter(name: str, description: str) -> PatternParameter:
@@ -132,7 +132,7 @@ _PATTERN_LIST = (
                 None,
                 "fall between peaks; by default that of the shortest pulses, which need the least energy",
                 "µm",
-                min=0.1,
+                min=0.5,
                 max=1000.0,
             ),
             PatternParameter("rate_hz", "number", 25.0, "peaks per second", "Hz", min=0.1, max=200.0),
@@ -212,6 +212,19 @@ _PATTERN_LIST = (
             _INVERT_PARAMETER,
         ),
         images.build_animation,
+    ),
+    Pattern(
+        "scope",
+        "a waveform on the converter's outputs for an oscilloscope, with weak pulses of 1 ms",
+        (
+            _choice_parameter("waveform", "steps-x", "steps, square or ramp", bring_up.WAVEFORMS),
+            PatternParameter("dwell_s", "number", 0.02, "time at each place", "s", min=0.005, max=1.0),
+            PatternParameter("power_mw", "number", 25.0, "power of the pulses", "mW", min=0.1, max=50.0),
+            PatternParameter("seconds", "number", 10.0, "duration, in whole periods", "s", min=0.1, max=60.0),
+        ),
+        bring_up.build_scope_waveform,
+        "Steps are between the ends of the middle row or column, the square between the corners of the display; a ramp "
+        "visits the middle row or column pixel by pixel.",
     ),
 )
 

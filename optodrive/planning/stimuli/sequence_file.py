@@ -10,6 +10,7 @@ from optodrive.core.units import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.planning.stimuli.frame_json import parse_frames
 from optodrive.planning.stimuli.json_values import decode_json, require_list, require_object
+from optodrive.planning.stimuli.labels import Labels, parse_labels
 from optodrive.planning.stimuli.train_json import check_trains, parse_train, train_to_json, validate_train
 
 FRAMES_MAX = 10_000
@@ -47,8 +48,13 @@ def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
     """Parse a sequence for a display from JSON text or decoded JSON; `where` names the source in errors.
 
     Raises InputError with the place, and a code: bad_json, unknown_key, missing_key, unknown_pixel, bad_target,
-    bad_time, bad_train, bad_priority, overlapping_trains, too_many.
+    bad_time, bad_train, bad_priority, overlapping_trains, bad_label, too_many.
     """
+    return parse_request(body, config, where)[0]
+
+
+def parse_request(body: object, config: Config, where: str) -> tuple[FrameSequence, Labels]:
+    """Parse a sequence and its labels; raises InputError as `parse_sequence`."""
     try:
         return _parse_decoded(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
     except RecursionError:  # the repr of a value that nests deeper than Python's stack
@@ -99,17 +105,19 @@ def _priority_to_json(item: TactileFrame | Train) -> dict[str, object]:
     return {"priority": item.priority} if item.priority else {}
 
 
-def _parse_decoded(decoded: object, config: Config, where: str) -> FrameSequence:
-    table = require_object(decoded, where, ("frames", "trains"), ())
+def _parse_decoded(decoded: object, config: Config, where: str) -> tuple[FrameSequence, Labels]:
+    table = require_object(decoded, where, ("frames", "trains", "labels"), ())
+    labels = parse_labels(table.get("labels", {}), f"{where}: labels")
     pixel_count = len(build_pixel_layout(config.display))
     frame_list = require_list(table.get("frames", []), f"{where}: frames", _compute_frames_max(pixel_count))
     train_list = require_list(table.get("trains", []), f"{where}: trains", TRAINS_MAX)
     if not frame_list and not train_list:
         raise InputError(where, "neither frames nor trains", "at least one of them", code="bad_json")
-    return FrameSequence(
+    sequence = FrameSequence(
         frames=parse_frames(frame_list, f"{where}: frames", pixel_count),
         trains=_parse_trains(train_list, f"{where}: trains", config, pixel_count),
     )
+    return sequence, labels
 
 
 def _parse_trains(entries: list[object], where: str, config: Config, pixel_count: int) -> tuple[Train, ...]:

@@ -6,7 +6,9 @@ from math import ceil
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.plausibility import guess_unit
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain, Train
 from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config
@@ -16,6 +18,9 @@ PULSE_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", 
 HEIGHT_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "period_s", "target_um", "peak_to_peak_um")
 HEIGHT_ONLY_KEYS = frozenset(HEIGHT_TRAIN_KEYS) - frozenset(PULSE_TRAIN_KEYS)
 """Keys that only a height train has."""
+PLAUSIBLE = RANGES["frames"]
+LONG_INTERVAL_S = 1.0
+"""Intervals from here on, in a shorter train, are compared with ms."""
 PULSES_MAX = 2_000_000
 """Largest number of pulses of all trains."""
 HEIGHT_PULSES_MAX = 100_000
@@ -71,15 +76,47 @@ def _parse_height_train(value: object, where: str, config: Config, pixel_count: 
 def _validate_height_train(train: HeightTrain, where: str, config: Config) -> HeightTrain:
     if train.target_m <= 0.0:
         raise InputError(f"{where}.target_um", m_to_um(train.target_m), "a height > 0 in µm", code="bad_target")
+    _check_height(f"{where}.target_um", train.target_m)
     if train.peak_to_peak_m is not None and not 0.0 < train.peak_to_peak_m <= train.target_m:
         peak_to_peak_um = round(m_to_um(train.peak_to_peak_m), 9)
         expected = f"a height above 0, at most target_um = {m_to_um(train.target_m):g} µm"
         raise InputError(f"{where}.peak_to_peak_um", peak_to_peak_um, expected, code="bad_train")
+    if train.peak_to_peak_m is not None:
+        _check_height(f"{where}.peak_to_peak_um", train.peak_to_peak_m)
     period_min_s = 1.0 / config.laser.pwm_hz + config.limits.pulse_gap_min_s
     if train.period_s < period_min_s * (1 - 1e-9):
         expected = f"at least {period_min_s:g} s, a PWM period and limits.pulse_gap_min_s"
         raise InputError(f"{where}.period_s", train.period_s, expected, code="bad_train")
+    _check_repeats(f"{where}.period_s", train.period_s, 0.0, train.duration_s)
     return train
+
+
+def _check_height(where: str, height_m: float) -> None:
+    """Raise InputError for a height that is plausible in another unit only."""
+    plausible, height_um = PLAUSIBLE[f"trains.{where.rpartition('.')[2]}"], m_to_um(height_m)
+    unit = guess_unit(height_um, plausible)
+    if not plausible.low * (1.0 - 1e-9) <= height_um <= plausible.high and unit is not None:
+        expected = f"{plausible.low:g} to {plausible.high:.0f} µm; this value is likely in {unit}"
+        raise InputError(where, Unquoted(f"{height_um:g}"), expected, code="bad_target")
+
+
+def _check_repeats(where: str, interval_s: float, width_s: float, duration_s: float) -> None:
+    """Raise InputError for an interval between pulses that is beyond any train's, or that the train ends before.
+
+    The second is a mistake only if the train would have several pulses with the number read in ms.
+    """
+    name = where.rpartition(".")[2]
+    is_long = interval_s > PLAUSIBLE[f"trains.{name}"].high
+    if is_long or (interval_s >= LONG_INTERVAL_S > duration_s > 2.0 * (width_s + 1e-3 * interval_s)):
+        expected = "an interval that the train repeats; this value is likely in ms"
+        raise InputError(where, interval_s, expected, code="bad_train")
+
+
+def _guess(name: str, value: float, high: float) -> str:
+    """Return a hint at the unit in which a value would be at most `high`."""
+    plausible = PLAUSIBLE[f"trains.{name}"]
+    unit = guess_unit(value, plausible._replace(high=high))
+    return "" if unit is None else f"; this value is likely in {unit}"
 
 
 def validate_train(train: Train, where: str, config: Config) -> Train:
@@ -92,11 +129,14 @@ def validate_train(train: Train, where: str, config: Config) -> Train:
 def _validate_pulse_train(train: PulseTrain, where: str, config: Config) -> PulseTrain:
     if not 0 < train.power_w <= config.laser.max_power_w:
         expected = f"a power above 0, at most laser.max_power_w = {config.laser.max_power_w:g} W"
+        expected += _guess("power_w", train.power_w, config.laser.max_power_w)
         raise InputError(f"{where}.power_w", train.power_w, expected, code="bad_train")
     place, width_max_s = f"{where}.pulse_width_s", config.limits.pulse_width_max_s
     if not 0 < train.pulse_width_s <= width_max_s * (1 + 1e-9):
         expected = f"a width above 0, at most limits.pulse_width_max_s = {width_max_s:g} s"
+        expected += _guess("pulse_width_s", train.pulse_width_s, width_max_s)
         raise InputError(place, train.pulse_width_s, expected, code="bad_train")
+    _check_repeats(f"{where}.gap_s", train.gap_s, train.pulse_width_s, train.duration_s)
     periods = train.pulse_width_s * config.laser.pwm_hz
     period_count = max(1, round(periods))
     if abs(periods - period_count) > PWM_TOLERANCE_PERIODS:

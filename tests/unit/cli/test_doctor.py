@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from optodrive.cli import doctor_host as host
 from optodrive.cli.doctor_board import check_board
 from optodrive.cli.doctor_finding import report_ok
 from optodrive.cli.doctor_port import check_port
+from optodrive.cli.doctor_watch import INTERVAL_S, watch
 from optodrive.cli.main import run
 from optodrive.core.clock import ManualClock, MonotonicClock
 from optodrive.device.config import BoardSection
@@ -226,3 +228,34 @@ def test_the_command_exits_0_without_a_problem_and_1_with_one(tmp_path, capsys, 
     path.write_text("format = 3")
     assert run(["doctor", "--config", str(path)]) == 1
     assert "PROBLEM  configuration" in capsys.readouterr().out
+
+
+def test_watch_reports_what_changed_and_no_numbers_that_vary(tree):
+    clock, trips = ManualClock(), iter((0.4, 0.5, 0.6, 0.7))
+    (tree / "run/udev/data/c166:0").write_text("E:ID_MM_DEVICE_IGNORE=1\n")
+
+    def examine():
+        return [*port_findings(tree)[0], report_ok("link", f"round trip {next(trips)} ms")]
+
+    changes = watch(examine, clock)
+    first = next(changes)
+    assert {"port", "permission", "link"} <= {finding.check for finding in first}
+    (tree / "dev/ttyACM0").unlink()
+    (missing,) = next(changes)
+    assert (missing.check, missing.status) == ("port", "problem")
+    (tree / "dev/ttyACM0").touch()
+    back = next(changes)
+    assert "port" in {finding.check for finding in back}
+    assert "link" not in {finding.check for finding in back}
+    assert clock.now_s() == pytest.approx(2 * INTERVAL_S)
+
+
+def test_watch_runs_until_it_is_interrupted(tmp_path):
+    command = [sys.executable, "-m", "optodrive.cli.main", "doctor", "--watch", "--json", "--config", "nowhere.toml"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        line = json.loads(process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == "optodrive: interrupted\n"
+    assert "configuration" in {finding["check"] for finding in line["findings"]}

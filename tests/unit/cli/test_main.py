@@ -52,6 +52,6 @@ def test_the_address_may_come_from_the_environment(tokenless, monkeypatch, capsy
 def test_patterns_are_listed_with_their_bounds_and_units(capsys):
     assert run(["patterns"]) == 0
     text = capsys.readouterr().out
-    assert "height_um=100.0 (0.1 to 1000 µm)" in text
+    assert "height_um=100.0 (1 to 1000 µm)" in text
     assert "direction=right (left, right, up, down)" in text
     assert "None" not in text

@@ -35,7 +35,7 @@ def test_show_prints_a_row_for_each_signal(path, capsys):
     assert run(["recording", "show", str(path)]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines[0] == ["run", "group", "pulses", "energy", "signal", "pixel", "samples", "missing", "span"]
-    energy = ["0.05567", "J"]
+    energy = ["55.67", "mJ"]
     assert lines[1][:5] == ["run2", "a", "2", *energy]
     assert lines[1][5:] == ["absorber_temperature_K", "17", "101", "0", "0", "to", "0.1", "s"]
     assert lines[2] == ["displacement_m", "17", "101", "2", "0", "to", "0.1", "s"]

@@ -58,7 +58,7 @@ def test_the_command_lists_all_shows_one_and_refuses_another(capsys):
     assert all(f"{key} " in listed for key in discover_terms())
     assert run(["terms", "membrane_creep"]) == 0
     shown = capsys.readouterr().out
-    assert "spread            1 to 30 1, 1.5 if omitted" in shown
+    assert "spread            1 to 30, 1.5 if omitted" in shown
     assert "[terms.membrane_creep]" in shown
     assert run(["terms", "--json"]) == 0
     assert [item["key"] for item in json.loads(capsys.readouterr().out)["terms"]] == sorted(discover_terms())

@@ -9,6 +9,7 @@ import pytest
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import ExchangePolicy, parse_response
 from optodrive.client.http import AsyncDaemonClient, DaemonClient
+from optodrive.client.plan import report_loss
 from optodrive.client.problems import build_error, parse_problem
 from optodrive.client.requests import READ_STATE, STOP, ApiRequest, build_push_request
 from optodrive.core.errors import (
@@ -169,9 +170,24 @@ def test_a_given_token_that_is_refused_is_an_input_error(call):
         call([REFUSED_TOKEN], send(READ_STATE))
 
 
-def test_stop_is_attempted_three_times(call):
+def test_stop_is_attempted_twice_but_once_at_a_daemon_that_has_just_not_answered(call):
+    silence = httpx.ReadTimeout("silence")
     with pytest.raises(LinkError, match="emergency stop"):
-        call([httpx.ReadTimeout("silence")] * 3, ExchangePolicy.stop)
+        call([silence] * 2, ExchangePolicy.stop)
+
+    def fail_and_stop(policy):
+        try:
+            yield from policy.call(HEALTH)
+        except LinkError:
+            yield from policy.stop()
+
+    with pytest.raises(LinkError, match="emergency stop"):
+        call([silence] * 2, fail_and_stop)
+
+
+def test_a_plan_that_the_daemon_has_forgotten_was_lost_with_its_planner():
+    with pytest.raises(RefusedError, match="plan p1 failed: the planner process has ended"), report_loss("p1"):
+        raise InputError("plan", "p1", "a known plan", "plan_not_found")
 
 
 def test_stop_is_not_answered_by_a_problem_document(call):

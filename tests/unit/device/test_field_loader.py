@@ -85,7 +85,9 @@ def test_a_field_is_looked_for_beside_the_configuration(tmp_path):
 def test_a_field_of_another_scanner_is_refused(tmp_path):
     calibrate_hidden_field(tmp_path / "field.toml", side=5)
     with pytest.raises(
-        InputError, match=r"scanner\.range_rad: got 0\.2, expected 0\.1745, the value that .*field\.toml"
+        InputError,
+        match=r"scanner\.range_rad: got 0\.2, expected 0\.1745, the value that .*field\.toml, a field of "
+        "display-437 was made with; this display is display-437",
     ):
         load_scan_field(config_with_field(tmp_path / "field.toml", range_rad=0.2))
     with pytest.raises(InputError, match=r"scanner\.focal_length_m: got 0\.25, expected 0\.22"):
@@ -95,8 +97,21 @@ def test_a_field_of_another_scanner_is_refused(tmp_path):
 def test_pixels_beyond_the_field_or_the_converter_are_refused_by_name(tmp_path):
     calibrate_hidden_field(tmp_path / "field.toml", side=5)
     large = load_config("display-1511")
-    with pytest.raises(InputError, match=r"pixel 0 at -.* mm: got .*(codes .* outside its extent|converter's range)"):
+    with pytest.raises(
+        InputError, match=r"pixel 0 of display-1511 at -.* mm: got .*(codes .* outside its extent|converter's range)"
+    ) as caught:
         load_scan_field(config_with_field(tmp_path / "field.toml", large))
+    assert str(caught.value).endswith(
+        f"every pixel of display-1511 within {tmp_path}/field.toml, a field of display-437"
+    )
+
+
+def test_a_field_without_the_name_of_a_display_is_read(tmp_path):
+    path = tmp_path / "field.toml"
+    calibrate_hidden_field(path, side=5)
+    path.write_text(path.read_text().replace('display = "display-437"\n', ""))
+    with pytest.raises(InputError, match="a field of an unnamed display"):
+        load_scan_field(config_with_field(path, range_rad=0.2))
 
 
 def test_a_field_less_sure_than_the_aim_error_is_refused(tmp_path):

@@ -16,7 +16,7 @@ servos = st.builds(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=3 * settings.default.max_examples // 2)
 @given(servo=servos, move_rad=st.floats(2e-3, 0.3), share=st.floats(0.01, 0.45))
 def test_settled_is_when_the_stepped_servo_last_comes_inside(servo, move_rad, share):
     """The diagnosis integrates the servo with an error of about 2e-4 of a step."""

@@ -1,5 +1,7 @@
 """Settling times in a calibrated field, where moves have any distance: every move gets the time that it needs."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -37,7 +39,11 @@ CASES = {
     "overshooting": servo(damping=0.5, bandwidth_hz=400.0, slew_rad_per_s=300.0),
     "resonant": servo(damping=0.3, bandwidth_hz=400.0, slew_rad_per_s=30.0),  # a ramp may damp the ringing or excite it
 }
-MOVES = {name: SettlingTable.from_config(config, Askew()) for name, config in CASES.items()}
+
+
+@cache
+def build_moves(name):
+    return SettlingTable.from_config(CASES[name], Askew())
 
 
 def required_us(config, axis, distance_rad):
@@ -49,10 +55,10 @@ def required_us(config, axis, distance_rad):
     return 1e6 * settling_s(build_servo(config.scanner), distance_rad, tolerance_left_rad)
 
 
-@settings(max_examples=300)
+@settings(max_examples=3 * settings.default.max_examples)
 @given(st.sampled_from(sorted(CASES)), st.integers(0, 1), st.floats(1e-3, 19.9))
 def test_no_move_is_given_less_than_it_needs(name, axis, pitches):
-    config, moves = CASES[name], MOVES[name]
+    config, moves = CASES[name], build_moves(name)
     distance_rad = pitches * moves.pitch_rad
     move = (distance_rad, 0.0) if axis == 0 else (0.0, distance_rad)
     assert moves.settling_us(*move, moves.long_dwell_us) >= required_us(config, axis, distance_rad)
@@ -60,7 +66,7 @@ def test_no_move_is_given_less_than_it_needs(name, axis, pitches):
 
 def test_times_of_whole_pitches_alone_would_be_too_short():
     """Mutant: the time of a whole pitch for all shorter moves."""
-    config, moves = CASES["resonant"], MOVES["resonant"]
+    config, moves = CASES["resonant"], build_moves("resonant")
     short = 0
     for pitches in np.linspace(0.05, 19.95, 400):
         whole_us = required_us(config, 0, np.ceil(pitches) * moves.pitch_rad)
@@ -79,7 +85,7 @@ def test_every_move_between_pixels_is_in_the_tables():
 
 
 def test_neighbours_are_one_pitch_apart_whatever_the_field():
-    moves = MOVES["shipped"]
+    moves = build_moves("shipped")
     x_rad, y_rad = Askew().angles_rad(LAYOUT.x_m, LAYOUT.y_m)
     one_us = moves.settling_us(moves.pitch_rad, moves.pitch_rad, moves.long_dwell_us)
     for one in range(0, len(LAYOUT), 7):
@@ -122,7 +128,7 @@ def replace_display(**display):
 def test_giving_less_away_costs_more_looking_and_saves_little(monkeypatch):
     """The bound over all distances in between costs a move few microseconds."""
     config = CASES["shipped"]
-    moves = MOVES["shipped"]
+    moves = build_moves("shipped")
     monkeypatch.setattr(settling, "INTERVAL_SHARE", 0.005)
     closer = SettlingTable.from_config(config, Askew())
     assert all(0 <= a - b <= 12 for a, b in zip(moves.after_long_dwell[0], closer.after_long_dwell[0], strict=True))

@@ -90,10 +90,11 @@ def test_strict_selects_refuse_and_contradicts_delay():
 def test_progress_is_reported_within_a_frame():
     """A planner without progress reports counts as failed, and a frame planned with terms takes long."""
     target_m, reported = np.full(len(DISPLAY.layout), 50e-6), []
+    with_term = replace(DISPLAY, parameters=DISPLAY.parameters.model_copy(update={"planner_terms": ("wall_heating",)}))
     plan_sequence(
-        DISPLAY,
+        with_term,
         FrameSequence((TactileFrame("all", 0.0, 9.0, target_m),)),
-        *DISPLAY.build_cold_state(),
+        *with_term.build_cold_state(),
         on_progress=reported.append,
     )
     assert len(reported) >= len(target_m) // 16

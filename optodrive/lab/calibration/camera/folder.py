@@ -11,6 +11,8 @@ from pydantic import ValidationError, model_validator
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
+from optodrive.core.plausibility import check_plausible, check_table
+from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.field_geometry import CODE_MAX
 
@@ -24,8 +26,6 @@ SPOTS_FILE = "spots.csv"
 """File of the folder that receives the measured spots."""
 VIEWS_MIN = 3
 """Smallest number of views of the grid, if more than one, that separates the camera's intrinsics from its pose."""
-PITCH_RANGE_M = (0.2e-3, 0.1)
-"""Smallest and largest pitch of a grid that a camera sees completely, m."""
 
 Finite = Annotated[float, Item(allow_inf_nan=False)]
 FinitePair = tuple[Finite, Finite]
@@ -105,11 +105,12 @@ def read_picture_folder(folder: Path) -> PictureFolder:
     path = folder / DESCRIPTION_FILE
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
+    check_table(str(path), table, RANGES["pictures"])
     try:
         content = _PicturesFile.model_validate(table)
     except ValidationError as error:
         raise build_input_error(error, str(path), _PicturesFile) from None
-    _check_pitch(path, content.grid.pitch_m)
+    check_plausible(f"{path}: grid.pitch_m", content.grid.pitch_m, RANGES["pictures"]["grid.pitch_m"])
     if 1 < len(content.grid.pictures) < VIEWS_MIN:
         expected = f"1, or at least {VIEWS_MIN}, which the calibration of the camera needs"
         raise InputError(f"{path}: grid.pictures", len(content.grid.pictures), expected)
@@ -121,18 +122,6 @@ def read_picture_folder(folder: Path) -> PictureFolder:
         else _list_by_name(folder, path, content.spots)
     )
     return PictureFolder(path, content.grid, content.origin, views, dark, rows)
-
-
-def _check_pitch(path: Path, pitch_m: float) -> None:
-    pitch_min_m, pitch_max_m = PITCH_RANGE_M
-    if not pitch_min_m <= pitch_m <= pitch_max_m:
-        plausible_units = [
-            name
-            for name, unit in (("millimetres", 1e-3), ("micrometres", 1e-6))
-            if pitch_min_m <= pitch_m * unit <= pitch_max_m
-        ]
-        hint = f"; this looks like {plausible_units[0]}" if pitch_m > pitch_max_m and plausible_units else ""
-        raise InputError(f"{path}: grid.pitch_m", pitch_m, f"{pitch_min_m:g} to {pitch_max_m:g} m{hint}")
 
 
 def _require_picture(folder: Path, name: str, where: str) -> Path:

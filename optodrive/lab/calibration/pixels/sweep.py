@@ -83,12 +83,12 @@ def edge_power_max_w(config: Config, width_s: float) -> float:
     return float(min(root**2, energy_w, laser.max_power_w))
 
 
-def build_sweep(config: Config, aim: Aim) -> tuple[PulseTrain, ...]:
-    """Build one pulse per pixel in an order without successive neighbours."""
+def build_sweep(config: Config, aim: Aim, omitted: frozenset[int] = frozenset()) -> tuple[PulseTrain, ...]:
+    """Build one pulse per pixel, except the omitted ones, in an order without successive neighbours."""
     layout, (width_s, power_w) = build_pixel_layout(config.display), compute_pulse(config, aim)
     order = np.lexsort((layout.column, layout.row, layout.column % 2, layout.row % 2))
     slot_s = width_s + GATE_OFF_S
     return tuple(
         PulseTrain(int(pixel), round(k * slot_s, 6), width_s, width_s, GATE_OFF_S, power_w)
-        for k, pixel in enumerate(order)
+        for k, pixel in enumerate(pixel for pixel in order if pixel not in omitted)
     )

@@ -180,4 +180,4 @@ def test_plan_and_simulate_take_a_field(folder, capsys, command):
     assert "nowhere.toml" in capsys.readouterr().err
     large = ["--config", "display-1511", "--field", f"{folder}/field.toml"]
     assert run([command, f"{folder}/frames.json", *large]) == 2
-    assert "pixel 0 at" in capsys.readouterr().err
+    assert "pixel 0 of display-1511 at" in capsys.readouterr().err

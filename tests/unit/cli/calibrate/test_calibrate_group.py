@@ -10,10 +10,10 @@ import pytest
 from optodrive.cli.main import run
 
 
-def test_without_a_subcommand_the_help_lists_all_five(capsys):
+def test_without_a_subcommand_the_help_lists_all_seven(capsys):
     assert run(["calibrate"]) == 2
     output = capsys.readouterr().out
-    assert all(f" {name} " in output for name in ("field", "camera", "board", "servo", "pixels"))
+    assert all(f" {name} " in output for name in ("field", "camera", "board", "steps", "servo", "sweep", "pixels"))
 
 
 @pytest.mark.parametrize(

@@ -8,19 +8,11 @@ from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
-from optodrive.daemon.preview.jobs import plan_dry_run
+from optodrive.daemon.preview.jobs import BuiltRequest, plan_dry_run
 from optodrive.planning.pipeline import resolve_policy
-from planner_rig import DISPLAY, PlannerRig, build_frame, build_train
+from planner_rig import DISPLAY, build_frame, build_train
 
 DUTY_MAX = 65535
-
-
-@pytest.fixture
-def rig(monkeypatch):
-    rig = PlannerRig(monkeypatch).ready()
-    rig.arm()
-    rig.run(0.01)
-    return rig
 
 
 def play(rig, sequence):
@@ -101,6 +93,6 @@ def test_a_later_planner_is_as_dim():
 def test_a_dry_run_is_as_dim():
     start = DryRunStart(*DISPLAY.build_cold_state(), 0.0, power_share=0.1)
     fields = {"name": "dry", "policy": "trim", "fit": "as_is"}
-    report = plan_dry_run(DISPLAY, REQUIREMENTS.scale, build_frame(90.0), start, fields)
+    report = plan_dry_run(DISPLAY, REQUIREMENTS.scale, BuiltRequest(build_frame(90.0)), start, fields)
     assert set(report.pulses.reason) == {"dim"}
     assert max(report.pulses.power_w) <= 0.1 * DISPLAY.config.laser.max_power_w

@@ -14,14 +14,6 @@ from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from planner_rig import PlannerRig, build_frame, build_train
 
 
-@pytest.fixture
-def rig(monkeypatch):
-    rig = PlannerRig(monkeypatch).ready()
-    rig.arm()
-    rig.run(0.01)
-    return rig
-
-
 def submit(rig, sequence, streamed=False, caller=""):
     return rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed, caller).result().plan)
 
@@ -74,7 +66,7 @@ def test_pulses_that_are_reported_together_with_a_stop_count_as_executed(rig):
     ServiceRig.run(rig, 0.1)  # without the planner's loop, to which the reports come together with the new epoch
     stop(rig)
     assert record.executed_count == len(record.execution.start_s) > counted
-    assert rig.queue.totals["executed"] == record.executed_count
+    assert rig.queue.accounts.totals["executed"] == record.executed_count
 
 
 def test_a_request_from_before_stop_is_answered_stopped_and_never_lights(rig):

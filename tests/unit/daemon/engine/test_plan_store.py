@@ -14,18 +14,10 @@ from optodrive.daemon.engine import plan_store
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.planning import listed_pulses
 from optodrive.planning.planned_sequence import PlannedSequence
-from planner_rig import DISPLAY, PlannerRig, build_frame, build_train
+from planner_rig import DISPLAY, build_frame, build_train
 
 HEAVY = (type(DISPLAY.build_cold_heat()), BudgetState, WirePoints, LimitedPlan, PlannedSequence)
 """Types of what planning and execution need of a plan."""
-
-
-@pytest.fixture
-def rig(monkeypatch):
-    rig = PlannerRig(monkeypatch).ready()
-    rig.arm()
-    rig.run(0.01)
-    return rig
 
 
 def submit(rig, sequence, streamed=False):
@@ -65,7 +57,7 @@ def test_an_ended_plan_leaves_its_report_and_no_thermal_state(rig, ending):
     elif ending in ("cancelled", "removed"):
         rig.queue.cancel(record)
     rig.until(lambda: record.has_ended)
-    rig.queue.events.clear()  # read by the telemetry
+    rig.queue.accounts.events.clear()  # read by the telemetry
     gc.collect()
     assert record.status == ("cancelled" if ending == "removed" else ending)
     assert holds_heavy(record) == []

@@ -3,19 +3,12 @@
 import numpy as np
 import pytest
 
-from optodrive.daemon.engine.plan_queue import HOLD_MAX_S, PlanQueue
+from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
+from optodrive.daemon.engine.queue_thermal import HOLD_MAX_S
 from optodrive.daemon.engine.thermal_memory import HEADER, ThermalMemory
 from optodrive.planning.limiter.cap_checks import compute_levels
-from planner_rig import DISPLAY, InlineExecutor, PlannerRig, build_frame, build_train
-
-
-@pytest.fixture
-def rig(monkeypatch):
-    rig = PlannerRig(monkeypatch).ready()
-    rig.arm()
-    rig.run(0.01)
-    return rig
+from planner_rig import DISPLAY, InlineExecutor, build_frame, build_train
 
 
 def submit(rig, sequence):

@@ -111,7 +111,7 @@ def problem(message):
 def assert_serves(preview):
     preview.build(99, SMALL)
     message = preview.result()
-    assert message.fields == {"id": 99, "status": 200}
+    assert message.fields == {"id": 99, "status": 200, "labels": {}, "parameters": {}}
     (frame,) = decode_sequence(message.payload).frames
     assert frame.target_m[5] == pytest.approx(60e-6)
 
@@ -171,10 +171,10 @@ def start(tmp_path, monkeypatch):
     """Return a function that starts a preview process; act: what building the body b"bad" does."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     warm_up(DISPLAY)
-    started, parse = [], jobs.parse_sequence
+    started, parse = [], jobs.parse_request
 
     def start_preview(act=build_slowly):
-        monkeypatch.setattr(jobs, "parse_sequence", lambda body, *more: act() if body == b"bad" else parse(body, *more))
+        monkeypatch.setattr(jobs, "parse_request", lambda body, *more: act() if body == b"bad" else parse(body, *more))
         started.append(Preview())
         return started[-1]
 

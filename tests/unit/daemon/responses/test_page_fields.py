@@ -49,7 +49,8 @@ VARIABLES = {
     "queue.js": {"plan": QueuedPlan, "queue": QueueReport},
     "dim.js": {"state": StateReport},
     "hold.js": {"report": HoldReport},
-    "header.js": {"board": StateReport.model_fields["board"].annotation},
+    "pause.js": {"queue": QueueReport},
+    "header.js": {"queue": QueueReport, "board": StateReport.model_fields["board"].annotation},
     "status.js": {"fault": FaultEvent, "board": StateReport.model_fields["board"].annotation},
     "timeline.js": {"batch": PulseBatch},
 }
@@ -59,6 +60,7 @@ DESTRUCTURED = {
     ("main.js", r"const \[config, \{([^}]*)\}\]"): PatternList,
     ("arm.js", r"const \{([^}]*)\} = control;"): ControlReport,
     ("header.js", r"showState\(\{([^}]*)\}\)"): StateReport,
+    ("pause.js", r"const \{([^}]*)\} = await call"): StateReport,
     ("permissions.js", r"const \{([^}]*)\} = this.caller;"): CallerReport,
     ("plans.js", r"const \{([^}]*)\} = plan;"): PlanReport,
     ("status.js", r"const \{([^}]*)\} = state;"): StateReport,

@@ -15,6 +15,8 @@ from optodrive.daemon.web.peer import Peer
 from optodrive.daemon.web.state_merge import NO_PLANNER, NO_STATS
 from optodrive.link.session.board_view import BoardView
 
+NO_PAUSE = {"number": 0, "began_s": 0.0, "ends_in_s": None}
+
 
 def build_status(epoch, state="ARMED"):
     return Message(
@@ -28,6 +30,7 @@ def build_status(epoch, state="ARMED"):
             "stats": dict(NO_STATS),
             "board": BoardView(state=state).to_dict(),
             "control": None,
+            "pause": NO_PAUSE,
         },
     )
 
@@ -46,7 +49,9 @@ def client():
 def test_a_request_has_the_epoch_of_its_arrival(link):
     link.on_message(build_status(7))
     before_s = time.monotonic()
-    link.on_message(Message("result", {"id": 1, "error": None, "epoch": 8, "board": BoardView().to_dict()}))
+    link.on_message(
+        Message("result", {"id": 1, "error": None, "epoch": 8, "board": BoardView().to_dict(), "pause": NO_PAUSE})
+    )
     assert link.require_epoch_at(before_s) == 7
     assert link.require_epoch_at(time.monotonic()) == 8
     # An older view is never too new: before the first status there is no epoch at all.
@@ -69,7 +74,9 @@ def test_the_state_is_merged_anew_for_every_report(client):
     client._on_link_message(build_status(1, "RUNNING"))
     client._on_planner_message(Message("state", NO_PLANNER.model_dump(mode="json")))
     assert (client.build_state().board.state, client.is_complete) == ("RUNNING", False)  # there are no previews yet
-    client._on_link_message(Message("result", {"id": 1, "error": None, "epoch": 2, "board": BoardView().to_dict()}))
+    client._on_link_message(
+        Message("result", {"id": 1, "error": None, "epoch": 2, "board": BoardView().to_dict(), "pause": NO_PAUSE})
+    )
     assert client.build_state().board.state == "UNKNOWN"
     client._on_link_lost()
     assert client.build_state().link.state == "down"
@@ -82,7 +89,10 @@ def test_the_last_state_answers_while_the_planner_is_silent(client):
     client._on_planner_message(Message("state", NO_PLANNER.model_dump(mode="json")))
     client._on_link_message(build_status(1, "RUNNING"))
     client._on_link_message(
-        Message("result", {"id": 1, "error": None, "epoch": 2, "board": BoardView(state="DISARMED").to_dict()})
+        Message(
+            "result",
+            {"id": 1, "error": None, "epoch": 2, "board": BoardView(state="DISARMED").to_dict(), "pause": NO_PAUSE},
+        )
     )
     assert client.build_state().board.state == "DISARMED"
 

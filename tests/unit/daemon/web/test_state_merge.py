@@ -10,6 +10,7 @@ STATUS = {
     "link_error": None,
     "stats": {**NO_STATS, "naks": 3},
     "board": BoardView(state="RUNNING", uid="b1").to_dict(),
+    "pause": {"number": 1, "began_s": 2.0, "ends_in_s": None},
     "control": {"caller": "ann", "armed_for_s": 3.0, "hold": True, "arming": 7},
 }
 
@@ -43,3 +44,18 @@ def test_a_process_that_does_not_run_is_reported(status, planner):
     if status is None:
         assert (state.board.state, state.link.state) == ("UNKNOWN", "down")
         assert "link process does not run" in state.link.error
+
+
+@pytest.mark.parametrize("ends_in_s", [None, 120.0])
+def test_a_pause_is_reported_before_the_planner_knows_of_it(ends_in_s):
+    plan = {"plan": "p1", "name": "push", "caller": "ann", "planned": 9, "executed": 3, "error": None}
+    plan |= {"duration_s": 2.0, "starts_in_s": -1.0, "ends_in_s": 1.0}
+    active = [plan | {"status": "running"}, plan | {"status": "queued"}]
+    queue = {**NO_PLANNER.queue.model_dump(), "active": active, "running": "p1", "paused": ends_in_s is None}
+    planner = PlannerState.model_validate({**NO_PLANNER.model_dump(), "queue": queue})
+    state = merge({**STATUS, "pause": {**STATUS["pause"], "ends_in_s": ends_in_s}}, planner)
+    assert (state.queue.paused, state.queue.pause_ends_in_s) == (ends_in_s is not None, ends_in_s)
+    running, waiting = state.queue.active
+    assert (running.status, running.ends_in_s) == (("running", 1.0) if ends_in_s is None else ("paused", None))
+    assert (waiting.status, waiting.ends_in_s) == ("queued", 1.0)
+    assert merge(None, planner).queue.paused is False

@@ -8,7 +8,9 @@ import pytest
 from optodrive.daemon.web.stop_first_selector import CLIENTS_PER_TURN, StopFirstSelector
 
 CLIENTS = 40
-STOP = b"POST /v1/stop HTTP/1.1\r\n"
+SECRET = b"a-valid-secret-of-a-viewer"
+STOP = b"POST /v1/stop HTTP/1.1\r\nAuthorization: Bearer " + SECRET + b"\r\n\r\n"
+REFUSED_STOP = STOP.replace(SECRET, b"guessed-by-nobody")
 
 
 @pytest.fixture
@@ -26,7 +28,7 @@ def make_pair():
 
 @pytest.fixture
 def selector():
-    with StopFirstSelector() as selector:
+    with StopFirstSelector(lambda head: SECRET in head) as selector:
         yield selector
 
 
@@ -52,6 +54,15 @@ def test_stop_precedes_all_clients_that_are_ready(selector, make_pair):
     assert len(select_read(super(StopFirstSelector, selector))) == CLIENTS + 1  # without the bound
 
 
+def test_a_stop_that_is_not_permitted_takes_no_precedence(selector, make_pair):
+    first = [add_client(selector, make_pair(), b"GET /v1/state HTTP/1.1\r\n") for _ in range(CLIENTS_PER_TURN)]
+    refused = add_client(selector, make_pair(), REFUSED_STOP)
+    turns = [select_read(selector) for _ in range(3)]
+    assert turns[0] == first
+    assert refused in turns[1]
+    assert add_client(selector, make_pair(), STOP) == select_read(selector)[0]
+
+
 def test_every_client_gets_its_turn_while_all_stay_ready(selector, make_pair):
     filenos = {add_client(selector, make_pair(), b"GET") for _ in range(CLIENTS)}
     turns = [select_read(selector) for _ in range(-(-CLIENTS // CLIENTS_PER_TURN))]
@@ -75,7 +86,7 @@ def test_the_request_stays_in_the_socket_and_a_removed_client_is_forgotten(selec
         add_client(selector, pair, STOP)
     select_read(selector)
     for own, _ in pairs:
-        assert own.recv(100) == STOP
+        assert own.recv(200) == STOP
         selector.remove_client(own.fileno())
         selector.unregister(own)
     assert select_read(selector) == []

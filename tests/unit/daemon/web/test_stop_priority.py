@@ -37,6 +37,10 @@ def test_nan_is_no_json():
         Leaf(names={}, values=[float("nan")])
 
 
+def is_permitted(scope):
+    return True
+
+
 def collect_start_order(middleware, paths):
     """Return the order in which requests start that arrive at the same time in the given order."""
     order = []
@@ -54,7 +58,12 @@ def collect_start_order(middleware, paths):
 
 def test_stop_starts_first_and_the_others_in_order():
     paths = [*(f"/v1/plans/{k}" for k in range(50)), "/v1/stop"]
-    assert collect_start_order(StopPriorityMiddleware, paths) == ["/v1/stop", *paths[:50]]
+    assert collect_start_order(lambda app: StopPriorityMiddleware(app, is_permitted), paths) == [
+        "/v1/stop",
+        *paths[:50],
+    ]
+    refused = collect_start_order(lambda app: StopPriorityMiddleware(app, lambda scope: False), paths)
+    assert refused == paths  # a STOP without a token waits for its turn
     assert collect_start_order(lambda app: app, paths)[-1] == "/v1/stop"  # without the middleware
 
 
@@ -68,7 +77,7 @@ def test_a_slow_request_delays_no_other():
             else:
                 done.set()
 
-        front = StopPriorityMiddleware(app)
+        front = StopPriorityMiddleware(app, is_permitted)
         scopes = [{"type": "http", "path": path} for path in ("/v1/arm", "/v1/state")]
         await asyncio.wait_for(asyncio.gather(*(front(scope, None, None) for scope in scopes)), 5)
 
@@ -84,7 +93,7 @@ async def collect_order_during_stop(stop):
             await stop(order)
         order.append(scope["path"])
 
-    front = StopPriorityMiddleware(app)
+    front = StopPriorityMiddleware(app, is_permitted)
     paths = ["/v1/stop", *(f"/v1/plans/{k}" for k in range(20))]
     await asyncio.gather(*(front({"type": "http", "path": path}, None, None) for path in paths))
     return order

@@ -27,7 +27,8 @@ def build_state(board="DISARMED", fault=None, error=None):
             "board": BOARD | {"state": board, "fault": fault, "hint": ""},
             "control": None,
             "limits": {"power_share": 1.0},
-            "queue": {"waiting": 0, "running": None, "active": [], "plans": []},
+            "queue": {"waiting": 0, "running": None, "active": [], "plans": []}
+            | {"paused": False, "pause_ends_in_s": None},
             "totals": {"planned": 0, "sent": 0, "executed": 0, "timing_error": None},
             "planner": {"busy": False, "alive": True},
         }

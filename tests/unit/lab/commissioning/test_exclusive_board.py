@@ -3,48 +3,29 @@
 import numpy as np
 import pytest
 
-from optodrive.core.clock import ManualClock
+from exclusive_rig import ExclusiveRig, limited
 from optodrive.core.errors import BoardFaultError, InputError, NotReadyError, RefusedError
 from optodrive.lab.commissioning.exclusive_board import (
-    ExclusiveBoard,
     find_weakest_pixel,
     max_settling_s,
     max_spot_power_w,
     spot_width_s,
 )
 from optodrive.link.protocol.quantisation import DUTY_MAX
-from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
-from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.planning.display_model import DisplayModel
 
 CENTRE = (CENTRE_CODE, CENTRE_CODE)
 
 
-class Rig:
+class Rig(ExclusiveRig):
     def __init__(self, display):
-        self.log, self.clock = [], ManualClock(3.0)
         self.mirrors = SimulatedGalvos(display.config, 0)
-        self.core = BoardCore(None, self.log.append, seed=4, mirror_sink=self.mirrors.move_to)
-        self.held = ExclusiveBoard(display, MemoryLink(self.core, self.clock), self.clock)
-
-    def of(self, kind):
-        return [event for event in self.log if event["event"] == kind]
-
-    def armed(self):
-        self.held.connect()
-        self.held.arm()
-        return self.held
+        super().__init__(display, self.mirrors.move_to)
 
 
 @pytest.fixture
 def rig(display):
     return Rig(display)
-
-
-def limited(display, **caps):
-    limits = display.config.limits.model_copy(update=caps)
-    return DisplayModel.from_config(display.config.model_copy(update={"limits": limits}))
 
 
 def test_a_spot_is_one_pulse_with_mirrors_at_rest(rig):

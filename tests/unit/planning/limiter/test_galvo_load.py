@@ -112,7 +112,7 @@ def test_no_servo_exceeds_the_bound(case):
 
 
 @pytest.mark.slow
-@settings(max_examples=400)
+@settings(max_examples=4 * settings.default.max_examples)
 @given(move_sequences())
 def test_no_servo_exceeds_the_bound_in_many_sequences(case):
     check_bound(case)

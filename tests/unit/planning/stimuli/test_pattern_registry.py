@@ -129,7 +129,7 @@ def test_flags_are_true_or_false():
             "all",
             {"height_um": -5},
             "bad_parameter",
-            "pattern all: height_um: got -5, expected a number from 0.1 to 1000 µm",
+            "pattern all: height_um: got -5, expected a number from 1 to 1000 µm",
         ),
         ("all", {"height_um": 1001}, "bad_parameter", "got 1001"),
         ("all", {"height_um": "tall"}, "bad_parameter", "got 'tall'"),

@@ -1,0 +1,85 @@
+"""`optodrive patterns`: list the named patterns, or write one as frames."""
+
+import json as json_format
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.output import print_json
+from optodrive.cli.pattern_parameters import parse_parameters
+from optodrive.core.errors import InputError
+
+if TYPE_CHECKING:
+    from optodrive.planning.stimuli.pattern import PatternDescription, PatternParameter
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(patterns)
+
+
+def patterns(
+    pattern: Annotated[str | None, typer.Argument(metavar="PATTERN", help="Describe this pattern only.")] = None,
+    values: Annotated[
+        list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Pattern parameters, for --out.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FRAMES.json", help="Write the pattern as frames and trains.")
+    ] = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """List the patterns and their parameters, or write one as a file for `plan`, `simulate` and `push`."""
+    from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
+
+    if out is not None:
+        if pattern is None:
+            raise InputError("PATTERN", None, "the name of a pattern, for --out")
+        _write_pattern(pattern, values or [], out, config, json)
+        return
+    if values:
+        raise InputError("--out", None, f"--out FRAMES.json for {values[0]}")
+    name = None if pattern is None else find_pattern(pattern).name
+    descriptions = [item for item in describe_patterns() if name in (None, item.name)]
+    if json:
+        print_json({"patterns": descriptions})
+        return
+    for item in descriptions:
+        _print_description(item)
+
+
+def _write_pattern(pattern: str, values: list[str], out: Path, config: str | None, json: bool) -> None:
+    from optodrive.core.files import atomic_write, check_output
+    from optodrive.device.config_file import load_config
+    from optodrive.planning.stimuli.pattern_registry import build_pattern, find_pattern
+    from optodrive.planning.stimuli.sequence_file import sequence_to_json
+
+    check_output("--out", out, ".json")
+    sequence = build_pattern(pattern, parse_parameters("patterns", pattern, values), load_config(config))
+    with atomic_write(out) as temporary:
+        temporary.write_text(json_format.dumps(sequence_to_json(sequence)) + "\n", encoding="utf-8")
+    policy = find_pattern(pattern).policy
+    if json:
+        counts = {"frames": len(sequence.frames), "trains": len(sequence.trains)}
+        print_json({"out": str(out), "pattern": pattern, "policy": policy, **counts})
+        return
+    treated = "" if policy == "trim" else f"; played as a pattern its policy is {policy}: --policy {policy}"
+    print(f"written          {out}: {len(sequence.frames)} frames, {len(sequence.trains)} trains{treated}")
+
+
+def _print_description(item: "PatternDescription") -> None:
+    print(f"{item.name}: {item.summary}")
+    for parameter in item.parameters:
+        default = "" if parameter.default is None else f"={parameter.default}"
+        print(f"    {parameter.name}{default}{_format_bounds(parameter)}  {parameter.description}")
+
+
+def _format_bounds(parameter: "PatternParameter") -> str:
+    if parameter.choices:
+        return f" ({', '.join(parameter.choices)})"
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    if parameter.min is None or parameter.max is None:
+        return f" ({parameter.kind})"
+    return f" ({parameter.min:g} to {parameter.max:g}{unit})"

@@ -1,0 +1,22 @@
+"""State of other processes of this computer, as /proc shows it."""
+
+from pathlib import Path
+
+
+def is_suspended(pid: int | None) -> bool:
+    """Return whether a signal, such as SIGSTOP, has stopped a process; False for one that does not exist."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except (OSError, IndexError):
+        return False
+
+
+def list_children() -> set[int]:
+    """Return the process ids of this process's children, whichever thread started them."""
+    found: set[int] = set()
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            found.update(map(int, (task / "children").read_text().split()))
+        except OSError:  # the thread has just ended
+            continue
+    return found

@@ -1,0 +1,141 @@
+"""Plans that go on after a pause: their rows that are left, limited and proven again from the heat that is left."""
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_record import LargestTarget
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.link.protocol.quantisation import WirePoints, WireScale, decode, quantise
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.limiter import verify
+from optodrive.planning.limiter.rest import delay_rest, limit_rest, replace_rest
+from optodrive.planning.listed_pulses import ListedPulses
+from optodrive.planning.plan_summary import summarize_plan
+from optodrive.planning.planned_sequence import PlannedSequence
+from optodrive.planning.summary_schema import PlanSummary
+
+
+@dataclass(frozen=True, eq=False)
+class RestartedPlan:
+    """What replaces the parts of a plan that goes on.
+
+    start_s: board time at which its points begin; after: state after it, in board time; end_s: of its last pulse
+    planned: the whole plan; its rows from plan.first_row on are limited and timed anew
+    zero_s: begin of the points on the time line of `planned`
+    """
+
+    plan: ActivePlan
+    start_s: float
+    zero_s: float
+    planned: PlannedSequence
+    points: WirePoints
+    crc: int
+    summary_json: bytes
+    before: ThermalEstimate
+    after: ThermalEstimate
+    end_s: float
+
+    def apply(self, delay_s: float) -> None:
+        """Replace the parts of the plan, which begins delay_s later than it was limited for: never warmer."""
+        plan, record, planned, zero_s = self.plan, self.plan.record, self.planned, self.zero_s
+        if plan.first_row:
+            zero_s += delay_s
+            planned = replace(planned, plan=delay_rest(planned.plan, plan.first_row, delay_s))
+        else:  # nothing was executed: the plan begins anew
+            record.start_s = self.start_s + delay_s
+            plan.heat_before, plan.budget_before = self.before.shift_to_plan(self.start_s)
+        plan.planned, plan.points, plan.crc, plan.is_interrupted = planned, self.points, self.crc, False
+        plan.zero_s = plan.origin_s = zero_s
+        record.duration_s = planned.duration_s
+        record.pulses = ListedPulses.from_planned(planned)
+        record.largest_target = LargestTarget.from_planned(planned)
+        record.summary_json = self.summary_json
+
+
+def restart_plans(
+    display: DisplayModel,
+    scale: WireScale,
+    plans: Sequence[ActivePlan],
+    before: ThermalEstimate,
+    start_s: float,
+    gap_s: float,
+    on_progress: Callable[[], None],
+) -> list[RestartedPlan]:
+    """Limit and prove plans that follow each other.
+
+    before: state before the first; start_s: board time at which the first begins; gap_s: between two plans
+    Raise LocalProtocolError if the bytes of one exceed a cap, and what on_progress raises.
+    """
+    restarted = []
+    for plan in plans:
+        start_s = max(start_s, before.budget.at_s)
+        restarted.append(_restart(display, scale, plan, before, start_s, on_progress))
+        before, start_s = restarted[-1].after, restarted[-1].end_s + gap_s
+    return restarted
+
+
+def _restart(
+    display: DisplayModel,
+    scale: WireScale,
+    plan: ActivePlan,
+    before: ThermalEstimate,
+    start_s: float,
+    on_progress: Callable[[], None],
+) -> RestartedPlan:
+    first, planned = plan.first_row, plan.planned
+    heat, budget = before.shift_to_plan(start_s)
+    rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)
+    points = quantise(rest, scale)
+    on_progress()
+    payload = points.encode_payload()
+    decoded = decode(payload, scale)
+    verify(rest, points.row[decoded.index], decoded, budget, display.budget, on_progress)
+    heat_after = heat.copy()
+    peaks = heat_after.apply_pulses(rest.pixel, rest.start_s, rest.width_s, rest.power_w, on_progress)
+    after = ThermalEstimate.from_plan(heat_after, budget_after, start_s)
+    end_s = start_s + (float(rest.start_s[-1] + rest.width_s[-1]) if len(rest) else 0.0)
+    zero_s = start_s - plan.record.start_s if first else 0.0
+    whole = replace_rest(planned.plan, first, rest, zero_s, budget_after, display.budget)
+    plan_zero_s = start_s - zero_s
+    whole_planned = replace(
+        planned,
+        plan=whole,
+        predicted_m=np.concatenate([planned.predicted_m[:first], peaks.displacement_m]),
+        heat=after.heat.copy_shifted(-plan_zero_s),
+        budget=after.shift_to_plan(plan_zero_s)[1],
+    )
+    return RestartedPlan(
+        plan=plan,
+        start_s=start_s,
+        zero_s=zero_s,
+        planned=whole_planned,
+        points=WirePoints(points.table, np.where(points.row >= 0, points.row + first, -1)),
+        crc=zlib.crc32(payload),
+        summary_json=_summarize_again(whole_planned, plan.record.summary_json),
+        before=before,
+        after=after,
+        end_s=end_s,
+    )
+
+
+def _find_origin_s(plan: ActivePlan) -> float:
+    """Return the time of the plan at which its points begin again: when the light went off, or shortly before a pulse.
+
+    The mirrors need the lead-in before the first pulse.
+    """
+    start_s = plan.planned.plan.start_s
+    if plan.first_row >= len(start_s):
+        return plan.origin_s
+    latest_s = float(start_s[plan.first_row]) - plan.planned.lead_in_s
+    return float(np.floor(min(plan.origin_s, latest_s) * 1e6) * 1e-6)
+
+
+def _summarize_again(planned: PlannedSequence, before_json: bytes) -> bytes:
+    """Summarize a plan again. Its feasibility, and the first trimmed pulse, are those of its request."""
+    before = PlanSummary.model_validate_json(before_json)
+    summary = summarize_plan(planned)
+    return summary.model_copy(update={"feasibility": before.feasibility}).model_dump_json().encode()

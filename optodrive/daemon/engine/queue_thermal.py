@@ -1,0 +1,96 @@
+"""Thermal estimate after all plans of the queue, and its changes at early ends, delays and restarts."""
+
+from collections.abc import Callable, Sequence
+
+from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.thermal_estimate import (
+    EndedPlan,
+    ThermalEstimate,
+    estimate_before_rest,
+    rewind_estimate,
+)
+from optodrive.daemon.engine.thermal_memory import SavedThermalState
+from optodrive.link.service.remote_session import RemoteSession
+from optodrive.planning.display_model import DisplayModel
+
+HOLD_MAX_S = 1.0
+"""Longest time for which the board waits for points before it ends a plan."""
+
+
+class QueueThermal:
+    """The queue's thermal estimate. Not thread-safe: the queue's lock guards it.
+
+    estimate: heat and budget after all plans, in board time; every change replaces it
+    end_s: board time at which the last plan ends
+    on_progress: called during long computations
+    """
+
+    def __init__(self, display: DisplayModel, session: RemoteSession, on_progress: Callable[[], None]) -> None:
+        self.estimate = ThermalEstimate(*display.build_cold_state())
+        self.end_s = 0.0
+        self._budget = display.budget
+        self._lease_s = display.config.board.lease_s
+        self._session = session
+        self._on_progress = on_progress
+
+    def append(self, plan: ActivePlan) -> None:
+        """Continue after a plan that was accepted as the last one."""
+        record, planned = plan.record, plan.planned
+        self.estimate = ThermalEstimate.from_plan(planned.heat, planned.budget, record.start_s)
+        self.end_s = record.start_s + record.duration_s
+
+    def set(self, estimate: ThermalEstimate, end_s: float | None = None) -> None:
+        """Continue from another estimate. end_s: end of the last plan, that of the last pulse if None."""
+        self.estimate = estimate
+        self.end_s = estimate.budget.at_s if end_s is None else end_s
+
+    def estimate_before(self, plan: ActivePlan) -> ThermalEstimate:
+        """Return the estimate before a plan that waits, or before the rest of one that was interrupted."""
+        return estimate_before_rest(plan, self._budget, self._on_progress)
+
+    def rewind(self, ended: Sequence[ActivePlan], clock_shift_s: float = 0.0) -> None:
+        """Count only what plans that end early may have executed.
+
+        clock_shift_s: by which the board's clock has jumped since they were queued
+        """
+        gate_off_s = self._session.board_s() - clock_shift_s + self._lease_s
+        plans = [EndedPlan.from_plan(plan) for plan in ended]
+        estimate = rewind_estimate(plans, gate_off_s, self._budget, self._on_progress)
+        self.set(estimate, max(gate_off_s, estimate.budget.at_s))
+
+    def delay(self, delay_s: float) -> None:
+        """Shift all pulses, because a plan was late."""
+        self.set(self.estimate.with_delay(delay_s), self.end_s + delay_s)
+
+    # --- restarts -----------------------------------------------------------------------------------------------
+
+    def shift_clock(self, delay_s: float) -> None:
+        """Shift all pulses to the restarted clock of the board."""
+        self.set(self.estimate.with_delay(delay_s))
+
+    def build_saved_state(self, active: Sequence[ActivePlan], host_s: float) -> SavedThermalState:
+        """Return the state from which a later planner process continues.
+
+        active: plans that run, or the first that waits; host_s: present host time
+        """
+        plans = tuple(EndedPlan.from_plan(plan) for plan in active)
+        return SavedThermalState(host_s, self._session.board_s(), self.estimate, plans)
+
+    def build_saved_key(self, active: Sequence[ActivePlan]) -> object:
+        """Return a value that changes whenever build_saved_state() would return another state."""
+        records = [plan.record for plan in active]
+        return id(self.estimate), tuple((record.plan_id, record.dropped, record.start_s) for record in records)
+
+    def restore(self, saved: SavedThermalState, host_s: float) -> None:
+        """Continue from the state of an earlier planner, whose plans the link process has ended.
+
+        Every pulse that may have started before now counts, up to the longest time late that the board permits. The
+        board's clock may have restarted meanwhile.
+        """
+        board_s = self._session.board_s()
+        expected_s = saved.board_s + host_s - saved.host_s
+        gate_off_s = expected_s + self._lease_s
+        estimate = saved.estimate
+        if saved.plans:
+            estimate = rewind_estimate(saved.plans, gate_off_s, self._budget, self._on_progress)
+        self.set(estimate.with_delay(board_s - expected_s + HOLD_MAX_S))

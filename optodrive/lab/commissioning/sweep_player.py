@@ -1,0 +1,123 @@
+"""A whole sweep of pixel calibration under one arming: every aim and every pixel, each pulse in the journal at once."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from optodrive.core.errors import InputError, RefusedError
+from optodrive.core.types.plans import LimitedPlan, PulsePlan
+from optodrive.core.types.stimuli import FrameSequence
+from optodrive.lab.calibration.pixels.sweep import Aim, build_sweep
+from optodrive.lab.calibration.pixels.sweep_journal import SweepJournal, SweepPulse
+from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
+from optodrive.link.session.plan_job import PlanJob
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
+
+PULSES_PER_JOB = 128
+"""Pulses that are limited and verified at once: this takes a few milliseconds, in which the lease is not renewed."""
+
+
+@dataclass(frozen=True, eq=False)
+class AimPlan:
+    """The pulses of one aim, planned for a cold display."""
+
+    aim: Aim
+    plan: LimitedPlan
+
+
+def plan_aims(displays: list[tuple[Aim, DisplayModel]], journal: SweepJournal) -> list[AimPlan]:
+    """Plan the pulses that the journal lacks. displays: for each aim, the display with its pixel map.
+
+    Raises InputError if the mirrors cannot reach an aim, and RefusedError if a pulse never fits the caps.
+    """
+    plans = []
+    for aim, display in displays:
+        trains = build_sweep(display.config, aim, journal.list_done(aim.name))
+        if trains:
+            sequence = FrameSequence((), trains)
+            plan = plan_sequence(display, sequence, *display.build_cold_state(), policy="delay").plan
+            range_rad = display.config.scanner.range_rad
+            if max(np.abs(plan.x_rad).max(), np.abs(plan.y_rad).max()) > range_rad:
+                raise InputError(
+                    "scanner.range_rad", range_rad, f"a range that contains the aim {aim.name} of each pixel"
+                )
+            plans.append(AimPlan(aim, plan))
+    return plans
+
+
+def play_aims(
+    plans: list[AimPlan],
+    board: ExclusiveBoard,
+    journal: SweepJournal,
+    rest_s: float,
+    on_progress: Callable[[AimPlan, int], None],
+) -> None:
+    """Play all plans on the armed board, with a rest between them in which the display cools.
+
+    on_progress: called with the plan and its number of executed pulses. Raises InputError if the journal cannot be
+    written; errors of the board as ExclusiveBoard.
+    """
+    for number, item in enumerate(plans):
+        if number:
+            board.wait(rest_s)
+        recorder = _JournalRecorder(item, board, journal, on_progress)
+        for first in range(0, len(item.plan), PULSES_PER_JOB):
+            recorder.begin(first)
+            board.play(_cut_plan(item.plan, first), recorder.record)
+        journal.raise_if_failed()
+        if recorder.count != len(item.plan):
+            raise RefusedError(f"sweep: aim {item.aim.name}: {recorder.count} of {len(item.plan)} pulses were reported")
+
+
+def _cut_plan(plan: LimitedPlan, first: int) -> PulsePlan:
+    """Return up to PULSES_PER_JOB pulses from `first` on, with the lead-in of the whole plan."""
+    rows = slice(first, first + PULSES_PER_JOB)
+    columns = {item.name: getattr(plan, item.name)[rows].copy() for item in fields(PulsePlan)}
+    shift_s = float(plan.start_s[first] - plan.start_s[0])
+    columns["start_s"] -= shift_s
+    columns["requested_start_s"] -= shift_s
+    return PulsePlan(**columns)
+
+
+class _JournalRecorder:
+    """Copies the reported pulses of one aim to the journal. count: number of pulses copied."""
+
+    def __init__(
+        self,
+        item: AimPlan,
+        board: ExclusiveBoard,
+        journal: SweepJournal,
+        on_progress: Callable[[AimPlan, int], None],
+    ) -> None:
+        self._item, self._board, self._journal = item, board, journal
+        self._on_progress = on_progress
+        self._first = self.count = 0
+
+    def begin(self, first: int) -> None:
+        """Begin with the job whose first pulse is row `first` of the plan."""
+        self._first = self.count = first
+
+    def record(self, job: PlanJob) -> None:
+        """Append the pulses reported since the last call."""
+        scale, plan = self._board.session.scale, self._item.plan
+        done = job.executed_count
+        reported = job.read_reported(self.count - self._first, done)
+        unix_minus_board_s = time.time() - self._board.session.board_s()
+        self._journal.append(
+            [
+                SweepPulse(
+                    self._item.aim.name,
+                    int(plan.pixel[self._first + row]),
+                    round(unix_minus_board_s + on_tick * scale.tick_s, 6),
+                    round(on_tick * scale.tick_s, 6),
+                    round(on_ticks * scale.tick_s, 6),
+                    round(duty / 65535.0 * scale.full_power_w, 9),
+                )
+                for row, on_tick, on_ticks, duty in zip(*(column.tolist() for column in reported), strict=True)
+            ]
+        )
+        self.count = self._first + done
+        self._on_progress(self._item, self.count)

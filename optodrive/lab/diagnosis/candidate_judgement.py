@@ -1,0 +1,84 @@
+"""Judgement of every hypothesis, and the numbers of those that were refitted."""
+
+import numpy as np
+from scipy.stats import chi2 as chi_squared
+
+from optodrive.core.quantity import format_quantity
+from optodrive.core.types.discrepancy import CandidateCause, RivalModel
+from optodrive.lab.diagnosis.detection import Score
+from optodrive.lab.diagnosis.model_selection import Verdict
+from optodrive.physics.terms import discover_terms
+
+DETECTABLE_RATIO = 30.0
+"""Likelihood ratio of an effect that is detected nine times in ten."""
+MIN_INDEPENDENT_FRACTION = 1e-4
+"""Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
+
+
+def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[CandidateCause, ...]:
+    """Return the judgement of every hypothesis; gains: reduction on held-out runs by label."""
+    chosen = verdict.chosen
+    tests = max(len(verdict.nominal_detection.scores), 1)
+    out = []
+    for score in verdict.nominal_detection.scores:
+        item = score.hypothesis
+        if chosen is not None and item.label in {part.label for part in chosen.hypotheses}:
+            judgement = "identified" if verdict.verdict == "cause" else "indistinguishable"
+        elif item.key in verdict.causes:
+            judgement = "indistinguishable" if verdict.verdict == "ambiguous" else "alternative form"
+        elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
+            judgement = "not observable"
+        else:
+            judgement = "not detected" if score.ratio < DETECTABLE_RATIO else "ruled out"
+        p_value = min(1.0, tests * float(chi_squared.sf(score.ratio, len(score.columns))))
+        out.append(
+            CandidateCause(
+                item.key,
+                item.label,
+                score.ratio,
+                p_value,
+                gains.get(item.label),
+                judgement,
+                _describe_detection_limit(score),
+            )
+        )
+    return tuple(out)
+
+
+def _describe_detection_limit(score: Score) -> str:
+    """Return the smallest detectable size as text."""
+    stated_limit = discover_terms()[score.hypothesis.key].detection_limit
+    if stated_limit:
+        return stated_limit
+    free = score.hypothesis.free[-1 if score.hypothesis.is_linear else 0]
+    start = score.start.get(free.names[0], 0.0) or 1.0
+    if score.start_ratio <= 0.0 or score.independent_fraction < MIN_INDEPENDENT_FRACTION:
+        return "not observable"
+    size = abs(start) * float(np.sqrt(DETECTABLE_RATIO / score.start_ratio))
+    if size > 3.0 * free.parameter.high:
+        return f"more than {format_quantity(free.parameter.high, free.parameter.unit)}"
+    return f"{'all' if len(free.names) > 1 else free.names[0]} {format_quantity(size, free.parameter.unit, 2)}"
+
+
+def list_rivals(verdict: Verdict, gains: dict[str, float]) -> tuple[RivalModel, ...]:
+    """Return the refitted candidates, best first; gains: reduction on held-out runs by label."""
+    candidates = verdict.candidates
+    if not candidates:
+        return ()
+    chi2, bic = candidates[0].fit.chi2, candidates[0].bic
+    return tuple(
+        RivalModel(
+            item.label,
+            item.causes,
+            item.fit.chi2 - chi2,
+            item.bic - bic,
+            gains.get(item.label),
+            item is verdict.chosen,
+            {
+                f"{free.key}.{name}": (item.fit.point.terms[free.key][name], free.parameter.unit)
+                for free in item.fit.free
+                for name in free.names
+            },
+        )
+        for item in candidates
+    )

@@ -1,0 +1,153 @@
+"""The pulses of a frame's round on nominal pixels, in one kernel.
+
+It states what `BatchPlanner.plan_round` does pulse by pulse, without train pulses; other threads run meanwhile.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.device.settling import CEIL_OFFSET
+from optodrive.physics.nominal_display import NominalThermalState, solve_pulse_at
+from optodrive.physics.pulse_for_height import DriveRange
+from optodrive.planning.scheduler.batch_draft import BatchDraft, PlannedPulse
+from optodrive.planning.scheduler.scan_head import MoveTimes
+
+NO_PIXEL = -1
+
+
+class KernelBeam(NamedTuple):
+    """The part of a `BeamState` that a round changes, NO_PIXEL for an unknown pixel."""
+
+    free_us: int
+    pixel: int
+    arrival_us: int
+    dwell_us: int
+
+
+class DriveSpan(NamedTuple):
+    """A `DriveRange` for kernels."""
+
+    max_power_w: float
+    period_s: float
+    max_periods: int
+
+
+class RoundPulses(NamedTuple):
+    """Columns of the pulses [n] of a round, filled in by the kernel. periods: 0 for a pixel that needs no pulse."""
+
+    start_us: IntArray
+    settling_us: IntArray
+    periods: IntArray
+    duty: FloatArray
+
+    @classmethod
+    def empty(cls, count: int) -> "RoundPulses":
+        """Return columns of `count` pulses."""
+        start_us, settling_us, periods = np.zeros((3, count), dtype=np.int64)
+        return cls(start_us, settling_us, periods, np.zeros(count))
+
+
+def draft_round(
+    draft: BatchDraft,
+    heat: NominalThermalState,
+    pixel: IntArray,
+    target_m: FloatArray,
+    requested_us: int,
+    source: int,
+    drive: DriveRange,
+    max_rows: int | None,
+) -> None:
+    """Draft pulses to the heights target_m [n] on `pixel` [n], in this order, up to max_rows pulses.
+
+    Raises ValueError for a pulse before its pixel's last event.
+    """
+    beam, pulses = draft.beam, RoundPulses.empty(len(pixel))
+    start = KernelBeam(beam.free_us, NO_PIXEL if beam.pixel is None else beam.pixel, beam.arrival_us, beam.dwell_us)
+    span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods)
+    count = len(pixel) if max_rows is None else max_rows
+    visited, *after = _solve_round(
+        *heat.kernel_state, draft.path.moves, pixel, target_m, requested_us + beam.delay_us, start, span, count, pulses
+    )
+    if visited < 0:
+        row = -1 - visited
+        raise heat.build_time_order_error(int(pixel[row]), float(pulses.start_us[row]) * 1e-6)
+    beam.position += visited
+    beam.free_us, last_pixel, beam.arrival_us, beam.dwell_us = after
+    beam.pixel = None if last_pixel == NO_PIXEL else last_pixel
+    columns = (pixel, target_m, *pulses)
+    for index, target, start_us, settling_us, periods, duty in zip(
+        *(column[:visited].tolist() for column in columns), strict=True
+    ):
+        if not periods:
+            draft.skip(source, index, target)
+            continue
+        width_us, power_w = round(periods * drive.period_s * 1e6), duty * drive.max_power_w
+        draft.rows.append(PlannedPulse(start_us, width_us, power_w, index, settling_us, target, requested_us, source))
+
+
+@kernel
+def _solve_round(
+    columns: FloatArray,
+    at_s: FloatArray,
+    theta_k: FloatArray,
+    gamma_k: FloatArray,
+    moves: MoveTimes,
+    pixel: IntArray,
+    target_m: FloatArray,
+    earliest_us: int,
+    beam: KernelBeam,
+    drive: DriveSpan,
+    max_rows: int,
+    pulses: RoundPulses,
+) -> tuple[int, int, int, int, int]:
+    """Fill in the pulses [n]; return how many pixels were visited, and the beam after them.
+
+    The number is −1 − n if pulse n is before its pixel's last event.
+    """
+    row = rows = 0
+    free_us, origin, arrival_us, dwell_us = beam.free_us, beam.pixel, beam.arrival_us, beam.dwell_us
+    while row < len(pixel) and rows < max_rows:
+        i = pixel[row]
+        settling_us = _compute_settling_us(moves, origin, i, dwell_us)
+        start_us = max(earliest_us, free_us + settling_us)
+        periods, duty = solve_pulse_at(
+            columns,
+            at_s,
+            theta_k,
+            gamma_k,
+            i,
+            start_us * 1e-6,
+            target_m[row],
+            drive.max_power_w,
+            drive.period_s,
+            1,
+            drive.max_periods,
+            0.0,
+        )
+        pulses.start_us[row], pulses.settling_us[row] = start_us, settling_us
+        pulses.periods[row], pulses.duty[row] = periods, duty
+        if periods < 0:
+            return -1 - row, free_us, origin, arrival_us, dwell_us
+        if periods:
+            if i != origin:
+                arrival_us = start_us
+            free_us, origin = start_us + int(np.rint(periods * drive.period_s * 1e6)), i
+            dwell_us = free_us - arrival_us
+            rows += 1
+        row += 1
+    return row, free_us, origin, arrival_us, dwell_us
+
+
+@kernel
+def _compute_settling_us(moves: MoveTimes, origin: int, pixel: int, dwell_us: int) -> int:
+    """Return the settling time of a move as `SettlingTable.settling_us` does, from NO_PIXEL too."""
+    if origin == NO_PIXEL:
+        return moves.lead_in_us
+    x = int(abs(moves.x_rad[pixel] - moves.x_rad[origin]) / moves.pitch_rad + CEIL_OFFSET)
+    y = int(abs(moves.y_rad[pixel] - moves.y_rad[origin]) / moves.pitch_rad + CEIL_OFFSET)
+    if dwell_us >= moves.long_dwell_us:
+        return int(max(moves.long_x_us[x], moves.long_y_us[y]))
+    return int(max(moves.short_x_us[x], moves.short_y_us[y]))

@@ -1,0 +1,177 @@
+"""Pause and resume of a real daemon on a board process, judged from the board's log."""
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from optodrive.client import AsyncDisplay, Display
+from optodrive.core.errors import NotReadyError
+from rig import OPTODRIVE, TOKEN, long_train, read_role_tokens, running, wait_for
+
+STOP_MAX_S = 0.5
+"""Longest time from a request to the end of the light, on a busy computer; the same as that of STOP in the floods."""
+WATCH_S = 0.4
+ON_US = 10_000
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("kept")
+    audit = ("lease_s = 1.0", f'lease_s = 1.0\n[daemon]\naudit = "{folder}/audit.jsonl"\n#')
+    with running(folder, replace=[audit]) as board_and_daemon:
+        yield board_and_daemon
+
+
+@pytest.fixture
+def board(kept):
+    return kept[0]
+
+
+@pytest.fixture
+def daemon(kept):
+    daemon = kept[1]
+    daemon.call("POST", "/v1/stop")
+    kept[0].forget()
+    daemon.arm()
+    return daemon
+
+
+def start_train(daemon, board, seconds):
+    """Start a train and return its plan once it emits."""
+    plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=seconds))["plan"]
+    wait_for(lambda: len(board.of("pulse")) > 5, "light")
+    return plan
+
+
+def is_dark(board):
+    return not any(event["on"] for event in board.of("gate")[-1:])
+
+
+def check_paused(daemon, board, plan, requested_us):
+    """Require dark within the time of STOP, and then nothing, and the state of a pause."""
+    state = daemon.state()
+    (active,) = state["queue"]["active"]
+    assert (state["board"]["state"], state["queue"]["paused"]) == ("ARMED", True)
+    assert 290 < state["queue"]["pause_ends_in_s"] <= 300
+    assert (active["plan"], active["status"], active["ends_in_s"]) == (plan, "paused", None)
+    assert (state["queue"]["running"], state["queue"]["waiting"]) == (plan, 0)
+    emitted = board.of("pulse")
+    assert emitted[-1]["off_us"] - requested_us < STOP_MAX_S * 1e6
+    time.sleep(WATCH_S)
+    assert len(board.of("pulse")) == len(emitted)
+    assert is_dark(board)
+    report = daemon.call("GET", f"/v1/plans/{plan}")
+    assert (report["status"], report["executed"], report["sent"]) == ("paused", len(emitted), len(emitted))
+
+
+def test_pauses_are_dark_at_once_and_resume_plays_exactly_the_rest(daemon, board):
+    plan = start_train(daemon, board, seconds=3.0)
+    for _ in range(3):
+        time.sleep(0.3)
+        requested_us = board.now_us()
+        daemon.call("POST", "/v1/pause")
+        check_paused(daemon, board, plan, requested_us)
+        emitted = len(board.of("pulse"))
+        daemon.call("POST", "/v1/resume")
+        wait_for(lambda count=emitted: len(board.of("pulse")) > count + 5, "light after the resumption")
+    report = daemon.finished(plan)
+    pulses = board.of("pulse")
+    assert report["status"] == "done"
+    assert len(pulses) == report["executed"] == report["planned"] == 150
+    assert report["executed_complete"]
+    cut = [event for event in pulses if event["off_us"] - event["on_us"] != ON_US]
+    assert len(cut) <= 3
+    widths_us = [event["off_us"] - event["on_us"] for event in pulses]
+    assert report["executed_pulses"]["width_s"] == pytest.approx([1e-6 * width_us for width_us in widths_us])
+    assert {event["state"] for event in board.of("state")} == {"ARMED", "RUNNING", "ARMING"}
+    assert daemon.state()["queue"]["paused"] is False
+
+
+def test_frames_that_are_pushed_as_the_newest_are_refused_and_others_wait(daemon, board):
+    plan = start_train(daemon, board, seconds=1.0)
+    with Display(daemon.url, TOKEN) as display:
+        state = display.pause()
+        assert (state.queue.paused, state.queue.active[0].status) == (True, "paused")
+        problem = daemon.call("POST", "/v1/plans", 409, json=long_train(), params={"newest": True})
+        assert problem["code"] == "not_ready"
+        assert "the light is paused" in problem["detail"]
+        waiting = daemon.call("POST", "/v1/plans", json=long_train(pixel=100, seconds=0.2))["plan"]
+        assert daemon.state()["queue"]["waiting"] == 1
+        assert display.resume().queue.paused is False
+        for plan_id, pulses in ((plan, 50), (waiting, 10)):
+            report = daemon.finished(plan_id)
+            assert (report["status"], report["executed"]) == ("done", pulses)
+    assert len(board.of("pulse")) == 60
+
+
+def test_roles_and_states_in_which_it_is_refused(daemon, board, kept):
+    def call(command, role, status):
+        headers = {"Authorization": f"Bearer {read_role_tokens(daemon)[role]}"}
+        return daemon.call("POST", f"/v1/{command}", status, headers=headers)
+
+    for command in ("pause", "resume"):
+        assert call(command, "viewer", 403)["required_role"] == "operator"
+        call(command, "operator", 200)
+        call(command, "operator", 200)
+    daemon.call("POST", "/v1/disarm")
+    for command in ("pause", "resume"):
+        problem = call(command, "armer", 409)
+        assert problem["code"] == "not_ready"
+        assert f"the board is DISARMED; only an armed board can be {command}d" in problem["detail"]
+
+    async def pause():
+        async with AsyncDisplay(daemon.url, TOKEN) as display:
+            with pytest.raises(NotReadyError):
+                await display.resume()
+            with pytest.raises(NotReadyError):
+                await display.pause()
+
+    asyncio.run(pause())
+    lines = [json.loads(line) for line in (daemon.config.parent / "audit.jsonl").read_text().splitlines()]
+    paused = [(line["role"], line["status"]) for line in lines if line.get("call") == "POST /v1/pause"]
+    assert ("viewer", 403) in paused
+    assert ("operator", 200) in paused
+
+
+def test_commands_pause_and_resume(daemon, board):
+    plan = start_train(daemon, board, seconds=1.0)
+    environment = os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN}
+    for command, expected in (("pause", "dark until `optodrive resume`; disarms in"), ("resume", "running")):
+        ended = subprocess.run([OPTODRIVE, command], env=environment, capture_output=True, text=True, timeout=30)
+        assert (ended.returncode, ended.stderr) == (0, "")
+        assert expected in ended.stdout
+    assert daemon.finished(plan)["executed"] == 50
+
+
+def find_link(daemon):
+    (link,) = (
+        pid
+        for pid in daemon.list_children()
+        if b"optodrive.link.service.process" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    )
+    return link
+
+
+def test_the_end_of_the_link_process_ends_a_pause_dark_and_drops_everything(daemon, board):
+    plan = start_train(daemon, board, seconds=5.0)
+    daemon.call("POST", "/v1/pause")
+    waiting = daemon.call("POST", "/v1/plans", json=long_train(seconds=0.2))["plan"]
+    emitted = len(board.of("pulse"))
+    os.kill(find_link(daemon), signal.SIGKILL)
+    wait_for(lambda: board.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the board to leave ARMED")
+    for plan_id in (plan, waiting):
+        assert daemon.finished(plan_id)["status"] == "failed"
+    wait_for(lambda: daemon.state()["link"]["state"] == "up", "the next link process")
+    daemon.call("POST", "/v1/disarm")
+    wait_for(lambda: daemon.client.post("/v1/arm").is_success, "processes that may arm")
+    daemon.call("POST", "/v1/resume")
+    time.sleep(WATCH_S)
+    assert len(board.of("pulse")) == emitted
+    assert daemon.state()["queue"]["active"] == []
+    assert is_dark(board)

@@ -1,0 +1,56 @@
+"""Exit statuses of commands whose stimulus does not fit."""
+
+import json
+
+import pytest
+
+from optodrive.cli.exit_status import DOES_NOT_FIT, SUMMARY
+from optodrive.cli.main import run
+
+LATE = {"frames": [{"show_at_s": 0.0, "duration_s": 0.01, "target_um": {"3": 100, "4": 100, "5": 100}}]}
+EASY = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"3": 50}}]}
+
+
+@pytest.fixture
+def frames(tmp_path):
+    def write(content):
+        path = tmp_path / "frames.json"
+        path.write_text(json.dumps(content))
+        return str(path)
+
+    return write
+
+
+@pytest.mark.parametrize("command", ["plan", "simulate"])
+def test_does_not_fit_is_a_status_of_its_own(frames, command, capsys):
+    assert run([command, frames(EASY), "--config", "display-16"]) == 0
+    assert capsys.readouterr().out.startswith("fits: yes\n")
+    for options in ([], ["--json"]):
+        assert run([command, frames(LATE), "--config", "display-16", *options]) == DOES_NOT_FIT
+        shown = capsys.readouterr()
+        assert shown.err == ""
+        if options:
+            summary = json.loads(shown.out)
+            assert summary.get("summary", summary)["feasibility"]["fits"] is False
+        else:
+            assert shown.out.startswith("fits: no, ")
+
+
+def test_the_files_are_written_all_the_same(frames, tmp_path, capsys):
+    out = tmp_path / "plan.csv"
+    assert run(["plan", frames(LATE), "--config", "display-16", "--out", str(out)]) == DOES_NOT_FIT
+    assert len(out.read_text().splitlines()) == 4
+    assert capsys.readouterr().out.endswith(f"written          {out}\n")
+
+
+@pytest.mark.parametrize(("options", "status"), [(["--fit", "even"], DOES_NOT_FIT), (["--strict"], 1)])
+def test_a_reduced_variant_does_not_fit_and_a_refusal_fails(frames, options, status, capsys):
+    assert run(["plan", frames(LATE), "--config", "display-16", *options]) == status
+    shown = capsys.readouterr()
+    assert ("fits: no" in shown.out) == (status == DOES_NOT_FIT)
+    assert shown.err.count("\n") == (status == 1)
+
+
+def test_the_help_lists_the_statuses(capsys):
+    assert run(["--help"]) == 0
+    assert " ".join(capsys.readouterr().out.split()).endswith(SUMMARY)

@@ -1,0 +1,160 @@
+"""Every quantity of a file or a recording has a plausible range: one that is added without one fails here."""
+
+import re
+import typing
+from types import UnionType
+
+import pytest
+from pydantic import BaseModel
+
+from optodrive.core.errors import InputError
+from optodrive.core.plausibility import OTHER_UNITS, PlausibleRange, check_plausible, check_table
+from optodrive.core.plausible_ranges import RANGES
+from optodrive.device.config import Config
+from optodrive.device.config_file import MirrorsFile
+from optodrive.device.field_file import _FieldFile
+from optodrive.device.field_geometry import FieldGeometry
+from optodrive.device.pixel_map import _PixelMapFile
+from optodrive.lab.calibration.camera.folder import _PicturesFile
+from optodrive.lab.calibration.spots import COLUMNS
+from optodrive.lab.diagnosis.plausible_units import LENGTHS
+from optodrive.lab.recording.storage import SAMPLE_COLUMNS, SIGNALS, TABLE_COLUMNS
+from optodrive.physics.parameters import PARAMETER_UNITS, ParameterSet
+from optodrive.physics.terms import discover_terms
+from optodrive.planning.stimuli.frame_json import FRAME_QUANTITIES
+from optodrive.planning.stimuli.pattern_registry import describe_patterns
+from optodrive.planning.stimuli.train_json import HEIGHT_TRAIN_KEYS, PULSE_TRAIN_KEYS
+
+UNITS = {
+    "_per_code": "rad",
+    "_per_s2": "rad/s²",
+    "_per_rad2": "1/rad²",
+    "_per_rad4": "1/rad⁴",
+    "rad_per_s": "rad/s",
+    "_um": "µm",
+    "_m": "m",
+    "_s": "s",
+    "_w": "W",
+    "_W": "W",
+    "_j": "J",
+    "_K": "K",
+    "_N": "N",
+    "_c": "°C",
+    "_hz": "Hz",
+    "_rad": "rad",
+}
+"""Endings of names to units, longer ones first."""
+COUNTS = {"board.points_per_s", "daemon.requests_per_s"}
+"""Rates of events, of which each has its own bounds."""
+MODELS = {
+    "config": Config,
+    "mirrors": MirrorsFile,
+    "field": _FieldFile,
+    "pixels": _PixelMapFile,
+    "pictures": _PicturesFile,
+}
+
+
+def list_models(annotation):
+    """Return the models in an annotation: itself, the items of its containers, the parts of a union."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    is_compound = typing.get_origin(annotation) is not None or isinstance(annotation, UnionType)
+    return [model for part in typing.get_args(annotation) for model in list_models(part)] if is_compound else []
+
+
+def list_keys(model, prefix=""):
+    """Return the dotted keys of all numbers of a model."""
+    keys = []
+    for name, item in model.model_fields.items():
+        inner = list_models(item.annotation)
+        keys += [key for each in inner for key in list_keys(each, f"{prefix}{name}.")] or [prefix + name]
+    return keys
+
+
+def find_unit(key):
+    return next((unit for ending, unit in UNITS.items() if key.endswith(ending)), None)
+
+
+def list_quantities():
+    """Return format, place and unit of every quantity."""
+    found = {(name, key): find_unit(key) for name, model in MODELS.items() for key in list_keys(model)}
+    found |= {("field", f"geometry.{name}"): find_unit(name) for name in FieldGeometry._fields}
+    found |= {("config", key): "1" for key in list_keys(Config) if key.startswith("limits.uncertainty.")}
+    found |= {
+        ("recording", f"{name}.{key}"): find_unit(f"_{key}") for name in TABLE_COLUMNS for key in TABLE_COLUMNS[name]
+    }
+    found |= {("recording", f"signal.{key}"): find_unit(f"_{key}") for key in SAMPLE_COLUMNS}
+    found |= {("recording", name): find_unit(name) for name in (*SIGNALS, *LENGTHS, "ambient_K")}
+    found |= {("spots", name): find_unit(name) for name in COLUMNS}
+    found |= {("frames", f"frames.{name}"): find_unit(name) for name in FRAME_QUANTITIES}
+    found |= {("frames", f"trains.{name}"): find_unit(name) for name in (*PULSE_TRAIN_KEYS, *HEIGHT_TRAIN_KEYS)}
+    parameters = [key for key in list_keys(ParameterSet) if key.endswith((".value", "_m"))]
+    found |= {
+        ("parameters", key): find_unit(key) or PARAMETER_UNITS[key.split(".")[-2]]
+        for key in parameters
+        if not key.startswith("terms.")
+    }
+    return {place: unit for place, unit in found.items() if unit is not None and place[1] not in COUNTS}
+
+
+QUANTITIES = list_quantities()
+
+
+def test_every_quantity_has_a_range_in_its_unit_and_every_range_a_quantity():
+    stated = {(name, key): item.unit for name, table in RANGES.items() for key, item in table.items()}
+    assert stated == QUANTITIES
+
+
+def test_a_new_quantity_without_a_range_is_noticed():
+    class Extended(Config):
+        settling_time_s: float
+
+    new = [key for key in list_keys(Extended) if find_unit(key) and ("config", key) not in QUANTITIES]
+    assert [key for key in new if key not in COUNTS] == ["settling_time_s"]
+
+
+def test_another_unit_is_known_for_each_range():
+    assert {item.unit for table in RANGES.values() for item in table.values()} <= set(OTHER_UNITS)
+
+
+@pytest.mark.parametrize("key", sorted(discover_terms()))
+def test_parameters_of_terms_have_a_bounded_range_in_a_known_unit(key):
+    for item in discover_terms()[key].parameters:
+        assert item.unit in OTHER_UNITS, item
+        assert item.low <= item.default <= item.high, item
+
+
+def test_parameters_of_patterns_with_a_unit_have_a_range():
+    numbers = [item for pattern in describe_patterns() for item in pattern.parameters if item.kind == "number"]
+    assert numbers
+    for item in numbers:
+        assert item.min is not None, item
+        assert item.max is not None, item
+        assert item.unit in ("", *OTHER_UNITS), item
+        ending = re.search(r"_(s|um|mm|hz)$", item.name)
+        assert ending is None or item.unit, item
+
+
+def test_a_table_is_checked_at_any_depth_and_the_place_is_named():
+    ranges = {"map.pixels.offset_m": PlausibleRange(0.0, 5e-3, "m"), "grid.corner_m": PlausibleRange(0.0, 0.5, "m")}
+    sound = {"map": {"pixels": [{"offset_m": 1e-3}, {"offset_m": -2e-3}]}, "grid": {"corner_m": [0.1, -0.2]}}
+    check_table("file", sound, ranges)
+    sound["map"]["pixels"][1]["offset_m"] = -2.0
+    with pytest.raises(InputError, match=r"file: map.pixels\[1\].offset_m: got -2.0, expected .* likely in mm"):
+        check_table("file", sound, ranges)
+    sound["map"] = {}
+    sound["grid"]["corner_m"] = [0.1, 200.0]
+    with pytest.raises(InputError, match=r"grid.corner_m\[1\].*likely in mm"):
+        check_table("file", sound, ranges)
+
+
+@pytest.mark.parametrize("value", [10**400, float("nan"), float("inf"), True, "5", None, {"deep": 1}])
+def test_what_no_unit_explains_is_left_to_the_schema(value):
+    check_table("file", {"grid": {"corner_m": value}}, {"grid.corner_m": PlausibleRange(0.0, 0.5, "m")})
+
+
+def test_a_quantity_out_of_range_in_every_unit_is_refused_without_a_guess():
+    with pytest.raises(InputError) as caught:
+        check_plausible("bridge_width_m", 1e9, PlausibleRange(1e-5, 5e-3, "m"))
+    assert "likely" not in str(caught.value)

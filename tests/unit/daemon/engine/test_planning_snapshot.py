@@ -1,0 +1,51 @@
+"""Where a running stream is cut for a newer frame."""
+
+import numpy as np
+import pytest
+
+from displays import DISPLAYS
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
+from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.link.board_setup import build_board_requirements
+
+DISPLAY = DISPLAYS["display-1511"]
+SCALE = build_board_requirements(DISPLAY.config).scale
+START_S = 7.0
+
+
+@pytest.fixture(scope="module")
+def running():
+    """Return the plan of a frame that the mirrors cannot draw without pauses."""
+    sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, np.full(len(DISPLAY.layout), 20e-6)),))
+    thermal = ThermalEstimate(*DISPLAY.build_cold_state())
+    snapshot = PlanningSnapshot(thermal, START_S, thermal.heat, thermal.budget)
+    request = PlanningRequest(lambda: sequence, "f", streamed=True)
+    return make_plan(DISPLAY, SCALE, request, sequence, snapshot, "p1", lambda fraction: None)
+
+
+def cut(running, at_s):
+    thermal = ThermalEstimate(running.heat_before, running.budget_before)
+    return build_cut_snapshot(running, thermal, START_S + at_s, DISPLAY.budget)
+
+
+def test_within_a_pause_of_the_mirrors_the_pulse_after_it_is_kept(running):
+    """Its point begins at the end of the pulse before the pause, and may have left."""
+    plan = running.planned.plan
+    end_s = plan.start_s + plan.width_s
+    pauses = np.flatnonzero(plan.start_s[1:] - end_s[:-1] > 0.009)
+    assert len(pauses) > 3
+    for row in pauses[:4].tolist():
+        snapshot = cut(running, 0.5 * (end_s[row] + plan.start_s[row + 1]))
+        assert snapshot.cut_row == row + 2
+        assert snapshot.start_s == pytest.approx(START_S + end_s[row + 1])
+
+
+def test_the_cut_is_at_the_first_end_after_the_stated_time(running):
+    plan = running.planned.plan
+    end_s = plan.start_s + plan.width_s
+    for row in (3, 100, 1000):
+        assert cut(running, end_s[row] - 1e-5).cut_row == row + 1
+        assert cut(running, end_s[row] + 1e-5).cut_row == row + 2
+    assert cut(running, end_s[-1]) is None

@@ -1,0 +1,77 @@
+"""First light in virtual time: where, how weak and how often, and what prevents it."""
+
+from itertools import pairwise
+
+import pytest
+
+from exclusive_rig import ExclusiveRig
+from optodrive.cli.main import run
+from optodrive.core.errors import BoardFaultError, InputError, RefusedError
+from optodrive.lab.commissioning.exclusive_board import max_spot_power_w, spot_width_s
+from optodrive.lab.commissioning.first_light import default_power_w, emit_first_light
+from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX
+
+
+class Rig(ExclusiveRig):
+    def __init__(self, display):
+        super().__init__(display, lambda x_code, y_code, at_us: None)
+        self.steps = []
+
+    def emit(self, power_w, pulses=1):
+        with self.held as board:
+            emit_first_light(board, power_w, pulses, False, lambda step: self.steps.append(step.step))
+
+
+def test_one_weak_pulse_at_the_centre(any_display):
+    rig, config = Rig(any_display), any_display.config
+    rig.emit(default_power_w(config))
+    (pulse,) = rig.of("pulse")
+    assert (pulse["x"], pulse["y"]) == (CENTRE_CODE, CENTRE_CODE)
+    assert 0.009 < pulse["duty"] / DUTY_MAX <= 0.01
+    assert (pulse["off_us"] - pulse["on_us"]) * 1e-6 == pytest.approx(spot_width_s(config))
+    assert [event["on"] for event in rig.of("gate")] == [True, False]
+    assert rig.core.state == "DISARMED"
+    assert rig.steps == ["link", "status", "inputs", "indicator", "light", "end"]
+
+
+def test_pulses_are_a_second_apart(display):
+    rig = Rig(display)
+    rig.emit(5e-3, 3)
+    on_us = [pulse["on_us"] for pulse in rig.of("pulse")]
+    assert len(on_us) == 3
+    assert min(b - a for a, b in pairwise(on_us)) >= 1_000_000
+
+
+@pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])
+def test_an_unsafe_input_prevents_it(display, name, value):
+    rig = Rig(display)
+    rig.core.set_input(name, value, round(rig.clock.now_s() * 1e6))
+    with pytest.raises((RefusedError, BoardFaultError), match=name.upper()):
+        rig.emit(5e-3)
+    assert not rig.of("gate")
+
+
+@pytest.mark.parametrize(("power_w", "pulses"), [(0.0, 1), (2.45, 1), (float("nan"), 1), (5e-3, 0), (5e-3, 101)])
+def test_no_more_than_a_spot(display, power_w, pulses):
+    rig = Rig(display)
+    with pytest.raises(InputError):
+        rig.emit(power_w, pulses)
+    assert not rig.of("gate")
+    assert rig.core.state == "DISARMED"
+
+
+def test_the_default_is_never_more_than_a_spot(any_display):
+    assert default_power_w(any_display.config) <= max_spot_power_w(any_display.config)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "--yes: got None, expected --yes, because without a terminal nobody can confirm: this arms the board"),
+        (["--power-mw", "51", "--yes"], "--power-mw: got '51 mW', expected more than 0 and at most 50 mW"),
+        (["--pulses", "0", "--yes"], "--pulses: got 0, expected 1 to 100"),
+    ],
+)
+def test_the_command_refuses_before_it_opens_the_board(capsys, arguments, says):
+    assert run(["first-light", *arguments]) == 2
+    assert says in capsys.readouterr().err

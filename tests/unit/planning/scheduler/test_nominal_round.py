@@ -1,0 +1,64 @@
+"""A frame's round in one kernel against the same round pulse by pulse."""
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
+
+
+class PulseByPulse:
+    """Heat that the scheduler does not take for nominal pixels."""
+
+    def __init__(self, heat):
+        self._heat = heat
+
+    def __getattr__(self, name):
+        return getattr(self._heat, name)
+
+    def copy(self):
+        return PulseByPulse(self._heat.copy())
+
+
+def plan_batches(display, frames, heat, initial_pixel, halves):
+    """Return the batches of a scheduler, the first ones cut in halves by pauses, and what it skipped."""
+    scheduler = Scheduler(
+        display.scan_head, FrameSequence(frames), display.build_cold_heat, initial_pixel=initial_pixel
+    )
+    batches = []
+
+    def grant(batch):
+        if len(batches) < halves and len(batch) > 1 and not scheduler._pending_pause:
+            scheduler.pause(GalvoPause(len(batch) // 2, 1234))
+            return None
+        batches.append(batch)
+        return batch
+
+    list(scheduler.run(heat, grant))
+    return batches, scheduler.skipped, scheduler._beam
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.sampled_from([1, 2, 30, 400]),
+    initial_pixel=st.sampled_from([None, 0, 200]),
+    halves=st.integers(0, 3),
+)
+def test_the_kernel_plans_what_the_loop_plans(display, seed, count, initial_pixel, halves):
+    rng = np.random.default_rng(seed)
+    frames = []
+    for number in range(2):  # the second frame meets warm pixels, of which some need no pulse
+        target_m = np.zeros(len(display.layout))
+        target_m[rng.choice(len(display.layout), count, replace=False)] = rng.uniform(1e-6, 2e-4, count)
+        frames.append(TactileFrame("f", 0.02 * number, 0.5, target_m))
+    by_kernel, by_loop = (
+        plan_batches(display, tuple(frames), heat, initial_pixel, halves)
+        for heat in (display.build_cold_heat(), PulseByPulse(display.build_cold_heat()))
+    )
+    assert by_kernel[1:] == by_loop[1:]
+    assert len(by_kernel[0]) == len(by_loop[0])
+    for kernel_batch, loop_batch in zip(by_kernel[0], by_loop[0], strict=True):
+        for name in vars(loop_batch):
+            np.testing.assert_array_equal(getattr(kernel_batch, name), getattr(loop_batch, name), name)
