@@ -10,7 +10,7 @@ import typer
 
 from optodrive.cli.options import JsonOption
 from optodrive.cli.output import print_json
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import InputError, suggest_near_name
 
 FOLDERS = ("docs", "firmware_protocol")
 PAGE_SUFFIX = ".md"
@@ -79,11 +79,11 @@ def _find_page(name: str, paths: list[str]) -> str:
     requested = name.removesuffix(PAGE_SUFFIX).lower()
     matches = [path for path in paths if f"/{path.lower()}".endswith(f"/{requested}{PAGE_SUFFIX}")]
     if len(matches) != 1:
-        stems = {path.rpartition("/")[2].removesuffix(PAGE_SUFFIX): path for path in paths}
-        expected = (
-            f"one of {', '.join(sorted(matches))}" if matches else f"a page, {suggest_nearest(name, list(stems))}"
-        )
-        raise InputError("PAGE", name, expected)
+        if matches:
+            raise InputError("PAGE", name, f"one of {', '.join(sorted(matches))}")
+        stems = [path.rpartition("/")[2].removesuffix(PAGE_SUFFIX) for path in paths]
+        near = suggest_near_name(name, stems)
+        raise InputError("PAGE", name, "a page that `optodrive docs` lists" + (f", {near}" if near else ""))
     return matches[0]
 
 

@@ -48,7 +48,7 @@ def add(
 
     known = {each: each for each in ROLES}
     if role not in known:
-        raise InputError("--role", role, f"{' or '.join(ROLES)}, {suggest_nearest(role, list(ROLES))}")
+        raise InputError("--role", role, f"a role, {suggest_nearest(role, list(ROLES))}")
     if out is None and (json or not sys.stdout.isatty()):
         raise InputError("--out", None, "--out FILE: a secret is shown on a terminal only, never in a pipe or a log")
     check_output("--out", out)

@@ -104,8 +104,13 @@ def abbreviate(value: object, limit: int = 60) -> str:
 
 def suggest_nearest(name: str, known: list[str]) -> str:
     """Return a phrase with the known name nearest to `name`, or with all known names if none is near."""
+    return suggest_near_name(name, known) or "one of " + ", ".join(known)
+
+
+def suggest_near_name(name: str, known: list[str]) -> str:
+    """Return a phrase with the known name nearest to `name`, empty if none is near."""
     match = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"nearest is '{match[0]}'" if match else "one of " + ", ".join(known)
+    return f"nearest is '{match[0]}'" if match else ""
 
 
 class Unquoted:

@@ -20,8 +20,9 @@ from optodrive.core.errors import (
     LocalProtocolError,
     NotReadyError,
     OverBudgetError,
+    Unquoted,
 )
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config
@@ -353,5 +354,5 @@ def check_spot_power(config: Config, power_w: float, option: str = "--spot-power
     max_w = max_spot_power_w(config)
     if not 0.0 < power_w <= max_w:
         raise InputError(
-            option, format_quantity(power_w, "W"), f"more than 0 and at most {format_quantity(max_w, 'W')}"
+            option, Unquoted(f"{power_w * 1e3:g} mW"), f"more than 0 and at most {format_number(max_w * 1e3)} mW"
         )

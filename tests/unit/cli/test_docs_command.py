@@ -29,7 +29,9 @@ def test_a_page_is_printed(capsys, name):
 
 def test_an_unknown_page_is_refused_with_the_nearest(capsys):
     assert run(["docs", "wire-a-bord"]) == 2
-    assert "nearest is 'wire-a-board'" in capsys.readouterr().err
+    assert "expected a page that `optodrive docs` lists, nearest is 'wire-a-board'\n" in capsys.readouterr().err
+    assert run(["docs", "nope"]) == 2  # no page is near, and all of them would fill the terminal
+    assert capsys.readouterr().err.endswith("expected a page that `optodrive docs` lists\n")
 
 
 def test_a_copy_has_the_wiring_and_the_sources_of_the_firmware(tmp_path, capsys):

@@ -107,7 +107,8 @@ def test_list_shows_no_secret(path, capfd):
     [
         (["add", "anna", "--role", "viewer"], "NAME: got 'anna', expected a name that no token"),
         (["add", 'x"\n[y]', "--role", "viewer"], "expected 1 to 40 letters"),
-        (["add", "cara", "--role", "admin"], "--role: got 'admin', expected viewer or operator or armer"),
+        (["add", "cara", "--role", "admin"], "--role: got 'admin', expected a role, one of viewer, operator, armer\n"),
+        (["add", "cara", "--role", "veiwer"], "--role: got 'veiwer', expected a role, nearest is 'viewer'\n"),
         (["revoke", "bem"], "nearest is 'ben'"),
     ],
 )
