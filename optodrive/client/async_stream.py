@@ -86,10 +86,8 @@ class AsyncStream:
                 deadline_s = time.monotonic() + (0.0 if was_silent else self._reconnect_timeout_s)
             try:
                 await self._connect(max(deadline_s - time.monotonic(), RETRY_TIMEOUT_MIN_S))
-                self._endpoint.is_lost = False
             except LinkError:
                 if time.monotonic() >= deadline_s:
-                    self._endpoint.is_lost = True
                     raise
                 await asyncio.sleep(RETRY_S)
 

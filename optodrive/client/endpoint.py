@@ -37,6 +37,7 @@ class Endpoint:
             raise InputError("--url", address, f"an address like {DEFAULT_URL} or unix:/run/optodrive/optodrive.sock")
         self.url = "http://localhost" if self.unix_path else self.address
         self._port = None if self.unix_path else parts.port or (443 if parts.scheme == "https" else 80)
+        self._has_certificate = parts.scheme == "https"  # loading what verifies it takes as long as many requests
         self.is_lost = False
         self._explicit_token = token
         self._token = token or self._read_token()
@@ -88,14 +89,14 @@ class Endpoint:
             raise
         return connection
 
-    def open_client(self, timeout_s: float) -> httpx.Client:
+    def open_client(self, timeout_s: float | None) -> httpx.Client:
         """Open an HTTP client for the daemon."""
-        transport = httpx.HTTPTransport(uds=self.unix_path)
+        transport = httpx.HTTPTransport(uds=self.unix_path, verify=self._has_certificate)
         return httpx.Client(base_url=self.url, transport=transport, timeout=timeout_s)
 
-    def open_async_client(self, timeout_s: float) -> httpx.AsyncClient:
+    def open_async_client(self, timeout_s: float | None) -> httpx.AsyncClient:
         """Open an asynchronous HTTP client for the daemon."""
-        transport = httpx.AsyncHTTPTransport(uds=self.unix_path)
+        transport = httpx.AsyncHTTPTransport(uds=self.unix_path, verify=self._has_certificate)
         return httpx.AsyncClient(base_url=self.url, transport=transport, timeout=timeout_s)
 
     def build_unreachable_error(self, error: Exception) -> LinkError:

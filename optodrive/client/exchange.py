@@ -19,15 +19,18 @@ from optodrive.daemon.responses.state import StateReport
 RETRY_S = 0.1
 RETRY_TIMEOUT_MIN_S = 0.3
 """Shortest time for the answer to a repeated request, however little is left of the time for repetitions."""
-STOP_ATTEMPTS = 2
+STOP_TIMEOUTS_S = 1.5, 1.5
+"""Longest wait for the answer to each attempt to stop."""
+STOP_LOST_TIMEOUTS_S = (1.0,)
+"""The same at a daemon that has just not answered: the attempts before the stop failed already."""
 NOT_SENT_ERRORS = (httpx.ConnectError, httpx.ConnectTimeout)
 T = TypeVar("T")
 
 
 class Transmission(NamedTuple):
-    """A request to send; `on_new_connection`: a connection of its own with a short timeout.
+    """A request to send; `on_new_connection`: on a connection of its own.
 
-    timeout_s: longest wait for the answer to a request that only reads, None for the client's
+    timeout_s: longest wait for the answer to a stop or to a request that only reads, None for the client's
     """
 
     request: ApiRequest[Any]
@@ -82,17 +85,14 @@ class ExchangePolicy:
             return parse_response(request, response)
 
     def stop(self) -> Exchange[StateReport]:
-        """Stop on new connections, since an open one may be broken unnoticed.
-
-        Two attempts, but one at a daemon that has just not answered: the attempts before the stop failed already.
-        """
+        """Stop on new connections, since an open one may be broken unnoticed."""
         error: Exception = LinkError("not attempted")
-        for _ in range(1 if self.endpoint.is_lost else STOP_ATTEMPTS):
+        for timeout_s in STOP_LOST_TIMEOUTS_S if self.endpoint.is_lost else STOP_TIMEOUTS_S:
             try:
-                response = yield Transmission(STOP, on_new_connection=True)
+                response = yield Transmission(STOP, on_new_connection=True, timeout_s=timeout_s)
                 assert response is not None  # noqa: S101 - the reply to a transmission
                 if response.status_code == 401 and self.endpoint.renew_token():
-                    response = yield Transmission(STOP, on_new_connection=True)
+                    response = yield Transmission(STOP, on_new_connection=True, timeout_s=timeout_s)
                     assert response is not None  # noqa: S101 - the reply to a transmission
                 return parse_response(STOP, response)
             except httpx.TransportError as transport_error:

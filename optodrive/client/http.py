@@ -21,8 +21,8 @@ READ_TIMEOUT_S = 2.5
 TIMEOUT_S = 60.0
 """Longest wait for an action, while the daemon shows that it is alive."""
 PROBE_PERIOD_S = 0.5
-PROBE_TIMEOUT_S = 2.0
-STOP_TIMEOUT_S = 1.5
+PROBE_TIMEOUT_S = 1.5
+"""Half as long again as a web process may be silent before the board goes dark."""
 PROBE: dict[str, Any] = {"method": "GET", "url": "/v1/health", "timeout": PROBE_TIMEOUT_S}
 
 
@@ -68,7 +68,7 @@ class DaemonClient:
             time.sleep(step.duration_s)
             return None
         if step.on_new_connection:
-            with self.policy.endpoint.open_client(STOP_TIMEOUT_S) as client:
+            with self.policy.endpoint.open_client(step.timeout_s) as client:
                 return client.request(**_build_arguments(step.request, self.policy.endpoint))
         arguments = _build_arguments(step.request, self.policy.endpoint)
         if step.request.method == "GET":
@@ -123,7 +123,7 @@ class AsyncDaemonClient:
             await asyncio.sleep(step.duration_s)
             return None
         if step.on_new_connection:
-            async with self.policy.endpoint.open_async_client(STOP_TIMEOUT_S) as client:
+            async with self.policy.endpoint.open_async_client(step.timeout_s) as client:
                 return await client.request(**_build_arguments(step.request, self.policy.endpoint))
         arguments = _build_arguments(step.request, self.policy.endpoint)
         if step.request.method == "GET":

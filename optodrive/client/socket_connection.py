@@ -48,12 +48,14 @@ def open_connection(
         )
         return stack.enter_context(opened)
 
+    endpoint.is_lost = False
     try:
         return connect()
     except InvalidStatus as error:
         _renew_token(endpoint, error)
         return connect()
     except CONNECTION_ERRORS as error:
+        endpoint.is_lost = True
         raise endpoint.build_unreachable_error(error) from None
 
 
@@ -71,12 +73,14 @@ async def open_async_connection(
         opening = websockets.asyncio.client.connect(build_socket_url(endpoint, path), **options)
         return await stack.enter_async_context(opening)
 
+    endpoint.is_lost = False
     try:
         return await connect()
     except InvalidStatus as error:
         _renew_token(endpoint, error)
         return await connect()
     except CONNECTION_ERRORS as error:
+        endpoint.is_lost = True
         raise endpoint.build_unreachable_error(error) from None
 
 

@@ -118,11 +118,9 @@ class Stream:
         while True:
             try:
                 self._connection = self._connect(max(deadline_s - time.monotonic(), RETRY_TIMEOUT_MIN_S))
-                self._endpoint.is_lost = False
                 return
             except LinkError:
                 if time.monotonic() >= deadline_s:
-                    self._endpoint.is_lost = True
                     raise
                 time.sleep(RETRY_S)
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from rig import is_alive, wait_for
 
 END_S = 5.0
-"""Longest time from a fault to the end of the command; the product's own bounds add up to 4 s."""
+"""Longest time from a fault to the end of the command; the product's own bounds add up to 3.5 s."""
 GIVE_UP_S = 40.0
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 EMITTING_STATES = ("ARMING", "ARMED", "RUNNING")

@@ -1,17 +1,28 @@
 """The client's exchanges with a daemon, without one: retries, tokens and errors."""
 
 import asyncio
+import socket
+import ssl
+from contextlib import AsyncExitStack, ExitStack
 from math import inf
 
 import httpx
 import pytest
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import ExchangePolicy, parse_response
-from optodrive.client.http import AsyncDaemonClient, DaemonClient
+from optodrive.client.exchange import STOP_LOST_TIMEOUTS_S, ExchangePolicy, parse_response
+from optodrive.client.hold import SILENCE_MAX_S
+from optodrive.client.http import (
+    PROBE_PERIOD_S,
+    PROBE_TIMEOUT_S,
+    READ_TIMEOUT_S,
+    AsyncDaemonClient,
+    DaemonClient,
+)
 from optodrive.client.plan import report_loss
 from optodrive.client.problems import build_error, parse_problem
 from optodrive.client.requests import READ_STATE, STOP, ApiRequest, build_push_request
+from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_async_connection, open_connection
 from optodrive.core.errors import (
     BoardFaultError,
     InputError,
@@ -183,6 +194,27 @@ def test_stop_is_attempted_twice_but_once_at_a_daemon_that_has_just_not_answered
 
     with pytest.raises(LinkError, match="emergency stop"):
         call([silence] * 2, fail_and_stop)
+
+
+def test_a_call_at_a_suspended_daemon_leaves_time_for_its_stop():
+    """The silence that a stream, a hold, a request and a new connection wait for, and the stop of the client's exit."""
+    longest_s = max(PROBE_PERIOD_S + PROBE_TIMEOUT_S, READ_TIMEOUT_S, OPEN_TIMEOUT_S, SILENCE_MAX_S)
+    assert longest_s + sum(STOP_LOST_TIMEOUTS_S) <= 3.5
+    with socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as stack:  # accepts, and nobody answers
+        policy = ExchangePolicy(Endpoint(f"http://127.0.0.1:{listener.getsockname()[1]}", "token"))
+        with pytest.raises(LinkError):
+            open_connection(policy.endpoint, "/v1/hold", stack, open_timeout_s=0.05)
+        with pytest.raises(LinkError):
+            asyncio.run(open_async_connection(policy.endpoint, "/v1/hold", AsyncExitStack(), open_timeout_s=0.05))
+    assert next(policy.stop()).timeout_s == 1.0
+
+
+@pytest.mark.parametrize(("scheme", "mode"), [("https", ssl.CERT_REQUIRED), ("http", ssl.CERT_NONE)])
+def test_certificates_are_verified_where_there_are_some(scheme, mode):
+    """Loading what verifies them takes tens of milliseconds for each of the clients that stop and probe."""
+    endpoint = Endpoint(f"{scheme}://localhost", "token")
+    for client in (endpoint.open_client(1.0), endpoint.open_async_client(1.0)):
+        assert client._transport._pool._ssl_context.verify_mode == mode
 
 
 def test_a_plan_that_the_daemon_has_forgotten_was_lost_with_its_planner():
