@@ -1,20 +1,25 @@
 /* Model of the epochs of the link process: pushes are accepted, STOP and other ends of an epoch come at any moment, pushes
-   are handed over late, and users arm again.
+   are handed over late, and users pause, resume and arm again.
 
    The web process stamps each push with the epoch that it has seen last, which may be an older one. The planner hands
    over each push at any later moment. The link process refuses pushes of another epoch (gate 1), sends only while it
    sees the board armed, and drops at arming what was handed over before (gate 2). STOP, the loss of planner or web, and
    the loss of the link send ABORT, which may be lost, and begin a new session; disarm travels behind points already sent.
 
+   A pause sends FLUSH behind the points already sent and drops those that wait. While the light is paused, the link process
+   refuses points (gate 3), and always those that were built before the last pause (gate 4). Once the board has flushed,
+   the planner hands over the rest of its last push at any later moment, with the epoch of this push (gate 5).
+
    The planner keeps the order of pushes: they do not interact.
 
    Verified for all interleavings:
      the board emits a push only if it was accepted in the epoch in which the board was armed
      after STOP has begun a new session, the board is disarmed until a user arms it again
+     after a pause has flushed the board, it emits nothing until the end of the pause, and then no points built before
 
-   MUTANT=1 removes gate 1, MUTANT=2 removes gate 2; the search must find a violation.
+   MUTANT=1 to 5 removes the gate of this number; the search must find a violation.
 
-   spin -a epochs.pml && gcc -O3 -DSAFETY -o pan pan.c && ./pan -m2000000 -w24      1 million states, some seconds */
+   spin -a epochs.pml && gcc -O3 -DSAFETY -o pan pan.c && ./pan -m2000000 -w24      2 million states, some seconds */
 
 #ifndef MUTANT
 #define MUTANT 0
@@ -31,20 +36,42 @@
 #define DROP_HELD_POINTS job = 0
 #endif
 
+#if MUTANT == 3
+#define IS_LIT true
+#else
+#define IS_LIT (!paused)
+#endif
+#if MUTANT == 4
+#define IS_RECENT(points) true
+#else
+#define IS_RECENT(points) (PAUSE(points) == pause)
+#endif
+#if MUTANT == 5
+#define STAMP_REST stamp[rest] = epoch
+#else
+#define STAMP_REST skip
+#endif
+
 #define PUSHES 2
 #define ENDS 2        /* of epochs */
 #define ARMINGS 2
+#define PAUSES 1
 
-mtype = { ABORT, HELLO, ARM_REQ, CONFIRM, DISARM, DATA, REPLY, CHALLENGE, ENTERED };
+#define POINTS(push, number) (push + 4 * (number))    /* of a push, built after a pause */
+#define PUSH(points) (points % 4)
+#define PAUSE(points) (points / 4)
+
+mtype = { ABORT, HELLO, ARM_REQ, CONFIRM, DISARM, DATA, FLUSH, REPLY, CHALLENGE, ENTERED };
 mtype = { DISARMED, ARMING, ARMED, FAULT };
 
-chan handover = [1] of { byte };               /* push */
-chan down = [2] of { mtype, byte, byte };      /* kind, session, push or nonce */
+chan handover = [1] of { byte };               /* points */
+chan down = [2] of { mtype, byte, byte };      /* kind, session, points, pause or nonce */
 chan up = [1] of { mtype, byte, mtype, byte }; /* kind, session, state, nonce */
 
 /* --- the link process --- */
 byte epoch = 1, session = 1, job, nonce;
-bool held, connected = true;
+byte pause;                   /* number of the last one */
+bool held, connected = true, paused, flushing;
 mtype view = DISARMED;
 
 /* --- the board --- */
@@ -54,13 +81,15 @@ byte board_session = 1, challenge;
 /* --- the web process and the planner --- */
 byte seen = 1, pushes;
 byte stamp[PUSHES + 1];
+byte drained, rest;           /* last pause that the planner knows; push whose rest is to be handed over */
 
 /* --- what no process knows --- */
 byte accepted[PUSHES + 1];    /* epoch in which each push was accepted */
 byte armed_epoch, ends, armings;
+byte flushed;                 /* last pause for which the board has flushed */
 bool stopped;                 /* a new session has begun since a user armed */
 
-inline end_epoch() { ends = ends + 1; epoch = epoch + 1; held = true; nonce = 0 }
+inline end_epoch() { ends = ends + 1; epoch = epoch + 1; held = true; nonce = 0; paused = false }
 
 inline report(kind, what, value) {
     if
@@ -85,8 +114,11 @@ end:
             state = ARMED; armed_epoch = epoch; stopped = false; report(ENTERED, ARMED, 0)
         :: kind == DISARM && from == board_session -> state = DISARMED; report(ENTERED, DISARMED, 0)
         :: kind == DATA && from == board_session && state == ARMED ->
-            assert(accepted[argument] == armed_epoch);
-            assert(!stopped)
+            assert(accepted[PUSH(argument)] == armed_epoch);
+            assert(!stopped);
+            assert(!(paused && flushed == pause));
+            assert(PAUSE(argument) >= flushed)
+        :: kind == FLUSH && from == board_session -> flushed = argument; flushing = false
         :: else
         fi;
         kind = 0; from = 0; argument = 0 }
@@ -96,12 +128,12 @@ end:
 }
 
 active proctype Link() {
-    mtype kind, what; byte from, value, push;
+    mtype kind, what; byte from, value, points;
 end:
     do
     /* STOP, the end of planner or web, the loss of the link */
     :: atomic { ends < ENDS && nfull(down) ->
-        end_epoch(); connected = false; session = session + 1;
+        end_epoch(); connected = false; session = session + 1; flushing = false;
         if
         :: down!ABORT, 0, 0
         :: skip /* the line loses it */
@@ -124,15 +156,19 @@ end:
         :: else
         fi;
         kind = 0; from = 0; what = 0; value = 0 }
-    :: atomic { handover?push ->
+    :: atomic { handover?points ->
         if
-        :: IS_CURRENT(stamp[push]) && connected && view == ARMED && job == 0 -> job = push
+        :: IS_CURRENT(stamp[PUSH(points)]) && IS_LIT && IS_RECENT(points) && connected && view == ARMED && job == 0 ->
+            job = points
         :: else /* refused */
         fi;
-        push = 0 }
+        points = 0 }
     :: atomic { connected && !held && job != 0 && view == ARMED && nfull(down) -> down!DATA, session, job; job = 0 }
     :: atomic { connected && view == DISARMED && armings < ARMINGS && nfull(down) ->
         armings = armings + 1; DROP_HELD_POINTS; held = false; nonce = armings; down!ARM_REQ, session, nonce }
+    :: atomic { connected && view == ARMED && !paused && pause < PAUSES && nfull(down) ->
+        pause = pause + 1; paused = true; flushing = true; job = 0; down!FLUSH, session, pause }
+    :: atomic { paused -> paused = false }
     od
 }
 
@@ -148,6 +184,8 @@ active proctype Planner() {
     byte next = 1;
 end:
     do
-    :: atomic { next <= pushes && nfull(handover) -> handover!next; next = next + 1 }
+    :: atomic { next <= pushes && nfull(handover) -> handover!POINTS(next, drained); next = next + 1 }
+    :: atomic { drained != pause && !flushing -> drained = pause; rest = next - 1 }
+    :: atomic { rest != 0 && nfull(handover) -> STAMP_REST; handover!POINTS(rest, drained); rest = 0 }
     od
 }
