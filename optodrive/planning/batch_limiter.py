@@ -34,6 +34,7 @@ class BatchLimiter:
         self.delays: list[Delay] = []
         self.galvo_pause_s = 0.0
         self._pause_fraction = FIRST_PAUSE_FRACTION
+        self._batch_pause_s, self._paused_row = 0.0, 0
         self._scheduler = scheduler
         self._budget = budget
         self._frame_count = frame_count
@@ -47,7 +48,7 @@ class BatchLimiter:
         """
         pause = self._find_galvo_pause(batch)
         if pause is not None:
-            self.galvo_pause_s += pause.pause_us * 1e-6
+            self._batch_pause_s, self._paused_row = self._batch_pause_s + pause.pause_us * 1e-6, pause.rows
             self._scheduler.pause(pause)
             return None
         try:
@@ -57,11 +58,18 @@ class BatchLimiter:
                 raise
             self.delays.append(Delay(int(batch.source[0]), error.pixel, error.cap, error.fits_after_s))
             self._scheduler.delay(ceil(error.fits_after_s * 1e6))
+            self._forget_pauses()
             return None
         if self._first_trimmed is None and granted.trimmed_j.any():
             self._first_trimmed = batch, granted, self.state
         self.state = state
+        self.galvo_pause_s += self._batch_pause_s
+        self._forget_pauses()
         return granted
+
+    def _forget_pauses(self) -> None:
+        """Begin a batch, which has no pauses yet."""
+        self._batch_pause_s, self._paused_row = 0.0, 0
 
     def build_shortfall(self) -> Shortfall | None:
         """Describe the first trimmed pulse; return None if no pulse was trimmed."""
@@ -87,7 +95,7 @@ class BatchLimiter:
         if row == len(batch) or batch.source[row] >= self._frame_count:
             return None
         cold_s = COLD_AFTER_AVERAGING_TIMES * averaging_s
-        if row == 0 and galvo_feasible_prefix(batch, self.state, self._budget, cold_s) == 0:
+        if row == self._paused_row and galvo_feasible_prefix(batch, self.state, self._budget, row, cold_s) == row:
             return None
         pause_s = self._pause_fraction * averaging_s
         self._pause_fraction = min(2.0 * self._pause_fraction, PAUSE_FRACTION_MAX)

@@ -1,8 +1,5 @@
 """Aliases of array types, and read-only arrays for the shared types."""
 
-from dataclasses import fields
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +14,6 @@ StrArray = NDArray[np.str_]
 
 def freeze_arrays(instance: object) -> None:
     """Make every array field of a dataclass instance read-only."""
-    for item in fields(instance):  # type: ignore[arg-type]
-        value: Any = getattr(instance, item.name)
+    for value in vars(instance).values():
         if isinstance(value, np.ndarray):
             value.setflags(write=False)

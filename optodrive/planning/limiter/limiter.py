@@ -165,9 +165,15 @@ def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float
     return high_s
 
 
-def galvo_feasible_prefix(plan: PulsePlan, state: BudgetState, budget: Budget, delay_s: float = 0.0) -> int:
-    """Count the pulses before the first one whose move exceeds the galvo cap, for a plan delayed by `delay_s`."""
-    empty = np.zeros(0)
+def galvo_feasible_prefix(
+    plan: PulsePlan, state: BudgetState, budget: Budget, first_row: int = 0, delay_s: float = 0.0
+) -> int:
+    """Count the pulses before the first one whose move exceeds the galvo cap.
+
+    delay_s: delay of the rows from first_row on
+    """
+    empty, start_s = np.zeros(0), plan.start_s.copy()
+    start_s[first_row:] += delay_s
     budgets = PixelBudgets(
         bucket_j=empty,
         merged_width_s=empty,
@@ -178,7 +184,7 @@ def galvo_feasible_prefix(plan: PulsePlan, state: BudgetState, budget: Budget, d
         galvo_ringing=state.galvo_ringing.copy(),
         mirror_at_s=np.array([state.mirror_at_s]),
     )
-    columns = (plan.start_s + delay_s, plan.width_s.copy(), plan.x_rad.copy(), plan.y_rad.copy())
+    columns = (start_s, plan.width_s.copy(), plan.x_rad.copy(), plan.y_rad.copy())
     return count_galvo_feasible(budget, budgets, *columns)
 
 

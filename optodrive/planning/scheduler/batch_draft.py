@@ -71,6 +71,10 @@ class BatchDraft:
         """Return an empty draft that starts at `beam`."""
         return cls(path, replace(beam))
 
+    def copy(self) -> "BatchDraft":
+        """Return an independent copy."""
+        return BatchDraft(self.path, replace(self.beam), self.rows.copy(), self.skipped.copy())
+
     def compute_start(self, pixel: int, requested_us: int) -> PulseStart:
         """Return the earliest start of a pulse on `pixel` that is requested for `requested_us`."""
         beam = self.beam

@@ -67,16 +67,16 @@ class BatchPlanner:
             self._draft_train_pulse(draft, heat)
         return draft
 
-    def plan_round(self, beam: BeamState, each: Round, heat: ThermalState, max_rows: int | None = None) -> BatchDraft:
-        """Draft pulses of a round: up to the next due train pulse, `max_rows` pulses or the end of the round."""
-        draft = BatchDraft.begin(self._path, beam)
+    def extend_round(self, draft: BatchDraft, each: Round, heat: ThermalState, max_rows: int | None = None) -> None:
+        """Append pulses of a round: up to the next due train pulse, `max_rows` pulses or the end of the round."""
+        beam = draft.beam
         frame, source, drive = self._sequence.frames[each.source], each.source, self._drive
         requested_us = self.compute_requested_us(frame.show_at_s)
         if isinstance(heat, NominalThermalState) and each.periods is None and beam.next_train >= len(self._trains):
             self._on_progress()
             pixels = np.array(each.order[beam.position :], dtype=np.int64)
             draft_round(draft, heat, pixels, frame.target_m[pixels], requested_us, source, drive, max_rows)
-            return draft
+            return
         while draft.beam.position < len(each.order) and len(draft.rows) < (inf if max_rows is None else max_rows):
             pixel = each.order[draft.beam.position]
             target_m = float(frame.target_m[pixel])
@@ -101,7 +101,6 @@ class BatchPlanner:
                 continue
             draft.add(pixel, start, width_us, pulse[1] * drive.max_power_w, requested_us, target_m, source)
             draft.beam.position += 1
-        return draft
 
     def _draft_train_pulse(self, draft: BatchDraft, heat: ThermalState) -> None:
         """Draft the next train pulse, or skip it if the residual heat reaches its target."""

@@ -3,6 +3,7 @@
 It states what `BatchPlanner.plan_round` does pulse by pulse, without train pulses; other threads run meanwhile.
 """
 
+from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -60,14 +61,14 @@ def draft_round(
     drive: DriveRange,
     max_rows: int | None,
 ) -> None:
-    """Draft pulses to the heights target_m [n] on `pixel` [n], in this order, up to max_rows pulses.
+    """Draft pulses to the heights target_m [n] on `pixel` [n], in this order, until the draft has max_rows pulses.
 
     Raises ValueError for a pulse before its pixel's last event.
     """
     beam, pulses = draft.beam, RoundPulses.empty(len(pixel))
     start = KernelBeam(beam.free_us, NO_PIXEL if beam.pixel is None else beam.pixel, beam.arrival_us, beam.dwell_us)
     span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods)
-    count = len(pixel) if max_rows is None else max_rows
+    count = len(pixel) if max_rows is None else max_rows - len(draft.rows)
     visited, *after = _solve_round(
         *heat.kernel_state, draft.path.moves, pixel, target_m, requested_us + beam.delay_us, start, span, count, pulses
     )
@@ -77,15 +78,20 @@ def draft_round(
     beam.position += visited
     beam.free_us, last_pixel, beam.arrival_us, beam.dwell_us = after
     beam.pixel = None if last_pixel == NO_PIXEL else last_pixel
-    columns = (pixel, target_m, *pulses)
-    for index, target, start_us, settling_us, periods, duty in zip(
-        *(column[:visited].tolist() for column in columns), strict=True
-    ):
-        if not periods:
-            draft.skip(source, index, target)
-            continue
-        width_us, power_w = round(periods * drive.period_s * 1e6), duty * drive.max_power_w
-        draft.rows.append(PlannedPulse(start_us, width_us, power_w, index, settling_us, target, requested_us, source))
+    for skipped in np.flatnonzero(pulses.periods[:visited] == 0):
+        draft.skip(source, int(pixel[skipped]), float(target_m[skipped]))
+    drawn = np.flatnonzero(pulses.periods[:visited])
+    columns = (
+        pulses.start_us[drawn],
+        np.rint(pulses.periods[drawn] * drive.period_s * 1e6).astype(np.int64),
+        pulses.duty[drawn] * drive.max_power_w,
+        pixel[drawn],
+        pulses.settling_us[drawn],
+        target_m[drawn],
+    )
+    draft.rows += map(
+        PlannedPulse._make, zip(*(column.tolist() for column in columns), repeat(requested_us), repeat(source))
+    )
 
 
 @kernel

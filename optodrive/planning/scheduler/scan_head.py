@@ -1,6 +1,7 @@
 """Optics and laser as the scheduler sees them, and the times of the mirrors' moves between pixels."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,17 @@ class ScanHead:
     settling: SettlingTable
     drive: DriveRange
     pulse_gap_s: float
+
+    @cached_property
+    def moves(self) -> "MoveTimes":
+        """Mirror angles of the pixels and times of moves, computed once; lead_in_us is that of an unknown pixel."""
+        x_rad, y_rad = self.field.angles_rad(self.layout.x_m, self.layout.y_m)
+        return MoveTimes.from_table(self.settling, np.array(x_rad), np.array(y_rad), self.settling.lead_in_us)
+
+    @cached_property
+    def angle_lists(self) -> tuple[list[float], list[float]]:
+        """The mirror angles as lists, because single elements of a list are read faster than those of an array."""
+        return self.moves.x_rad.tolist(), self.moves.y_rad.tolist()
 
 
 class MoveTimes(NamedTuple):
@@ -58,14 +70,10 @@ class BeamPath:
     """
 
     def __init__(self, scan_head: ScanHead, lead_in_us: int) -> None:
-        x_rad, y_rad = scan_head.field.angles_rad(scan_head.layout.x_m, scan_head.layout.y_m)
-        self.x_rad: FloatArray = np.array(x_rad)
-        self.y_rad: FloatArray = np.array(y_rad)
         self.lead_in_us = lead_in_us
-        self.moves = MoveTimes.from_table(scan_head.settling, self.x_rad, self.y_rad, lead_in_us)
-        # Lists, because single elements of a list are read faster than those of an array.
-        self._x_rad: list[float] = self.x_rad.tolist()
-        self._y_rad: list[float] = self.y_rad.tolist()
+        self.moves = scan_head.moves._replace(lead_in_us=lead_in_us)
+        self.x_rad, self.y_rad = self.moves.x_rad, self.moves.y_rad
+        self._x_rad, self._y_rad = scan_head.angle_lists
         self._layout = scan_head.layout
         self._settling = scan_head.settling
 
@@ -81,4 +89,5 @@ class BeamPath:
         """Return a short visiting order of the pixels `active` [k], starting from `origin` if it is known."""
         layout = self._layout
         order = compute_visiting_order(active, layout.row, layout.column, self.x_rad, self.y_rad, origin)
-        return [int(pixel) for pixel in order]
+        visits: list[int] = order.tolist()
+        return visits

@@ -111,6 +111,7 @@ class Scheduler:
         self._beam = BeamState(pixel=initial_pixel)
         self._steps: deque[_TrainsBefore | _Frame | Round] = deque(_list_steps(sequence))
         self._draft: BatchDraft | None = None
+        self._kept: BatchDraft | None = None
         self._pending_pause: GalvoPause | None = None
 
     def run(self, heat: ThermalState, grant: Callable[[PulsePlan], Granted | None]) -> Iterator[Granted]:
@@ -134,38 +135,44 @@ class Scheduler:
                 self._steps.extendleft(reversed(self._plan_frame(step.source, heat)))
                 continue
             if isinstance(step, Round):
-                max_rows = None if self._pending_pause is None else self._pending_pause.rows
-                draft = self._planner.plan_round(self._beam, step, heat, max_rows)
+                draft = self._draft_round(step, heat)
             else:
                 draft = self._planner.plan_trains(self._beam, step.until_us, heat)
             if draft.rows:
                 self._draft = draft
                 return draft.to_plan()
             self._commit(draft)
-            self._beam.position = 0
+            self._kept, self._beam.position = None, 0
             self._steps.popleft()
         return None
 
-    def accept(self) -> None:
-        """Keep the proposed batch; a pause requested for it follows its last pulse."""
-        self._commit(self._take_draft())
+    def _draft_round(self, step: Round, heat: ThermalState) -> BatchDraft:
+        """Draft the pulses of a round; those before the batch's last pause are the ones that were proposed before."""
+        kept = self._kept or BatchDraft.begin(self._path, self._beam)
         if self._pending_pause is not None:
-            self._beam.free_us += self._pending_pause.pause_us
-            self._pending_pause = None
+            self._planner.extend_round(kept, step, heat, self._pending_pause.rows)
+            kept.beam.free_us += self._pending_pause.pause_us
+            self._kept, self._pending_pause = kept, None
+        draft = kept.copy()
+        self._planner.extend_round(draft, step, heat)
+        return draft
+
+    def accept(self) -> None:
+        """Keep the proposed batch."""
+        self._commit(self._take_draft())
+        self._kept = None
 
     def delay(self, delay_us: int) -> None:
         """Withdraw the proposed batch; it is planned again, and everything from it on starts `delay_us` later."""
         self._take_draft()
+        self._kept = None
         self._beam.free_us += delay_us
         self._beam.delay_us += delay_us
 
     def pause(self, pause: GalvoPause) -> None:
-        """Withdraw the proposed batch; its first pulses are planned again as a batch, which the pause follows."""
+        """Withdraw the proposed batch; it is planned again with a pause after its first pulses, which stay."""
         self._take_draft()
-        if pause.rows:
-            self._pending_pause = pause
-        else:
-            self._beam.free_us += pause.pause_us
+        self._pending_pause = pause
 
     def _take_draft(self) -> BatchDraft:
         if self._draft is None:

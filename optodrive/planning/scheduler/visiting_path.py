@@ -24,8 +24,8 @@ def compute_serpentine_order(active: IntArray, row: IntArray, column: IntArray) 
     active: [k] pixels; row, column: [p] positions on the lattice
     """
     rows, columns = row[active], column[active]
-    rank = np.unique(rows, return_inverse=True)[1]
-    direction = np.where(rank % 2 == 0, columns, -columns)
+    number = np.cumsum(np.bincount(rows) > 0)[rows]  # of the row among those with pixels, from 1
+    direction = np.where(number % 2 == 1, columns, -columns)
     return active[np.lexsort((direction, rows))]
 
 

@@ -82,3 +82,17 @@ def test_a_frame_between_trains_pauses_and_the_trains_are_not_delayed():
     assert planned.galvo_pause_s > 0
     assert (plan.power_w[~is_train] > 0).all()
     assert np.count_nonzero(is_train) == 40
+
+
+def test_a_frame_with_pauses_waits_for_a_cap_as_a_whole():
+    capped = with_galvo_cap(6e4)
+    caps = capped.budget.caps._replace(touch_k=0.1)
+    display = replace(capped, budget=capped.budget._replace(caps=caps))
+    frames = tuple(replace(frame(20, 0.6, 200), show_at_s=0.6 * k) for k in range(3))
+    planned = plan_sequence(display, FrameSequence(frames), *display.build_cold_state(), "delay")
+    plan = planned.plan
+    assert planned.delays
+    dark_s = plan.start_s[1:] - (plan.start_s + plan.width_s)[:-1] - plan.settling_s[1:]
+    within_frame = plan.source[1:] == plan.source[:-1]
+    assert planned.galvo_pause_s > 0.0
+    assert dark_s[within_frame].sum() == pytest.approx(planned.galvo_pause_s, abs=1e-6)

@@ -21,16 +21,17 @@ class PulseByPulse:
         return PulseByPulse(self._heat.copy())
 
 
-def plan_batches(display, frames, heat, initial_pixel, halves):
-    """Return the batches of a scheduler, the first ones cut in halves by pauses, and what it skipped."""
+def plan_batches(display, frames, heat, initial_pixel, pause_count):
+    """Return the batches of a scheduler, the first ones with pauses, and what it skipped."""
     scheduler = Scheduler(
         display.scan_head, FrameSequence(frames), display.build_cold_heat, initial_pixel=initial_pixel
     )
-    batches = []
+    batches, pauses = [], []
 
     def grant(batch):
-        if len(batches) < halves and len(batch) > 1 and not scheduler._pending_pause:
-            scheduler.pause(GalvoPause(len(batch) // 2, 1234))
+        if len(pauses) < pause_count:
+            pauses.append(GalvoPause(len(batch) * (len(pauses) + 1) // 4, 1234))
+            scheduler.pause(pauses[-1])
             return None
         batches.append(batch)
         return batch
@@ -44,9 +45,9 @@ def plan_batches(display, frames, heat, initial_pixel, halves):
     seed=st.integers(0, 2**32 - 1),
     count=st.sampled_from([1, 2, 30, 400]),
     initial_pixel=st.sampled_from([None, 0, 200]),
-    halves=st.integers(0, 3),
+    pause_count=st.integers(0, 3),
 )
-def test_the_kernel_plans_what_the_loop_plans(display, seed, count, initial_pixel, halves):
+def test_the_kernel_plans_what_the_loop_plans(display, seed, count, initial_pixel, pause_count):
     rng = np.random.default_rng(seed)
     frames = []
     for number in range(2):  # the second frame meets warm pixels, of which some need no pulse
@@ -54,7 +55,7 @@ def test_the_kernel_plans_what_the_loop_plans(display, seed, count, initial_pixe
         target_m[rng.choice(len(display.layout), count, replace=False)] = rng.uniform(1e-6, 2e-4, count)
         frames.append(TactileFrame("f", 0.02 * number, 0.5, target_m))
     by_kernel, by_loop = (
-        plan_batches(display, tuple(frames), heat, initial_pixel, halves)
+        plan_batches(display, tuple(frames), heat, initial_pixel, pause_count)
         for heat in (display.build_cold_heat(), PulseByPulse(display.build_cold_heat()))
     )
     assert by_kernel[1:] == by_loop[1:]

@@ -118,18 +118,33 @@ def test_a_delayed_batch_and_everything_after_it_start_later(display):
     assert second.start_s[0] == pytest.approx(scheduler.lead_in_us * 1e-6 + 0.1 + 0.02)
 
 
-def test_a_pause_splits_a_batch_after_its_first_pulses(display):
+def test_a_pause_follows_the_first_pulses_of_a_batch(display):
     scheduler, heat = start(display, frame(display, {3: 50, 4: 50, 5: 50})), cold(display)
     whole = scheduler.next_batch(heat)
     scheduler.pause(GalvoPause(2, 100_000))
-    first = scheduler.next_batch(heat)
+    paused = scheduler.next_batch(heat)
+    assert paused.start_s == pytest.approx(whole.start_s + np.array([0.0, 0.0, 0.1]))
+    scheduler.pause(GalvoPause(2, 50_000))
+    again = scheduler.next_batch(heat)
+    assert again.start_s == pytest.approx(paused.start_s + np.array([0.0, 0.0, 0.05]))
     scheduler.accept()
-    last = scheduler.next_batch(heat)
-    assert [len(batch) for batch in (whole, first, last)] == [3, 2, 1]
-    assert first.start_s == pytest.approx(whole.start_s[:2])
-    assert last.start_s[0] == pytest.approx(whole.start_s[2] + 0.1)
+    assert scheduler.next_batch(heat) is None
+
+
+def test_a_pause_before_the_first_pulse_delays_the_batch(display):
+    scheduler, heat = start(display, frame(display, {3: 50, 4: 50})), cold(display)
+    whole = scheduler.next_batch(heat)
     scheduler.pause(GalvoPause(0, 50_000))
-    assert scheduler.next_batch(heat).start_s[0] == pytest.approx(last.start_s[0] + 0.05)
+    assert scheduler.next_batch(heat).start_s == pytest.approx(whole.start_s + 0.05)
+
+
+def test_a_delayed_batch_is_planned_without_its_pauses(display):
+    scheduler, heat = start(display, frame(display, {3: 50, 4: 50})), cold(display)
+    whole = scheduler.next_batch(heat)
+    scheduler.pause(GalvoPause(1, 50_000))
+    scheduler.next_batch(heat)
+    scheduler.delay(20_000)
+    assert scheduler.next_batch(heat).start_s == pytest.approx(whole.start_s + 0.02)
 
 
 def test_a_withdrawn_batch_leaves_no_trace(display):
