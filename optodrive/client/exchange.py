@@ -19,7 +19,7 @@ from optodrive.daemon.responses.state import StateReport
 RETRY_S = 0.1
 RETRY_TIMEOUT_MIN_S = 0.3
 """Shortest time for the answer to a repeated request, however little is left of the time for repetitions."""
-STOP_TIMEOUTS_S = 1.5, 1.5
+STOP_TIMEOUTS_S = 1.5, 1.0
 """Longest wait for the answer to each attempt to stop."""
 STOP_LOST_TIMEOUTS_S = (1.0,)
 """The same at a daemon that has just not answered: the attempts before the stop failed already."""

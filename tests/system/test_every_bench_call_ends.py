@@ -160,6 +160,7 @@ def test_doctor_names_a_board_that_does_not_answer(tmp_path, start, number):
                 send(number, [board.process.pid])
             began_s = time.monotonic()
             status, out, errors = command.ended()
+            print(f"\n{time.monotonic() - began_s:.2f} s")
             assert time.monotonic() - began_s <= END_S
     finally:
         board.stop()

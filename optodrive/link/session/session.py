@@ -28,7 +28,7 @@ from optodrive.link.session.point_stream import PointStream
 from optodrive.link.transport.base import Transport
 
 HELLO_RETRY_S = 0.25
-CONNECT_TIMEOUT_S = 3.5
+CONNECT_TIMEOUT_S = 2.5
 HANDSHAKE_INTERVAL_S = 0.02
 """Interval between two requests of the handshake; a board that answers only some of them is not polled faster."""
 STATUS_INTERVAL_S = 0.2
