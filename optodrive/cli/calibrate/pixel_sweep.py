@@ -22,41 +22,44 @@ def write_sweep(folder: Path, config: str | None, json: bool) -> None:
     Raises InputError where a cell is too small for the offsets or the folder cannot be created.
     """
     from optodrive.core.files import atomic_write, check_output
-    from optodrive.device.config import build_pixel_layout
     from optodrive.lab.calibration.pixels.sweep import compute_pulse
 
     check_output("--sweep", folder, folder=True)
-    loaded, aims = write_sweep_files(folder, config)
-    pixel_count = len(build_pixel_layout(loaded.display))
+    loaded, aims, counts = write_sweep_files(folder, config)
     with atomic_write(folder / README) as temporary:
         temporary.write_text("\n".join(_format_instructions(aims, loaded.name)) + "\n", encoding="utf-8")
     pulses = [dict(zip(PULSE_FIELDS, compute_pulse(loaded, aim), strict=True)) for aim in aims]
     if json:
-        described = [aim._asdict() | pulse for aim, pulse in zip(aims, pulses, strict=True)]
-        print_json({"folder": str(folder), "aims": described, "pulses": pixel_count})
+        described = [
+            aim._asdict() | pulse | {"pulses": count} for aim, pulse, count in zip(aims, pulses, counts, strict=True)
+        ]
+        print_json({"folder": str(folder), "aims": described, "pulses": counts[0]})
         return
-    print(f"aims             {len(aims)}, one file per aim, {pixel_count} pulses per file")
+    print(f"aims             {len(aims)}, one file per aim, {counts[0]} pulses per file")
+    if min(counts) < counts[0]:
+        print(f"out of range     up to {counts[0] - min(counts)} pixels per aim, which get no pulse there")
     for pulse, label in zip(pulses[:2], ("centre", "across edges"), strict=True):
         print(f"{label:<17}{format_quantity(pulse['pulse_width_s'], 's')} at {format_quantity(pulse['power_w'], 'W')}")
     print(f"written          {folder}; {README} lists what to play and what to record")
 
 
-def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[Aim]]":
-    """Write, for each aim, its pulses and the pixel map that offsets the beam by it; return the configuration and aims.
+def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[Aim], list[int]]":
+    """Write, for each aim, its pulses and the pixel map that offsets the beam by it.
 
+    Returns the configuration, the aims, and for each the number of pixels that the mirrors' range contains.
     Raises InputError where a cell is too small for the offsets or the folder cannot be created.
     """
     from json import dumps
 
     from optodrive.core.files import atomic_write
     from optodrive.core.types.stimuli import FrameSequence
-    from optodrive.device.config import build_pixel_layout
-    from optodrive.device.pixel_map import PixelMap, max_aim_offset_m, remove_pixel_map, write_pixel_map
-    from optodrive.lab.calibration.pixels.sweep import build_sweep, list_aims
+    from optodrive.device.field_loader import load_scan_field
+    from optodrive.device.pixel_map import max_aim_offset_m, remove_pixel_map, write_pixel_map
+    from optodrive.lab.calibration.pixels.sweep import build_aim_map, build_sweep, is_reachable, list_aims
     from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
     loaded = remove_pixel_map(load_run_config(config, None))
-    offset_max_m, pixel_count = max_aim_offset_m(loaded), len(build_pixel_layout(loaded.display))
+    offset_max_m = max_aim_offset_m(loaded)
     aims = list_aims(loaded)
     for aim in aims:
         if abs(aim.x_m) > offset_max_m[0] or abs(aim.y_m) > offset_max_m[1]:
@@ -68,13 +71,15 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("--sweep", str(folder), f"a folder ({error.strerror})") from None
-    for aim in aims:
-        text = dumps(sequence_to_json(FrameSequence((), build_sweep(loaded, aim)))) + "\n"
+    field = load_scan_field(loaded)
+    reached = [is_reachable(loaded, field, aim) for aim in aims]
+    for aim, pixels in zip(aims, reached, strict=True):
+        text = dumps(sequence_to_json(FrameSequence((), build_sweep(loaded, aim, pixels)))) + "\n"
         with atomic_write(folder / f"{aim.name}.json") as temporary:
             temporary.write_text(text, encoding="utf-8")
-        pixel_map = PixelMap.uniform(pixel_count, aim.x_m, aim.y_m)
-        write_pixel_map(folder / f"{aim.name}.pixels.toml", pixel_map, loaded, {"source": f"sweep, aim {aim.name}"})
-    return loaded, aims
+        about: dict[str, str | float | int] = {"source": f"sweep, aim {aim.name}"}
+        write_pixel_map(folder / f"{aim.name}.pixels.toml", build_aim_map(aim, pixels), loaded, about)
+    return loaded, aims, [int(pixels.sum()) for pixels in reached]
 
 
 def _format_instructions(aims: "list[Aim]", display_name: str) -> list[str]:

@@ -45,10 +45,10 @@ def sweep(
     loaded = load_config(config)
     aims = list_aims(loaded)
     confirm_emission(yes, f"this arms the board and pulses every pixel of {loaded.name} at {len(aims)} aims")
-    displays = _build_displays(out, config, aims)
+    displays, total = _build_displays(out, config, aims)
     journal = SweepJournal.open(out / JOURNAL, loaded.name)
     try:
-        plans, total = plan_aims(displays, journal), sum(len(display.pixels) for _, display in displays)
+        plans = plan_aims(displays, journal)
         if plans:
             with open_board(config, calibrated_field=True) as (board, _), show_progress("sweeping") as on_progress:
 
@@ -73,14 +73,15 @@ def sweep(
     print(f"written          {out / RECORDING}: {len(journal.pulses)} runs, one per pixel and aim")
 
 
-def _build_displays(out: Path, config: str | None, aims: "list[Aim]") -> "list[tuple[Aim, DisplayModel]]":
-    """Write the files of the sweep, and load the display with the pixel map of each aim."""
+def _build_displays(out: Path, config: str | None, aims: "list[Aim]") -> "tuple[list[tuple[Aim, DisplayModel]], int]":
+    """Write the files of the sweep, and load the display with the map of each aim; return the number of pulses, too."""
     from optodrive.cli.calibrate.pixel_sweep import write_sweep_files
     from optodrive.cli.options import load_run_config
     from optodrive.planning.display_model import DisplayModel
 
-    write_sweep_files(out, config)
-    return [
+    counts = write_sweep_files(out, config)[2]
+    displays = [
         (aim, DisplayModel.from_config(load_run_config(config, None, pixel_map=out / f"{aim.name}.pixels.toml")))
         for aim in aims
     ]
+    return displays, sum(counts)

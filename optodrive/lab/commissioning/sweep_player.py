@@ -4,12 +4,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
-import numpy as np
-
-from optodrive.core.errors import InputError, RefusedError
+from optodrive.core.errors import RefusedError
 from optodrive.core.types.plans import LimitedPlan, PulsePlan
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.lab.calibration.pixels.sweep import Aim, build_sweep
+from optodrive.lab.calibration.pixels.sweep import Aim, build_sweep, is_reachable
 from optodrive.lab.calibration.pixels.sweep_journal import SweepJournal, SweepPulse
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.link.session.plan_job import PlanJob
@@ -29,21 +27,18 @@ class AimPlan:
 
 
 def plan_aims(displays: list[tuple[Aim, DisplayModel]], journal: SweepJournal) -> list[AimPlan]:
-    """Plan the pulses that the journal lacks. displays: for each aim, the display with its pixel map.
+    """Plan the pulses that the journal lacks, of the pixels at which the mirrors reach the aim.
 
-    Raises InputError if the mirrors cannot reach an aim, and RefusedError if a pulse never fits the caps.
+    displays: for each aim, the display with its pixel map. Raises RefusedError if a pulse never fits the caps.
     """
     plans = []
     for aim, display in displays:
-        trains = build_sweep(display.config, aim, journal.list_done(aim.name))
+        missing = is_reachable(display.config, display.scan_head.field, aim)
+        missing[list(journal.list_done(aim.name))] = False
+        trains = build_sweep(display.config, aim, missing)
         if trains:
             sequence = FrameSequence((), trains)
             plan = plan_sequence(display, sequence, *display.build_cold_state(), policy="delay").plan
-            range_rad = display.config.scanner.range_rad
-            if max(np.abs(plan.x_rad).max(), np.abs(plan.y_rad).max()) > range_rad:
-                raise InputError(
-                    "scanner.range_rad", range_rad, f"a range that contains the aim {aim.name} of each pixel"
-                )
             plans.append(AimPlan(aim, plan))
     return plans
 

@@ -4,12 +4,16 @@ Across an edge, part of the focus misses the absorber and falls on the wall, whi
 pulses are weak enough to keep even black acrylic below the wall's cap.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.types.arrays import BoolArray
 from optodrive.core.types.stimuli import PulseTrain
 from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.pixel_map import PixelMap
+from optodrive.device.scan_field import ScanField
 from optodrive.lab.calibration.pixels.fit import Optics
 
 EDGE_FRACTIONS = (0.7, 0.3)
@@ -83,12 +87,26 @@ def edge_power_max_w(config: Config, width_s: float) -> float:
     return float(min(root**2, energy_w, laser.max_power_w))
 
 
-def build_sweep(config: Config, aim: Aim, omitted: frozenset[int] = frozenset()) -> tuple[PulseTrain, ...]:
-    """Build one pulse per pixel, except the omitted ones, in an order without successive neighbours."""
+def is_reachable(config: Config, field: ScanField, aim: Aim) -> BoolArray:
+    """Return for which pixels an aim is within the range of the mirrors, [p]."""
+    layout, range_rad = build_pixel_layout(config.display), config.scanner.range_rad
+    angles_rad = field.angles_rad(layout.x_m + aim.x_m, layout.y_m + aim.y_m)
+    within = [np.abs(angle_rad) <= range_rad for angle_rad in angles_rad]  # False for NaN, outside a calibrated field
+    return np.asarray(within[0] & within[1], dtype=np.bool_)
+
+
+def build_aim_map(aim: Aim, reached: BoolArray) -> PixelMap:
+    """Return the pixel map that moves the beam of every pixel to an aim; pixels that it does not reach stay."""
+    unmoved = PixelMap.uniform(len(reached))
+    return replace(unmoved, offset_x_m=np.where(reached, aim.x_m, 0.0), offset_y_m=np.where(reached, aim.y_m, 0.0))
+
+
+def build_sweep(config: Config, aim: Aim, included: BoolArray) -> tuple[PulseTrain, ...]:
+    """Build one pulse per included pixel, in an order without successive neighbours."""
     layout, (width_s, power_w) = build_pixel_layout(config.display), compute_pulse(config, aim)
     order = np.lexsort((layout.column, layout.row, layout.column % 2, layout.row % 2))
     slot_s = width_s + GATE_OFF_S
     return tuple(
         PulseTrain(int(pixel), round(k * slot_s, 6), width_s, width_s, GATE_OFF_S, power_w)
-        for k, pixel in enumerate(pixel for pixel in order if pixel not in omitted)
+        for k, pixel in enumerate(order[included[order]])
     )

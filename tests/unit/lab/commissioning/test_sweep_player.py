@@ -11,7 +11,16 @@ from optodrive.cli.calibrate.sweep import _build_displays
 from optodrive.core.errors import BoardFaultError, InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config import build_pixel_layout
-from optodrive.lab.calibration.pixels.sweep import compute_pulse, list_aims
+from optodrive.device.config_file import load_config
+from optodrive.device.field_loader import load_scan_field
+from optodrive.lab.calibration.pixels.sweep import (
+    Aim,
+    build_aim_map,
+    build_sweep,
+    compute_pulse,
+    is_reachable,
+    list_aims,
+)
 from optodrive.lab.calibration.pixels.sweep_journal import PRE_PULSE_S, SweepJournal, build_runs
 from optodrive.lab.commissioning import sweep_player
 from optodrive.lab.commissioning.sweep_player import plan_aims, play_aims
@@ -29,7 +38,7 @@ def ignore(item, count):
 
 @pytest.fixture(name="displays", scope="module")
 def build_displays(tmp_path_factory):
-    return _build_displays(tmp_path_factory.mktemp("sweep"), "display-16", AIMS)
+    return _build_displays(tmp_path_factory.mktemp("sweep"), "display-16", AIMS)[0]
 
 
 def open_journal(folder):
@@ -160,11 +169,27 @@ def test_a_full_disk_ends_the_sweep_dark(displays, tmp_path, monkeypatch):
         play_to_the_end()
 
 
-def test_an_aim_beyond_the_mirrors_range_is_refused(displays, tmp_path):
+def test_a_pixel_gets_no_pulse_at_an_aim_beyond_the_mirrors_range(displays, tmp_path):
+    """As on display-1511, whose outermost pixels are 0.8 mm from the end of the range."""
     aim, display = displays[1]
-    scanner = display.config.scanner.model_copy(update={"range_rad": 1e-4})
-    journal = open_journal(tmp_path)
+    layout = build_pixel_layout(display.config.display)
+    range_rad = (np.abs(layout.x_m).max() + 0.0005) / (2.0 * display.config.scanner.focal_length_m)
+    scanner = display.config.scanner.model_copy(update={"range_rad": range_rad})
     narrow = display.__class__.from_config(display.config.model_copy(update={"scanner": scanner}))
-    with pytest.raises(InputError, match="range_rad"):
-        plan_aims([(aim, narrow)], journal)
+    journal = open_journal(tmp_path)
+    (item,) = plan_aims([(aim, narrow)], journal)
     journal.close()
+    assert aim.name == "x-minus-1"
+    assert sorted(item.plan.pixel) == np.flatnonzero(layout.x_m > layout.x_m.min()).tolist()
+    assert np.abs(item.plan.x_rad).max() <= range_rad
+
+
+def test_the_files_of_a_sweep_move_only_the_pixels_that_they_pulse():
+    config = load_config("display-1511")
+    layout = build_pixel_layout(config.display)
+    aim = Aim("x-plus-2", 0.0012, 0.0)
+    reached = is_reachable(config, load_scan_field(config), aim)
+    assert 0 < np.count_nonzero(~reached) < 50
+    assert np.all(layout.x_m[~reached] == layout.x_m.max())
+    assert np.array_equal(build_aim_map(aim, reached).offset_x_m, np.where(reached, 0.0012, 0.0))
+    assert {train.pixel for train in build_sweep(config, aim, reached)} == set(np.flatnonzero(reached).tolist())
