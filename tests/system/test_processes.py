@@ -13,7 +13,9 @@ from pathlib import Path
 import httpx
 import pytest
 
+from optodrive.daemon.priority import NICE
 from optodrive.daemon.supervisor.child import HANG_S
+from optodrive.daemon.web import acceptor
 from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, wait_for
 
 PROCESSES = ("link", "planner", "preview", "acceptor", "web", "supervisor")
@@ -240,6 +242,13 @@ def test_callers_are_not_refused_while_the_acceptor_or_the_web_process_is_away(s
     os.kill(first, signal.SIGKILL)
     assert ask(rig.daemon)["display"]
     assert rig.daemon.find_process(name) != first
+
+
+def test_every_process_has_the_priority_of_the_daemon(shared):
+    if os.geteuid():
+        pytest.skip("only the superuser may raise a priority")
+    niceness = {name: os.getpriority(os.PRIO_PROCESS, shared.daemon.find_process(name)) for name in PROCESSES}
+    assert niceness == dict.fromkeys(PROCESSES, NICE) | {"acceptor": acceptor.NICE}
 
 
 def test_the_supervisor_has_one_thread_and_children_hold_only_their_descriptors(shared):

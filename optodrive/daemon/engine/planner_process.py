@@ -11,7 +11,6 @@ from optodrive.daemon.engine.planner_server import PlannerServer
 from optodrive.daemon.engine.session_recording import start_session_recorder
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.log import open_daemon_log
-from optodrive.daemon.priority import raise_priority
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.service.remote_session import RemoteSession
@@ -30,7 +29,6 @@ def run_planner(
     display: warm, see `warm_up`; session_path: new HDF5 file for a recording of every plan, instead of the configured
     one; memory: shared with earlier and later planner processes. Raise InputError if the recording cannot be started.
     """
-    raise_priority()
     ending: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: ending.append(number))
     clock = MonotonicClock()

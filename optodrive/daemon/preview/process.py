@@ -14,7 +14,6 @@ from optodrive.daemon.message_loop import MessageLoop, MessageServer
 from optodrive.daemon.preview.job_queue import Job, JobQueue
 from optodrive.daemon.preview.jobs import build_refusal, run_job
 from optodrive.daemon.preview.worker import JobRunner, Worker, build_timeout_error
-from optodrive.daemon.priority import raise_priority
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.planning.display_model import DisplayModel
@@ -138,7 +137,6 @@ class PreviewServer:
 
 def run_preview(display: DisplayModel, folder: RuntimeFolder, beat: BeatWriter) -> None:
     """Serve previews until SIGTERM or the end of the supervisor."""
-    raise_priority()  # also of its workers, until they plan a dry run or build for longer than usual
     scale = build_board_requirements(display.config).scale
     loop = MessageLoop()
     server = PreviewServer(loop, folder, lambda job: run_job(display, scale, job))

@@ -14,6 +14,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
+from optodrive.daemon.priority import raise_priority
 from optodrive.daemon.reload import ConfigReloader
 from optodrive.daemon.runtime_folder import SHARED_LINK_MODE, RuntimeFolder, open_runtime_folder
 from optodrive.daemon.supervisor.child import Child
@@ -53,6 +54,7 @@ def run(
         find_transport_factory(build_port_settings(config.board))  # refuses a Helios
         if capture_path is not None and capture_path.exists():
             raise InputError("--capture", str(capture_path), "a name that is free: nothing is overwritten")
+        raise_priority()  # every process inherits it, link while it still loads
         clock = MonotonicClock()
         notifier = Notifier(clock)
         exit_stack.callback(notifier.close)

@@ -13,7 +13,6 @@ from fastapi import FastAPI
 
 from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.daemon.log import open_daemon_log
-from optodrive.daemon.priority import raise_priority
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.acceptor_client import AcceptorClient
 from optodrive.daemon.web.access_policy import AccessPolicy
@@ -44,7 +43,6 @@ def run_web(
 
     daemon: settings, whose reloaded keys may differ from the display's
     """
-    raise_priority()
     with ExitStack() as exit_stack:
         log = open_daemon_log()
         exit_stack.callback(log.close)
