@@ -23,7 +23,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / "system")
 from rig import TOKEN, Board, Daemon, read_role_tokens  # noqa: E402 - of the tests
 from stop_rig import FloodProcess  # noqa: E402
 
-RUNS = 50
+RUNS, SUPERSEDING = 50, 200
 MINUTE_S = 60.0
 PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
 LOAD_HZ = 1250.0
@@ -91,6 +91,36 @@ def measure_planning():
             (f"changed frame of {active} pixels: planned, limited, verified", 1e3 * statistics.median(times), "ms")
         )
     return rows
+
+
+def measure_superseding():
+    """Measure the CPU time of planning a stream's frame that truncates the one before it, mirrors near their cap."""
+    from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+    from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
+    from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
+    from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+    from optodrive.device.config_file import load_config
+    from optodrive.link.board_setup import build_board_requirements
+    from optodrive.planning.display_model import DisplayModel
+
+    display = DisplayModel.from_config(load_config("display-1511"))
+    scale = build_board_requirements(display.config).scale
+    thermal = ThermalEstimate(*display.build_cold_state())
+    snapshot = PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
+    rng, times = np.random.default_rng(7), []
+    for number in range(SUPERSEDING):
+        target = np.zeros(PIXELS)
+        target[rng.choice(PIXELS, ACTIVE, replace=False)] = 60e-6
+        sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, target),))
+        request = PlanningRequest(lambda: sequence, "bench", streamed=True)  # noqa: B023 - not called later
+        begin_s = time.process_time()
+        plan = make_plan(display, scale, request, sequence, snapshot, f"p{number}", lambda fraction: None)
+        planned_s = time.process_time()
+        snapshot = build_cut_snapshot(plan, thermal, (number + 1) / RATE_HZ, display.budget)
+        times.append((planned_s - begin_s, time.process_time() - planned_s))
+    name = f"frame of {ACTIVE} pixels that truncates the one before it"
+    make_s, cut_s = np.array(times[10:]).T
+    return [*format_percentiles(f"{name}: plan", make_s), *format_percentiles(f"{name}: state at the cut", cut_s)]
 
 
 def push_frames(url):
@@ -200,7 +230,7 @@ def measure_latency(load_hz=LOAD_HZ):
 
 def bench_stream(duration_s=MINUTE_S):
     """Return the rows of the table. duration_s: time of the full frames."""
-    return measure_planning() + measure_latency() + measure_full_frames(duration_s)
+    return measure_planning() + measure_superseding() + measure_latency() + measure_full_frames(duration_s)
 
 
 def main():
@@ -214,7 +244,7 @@ def main():
     options = parser.parse_args()
     duration_s = MINUTE_S * (options.minutes if options.hours is None else 60 * options.hours)
     parts = {
-        "planning": measure_planning,
+        "planning": lambda: measure_planning() + measure_superseding(),
         "latency": lambda: measure_latency(options.load_hz),
         "frames": lambda: measure_full_frames(duration_s),
     }
