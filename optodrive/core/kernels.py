@@ -8,7 +8,10 @@ A kernel counts no references to its arguments unless it creates arrays: numba w
 small kernel, atomically, which takes longer than what the kernel computes.
 """
 
+import ctypes
+import mmap
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable
 from functools import cached_property
@@ -114,6 +117,8 @@ def _collect_value(value: Any, names: list[str], parts: list[str], visited: set[
         parts.append(getattr(value, "__qualname__", None) or repr(value))
 
 
+COMPILER_LIBRARY = "/libllvmlite.so"
+MAPPING = re.compile(r"([0-9a-f]+)-([0-9a-f]+) ")
 ARRAY_FUNCTIONS = "numba.np.arraymath"
 
 
@@ -237,3 +242,18 @@ def _compile(function: Callable[P, T], counts_references: bool) -> Callable[P, T
         _caches.append(compiled._cache)
     result: Callable[P, T] = compiled
     return result
+
+
+def release_compiler() -> None:
+    """Give up the pages of LLVM's library, 65 MiB: only compiling and loading kernels needs them, not calling them.
+
+    A page that is needed later is read from the file again.
+    """
+    madvise = ctypes.CDLL(None).madvise
+    madvise.argtypes = (ctypes.c_size_t, ctypes.c_size_t, ctypes.c_int)
+    begin = end = 0
+    for line in Path("/proc/self/smaps").read_text(encoding="utf-8", errors="replace").splitlines():
+        if mapping := MAPPING.match(line):
+            begin, end = (int(text, 16) for text in mapping.groups()) if line.endswith(COMPILER_LIBRARY) else (0, 0)
+        elif line.split() == ["Anonymous:", "0", "kB"] and end:  # no page differs from the file
+            madvise(begin, end - begin, mmap.MADV_DONTNEED)

@@ -1,15 +1,17 @@
 """The cache of machine code: what invalidates it, and what happens if its folder is not writable."""
 
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
-from optodrive.core.kernels import array_kernel, code_stamp, kernel
+from optodrive.core.kernels import COMPILER_LIBRARY, array_kernel, code_stamp, kernel, release_compiler
 
 IS_COLD = (
     "import optodrive.planning.limiter.pulse_application, optodrive.core.kernels as c;"
@@ -157,3 +159,22 @@ def test_an_empty_folder_is_cold(tmp_path):
 def test_without_a_writable_folder_nothing_is_cached():
     is_cold, cached, _ = run_python(IS_COLD, "/proc/self/nowhere")
     assert (is_cold, cached) == ("True", "False")
+
+
+def read_compiler_mib():
+    """Return the resident pages of LLVM's library that equal its file, MiB."""
+    mappings = re.split(r"(?m)^(?=[0-9a-f]+-)", Path("/proc/self/smaps").read_text())
+    found = [text for text in mappings if text.partition("\n")[0].endswith(COMPILER_LIBRARY)]
+    rss, own = (sum(int(re.search(rf"{key}: +(\d+)", text)[1]) for text in found) for key in ("Rss", "Anonymous"))
+    return (rss - own) / 1024
+
+
+def test_a_released_compiler_holds_no_memory_and_compiles_again():
+    def build_kernel(summand):
+        return array_kernel(lambda x: x + summand)
+
+    assert build_kernel(1.0)(1.0) == 2.0
+    assert read_compiler_mib() > 20.0
+    release_compiler()
+    assert read_compiler_mib() < 1.0
+    assert build_kernel(2.0)(1.0) == 3.0
