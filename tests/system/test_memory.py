@@ -24,7 +24,7 @@ STREAM_MAX_S = 600.0
 @pytest.mark.slow
 def test_a_stream_takes_no_further_memory_once_the_oldest_plans_are_dropped(tmp_path):
     board = Board(tmp_path, limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
-    daemon = Daemon(tmp_path, board.port, NAME, lease_s=LEASE_S)
+    daemon = Daemon(tmp_path, board.port, NAME, lease_s=LEASE_S, is_fresh=True)
     stream = FrameStream(daemon, STREAM_MAX_S)
     thread = threading.Thread(target=stream.run)
     thread.start()

@@ -8,7 +8,7 @@ from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import PlanRecord
 
 RECORDS_MAX = 200
-BYTES_MAX = 30_000_000
+BYTES_MAX = 10_000_000
 """Beyond these numbers of plans or bytes the oldest ended plans are dropped."""
 RECENT_PLANS = 20
 

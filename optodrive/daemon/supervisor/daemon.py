@@ -1,5 +1,6 @@
 """Main function of the daemon: opens the sockets, tokens and runtime folder, and runs the supervisor."""
 
+import ctypes
 import gc
 import socket
 import sys
@@ -32,6 +33,7 @@ from optodrive.link.transport.registry import find_transport_factory
 if TYPE_CHECKING:
     from optodrive.planning.display_model import DisplayModel
 
+M_ARENA_MAX = -8
 LINK_MODULE = "optodrive.link.service.process"
 
 
@@ -79,6 +81,7 @@ def run(
         supervisor.start_link()  # it connects to the board while this process loads what the others need
         reloader = ConfigReloader(config, tokens, config.model_copy if read_config is None else read_config)
         starts = _build_starts(_load_display(config), folder, listeners, reloader, session_path)
+        _prepare_memory()
         if notifier.is_enabled and read_config is not None:
             handler = ReloadHandler(reloader, supervisor, notifier, log)
             supervisor.on_reload, supervisor.on_web_message = handler.request, handler.on_web_message
@@ -107,14 +110,23 @@ def _build_link_start(
 
 def _load_display(config: Config) -> "DisplayModel":
     """Load what the other processes need, so that they share its memory."""
+    from optodrive.core.kernels import release_compiler
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.pipeline import warm_up
 
     display = DisplayModel.from_config(config)
     warm_up(display)
+    release_compiler()
+    return display
+
+
+def _prepare_memory() -> None:
+    """Let forks of this process share its memory for as long as they can, and keep little of their own free."""
     gc.collect()
     gc.freeze()  # a collection in a child would copy every page that it visits
-    return display
+    libc = ctypes.CDLL(None)
+    libc.malloc_trim(0)
+    libc.mallopt(M_ARENA_MAX, 1)  # by default, memory that one thread has freed is of no use to another
 
 
 def _build_starts(
