@@ -16,6 +16,7 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
+import httpx
 import numpy as np
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
@@ -72,7 +73,7 @@ class FrameStream:
                 self._daemon.client.post("/v1/disarm")
                 self._daemon.client.post("/v1/arm").raise_for_status()
                 self._stream()
-            except (OSError, WebSocketException) as error:
+            except (OSError, httpx.HTTPError, WebSocketException) as error:
                 self.errors[type(error).__name__] += 1
                 time.sleep(1.0)
 
