@@ -108,8 +108,9 @@ def suggest_nearest(name: str, known: list[str]) -> str:
 
 
 def suggest_near_name(name: str, known: list[str]) -> str:
-    """Return a phrase with the known name nearest to `name`, empty if none is near."""
-    match = get_close_matches(name, known, n=1, cutoff=0.5)
+    """Return a phrase with the known name nearest to `name`, one that begins with it first; empty if none is near."""
+    longer = [each for each in known if len(name) > 1 and each.startswith(name)]
+    match = get_close_matches(name, longer, n=1, cutoff=0.0) or get_close_matches(name, known, n=1, cutoff=0.5)
     return f"nearest is '{match[0]}'" if match else ""
 
 

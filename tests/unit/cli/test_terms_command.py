@@ -86,3 +86,8 @@ def test_a_truth_refuses_a_term_that_only_the_limiter_knows(frames, tmp_path, ca
     path.write_text(HEAD + "\n".join(build_example(discover_terms()["touch_surface"])))
     assert run(["simulate", frames, "--truth", str(path)]) == 2
     assert "terms.touch_surface" in capsys.readouterr().err
+
+
+def test_the_beginning_of_a_name_is_nearest_to_this_name(capsys):
+    assert run(["terms", "membrane"]) == 2
+    assert "nearest is 'membrane_creep'" in capsys.readouterr().err
