@@ -45,7 +45,9 @@ class PlanStore:
         with self._lock:
             record = self._records.get(plan_id)
         if record is None:
-            raise InputError("plan", plan_id, f"one of the last {RECORDS_MAX} plans", "plan_not_found")
+            raise InputError(
+                "plan", plan_id, "a plan that runs or waits, or one of the latest that ended", "plan_not_found"
+            )
         return record
 
     def list_recent(self) -> list[PlanRecord]:

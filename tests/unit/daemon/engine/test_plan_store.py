@@ -91,7 +91,7 @@ def test_old_plans_make_room_for_newer_ones(rig, monkeypatch):
     monkeypatch.setattr(plan_store, "BYTES_MAX", int(2.5 * second.nbytes))
     third = submit(rig, build_frame())
     rig.until(lambda: third.has_ended)
-    with pytest.raises(InputError, match="one of the last 200 plans"):
+    with pytest.raises(InputError, match="one of the latest that ended"):
         rig.store.find(first.plan_id)
     assert rig.store.list_recent() == [second, third]
 
