@@ -55,7 +55,8 @@ def try_installation(optodrive, outside):
         raise SystemExit(f"scripts/wheel: {package_path} was imported, which is not the wheel")
     config_names = json.loads(
         run_python(
-            "-c", "import json; from optodrive.device.config import *; print(json.dumps(list_shipped_configs()))"
+            "-c",
+            "import json; from optodrive.device.config_file import list_shipped_configs; print(json.dumps(list_shipped_configs()))",
         )
     )
     for name in config_names:

@@ -1,7 +1,12 @@
 """Shared fixtures and options of pytest, profiles of hypothesis, and the order of the tests."""
 
+import gc
 import os
+import signal
+import tempfile
+from pathlib import Path
 
+import certifi
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -19,10 +24,28 @@ settings.register_profile("every run", settings.get_profile("thorough"), max_exa
 
 def pytest_configure(config):
     settings.load_profile("every run" if config.getoption("markexpr") == "not slow" else "thorough")
+    shorten_certificates(config)
+
+
+def shorten_certificates(config):
+    """Let clients of HTTP load one certificate: each loads all of them, 30 ms, also for http on the loopback."""
+    folder = tempfile.TemporaryDirectory()
+    config.add_cleanup(folder.cleanup)
+    first, end, _ = certifi.contents().partition("-----END CERTIFICATE-----\n")
+    path = Path(folder.name) / "certificate.pem"
+    path.write_text(first + end)
+    os.environ["SSL_CERT_FILE"] = str(path)
 
 
 def pytest_sessionstart():
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a job in the background; commands would inherit it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     forked_process.enable()
+
+
+def pytest_collection_finish():
+    gc.collect()
+    gc.freeze()  # what was imported and collected lives to the end; each collection would visit it again
 
 
 def pytest_sessionfinish():

@@ -19,6 +19,7 @@ from optodrive.device.config_file import locate_shipped
 
 TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
+NAP_MAX_S = 0.02
 START_S = 60.0
 PATIENT_LEASE_S, PATIENT_LEAD_S = 1.0, 0.06
 """Maximum lease, and a long lead of streams, for tests that are about neither.
@@ -28,13 +29,13 @@ ENDED = ("done", "superseded", "failed", "cancelled")
 
 
 def wait_for(condition, what, patience_s=PATIENCE_S, nap_s=0.005):
-    """Poll until condition() is truthy and return its value."""
-    until = time.monotonic() + patience_s
-    while time.monotonic() < until:
+    """Poll until condition() is truthy and return its value; less often the longer it takes."""
+    since = time.monotonic()
+    while (waited_s := time.monotonic() - since) < patience_s:
         value = condition()
         if value:
             return value
-        time.sleep(nap_s)
+        time.sleep(min(max(nap_s, waited_s / 50), NAP_MAX_S))
     raise AssertionError(f"timed out after {patience_s} s waiting for {what}")
 
 
