@@ -53,12 +53,8 @@ def try_installation(optodrive, outside):
     package_path = Path(run_python("-c", "import optodrive; print(optodrive.__file__)").strip())
     if optodrive.parent.parent not in package_path.parents:
         raise SystemExit(f"scripts/wheel: {package_path} was imported, which is not the wheel")
-    config_names = json.loads(
-        run_python(
-            "-c",
-            "import json; from optodrive.device.config_file import list_shipped_configs; print(json.dumps(list_shipped_configs()))",
-        )
-    )
+    listing = "import json; from optodrive.device.config_file import *; print(json.dumps(list_shipped_configs()))"
+    config_names = json.loads(run_python("-c", listing))
     for name in config_names:
         run_python("-m", "optodrive.cli.main", "config", "check", "--config", name)
     daemon = subprocess.Popen(

@@ -4,6 +4,7 @@ A fresh interpreter spends 1.5 s of processor time on imports and kernels before
 fork runs the same program from there on. Started with a socket of packets: each asks for one process, see `serve`.
 """
 
+import atexit
 import json
 import os
 import resource
@@ -11,6 +12,8 @@ import select
 import signal
 import socket
 import sys
+import threading
+import traceback
 from pathlib import Path
 
 REQUEST_MAX_BYTES = 200_000
@@ -48,6 +51,25 @@ def run_short_indicator_board():
     import short_indicator_board
 
     sys.exit(short_indicator_board.main())
+
+
+def run_to_end(program):
+    """Run a program as an interpreter does, and end at once: to free every object would take longer than to start."""
+    status = 0
+    try:
+        status = program()
+    except SystemExit as end:
+        status = end.code
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    if not isinstance(status, int | None):
+        print(status, file=sys.stderr)
+        status = 1
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    os._exit(status or 0)
 
 
 PROGRAMS = {"optodrive": run_optodrive, "board": run_board, "short_indicator_board": run_short_indicator_board}
@@ -125,4 +147,4 @@ if __name__ == "__main__":
     program = serve(control)
     if program is not None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        sys.exit(program())
+        run_to_end(program)
