@@ -20,7 +20,9 @@ from optodrive.link.simulator.script import SENSOR_ACTIONS, ScriptStep
 if TYPE_CHECKING:
     from optodrive.link.simulator.simulated_optics import SimulatedOptics
 
-LOOP_WAIT_MAX_S = 0.005
+LOOP_WAIT_MAX_S = 0.02
+POLLING_S = 0.005
+"""Interval in which a port that opens, and requests to a sensor, are looked for; a wait does not end with them."""
 LATE_LOOP_US = 2_000
 """An iteration this late was delayed by the operating system."""
 
@@ -156,7 +158,9 @@ class PtyBoard:
 
     def _wait(self) -> None:
         now_us, due_us = self._now_us(), self._core.next_event_us()
-        wait_s = LOOP_WAIT_MAX_S if due_us is None else min(LOOP_WAIT_MAX_S, max(0.0, (due_us - now_us) * 1e-6))
+        wait_s = LOOP_WAIT_MAX_S if self._is_open and self._optics is None else POLLING_S
+        if due_us is not None:
+            wait_s = min(wait_s, max(0.0, (due_us - now_us) * 1e-6))
         if self._script:
             wait_s = min(wait_s, max(0.0, self._script[0].at_s - self._now_s()))
         self._due_us = now_us + round(wait_s * 1e6)
