@@ -172,6 +172,9 @@ def test_pulses_and_board_are_in_view_on_a_desktop(page, daemon):
         play_for(daemon, seconds)
     expect(page.locator("#timeline-text")).to_contain_text("start within the next second")
     assert is_in_view(page, *panels)
+    page.locator("#picked").evaluate("line => line.style.width = '75%'")  # as wide figures may make it wrap
+    assert page.locator("#picked").bounding_box()["height"] > 30
+    assert is_in_view(page, *panels)
 
 
 def test_arm_and_confirm_are_in_view_on_a_phone(page):
