@@ -148,14 +148,14 @@ def test_a_submit_from_before_stop_is_answered_stopped_after_arming_again(web):
 
 
 def test_streamed_plans_report_their_end(web):
-    first = web.report(web.submit(build_frame(pixels=range(60), duration_s=10.0), streamed=True))
+    first = web.report(web.submit(build_frame(pixels=range(300), duration_s=10.0), streamed=True))
     wait_for(lambda: web.engine.get_plan(first.plan).executed >= 5, "a part of the frame")
     second = web.report(web.submit(build_frame(pixels=range(5), duration_s=10.0), streamed=True))
     wait_for(lambda: len(web.of_kind("ended")) == 2, "both ends")
     ended = {m.fields["plan"]: PlanReport.model_validate_json(m.payload) for m in web.of_kind("ended")}
     assert {plan: report.status for plan, report in ended.items()} == {first.plan: "superseded", second.plan: "done"}
     assert all(report.pulses is None for report in ended.values())
-    running = web.report(web.submit(build_frame(pixels=range(100), duration_s=10.0), streamed=True))
+    running = web.report(web.submit(build_frame(pixels=range(300), duration_s=10.0), streamed=True))
     wait_for(lambda: web.engine.get_plan(running.plan).executed >= 5, "a part of the frame")
     web.send("end_stream", epoch=web.engine.web.status["epoch"], caller="token")
     wait_for(lambda: web.engine.get_plan(running.plan).has_ended, "the end of the stream")
