@@ -8,6 +8,8 @@ import os
 import signal
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -16,6 +18,8 @@ import pytest
 from optodrive.daemon.priority import NICE
 from optodrive.daemon.supervisor.child import HANG_S
 from optodrive.daemon.web import acceptor
+from optodrive.daemon.web.acceptor_client import PERMITTED
+from optodrive.daemon.web.request_head import Rank
 from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, wait_for
 
 PROCESSES = ("link", "planner", "preview", "acceptor", "web", "supervisor")
@@ -27,6 +31,8 @@ AT_ONCE_S = 0.1
 """Aim for an end that the link process notices by the end of a connection."""
 BEAT_TIMEOUT_S = 1.0
 """Age of a beat from which the link process no longer renews the lease."""
+ESTABLISHED, LISTENS = "01", "0A"
+"""States of a socket in /proc/net/tcp."""
 LATENESS_S = 0.03
 """Maximum scheduling delay of the board process and of this test. The gate times in the log are exact."""
 DARK_S = {
@@ -237,13 +243,20 @@ def test_a_plan_finishes_without_the_web_process_if_that_is_configured(tmp_path,
 
 @pytest.mark.parametrize("name", ["acceptor", "web"])
 def test_callers_are_not_refused_while_the_acceptor_or_the_web_process_is_away(shared, name):
-    rig = shared
-    first = rig.daemon.find_process(name)
+    first = shared.daemon.find_process(name)
     os.kill(first, signal.SIGKILL)
-    # A connection that is made before the supervisor has noticed the end may be reset.
-    wait_for(lambda: rig.daemon.find_process(name) not in (None, first), f"another {name} process, which still loads")
-    assert ask(rig.daemon)["display"]
-    assert rig.daemon.find_process(name) != first
+    assert ask(shared.daemon)["display"]
+    wait_for(lambda: shared.daemon.find_process(name) not in (None, first), f"another {name} process")
+
+
+def test_connections_that_a_web_process_has_not_opened_at_its_end_are_opened_by_the_next(shared):
+    first = shared.daemon.find_process("web")
+    os.kill(first, signal.SIGSTOP)
+    with ThreadPoolExecutor() as pool:
+        answers = [pool.submit(ask, shared.daemon) for _ in range(2 * PERMITTED[Rank.TOKEN])]
+        wait_for(lambda: count_sockets(shared.daemon, "acceptor", ESTABLISHED) >= len(answers), "connections")
+        os.kill(first, signal.SIGKILL)
+        assert all(answer.result()["display"] for answer in answers)
 
 
 def test_every_process_has_the_priority_of_the_daemon(shared):
@@ -256,18 +269,16 @@ def test_every_process_has_the_priority_of_the_daemon(shared):
 def test_the_supervisor_has_one_thread_and_children_hold_only_their_descriptors(shared):
     pid = shared.daemon.find_process("supervisor")
     assert len(list(Path(f"/proc/{pid}/task").iterdir())) == 1
-    port = int(shared.daemon.url.rsplit(":")[-1])
-    assert {name for name in PROCESSES if listens(shared.daemon.find_process(name), port)} == {"supervisor", "acceptor"}
+    assert {name for name in PROCESSES if count_sockets(shared.daemon, name, LISTENS)} == {"supervisor", "acceptor"}
 
 
-def listens(pid, port):
-    """Return whether a process holds the socket that listens on a TCP port."""
+def count_sockets(daemon, name, state):
+    """Return how many sockets in a state at the daemon's TCP port a process holds."""
+    pid, port = daemon.find_process(name), int(daemon.url.rsplit(":")[-1])
     rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]]
-    inodes = {row[9] for row in rows if row[3] == "0A" and int(row[1].split(":")[1], 16) == port}
+    inodes = {f"socket:[{row[9]}]" for row in rows if row[3] == state and int(row[1].split(":")[1], 16) == port}
     held = set()
     for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-        try:
+        with suppress(OSError):  # closed since
             held.add(str(descriptor.readlink()))
-        except OSError:
-            continue
-    return bool(held & {f"socket:[{inode}]" for inode in inodes})
+    return len(inodes & held)

@@ -20,7 +20,7 @@ from optodrive.core.clock import request_realtime_scheduling
 from optodrive.core.ipc import IpcError, Message, MessageSocket
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.daemon.web.acceptor_protocol import BEAT, decode_permissions, send_connection
+from optodrive.daemon.web.acceptor_protocol import BEAT, decode_permission, send_connection
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.listeners import raise_descriptor_limit
 from optodrive.daemon.web.reload_message import apply_reload
@@ -128,6 +128,8 @@ class Acceptor:
         self._listener.setblocking(False)
         self._web: socket.socket | None = None
         self._permitted: Counter[Rank] = Counter()
+        self._unopened: dict[int, Waiting] = {}  # handed over; another web process gets them if this one ends before
+        self._handed_over = 0
         self._beat_at_s = self._room_at_s = 0.0
         self._is_ending = False
 
@@ -147,10 +149,10 @@ class Acceptor:
 
     def close(self) -> None:
         """Close everything but the listening sockets."""
+        self._lose_web()
         self._room.close()
         self._listener.close()
         self._link.close()
-        self._lose_web()
 
     def _step(self) -> None:
         now_s = time.monotonic()
@@ -163,7 +165,7 @@ class Acceptor:
         if self._listener.fileno() in ready:
             self._accept_web()
         if self._web is not None and self._web.fileno() in ready:
-            self._receive_permissions(self._web)
+            self._receive_permission(self._web)
         self._hand_over()
         if now_s >= self._beat_at_s:
             self._beat_at_s = now_s + TURN_MAX_S
@@ -231,11 +233,13 @@ class Acceptor:
 
     def _lose_web(self) -> None:
         self._permitted.clear()
+        while self._unopened:
+            self._room.put_back(self._unopened.popitem()[1])
         if self._web is not None:
             self._web.close()
             self._web = None
 
-    def _receive_permissions(self, web: socket.socket) -> None:
+    def _receive_permission(self, web: socket.socket) -> None:
         try:
             data = web.recv(4096)
         except BlockingIOError:
@@ -244,7 +248,11 @@ class Acceptor:
             data = b""
         if not data:
             self._lose_web()
-        self._permitted.update(decode_permissions(data))
+            return
+        rank, number = decode_permission(data)
+        self._permitted[rank] += 1
+        if number in self._unopened:
+            self._unopened.pop(number).sock.close()
 
     def _hand_over(self) -> None:
         """Hand over what the web process accepts, the highest rank first."""
@@ -255,6 +263,8 @@ class Acceptor:
                 self._permitted[rank] -= 1
 
     def _send(self, web: socket.socket, waiting: Waiting) -> bool:
+        self._handed_over += 1
+        waiting = waiting._replace(number=self._handed_over)
         try:
             send_connection(web, waiting)
         except OSError as error:
@@ -262,5 +272,5 @@ class Acceptor:
             if not isinstance(error, BlockingIOError):
                 self._lose_web()
             return False
-        waiting.sock.close()
+        self._unopened[waiting.number] = waiting
         return True

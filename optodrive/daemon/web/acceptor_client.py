@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from optodrive.daemon.web.acceptor_protocol import encode_permissions, receive_packet
+from optodrive.daemon.web.acceptor_protocol import NO_CONNECTION, encode_permission, receive_packet
 from optodrive.daemon.web.request_head import Rank
 from optodrive.daemon.web.waiting_room import Waiting
 
@@ -69,11 +69,11 @@ class AcceptorClient:
             for _ in range(count):
                 self.permit(rank)
 
-    def permit(self, rank: Rank) -> None:
-        """Permit one more connection of a rank."""
+    def permit(self, rank: Rank, opened: int = NO_CONNECTION) -> None:
+        """Permit one more connection of a rank. opened: number of the connection that has been opened or closed."""
         if self._socket is not None:
             try:
-                self._socket.send(encode_permissions([rank]))
+                self._socket.send(encode_permission(rank, opened))
             except OSError:
                 self._lose()
 

@@ -1,7 +1,7 @@
 """Packets between acceptor and web process, on a Unix socket that preserves message boundaries.
 
-acceptor → web: a beat, or a connection with its rank and the time of its head
-web → acceptor: permissions for connections of a rank, one each
+acceptor → web: a beat, or a connection with its number, its rank and the time of its head
+web → acceptor: a permission for one more connection of a rank, with the number of the connection that it has opened
 """
 
 import socket
@@ -11,12 +11,16 @@ from optodrive.daemon.web.request_head import Rank
 from optodrive.daemon.web.waiting_room import Waiting
 
 BEAT = b"beat"
-_CONNECTION = struct.Struct("<Bd")
+NO_CONNECTION = 0
+"""Number in a permission that follows no connection."""
+_CONNECTION = struct.Struct("<QBd")
+_PERMISSION = struct.Struct("<QB")
 
 
 def send_connection(link: socket.socket, waiting: Waiting) -> None:
-    """Send a connection; the caller closes its own descriptor afterwards. Raise OSError if it cannot be sent now."""
-    socket.send_fds(link, [_CONNECTION.pack(waiting.rank, waiting.since_s)], [waiting.sock.fileno()])
+    """Send a connection, of which the caller keeps its own descriptor. Raise OSError if it cannot be sent now."""
+    packet = _CONNECTION.pack(waiting.number, waiting.rank, waiting.since_s)
+    socket.send_fds(link, [packet], [waiting.sock.fileno()])
 
 
 def receive_packet(link: socket.socket) -> Waiting | bytes:
@@ -26,15 +30,16 @@ def receive_packet(link: socket.socket) -> Waiting | bytes:
         return data
     sock = socket.socket(fileno=descriptors[0])
     sock.setblocking(False)
-    rank, since_s = _CONNECTION.unpack(data)
-    return Waiting(sock, since_s, Rank(rank))
+    number, rank, since_s = _CONNECTION.unpack(data)
+    return Waiting(sock, since_s, Rank(rank), number)
 
 
-def encode_permissions(ranks: list[Rank]) -> bytes:
-    """Encode permissions."""
-    return bytes(ranks)
+def encode_permission(rank: Rank, number: int) -> bytes:
+    """Encode a permission."""
+    return _PERMISSION.pack(number, rank)
 
 
-def decode_permissions(data: bytes) -> list[Rank]:
-    """Decode permissions."""
-    return [Rank(value) for value in data]
+def decode_permission(data: bytes) -> tuple[Rank, int]:
+    """Decode a permission into its rank and the number of the opened connection."""
+    number, rank = _PERMISSION.unpack(data)
+    return Rank(rank), number

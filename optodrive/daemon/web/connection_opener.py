@@ -49,7 +49,7 @@ class ConnectionOpener:
         else:
             self._hold(waiting)
             return
-        self._loop.call_soon(self._acceptor.permit, waiting.rank)
+        self._loop.call_soon(self._acceptor.permit, waiting.rank, waiting.number)
 
     def _hold(self, waiting: Waiting) -> None:
         def retry() -> None:

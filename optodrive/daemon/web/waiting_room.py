@@ -25,11 +25,15 @@ END = select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR
 
 
 class Waiting(NamedTuple):
-    """A connection. since_s: monotonic time since which it waits for its head, or has had one; rank: by its head."""
+    """A connection. since_s: monotonic time since which it waits for its head, or has had one; rank: by its head.
+
+    number: of the connection among those that a web process has got
+    """
 
     sock: socket.socket
     since_s: float
     rank: Rank = Rank.OTHER
+    number: int = 0
 
 
 class WaitingRoom:
@@ -140,7 +144,11 @@ class WaitingRoom:
         return self._ranked[rank].popitem(last=False)[1]
 
     def put_back(self, waiting: Waiting) -> None:
-        """Let a connection that was taken be the first of its rank again."""
+        """Let a connection that was taken be the first of its rank again, unless its request has been read since."""
+        head = peek_head(waiting.sock)
+        if not head or not is_complete(head):
+            waiting.sock.close()
+            return
         self._ranked[waiting.rank][waiting.sock.fileno()] = waiting
         self._ranked[waiting.rank].move_to_end(waiting.sock.fileno(), last=False)
 

@@ -168,14 +168,33 @@ def test_a_connection_is_handed_over_with_its_request_if_its_rank_is_permitted(r
     assert later == [*first, Rank.OTHER]
 
 
+def open_first_of(count):
+    """Return what receives connections, opens the first and returns the ranks of all."""
+
+    async def act(client, taken):
+        ranks = await await_count(taken, count)
+        client.permit(Rank.TOKEN, taken[0].number)
+        await asyncio.sleep(SILENCE_S)
+        return ranks
+
+    return act
+
+
 def test_the_next_web_process_gets_what_waits(rig):
     rig.send(build_head(*HEADERS[Rank.TOKEN]))
     for _ in range(2):
-        assert run_client(rig, lambda client, taken: await_count(taken, 1)) == [Rank.TOKEN]
+        assert run_client(rig, open_first_of(1)) == [Rank.TOKEN]
         rig.send(build_head(*HEADERS[Rank.TOKEN]))
 
 
-def test_a_acceptor_without_beats_is_not_alive_and_its_end_is_reported(rig, monkeypatch):
+def test_the_next_web_process_gets_what_its_predecessor_has_not_opened(rig):
+    for _ in range(2):
+        rig.send(build_head(*HEADERS[Rank.TOKEN]))
+    assert run_client(rig, open_first_of(2)) == [Rank.TOKEN] * 2
+    assert run_client(rig, open_first_of(1)) == [Rank.TOKEN]
+
+
+def test_an_acceptor_without_beats_is_not_alive_and_its_end_is_reported(rig, monkeypatch):
     async def act(client, taken):
         lost = []
         client.on_lost = lambda: lost.append(True)
