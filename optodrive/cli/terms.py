@@ -19,8 +19,8 @@ def terms(
     name: Annotated[str | None, typer.Argument(metavar="TERM", help="Show this term with its parameters.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """List the terms of model.toml, or show one: equation, parameters, ranges, and the lines that state it."""
-    from optodrive.physics.term_reference import build_example, describe_term
+    """List the terms of model.toml, or show one: equation, parameters, ranges, and a model.toml that states it."""
+    from optodrive.physics.term_reference import build_example_file, describe_term
     from optodrive.physics.terms import discover_terms
 
     known = discover_terms()
@@ -45,4 +45,4 @@ def terms(
         print(f"{item['name']:<18}{limits}, {omitted}; {item['source']}")
     if term.requires:
         print(f"\nneeds {', '.join(term.requires)}")
-    print("\nin model.toml:\n\n    " + "\n    ".join(build_example(term)))
+    print("\nmodel.toml:\n\n" + "\n".join(build_example_file(term)))

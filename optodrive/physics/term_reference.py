@@ -4,6 +4,7 @@ from typing import Any
 
 from optodrive.physics.hypothesis import TermParameter
 from optodrive.physics.term import Term
+from optodrive.physics.terms import discover_terms
 
 
 def describe_term(term: Term) -> dict[str, Any]:
@@ -42,4 +43,18 @@ def build_example(term: Term) -> list[str]:
         f'{item.name} = {{ value = {item.default!r}, unit = "{item.unit}", source = "measured on …" }}'
         for item in stated
     ]
+    return lines
+
+
+def build_example_file(term: Term) -> list[str]:
+    """Return the lines of a complete parameter set that states a term and those that it requires."""
+    lines = [
+        'format = "optodrive-parameters"',
+        "version = 1",
+        f'name = "{term.key}"',
+        'base = "calibrated"',
+        f'claims = "an example: {term.label}"',
+    ]
+    for stated in (*(discover_terms()[key] for key in term.requires), term):
+        lines += ["", *build_example(stated)]
     return lines

@@ -34,14 +34,21 @@ def _simulate(capsys, frames, path):
 
 
 @pytest.mark.parametrize("key", discover_terms())
-def test_the_lines_that_state_a_term_load_as_they_are(key, tmp_path):
+def test_the_file_that_states_a_term_loads_as_it_is_printed(key, tmp_path, capsys):
     path, term = tmp_path / "set.toml", discover_terms()[key]
-    needed = [line for other in term.requires for line in build_example(discover_terms()[other])]
-    path.write_text(HEAD.replace("surroundings", "calibrated") + "\n".join([*needed, *build_example(term)]))
+    assert run(["terms", key]) == 0
+    path.write_text(capsys.readouterr().out.split("\nmodel.toml:\n\n")[1])
     values = load_parameters(path).term_values(key)
     assert list(values) == [item.name for item in term.parameters]
     omitted = [item for item in term.parameters if f"\n{item.name} = " not in "\n".join(build_example(term))]
     assert [values[item.name] for item in omitted] == [item.if_omitted for item in omitted]
+
+
+def test_a_printed_file_is_a_truth(frames, tmp_path, capsys):
+    assert run(["terms", "membrane_creep"]) == 0
+    path = tmp_path / "set.toml"
+    path.write_text(capsys.readouterr().out.split("\nmodel.toml:\n\n")[1])
+    assert _simulate(capsys, frames, path)["truth"]["terms"] == ["membrane_creep"]
 
 
 def test_an_empty_term_and_a_required_parameter_are_refused(tmp_path):
