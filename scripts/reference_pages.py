@@ -25,8 +25,8 @@ default and derived number. Quantities are in SI units, named by the suffix of t
 TERMS_HEAD = """# Terms
 
 Generated from `optodrive/physics/terms` by `scripts/reference`; `optodrive terms TERM` prints the same, as a complete
-file. A term is a physical effect beyond the nominal pixel. A parameter set may hold its parameters, `optodrive diagnose`
-looks for it in recordings, and the limiter bounds the heat that it can add.
+file. A term is a physical effect beyond the nominal pixel. A parameter set may hold its parameters, `optodrive
+diagnose` looks for it in recordings, and the limiter bounds the heat that it can add.
 
 A [parameter set](formats/parameter-sets.md) (`model.toml`) states a term by the lines below its table. A parameter with
 a value under "if omitted" need not be stated: the value has no effect, or is the usual shape. `planner_terms` names the

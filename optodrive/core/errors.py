@@ -12,6 +12,16 @@ class OptodriveError(Exception):
     problem: Mapping[str, object] | None = None
     """Problem document of the daemon's answer, if there is one."""
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle the message and the fields, so that a process of a pool can raise it in its parent."""
+        return _restore_error, (type(self), self.args, self.__dict__)
+
+
+def _restore_error(kind: type[OptodriveError], args: tuple[object, ...], fields: dict[str, object]) -> OptodriveError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(fields)
+    return error
+
 
 class InputError(OptodriveError):
     """Invalid input; the message states place, value and expectation in one line."""

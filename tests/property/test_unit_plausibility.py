@@ -76,6 +76,22 @@ def test_sound_recordings_pass_and_wrong_units_are_named(seeds, count):
     assert missed.total() <= max(1, (1.0 - REFUSED_SHARE) * tried), missed
 
 
+@pytest.mark.parametrize(("seeds", "count"), DRAWS)
+def test_recordings_whose_clock_is_offset_pass(seeds, count):
+    refused = []
+    for seed in range(FIRST_SEEDS[seeds], FIRST_SEEDS[seeds] + count):
+        rng = np.random.default_rng([7, seed])
+        sound, late_s = sound_recording(rng), rng.uniform(-3e-3, 3e-3)
+        runs = [
+            replace(run, signals={name: replace(item, t_s=item.t_s + late_s) for name, item in run.signals.items()})
+            for run in sound.runs
+        ]
+        message = _refusal(_check, type(sound)(tuple(runs)))
+        if message:
+            refused.append((seed, late_s, message))
+    assert refused == []
+
+
 @pytest.mark.parametrize("quantity", [*NAMES, "power_W", "width_s", "t_s"])
 def test_a_diagnosis_refuses_before_it_fits(quantity):
     key = next(key for key in WRONG_UNITS if key[0] == quantity)

@@ -41,6 +41,8 @@ LONG_PULSE_S, SHAPE_DISAGREES_LONG = 0.5, 0.7
 """Pulses above this width reach a plateau, which another time unit explains only a little better."""
 MOVEMENT_AGREES = 0.5
 """Share of a mirror's variance that its commands explain for a match; a slow servo follows steps badly."""
+CLOCK_OFFSETS_S = np.linspace(-5e-3, 5e-3, 21)
+"""Offsets of an instrument's clock that are tried before another unit is: they are a cause that a diagnosis names."""
 SAMPLES_MAX, PULSES_MAX = 300, 100
 RESISTANCE_FACTORS = (0.5, 1.0, 2.0)
 """Thermal resistances tried, relative to the reference pixel's."""
@@ -112,14 +114,10 @@ def _check_pixel_signal(
     if float((own[:, 1] * own[:, 2]).sum()) > 0.0:
         pulses, times_s, values = _thin(own, t_s, value)
         stated, ratio = _compare(name, pixel, pulses, times_s, values)
-        is_long = float(own[:, 1].max()) > LONG_PULSE_S
-        if stated < SHAPE_CERTAIN or is_long:
-            trials = [(_compare_in(unit, name, pixel, pulses, times_s, values), unit) for unit in TIME_UNITS]
-            explained, likely = max(trials, key=lambda item: item[0])
-            margin = SHAPE_DISAGREES_LONG if is_long else SHAPE_DISAGREES
-            if explained > SHAPE_AGREES and 1.0 - explained < margin * (1.0 - stated):
-                quantity = likely.quantity.format(signal=name)
-                _refuse(f"{where}/{quantity}", "times that do not suit the response", "s", likely.unit)
+        likely = _find_time_units(name, pixel, pulses, times_s, values, stated)
+        if likely is not None:
+            quantity = likely.quantity.format(signal=name)
+            _refuse(f"{where}/{quantity}", "times that do not suit the response", "s", likely.unit)
         if stated > SHAPE_AGREES and ratio > MAX_RATIO:
             _refuse_size(f"{where}/{name}", f"a response {ratio:.3g} times too large", ratio, UNITS[name])
         if stated <= SHAPE_AGREES:
@@ -130,6 +128,22 @@ def _check_pixel_signal(
         if change > PLAUSIBLE[name].high:
             check_plausible(f"{where}/{name}", change, PLAUSIBLE[name])
     return ratio
+
+
+def _find_time_units(
+    name: str, pixel: Pixel, pulses: FloatArray, t_s: FloatArray, value: FloatArray, stated: float
+) -> _TimeUnits | None:
+    """Return other units that explain the signal much better than the stated ones, with any clock offset, do."""
+    is_long = float(pulses[:, 1].max()) > LONG_PULSE_S
+    if stated >= SHAPE_CERTAIN and not is_long:
+        return None
+    margin = SHAPE_DISAGREES_LONG if is_long else SHAPE_DISAGREES
+    trials = [(_compare_in(unit, name, pixel, pulses, t_s, value), unit) for unit in TIME_UNITS]
+    explained, likely = max(trials, key=lambda item: item[0])
+    if explained <= SHAPE_AGREES or 1.0 - explained >= margin * (1.0 - stated):
+        return None
+    shifted = max(_compare(name, pixel, pulses, t_s - late_s, value)[0] for late_s in CLOCK_OFFSETS_S)
+    return likely if 1.0 - explained < margin * (1.0 - shifted) else None
 
 
 def _check_temperature(where: str, run: Run, t_s: FloatArray, value: FloatArray) -> None:
