@@ -62,6 +62,12 @@ class FreeParameter:
         return out
 
     @property
+    def limits(self) -> tuple[float, float]:
+        """Limits of the fitted number."""
+        low, high = self.parameter.low, self.parameter.high
+        return (log(low), log(high)) if self.logarithmic else (low, high)
+
+    @property
     def step(self) -> float:
         """Step of the fitted number for finite differences."""
         return 2e-3 if self.logarithmic else 1e-3 * (self.parameter.high - self.parameter.low)

@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.noise_model import NoiseModel
-from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
+from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve, solve_within
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.physics.hypothesis import FreeParameter
 
@@ -16,6 +16,10 @@ BASE_LOG_STEP = 1e-3
 BASE_LOG_SPAN = 1.8
 """Maximum deviation of a base parameter's logarithm from its prior; a very short gas time constant costs many steps."""
 POWER_STEP, DELAY_STEP_S = 5e-3, 1e-5
+MAX_ITERATIONS = 60
+"""Most fits end within 10 steps; creep with a spread of times has a curved valley that takes 20 to 50."""
+MIN_DAMPING, DAMPING_INCREASE, DAMPING_DECREASE = 1e-3, 4.0, 5.0
+"""Damping of the first step after one that increased χ², relative to the curvature, and its changes."""
 CHI2_CONVERGED = 0.02
 """Predicted or achieved decrease of χ² below which the iteration ends."""
 
@@ -75,15 +79,27 @@ def apply_step(
     problem: FitProblem, point: ParameterPoint, free: Sequence[FreeParameter], step: FloatArray
 ) -> ParameterPoint:
     """Return the point after a step in base and free parameters, clipped to their ranges."""
-    centre = np.array(problem.prior.mean)
-    stepped = np.add(point.base, np.clip(step[: len(BASE_PARAMETERS)], -0.5, 0.5))
-    base = tuple(np.clip(stepped, centre - BASE_LOG_SPAN, centre + BASE_LOG_SPAN).tolist())
+    lower, upper = compute_step_limits(problem, point, free)
+    step = np.clip(step, lower, upper)
+    base = tuple(np.add(point.base, step[: len(BASE_PARAMETERS)]).tolist())
     terms: Mapping[str, Mapping[str, float]] = point.terms
-    for item, change in zip(free, step[len(BASE_PARAMETERS) :], strict=True):
-        number = item.read_value(terms)
-        max_change = 1.0 if item.logarithmic else 0.5 * (item.parameter.high - item.parameter.low)
-        terms = item.with_value(terms, number + float(np.clip(change, -max_change, max_change)))
+    for item, change in zip(free, step[len(BASE_PARAMETERS) :].tolist(), strict=True):
+        terms = item.with_value(terms, item.read_value(terms) + change)
     return ParameterPoint(base, terms)
+
+
+def compute_step_limits(
+    problem: FitProblem, point: ParameterPoint, free: Sequence[FreeParameter]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the limits of one step in base and free parameters: their ranges, and what a linear model is good for."""
+    to_centre = np.subtract(problem.prior.mean, point.base)
+    lower, upper = np.maximum(-0.5, to_centre - BASE_LOG_SPAN), np.minimum(0.5, to_centre + BASE_LOG_SPAN)
+    for item in free:
+        number, (low, high) = item.read_value(point.terms), item.limits
+        max_change = 1.0 if item.logarithmic else 0.5 * (high - low)
+        lower = np.append(lower, max(-max_change, low - number))
+        upper = np.append(upper, min(max_change, high - number))
+    return np.minimum(lower, 0.0), np.maximum(upper, 0.0)
 
 
 def compute_jacobian(
@@ -112,10 +128,10 @@ def fit(
     problem: FitProblem,
     point: ParameterPoint,
     free: Sequence[FreeParameter] = (),
-    iterations: int = 12,
+    iterations: int = MAX_ITERATIONS,
     chi2_abandon: float = np.inf,
 ) -> ModelFit:
-    """Minimise χ² from a point by Gauss–Newton with step reduction.
+    """Minimise χ² from a point by Levenberg–Marquardt steps within the ranges of the parameters.
 
     chi2_abandon: from the second step on, the fit ends early if its predicted χ² stays above this value.
     """
@@ -126,7 +142,7 @@ def fit(
     centre = np.concatenate([problem.prior.mean, np.zeros(len(free))])
     best: ModelFit | None = None
     step, trial = np.zeros(count), point
-    remaining = iterations
+    damping, remaining = 0.0, iterations
     while best is None or remaining > 0:
         remaining -= 1
         deviation = np.concatenate([trial.base, np.zeros(len(free))]) - centre
@@ -136,23 +152,29 @@ def fit(
         )
         cost += float(precision @ deviation**2)
         if best is not None and not cost <= best.chi2 - 1e-9:
-            step = 0.3 * step
+            damping = max(DAMPING_INCREASE * damping, MIN_DAMPING)
             if float(np.abs(step).max()) < 1e-4:
                 break
         else:
             improvement = np.inf if best is None else best.chi2 - cost
+            damping = damping / DAMPING_DECREASE if damping > MIN_DAMPING else 0.0
             columns = np.column_stack([compute_jacobian(problem, trial, free, prediction), residual])
             gram = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).gram
             total = gram.sum(axis=0)
-            covariance = solve(total[:count, :count] + np.diag(precision), np.eye(count))
+            hessian = total[:count, :count] + np.diag(precision)
+            covariance = solve(hessian, np.eye(count))
             gradient = total[:count, -1] - precision * deviation
             best = ModelFit(trial, tuple(free), cost, covariance, gram, prediction)
-            step = covariance @ gradient
-            predicted_improvement = float(gradient @ step)
-            if min(predicted_improvement, improvement) < CHI2_CONVERGED or (
-                improvement < np.inf and cost - 2.0 * predicted_improvement > chi2_abandon
+            limits = compute_step_limits(problem, trial, free)
+            step = solve_within(hessian, gradient, *limits)
+            predicted_improvement = float(2.0 * gradient @ step - step @ hessian @ step)
+            if (
+                predicted_improvement < CHI2_CONVERGED
+                or (improvement < CHI2_CONVERGED and not damping)
+                or (improvement < np.inf and cost - 2.0 * float(gradient @ covariance @ gradient) > chi2_abandon)
             ):
                 break
+        step = solve_within(hessian, gradient, *limits, damping)
         trial = apply_step(problem, best.point, free, step)
         prediction = predict(data, trial, problem.epsilon)
     return best

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import Dataset
@@ -54,6 +55,27 @@ def solve(gram: FloatArray, right: FloatArray) -> FloatArray:
         (inverse @ (right / scale if right.ndim == 1 else right / scale[:, None]))
         / (scale if right.ndim == 1 else scale[:, None])
     )
+
+
+def solve_within(
+    gram: FloatArray, right: FloatArray, lower: FloatArray, upper: FloatArray, damping: float = 0.0
+) -> FloatArray:
+    """Return the minimum of xᵀ gram x − 2 rightᵀ x for lower ≤ x ≤ upper, with gram's diagonal raised by a share.
+
+    A solution that is clipped afterwards may increase the objective: the other numbers then do not fit the clipped one.
+    """
+    is_movable = upper > lower
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))[is_movable]
+    correlation = gram[np.ix_(is_movable, is_movable)] / scale / scale[:, None] + (1e-9 + damping) * np.eye(len(scale))
+    root = np.linalg.cholesky(correlation)
+    target = np.linalg.solve(root, right[is_movable] / scale)
+    scaled = np.linalg.solve(root.T, target)
+    limits = (lower[is_movable] * scale, upper[is_movable] * scale)
+    if ((scaled < limits[0]) | (scaled > limits[1])).any():
+        scaled = lsq_linear(root.T, target, limits, method="bvls").x
+    out = np.zeros(len(right))
+    out[is_movable] = scaled / scale
+    return out
 
 
 def project_out(gram: FloatArray, removed: list[int], kept: list[int]) -> FloatArray:
