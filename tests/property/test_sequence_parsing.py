@@ -5,14 +5,14 @@ from io import BytesIO
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.braille import DIGITS, PUNCTUATION
-from optodrive.planning.stimuli.frame_json import HEIGHT_MIN_UM
+from optodrive.planning.stimuli.frame_json import HEIGHT, HEIGHT_MIN_UM
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
@@ -41,6 +41,13 @@ def _is_one_line(error):
     return True
 
 
+def heights_of(entry):
+    """Return the heights of a frame, µm."""
+    target = entry["target_um"]
+    return list(target.values()) if isinstance(target, dict) else target
+
+
+@example([(1.0, 0.0, {0: 0.5})], 1, 0.0, 1.0)
 @given(
     st.lists(
         st.tuples(
@@ -62,7 +69,12 @@ def test_sequences_round_trip(frames, periods, gap_s, power_w):
         entries.append({"show_at_s": at_s, "duration_s": duration_s, "target_um": target})
         at_s += duration_s + pause_s
     train = {**TRAIN, "pulse_width_s": periods / 5000, "gap_s": gap_s, "power_w": power_w}
-    once = parse_sequence(json.dumps({"frames": entries, "trains": [train]}), CONFIG, "f")
+    text = json.dumps({"frames": entries, "trains": [train]})
+    if 0.0 < max(max(heights_of(entry), default=0.0) for entry in entries) < HEIGHT.low * (1.0 - 1e-9):
+        with pytest.raises(InputError, match="a highest pixel of at least 1 µm"):
+            parse_sequence(text, CONFIG, "f")
+        return
+    once = parse_sequence(text, CONFIG, "f")
     again = parse_sequence(json.dumps(sequence_to_json(once)), CONFIG, "f")
     assert again.trains == once.trains
     for one, two, entry in zip(once.frames, again.frames, entries, strict=True):
