@@ -145,19 +145,15 @@ def test_it_ends_in_one_line(bench, tmp_path, command, victim, number, stage):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", SIGNALS)
 def test_doctor_names_a_board_that_does_not_answer(tmp_path, start, number):
-    """The board is suspended before, because the handshake is short, and killed as soon as the port is open."""
+    """The board is suspended before, because the handshake is short; killed once the port is open."""
     board = Board(tmp_path)
     try:
         with signalling() as send:
-            if number == signal.SIGSTOP:
-                send(number, [board.process.pid])
+            send(signal.SIGSTOP, [board.process.pid])
             command = start(board, "doctor")
             pid, port = command.process.pid, str(board.port)
-            if number == signal.SIGSTOP:
-                wait_for(lambda: pid in [holder.pid for holder in find_holders(port)], "the open port", 60.0)
-            else:
-                wait_for(lambda: has_reached("connecting", board, tmp_path), "the open port", 60.0)
-                send(number, [board.process.pid])
+            wait_for(lambda: pid in [holder.pid for holder in find_holders(port)], "the open port", 60.0)
+            send(number, [board.process.pid])
             began_s = time.monotonic()
             status, out, errors = command.ended()
             print(f"\n{time.monotonic() - began_s:.2f} s")
