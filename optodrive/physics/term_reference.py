@@ -3,6 +3,7 @@
 from typing import Any
 
 from optodrive.physics.hypothesis import TermParameter
+from optodrive.physics.parameters import FORMAT, VERSION
 from optodrive.physics.term import Term
 from optodrive.physics.terms import discover_terms
 
@@ -49,8 +50,8 @@ def build_example(term: Term) -> list[str]:
 def build_example_file(term: Term) -> list[str]:
     """Return the lines of a complete parameter set that states a term and those that it requires."""
     lines = [
-        'format = "optodrive-parameters"',
-        "version = 1",
+        f'format = "{FORMAT}"',
+        f"version = {VERSION}",
         f'name = "{term.key}"',
         'base = "calibrated"',
         f'claims = "an example: {term.label}"',

@@ -145,7 +145,7 @@ def test_it_ends_in_one_line(bench, tmp_path, command, victim, number, stage):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", SIGNALS)
 def test_doctor_names_a_board_that_does_not_answer(tmp_path, start, number):
-    """The board is suspended before, because the handshake is short; killed once the port is open."""
+    """The board is suspended before, because the handshake is short, and killed, if at all, once the port is open."""
     board = Board(tmp_path)
     try:
         with signalling() as send:

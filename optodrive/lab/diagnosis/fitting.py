@@ -75,12 +75,8 @@ def compute_jitter_sensitivity(
     return JitterSensitivity((more_power - prediction) / np.log1p(POWER_STEP), 0.5 * (later - earlier) / DELAY_STEP_S)
 
 
-def apply_step(
-    problem: FitProblem, point: ParameterPoint, free: Sequence[FreeParameter], step: FloatArray
-) -> ParameterPoint:
-    """Return the point after a step in base and free parameters, clipped to their ranges."""
-    lower, upper = compute_step_limits(problem, point, free)
-    step = np.clip(step, lower, upper)
+def apply_step(point: ParameterPoint, free: Sequence[FreeParameter], step: FloatArray) -> ParameterPoint:
+    """Return the point after a step in base and free parameters, which `compute_step_limits` permits."""
     base = tuple(np.add(point.base, step[: len(BASE_PARAMETERS)]).tolist())
     terms: Mapping[str, Mapping[str, float]] = point.terms
     for item, change in zip(free, step[len(BASE_PARAMETERS) :].tolist(), strict=True):
@@ -175,6 +171,6 @@ def fit(
             ):
                 break
         step = solve_within(hessian, gradient, *limits, damping)
-        trial = apply_step(problem, best.point, free, step)
+        trial = apply_step(best.point, free, step)
         prediction = predict(data, trial, problem.epsilon)
     return best

@@ -75,7 +75,7 @@ def solve_within(
         scaled = lsq_linear(root.T, target, limits, method="bvls").x
     out = np.zeros(len(right))
     out[is_movable] = scaled / scale
-    return out
+    return np.clip(out, lower, upper)
 
 
 def project_out(gram: FloatArray, removed: list[int], kept: list[int]) -> FloatArray:
