@@ -10,12 +10,15 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.device.neighbours import Neighbours
+from optodrive.physics.extended_pulse_for_height import find_shortest_pulse
 from optodrive.physics.extended_pulses import (
+    EventStates,
     add_peaks_after_off,
-    advance_states,
+    advance_to,
     apply_pulses,
-    find_shortest_pulse,
+    set_light,
     simulate_displacement,
+    take_laser_rows,
 )
 from optodrive.physics.nominal_display import (
     TIME_ROUNDING_S,
@@ -29,7 +32,7 @@ from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.snapshot import SnapshotCache, compute_snapshot
-from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, FULL_W, ILLUMINATED_PIXEL, IS_TARGET, TermValues
+from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, TermValues
 from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import discover_terms
 
@@ -57,12 +60,10 @@ class ExtendedThermalState:
         is_coupled = any(discover_terms()[key].couples_neighbours for key in values)
         indices = neighbours.indices if is_coupled else np.zeros((len(pixels), 0), dtype=np.int64)
         self._neighbours = np.ascontiguousarray(indices)
-        self._columns = np.stack([getattr(pixels, name) for name in Pixel._fields], axis=1)
         self._context = np.zeros(CONTEXT_SIZE)
         self._context[FULL_W], self._context[AMBIENT_K], self._context[DOSE] = full_w, ambient_k, 1.0
-        self._at_s = np.full(len(pixels), at_s)
-        self._off_s = np.full(len(pixels), 1.0)
-        self._states = np.zeros((len(pixels), STATE_COUNT))
+        columns = np.stack([getattr(pixels, name) for name in Pixel._fields], axis=1)
+        self._events = EventStates.cold(columns, at_s)
         self._snapshot_cache: SnapshotCache | None = None
 
     def copy(self) -> "ExtendedThermalState":
@@ -73,8 +74,7 @@ class ExtendedThermalState:
         """Return a copy whose times are offset_s later, on a time line whose zero is offset_s earlier."""
         twin = ExtendedThermalState.__new__(ExtendedThermalState)
         vars(twin).update(vars(self))
-        twin._at_s = self._at_s + offset_s
-        twin._off_s, twin._states = self._off_s.copy(), self._states.copy()
+        twin._events = self._events.copy_shifted(offset_s)
         twin._snapshot_cache = None
         return twin
 
@@ -93,19 +93,17 @@ class ExtendedThermalState:
         """
         columns = build_kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
         peaks = PulsePeaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
-        display = (self._columns, self._at_s, self._off_s, self._states, self._neighbours)
+        display = (self._events, self._neighbours, self._active, self._context)
         last = np.full(len(self.pixels), -1)
         for begin in range(0, len(pixel), BATCH):
             end = min(begin + BATCH, len(pixel))
-            done = apply_pulses(*display, self._active, self._context, *columns, *peaks, last, begin, end)
+            done = apply_pulses(*display, *columns, *peaks, last, begin, end)
             if done < end:
                 raise self._time_order_error(int(pixel[done]), float(start_s[done]))
             on_progress()
         for begin in range(0, len(self.pixels), BATCH):
             end = min(begin + BATCH, len(self.pixels))
-            add_peaks_after_off(
-                self._columns, self._states, self._active, self._context, last, begin, end, peaks.displacement_m
-            )
+            add_peaks_after_off(self._events, self._active, self._context, last, begin, end, peaks.displacement_m)
             on_progress()
         return peaks
 
@@ -124,17 +122,13 @@ class ExtendedThermalState:
         pulse has at least min_periods, within the drive's range. peak_after_s: the peak counts only from this time
         after the pulse's start, and not before its end. Raises ValueError for a time before the pixel's last event.
         """
-        if start_s < self._at_s[pixel] - TIME_ROUNDING_S:
-            raise self._time_order_error(pixel, start_s)
-        context, one = self._context.copy(), self.pixels.elements[pixel]
-        context[ILLUMINATED_PIXEL], context[IS_TARGET] = pixel, 1.0
-        work, on_states = np.zeros((8, STATE_COUNT)), np.zeros((drive.max_periods + 1, STATE_COUNT))
-        work[0] = self._states[pixel]
-        off_s, wait_s = float(self._off_s[pixel]), max(0.0, float(start_s - self._at_s[pixel]))
-        advance_states(one, self._active, context, True, work, 0.0, off_s, wait_s)
+        context, work, off_s = self._advance_copy(pixel, start_s)
+        set_light(context, pixel, pixel)
+        on_states = np.zeros((drive.max_periods + 1, STATE_COUNT))
         span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
+        one = self.pixels.elements[pixel]
         periods, duty = find_shortest_pulse(
-            one, self._active, context, work, on_states, off_s + wait_s, target_m, *span, peak_after_s
+            one, self._active, context, work, on_states, off_s, target_m, *span, peak_after_s
         )
         return (periods, duty) if periods else None
 
@@ -147,7 +141,7 @@ class ExtendedThermalState:
         for index, kind in enumerate(kinds):
             if kind not in by_kind:
                 cold = self.copy_shifted(0.0)
-                cold._states[:], cold._at_s[:] = 0.0, 0.0
+                cold._events = EventStates.cold(self._events.columns, 0.0)
                 one = (np.array([index]), np.zeros(1), np.array([width_s]), np.array([drive.max_power_w]))
                 by_kind[kind] = float(cold.apply_pulses(*one).displacement_m[0])
         return np.array([by_kind[kind] for kind in kinds])
@@ -158,15 +152,13 @@ class ExtendedThermalState:
         pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
         pixel's last event.
         """
-        acting = np.array(pulses[np.isin(pulses[:, 3], [pixel, *self._neighbours[pixel].tolist()])])
+        acting = self._select_acting(pulses, pixel)
         first_s = min(float(t_s[0]), float(acting[0, 0]) if len(acting) else np.inf)
-        if first_s < self._at_s[pixel] - TIME_ROUNDING_S:
-            raise self._time_order_error(pixel, first_s)
-        last = (float(self._at_s[pixel]), float(self._off_s[pixel]), self._states[pixel].copy())
+        context, work, off_s = self._advance_copy(pixel, first_s)
         displacement_m = np.zeros(len(t_s))
         one = self.pixels.elements[pixel]
         simulate_displacement(
-            one, self._active, self._context.copy(), pixel, *last, acting, np.array(t_s), displacement_m
+            one, self._active, context, pixel, first_s, off_s, work[0], acting, np.array(t_s), displacement_m
         )
         return displacement_m
 
@@ -176,10 +168,9 @@ class ExtendedThermalState:
         Calls at successive times continue from the previous result, so each interval is integrated only once.
         """
         if self._snapshot_cache is None:
-            self._snapshot_cache = SnapshotCache.from_states(self._states)
+            self._snapshot_cache = SnapshotCache.from_events(self._events)
         state = DisplayState(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
-        display = (self._columns, self._at_s, self._off_s, self._states)
-        compute_snapshot(*display, self._active, self._context, self._snapshot_cache, float(at_s), *state)
+        compute_snapshot(self._events, self._active, self._context, self._snapshot_cache, float(at_s), *state)
         return state
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
@@ -187,7 +178,7 @@ class ExtendedThermalState:
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError if the display is not cold.
         """
-        if self._states.any():
+        if self._events.states.any():
             raise ValueError("a display with terms is traced from the cold state only")
         # Membrane terms do not act back on the gas: without them, the displacement is proportional to the gas's rise.
         gas_terms = {key: values for key, values in self._values.items() if not discover_terms()[key].moves_membrane}
@@ -196,7 +187,7 @@ class ExtendedThermalState:
         late_s = tuple(sum(getattr(item, name) for item in delays) for name in ("temperature", "displacement", "force"))
         columns = []
         for index in pixels:
-            acting = pulses[np.isin(pulses[:, 3], [index, *self._neighbours[index].tolist()])]
+            acting = self._select_acting(pulses, index)
             experiment = PixelExperiment(acting, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
             one = self.pixels.elements[index]
             absorber_k, displacement_m, force_n = simulate_signals(experiment, one, self._active, late_s)
@@ -206,5 +197,26 @@ class ExtendedThermalState:
         signals = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
         return PixelTrace(t_s, np.array(pixels, dtype=np.int64), *signals)
 
+    def _advance_copy(self, pixel: int, at_s: float) -> tuple[FloatArray, FloatArray, float]:
+        """Return a context, work space whose first row has a pixel's states at at_s, and the time since gate off then.
+
+        Raises ValueError for a time before the pixel's last event.
+        """
+        if at_s < self._events.at_s[pixel] - TIME_ROUNDING_S:
+            raise self._time_order_error(pixel, at_s)
+        context, work, laser = self._context.copy(), np.zeros((8, STATE_COUNT)), np.zeros((8, STATE_COUNT))
+        lit = int(self._events.lit[0])
+        set_light(context, pixel, lit if lit in (pixel, *self._neighbours[pixel].tolist()) else ELSEWHERE)
+        advance_to(self._events, self._active, context, work, pixel, at_s)
+        take_laser_rows(self._events, self._active, context, work, laser, at_s)
+        return context, work, float(self._events.off_s[pixel] + max(0.0, at_s - self._events.at_s[pixel]))
+
+    def _select_acting(self, pulses: FloatArray, pixel: int) -> FloatArray:
+        """Return the pulses [n, 4] that heat a pixel or a neighbour, and those ELSEWHERE if they act on the laser."""
+        is_near = np.isin(pulses[:, 3], [pixel, *self._neighbours[pixel].tolist()])
+        if not len(self._active.laser_rows):
+            return np.array(pulses[is_near])
+        return np.column_stack([pulses[:, :3], np.where(is_near, pulses[:, 3], ELSEWHERE)])
+
     def _time_order_error(self, pixel: int, at_s: float) -> ValueError:
-        return ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")
+        return ValueError(f"pixel {pixel} was advanced to {self._events.at_s[pixel]} s, {at_s} s lies before it")

@@ -1,7 +1,9 @@
-"""Pulses on pixels with terms: the states after them, their peaks, and the pulse that reaches a displacement.
+"""Pulses on pixels with terms: the states after them, and their peaks.
 
 Kernels over `pixel_ode.step`; `ExtendedThermalState` is their interface.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from optodrive.physics.nominal_display import TIME_ROUNDING_S, pixel_at
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, interpolate_states, next_step_s, output_signal, step
 from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, POWER_W
+from optodrive.physics.term_kernels import STATE_COUNT
 
 DISPLACEMENT_SIGNAL = 1
 """Number of the signal in `pixel_ode.output_signal`."""
@@ -18,8 +21,32 @@ DECAYED_SHARE, DECAYED_TIME_CONSTANTS = 0.7, 8.0
 """The peak after gate off is over once the displacement is below this share of it, after this many gas lags."""
 COLD_K = 1e-6
 """Largest rise of a pixel that counts as cold."""
-PEAK_TOLERANCE = 1e-5
-"""Relative distance of a peak from its target that is accepted."""
+
+
+class EventStates(NamedTuple):
+    """States of every pixel and, in the last row, of the laser, at the last event of each; kernels change them.
+
+    columns: [p, 6] the fields of `Pixel`; at_s, off_s: [p + 1] time of the last event, and time since gate off then;
+    states: [p + 1, STATE_COUNT]; lit: [1] pixel of the last pulse, −1 before the first
+    """
+
+    columns: FloatArray
+    at_s: FloatArray
+    off_s: FloatArray
+    states: FloatArray
+    lit: IntArray
+
+    @classmethod
+    def cold(cls, columns: FloatArray, at_s: float) -> "EventStates":
+        """Return the cold states of pixels [p, 6] whose last event is at at_s."""
+        count = len(columns) + 1
+        states, lit = np.zeros((count, STATE_COUNT)), np.full(1, -1)
+        return cls(columns, np.full(count, at_s), np.full(count, 1.0), states, lit)
+
+    def copy_shifted(self, offset_s: float) -> "EventStates":
+        """Return a copy whose times are offset_s later."""
+        at_s = self.at_s + offset_s
+        return EventStates(self.columns, at_s, self.off_s.copy(), self.states.copy(), self.lit.copy())
 
 
 @kernel
@@ -27,7 +54,6 @@ def advance_states(
     pixel: Pixel,
     active: ActiveTerms,
     c: FloatArray,
-    is_target: bool,
     work: FloatArray,
     at_s: float,
     since_edge_s: float,
@@ -48,7 +74,7 @@ def advance_states(
         last = done_s + 1.3 * h_s >= duration_s
         if last:
             h_s = duration_s - done_s
-        step(pixel, active, c, is_target, after_edge, at_s + done_s, since_edge_s + done_s, h_s, work)
+        step(pixel, active, c, after_edge, at_s + done_s, since_edge_s + done_s, h_s, work)
         begin_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
         end_m = output_signal(pixel, active, work[2], c, DISPLACEMENT_SIGNAL)
         interpolate_states(active.state_rows, work, 0.0, h_s, 0.5 * h_s)
@@ -89,18 +115,18 @@ def _vertex_m(begin_m: float, middle_m: float, end_m: float) -> float:
 
 
 @kernel
-def _peak_after_off_m(
+def peak_after_off_m(
     pixel: Pixel, active: ActiveTerms, c: FloatArray, work: FloatArray, since_edge_s: float, peak_after_s: float
 ) -> float:
     """Return the peak displacement, m, from peak_after_s after the states work[0] on; the gate is off."""
     c[POWER_W] = 0.0
     if peak_after_s > 0.0:
-        advance_states(pixel, active, c, True, work, 0.0, since_edge_s, peak_after_s)
+        advance_states(pixel, active, c, work, 0.0, since_edge_s, peak_after_s)
         since_edge_s += peak_after_s
     peak_m, done_s = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL), 0.0
     interval_s = pixel.tau_g_s
     while True:
-        interval_m = advance_states(pixel, active, c, True, work, done_s, since_edge_s + done_s, interval_s)[0]
+        interval_m = advance_states(pixel, active, c, work, done_s, since_edge_s + done_s, interval_s)[0]
         peak_m = max(peak_m, interval_m)
         done_s += interval_s
         has_decayed = done_s > DECAYED_TIME_CONSTANTS * pixel.tau_g_s
@@ -109,12 +135,60 @@ def _peak_after_off_m(
     return peak_m
 
 
+@kernel
+def set_light(c: FloatArray, index: int, illuminated: int) -> None:
+    """Let the context of pixel `index` have its light on the pixel `illuminated`."""
+    c[ILLUMINATED_PIXEL], c[IS_TARGET] = illuminated, 1.0 if illuminated == index else 0.0
+
+
+@kernel
+def advance_to(
+    events: EventStates, active: ActiveTerms, c: FloatArray, work: FloatArray, i: int, now_s: float
+) -> float:
+    """Write the states of pixel i at now_s to work[0], the gate off since its last event; return the peak meanwhile.
+
+    The context says on which pixel the light was. i may be the laser, which has the steps of the first pixel.
+    """
+    copy_states(events.states[i], work[0])
+    one = pixel_at(events.columns, i if i < len(events.columns) else 0)
+    c[POWER_W] = 0.0
+    return advance_states(one, active, c, work, 0.0, events.off_s[i], max(0.0, now_s - events.at_s[i]))[0]
+
+
+@kernel
+def take_laser_rows(
+    events: EventStates, active: ActiveTerms, c: FloatArray, work: FloatArray, laser: FloatArray, now_s: float
+) -> None:
+    """Give the states work[0] of a pixel the laser's at now_s; laser: [8, STATE_COUNT], work space."""
+    if len(active.laser_rows):
+        advance_to(events, active, c, laser, len(events.columns), now_s)
+        for row in active.laser_rows:
+            work[0, row] = laser[0, row]
+
+
+@kernel
+def _finish_wait(
+    events: EventStates, active: ActiveTerms, c: FloatArray, work: FloatArray, i: int, now_s: float
+) -> float:
+    """Advance pixel i to now_s, when the light leaves it, and let it have no laser states any more; return the peak."""
+    peak_m = advance_to(events, active, c, work, i, now_s)
+    for row in active.laser_rows:
+        work[0, row] = 0.0
+    wait_s = max(0.0, now_s - events.at_s[i])
+    _store(events, work, i, events.at_s[i] + wait_s, events.off_s[i] + wait_s)
+    return peak_m
+
+
+@kernel
+def _store(events: EventStates, work: FloatArray, i: int, at_s: float, off_s: float) -> None:
+    """Make work[0] the states of pixel i at at_s, off_s after gate off."""
+    copy_states(work[0], events.states[i])
+    events.at_s[i], events.off_s[i] = at_s, off_s
+
+
 @array_kernel
 def apply_pulses(
-    columns: FloatArray,
-    at_s: FloatArray,
-    off_s: FloatArray,
-    states: FloatArray,
+    events: EventStates,
     neighbours: IntArray,
     active: ActiveTerms,
     context: FloatArray,
@@ -130,44 +204,54 @@ def apply_pulses(
 ) -> int:
     """Apply the pulses begin to end and fill in their peaks [n]; return the first that is out of order, or end.
 
-    columns: [p, 6] the fields of `Pixel`; at_s, off_s, states: [p], [p], [p, STATE_COUNT] time of the last event,
-    time since gate off at that event, and the states then; neighbours: [p, k] pixels that the light on a pixel also
-    heats, −1 for none; last_pulse: [p] row of each pixel's last pulse so far, −1 for none
+    neighbours: [p, k] pixels that the light on a pixel also heats, −1 for none; last_pulse: [p] row of each pixel's
+    last pulse so far, −1 for none
     """
-    work, c = np.zeros((8, states.shape[1])), context.copy()
+    work, laser, c = np.zeros((8, events.states.shape[1])), np.zeros((8, events.states.shape[1])), context.copy()
     for row in range(begin, end):
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
-            if i >= 0 and start_s[row] - at_s[i] < -TIME_ROUNDING_S:
+            if i >= 0 and start_s[row] - events.at_s[i] < -TIME_ROUNDING_S:
                 return row
+        before = events.lit[0]
+        if len(active.laser_rows) and before >= 0 and before != pixel[row]:
+            for side in range(-1, neighbours.shape[1]):
+                i = before if side < 0 else neighbours[before, side]
+                if i >= 0:
+                    set_light(c, i, before)
+                    off_peak_m = _finish_wait(events, active, c, work, i, start_s[row])
+                    if last_pulse[i] >= 0:
+                        peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
         for side in range(-1, neighbours.shape[1]):
-            is_target = side < 0
-            i = pixel[row] if is_target else neighbours[pixel[row], side]
+            i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i < 0:
                 continue
-            one, wait_s = pixel_at(columns, i), max(0.0, start_s[row] - at_s[i])
-            copy_states(states[i], work[0])
-            c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, pixel[row], 1.0 if is_target else 0.0
-            off_peak_m, _ = advance_states(one, active, c, is_target, work, 0.0, off_s[i], wait_s)
+            set_light(c, i, pixel[row])
+            off_peak_m = advance_to(events, active, c, work, i, start_s[row])
             if last_pulse[i] >= 0:
                 peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
+            take_laser_rows(events, active, c, work, laser, start_s[row])
             before_k = work[0, ABSORBER]
             c[POWER_W] = power_w[row]
-            on_peak_m, on_peak_k = advance_states(one, active, c, is_target, work, 0.0, 0.0, width_s[row])
-            if is_target:
+            one = pixel_at(events.columns, i)
+            on_peak_m, on_peak_k = advance_states(one, active, c, work, 0.0, 0.0, width_s[row])
+            if side < 0:
                 last_pulse[i] = row
                 peak_k[row] = max(before_k, on_peak_k)
             if last_pulse[i] >= 0:
                 peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], on_peak_m)
-            copy_states(work[0], states[i])
-            at_s[i], off_s[i] = start_s[row] + width_s[row], 0.0
+            _store(events, work, i, start_s[row] + width_s[row], 0.0)
+        events.lit[0] = pixel[row]
+        source = events.states[pixel[row]]
+        for state in active.laser_rows:
+            events.states[len(events.columns), state] = source[state]
+        events.at_s[len(events.columns)], events.off_s[len(events.columns)] = start_s[row] + width_s[row], 0.0
     return end
 
 
 @array_kernel
 def add_peaks_after_off(
-    columns: FloatArray,
-    states: FloatArray,
+    events: EventStates,
     active: ActiveTerms,
     context: FloatArray,
     last_pulse: IntArray,
@@ -176,12 +260,12 @@ def add_peaks_after_off(
     peak_m: FloatArray,
 ) -> None:
     """Raise the peaks of the last pulses of the pixels begin to end by what follows after gate off."""
-    work, c = np.zeros((8, states.shape[1])), context.copy()
+    work, c = np.zeros((8, events.states.shape[1])), context.copy()
     for i in range(begin, end):
         if last_pulse[i] >= 0:
-            copy_states(states[i], work[0])
-            c[ILLUMINATED_PIXEL], c[IS_TARGET] = i, 1.0
-            off_peak_m = _peak_after_off_m(pixel_at(columns, i), active, c, work, 0.0, 0.0)
+            copy_states(events.states[i], work[0])
+            set_light(c, i, events.lit[0])
+            off_peak_m = peak_after_off_m(pixel_at(events.columns, i), active, c, work, 0.0, 0.0)
             peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
 
 
@@ -198,140 +282,29 @@ def simulate_displacement(
     t_s: FloatArray,
     displacement_m: FloatArray,
 ) -> None:
-    """Fill in the displacement of pixel `index` at t_s [m], under pulses [n, 4] on it and on its neighbours.
+    """Fill in the displacement of pixel `index` at t_s [m], under the pulses [n, 4] that act on it.
 
-    at_s, off_s, state: time of the last event, time since gate off at that event, and the states then
+    at_s, off_s, state: a time at which the gate is off, time since gate off then, and the states; the context says on
+    which pixel the light was
     """
     work = np.zeros((8, len(state)))
     copy_states(state, work[0])
     now_s, since_edge_s, row = at_s, off_s, 0
     for edge in range(2 * len(pulses) + 1):
-        pulse, gate_on, is_target = edge // 2, edge % 2 == 1, True
-        c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, index, 1.0
-        until_s = np.inf
+        pulse, gate_on, until_s = edge // 2, edge % 2 == 1, np.inf
+        c[POWER_W] = 0.0
         if pulse < len(pulses):
-            is_target = pulses[pulse, 3] == index
-            c[ILLUMINATED_PIXEL], c[IS_TARGET] = pulses[pulse, 3], 1.0 if is_target else 0.0
             until_s = pulses[pulse, 0] + (pulses[pulse, 1] if gate_on else 0.0)
-            c[POWER_W] = pulses[pulse, 2] if gate_on else 0.0
+        if gate_on:
+            c[POWER_W] = pulses[pulse, 2]
+            set_light(c, index, int(pulses[pulse, 3]))
         while row < len(t_s) and t_s[row] <= until_s:
             duration_s = max(0.0, t_s[row] - now_s)
-            advance_states(pixel, active, c, is_target, work, 0.0, since_edge_s, duration_s)
+            advance_states(pixel, active, c, work, 0.0, since_edge_s, duration_s)
             now_s, since_edge_s = now_s + duration_s, since_edge_s + duration_s
             displacement_m[row] = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
             row += 1
         if row == len(t_s):
             break
-        advance_states(pixel, active, c, is_target, work, 0.0, since_edge_s, max(0.0, until_s - now_s))
+        advance_states(pixel, active, c, work, 0.0, since_edge_s, max(0.0, until_s - now_s))
         now_s, since_edge_s = max(now_s, until_s), 0.0
-
-
-@kernel
-def _peak_after_state_m(
-    pixel: Pixel,
-    active: ActiveTerms,
-    c: FloatArray,
-    work: FloatArray,
-    state: FloatArray,
-    since_edge_s: float,
-    peak_after_s: float,
-) -> float:
-    """Return `_peak_after_off_m` from `state`, which stays as it is."""
-    copy_states(state, work[0])
-    return _peak_after_off_m(pixel, active, c, work, since_edge_s, peak_after_s)
-
-
-@kernel
-def find_shortest_pulse(
-    pixel: Pixel,
-    active: ActiveTerms,
-    c: FloatArray,
-    work: FloatArray,
-    on_states: FloatArray,
-    off_s: float,
-    target_m: float,
-    max_power_w: float,
-    period_s: float,
-    min_periods: int,
-    max_periods: int,
-    peak_after_s: float,
-) -> tuple[int, float]:
-    """Solve as `ExtendedThermalState.solve_pulse`, from the states work[0]; 0 periods if no pulse is needed.
-
-    on_states: [max_periods + 1, STATE_COUNT], work space for the states after each period at full power
-    """
-    copy_states(work[0], on_states[0])
-    if _peak_after_state_m(pixel, active, c, work, on_states[0], off_s, peak_after_s) >= target_m:
-        return 0, 0.0
-    high, highest_m = max_periods, 0.0
-    copy_states(on_states[0], work[0])
-    for period in range(max_periods):
-        c[POWER_W] = max_power_w
-        highest_m = advance_states(pixel, active, c, True, work, 0.0, period * period_s, period_s)[0]
-        copy_states(work[0], on_states[period + 1])
-        if highest_m >= target_m and peak_after_s <= 0.0:
-            high = max(period + 1, min_periods)
-            break
-    low = min_periods - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        after_off_s = max(0.0, peak_after_s - middle * period_s)
-        if _peak_after_state_m(pixel, active, c, work, on_states[middle], 0.0, after_off_s) >= target_m:
-            high = middle
-        else:
-            low = middle
-    return high, _solve_duty(pixel, active, c, work, on_states[0], target_m, max_power_w, high * period_s, peak_after_s)
-
-
-@kernel
-def _solve_duty(
-    pixel: Pixel,
-    active: ActiveTerms,
-    c: FloatArray,
-    work: FloatArray,
-    state: FloatArray,
-    target_m: float,
-    max_power_w: float,
-    width_s: float,
-    peak_after_s: float,
-) -> float:
-    """Return the duty at which a pulse's peak is target_m, by the Illinois method; 1 if none is."""
-    low, high = 0.0, 1.0
-    low_error_m = _peak_after_state_m(pixel, active, c, work, state, 0.0, peak_after_s) - target_m
-    high_error_m = _pulse_peak_m(pixel, active, c, work, state, max_power_w, width_s, peak_after_s) - target_m
-    if high_error_m <= 0.0:
-        return 1.0
-    retained_side = 0
-    for _ in range(30):
-        duty = (low * high_error_m - high * low_error_m) / (high_error_m - low_error_m)
-        error_m = _pulse_peak_m(pixel, active, c, work, state, duty * max_power_w, width_s, peak_after_s) - target_m
-        if abs(error_m) <= PEAK_TOLERANCE * target_m:
-            return duty
-        if error_m > 0.0:
-            high, high_error_m = duty, error_m
-            low_error_m *= 0.5 if retained_side > 0 else 1.0
-            retained_side = 1
-        else:
-            low, low_error_m = duty, error_m
-            high_error_m *= 0.5 if retained_side < 0 else 1.0
-            retained_side = -1
-    return high
-
-
-@kernel
-def _pulse_peak_m(
-    pixel: Pixel,
-    active: ActiveTerms,
-    c: FloatArray,
-    work: FloatArray,
-    state: FloatArray,
-    power_w: float,
-    width_s: float,
-    peak_after_s: float,
-) -> float:
-    """Return the peak displacement, m, of a pulse from `state`, counted from peak_after_s after its start."""
-    copy_states(state, work[0])
-    c[POWER_W] = power_w
-    on_peak_m = advance_states(pixel, active, c, True, work, 0.0, 0.0, width_s)[0]
-    off_peak_m = _peak_after_off_m(pixel, active, c, work, 0.0, max(0.0, peak_after_s - width_s))
-    return max(on_peak_m, off_peak_m) if peak_after_s <= 0.0 else off_peak_m

@@ -20,6 +20,7 @@ from optodrive.physics.term import (
     BRIDGE_FLOW_W,
     CONTEXT_SIZE,
     DOSE,
+    ELSEWHERE,
     FAR_END_K,
     FULL_W,
     GAS,
@@ -68,10 +69,11 @@ MAX_STEP_S = 6e-3
 class PixelExperiment:
     """One run as one pixel experiences it.
 
-    pulses: [n, 4] start_s, width_s, power_w, pixel, in order, on one beam; t_s: increasing sample times of temperature,
-    displacement and force; dose_before: dose of earlier runs on this pixel, relative to the largest dose of any pixel
-    in the recording; dose_per_j: relative dose per incident energy; session_time, session_time_per_s: start of the run
-    and rate of the session's time, which runs from −1 to 1; full_w: full power of the laser
+    pulses: [n, 4] start_s, width_s, power_w, pixel, in order, on one beam, a pixel of ELSEWHERE being neither this one
+    nor a neighbour; t_s: increasing sample times of temperature, displacement and force; dose_before: dose of earlier
+    runs on this pixel, relative to the largest dose of any pixel in the recording; dose_per_j: relative dose per
+    incident energy; session_time, session_time_per_s: start of the run and rate of the session's time, which runs from
+    −1 to 1; full_w: full power of the laser
     """
 
     pulses: FloatArray
@@ -94,25 +96,29 @@ class ActiveTerms(NamedTuple):
     """A set of terms as kernels take it.
 
     on: [terms], 1 for an active term; values: [terms, MAX_PARAMETERS] their parameters; state_rows: rows of the state
-    vector that move; is_fast: whether a term is faster than the gas
+    vector that move; laser_rows: those of them that all pixels share; is_fast: whether a term is faster than the gas
     """
 
     on: IntArray
     values: FloatArray
     state_rows: IntArray
+    laser_rows: IntArray
     is_fast: bool
 
     @classmethod
     def from_values(cls, values: Mapping[str, TermValues]) -> "ActiveTerms":
         """Return the set for term → parameter → SI value; terms without kernels have no effect."""
         on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), MAX_PARAMETERS))
-        rows = [ABSORBER, GAS, NEIGHBOUR]
+        rows, laser_rows = [ABSORBER, GAS, NEIGHBOUR], list[int]()
         for key, term_values in values.items():
             row, term = TERM_ROW[key], discover_terms()[key]
             on[row] = 1
             v[row, : len(term_values)] = [term_values[item.name] for item in term.parameters]
-            rows += [*term.states, *range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(term.followers))]
-        return cls(on, v, np.array(rows), any(discover_terms()[key].is_fast for key in values))
+            followers = range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(term.followers))
+            rows += [*term.states, *followers]
+            laser_rows += followers if term.has_laser_state else ()
+        is_fast = any(discover_terms()[key].is_fast for key in values)
+        return cls(on, v, np.array(rows), np.array(laser_rows, dtype=np.int64), is_fast)
 
 
 def simulate_signals(
@@ -149,11 +155,9 @@ def simulate_signals(
 
 
 @kernel
-def evaluate_rates(
-    pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArray, is_target: bool, dy: FloatArray
-) -> None:
-    """Write dy/dt [STATE_COUNT] for the context's command; is_target: the light is on this pixel, not beside it."""
-    on, v = active.on, active.values
+def evaluate_rates(pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArray, dy: FloatArray) -> None:
+    """Write dy/dt [STATE_COUNT] for the context's command, light on this pixel, beside it or elsewhere."""
+    on, v, is_target = active.on, active.values, c[IS_TARGET] > 0.0
     light_w = optical_power(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else decaying_power(on, v, y, c, 0.0)
     wall_k = wall_rise(on, v, y, c, y[WALL])
     c[FAR_END_K] = wall_k
@@ -161,7 +165,8 @@ def evaluate_rates(
     into_w = (pixel.epsilon * light_w if is_target else 0.0) - c[BRIDGE_FLOW_W] - heat_loss(on, v, y, c, 0.0)
     dy[ABSORBER] = into_w / heat_capacity(on, v, y, c, pixel.c_j_per_k)
     dy[GAS] = (0.5 * (y[ABSORBER] + wall_k) - y[GAS]) / pixel.tau_g_s
-    neighbour_w = (0.0 if is_target else pixel.epsilon * light_w) - y[NEIGHBOUR] / pixel.r_k_per_w
+    is_beside = not is_target and c[ILLUMINATED_PIXEL] != ELSEWHERE
+    neighbour_w = (pixel.epsilon * light_w if is_beside else 0.0) - y[NEIGHBOUR] / pixel.r_k_per_w
     dy[NEIGHBOUR] = neighbour_w / pixel.c_j_per_k
     rates(on, v, y, c, dy)
 
@@ -180,7 +185,6 @@ def step(
     pixel: Pixel,
     active: ActiveTerms,
     c: FloatArray,
-    is_target: bool,
     after_edge: bool,
     at_s: float,
     since_edge_s: float,
@@ -196,22 +200,22 @@ def step(
     k1, k2, k3, k4, stage = work[1], work[4], work[5], work[6], work[7]
     c[TIME_S], c[SINCE_EDGE_S] = at_s, since_edge_s
     if after_edge:
-        evaluate_rates(pixel, active, y, c, is_target, k1)
+        evaluate_rates(pixel, active, y, c, k1)
     rows = active.state_rows
     c[TIME_S], c[SINCE_EDGE_S] = at_s + 0.5 * h_s, since_edge_s + 0.5 * h_s
     for row in rows:
         stage[row] = y[row] + 0.5 * h_s * k1[row]
-    evaluate_rates(pixel, active, stage, c, is_target, k2)
+    evaluate_rates(pixel, active, stage, c, k2)
     for row in rows:
         stage[row] = y[row] + 0.5 * h_s * k2[row]
-    evaluate_rates(pixel, active, stage, c, is_target, k3)
+    evaluate_rates(pixel, active, stage, c, k3)
     c[TIME_S], c[SINCE_EDGE_S] = at_s + h_s, since_edge_s + h_s
     for row in rows:
         stage[row] = y[row] + h_s * k3[row]
-    evaluate_rates(pixel, active, stage, c, is_target, k4)
+    evaluate_rates(pixel, active, stage, c, k4)
     for row in rows:
         y1[row] = y[row] + h_s / 6.0 * (k1[row] + 2.0 * k2[row] + 2.0 * k3[row] + k4[row])
-    evaluate_rates(pixel, active, y1, c, is_target, work[3])
+    evaluate_rates(pixel, active, y1, c, work[3])
     tau_s = sensor_lag(active.on, active.values, y, c, 0.0)
     if tau_s > 0.0:
         y1[SENSOR] = _lagged_reading_k(y[SENSOR], y[ABSORBER], k1[ABSORBER], y1[ABSORBER], tau_s, h_s)
@@ -302,12 +306,12 @@ def _simulate(
             until_s = max(until_s, t_s[signal][-1] - clock_delay_s[signal])
     samples = np.zeros(3, dtype=np.int64)
     now_s, edge_s, row, dose = 0.0, 0.0, 0, span[0]
-    gate_on, is_target, after_edge = False, True, True
+    gate_on, after_edge = False, True
     while now_s < until_s or now_s == 0.0:
         if row < len(pulses) and not gate_on and pulses[row, 0] <= now_s:
             gate_on, edge_s, after_edge = True, now_s, True
-            c[POWER_W], c[ILLUMINATED_PIXEL], is_target = pulses[row, 2], pulses[row, 3], pulses[row, 3] == index
-            c[IS_TARGET] = 1.0 if is_target else 0.0
+            c[POWER_W], c[ILLUMINATED_PIXEL] = pulses[row, 2], pulses[row, 3]
+            c[IS_TARGET] = 1.0 if pulses[row, 3] == index else 0.0
         end_s = until_s + 1e-3
         if gate_on:
             end_s = pulses[row, 0] + pulses[row, 1]
@@ -320,7 +324,7 @@ def _simulate(
             h_s = end_s - now_s
         if h_s > 0.0:
             c[DOSE] = dose
-            step(pixel, active, c, is_target, after_edge, now_s, since_edge_s, h_s, work)
+            step(pixel, active, c, after_edge, now_s, since_edge_s, h_s, work)
             samples[0] = _fill_samples(
                 pixel, active, c, work, now_s, h_s, t_s[0], clock_delay_s[0], span, 0, samples[0], out[0]
             )

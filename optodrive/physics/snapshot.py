@@ -6,10 +6,10 @@ import numpy as np
 
 from optodrive.core.kernels import array_kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.extended_pulses import DISPLACEMENT_SIGNAL, advance_states, copy_states
+from optodrive.physics.extended_pulses import DISPLACEMENT_SIGNAL, EventStates, advance_states, copy_states, set_light
 from optodrive.physics.nominal_display import pixel_at
 from optodrive.physics.pixel_ode import ActiveTerms, output_signal
-from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, POWER_W
+from optodrive.physics.term import ABSORBER, POWER_W
 
 
 class SnapshotCache(NamedTuple):
@@ -20,17 +20,15 @@ class SnapshotCache(NamedTuple):
     states: FloatArray
 
     @classmethod
-    def from_states(cls, states: FloatArray) -> "SnapshotCache":
-        """Return an empty cache for states [p, STATE_COUNT]."""
-        return cls(np.full(len(states), np.nan), np.full(len(states), np.nan), np.zeros_like(states))
+    def from_events(cls, events: EventStates) -> "SnapshotCache":
+        """Return an empty cache for the pixels of some events."""
+        count = len(events.columns)
+        return cls(np.full(count, np.nan), np.full(count, np.nan), np.zeros((count, events.states.shape[1])))
 
 
 @array_kernel
 def compute_snapshot(
-    columns: FloatArray,
-    at_s: FloatArray,
-    off_s: FloatArray,
-    states: FloatArray,
+    events: EventStates,
     active: ActiveTerms,
     context: FloatArray,
     cache: SnapshotCache,
@@ -40,19 +38,19 @@ def compute_snapshot(
 ) -> None:
     """Fill in displacement and absorber rise of every pixel [p] at now_s, with the gate off since its last event.
 
-    columns, at_s, off_s, states: as in `extended_pulses.apply_pulses`. The cache is updated.
+    The cache is updated.
     """
-    work, c = np.zeros((8, states.shape[1])), context.copy()
-    c[POWER_W], c[IS_TARGET] = 0.0, 1.0
-    for i in range(len(at_s)):
+    work, c, at_s = np.zeros((8, events.states.shape[1])), context.copy(), events.at_s
+    c[POWER_W] = 0.0
+    for i in range(len(events.columns)):
         # After a new event, or for an earlier time, the cached states are no start: begin at the event.
         if cache.event_s[i] != at_s[i] or now_s < cache.at_s[i]:
             cache.event_s[i] = cache.at_s[i] = at_s[i]
-            copy_states(states[i], cache.states[i])
-        one, wait_s = pixel_at(columns, i), max(0.0, now_s - cache.at_s[i])
-        c[ILLUMINATED_PIXEL] = i
+            copy_states(events.states[i], cache.states[i])
+        one, wait_s = pixel_at(events.columns, i), max(0.0, now_s - cache.at_s[i])
+        set_light(c, i, events.lit[0])
         copy_states(cache.states[i], work[0])
-        advance_states(one, active, c, True, work, 0.0, off_s[i] + cache.at_s[i] - at_s[i], wait_s)
+        advance_states(one, active, c, work, 0.0, events.off_s[i] + cache.at_s[i] - at_s[i], wait_s)
         copy_states(work[0], cache.states[i])
         cache.at_s[i] += wait_s
         displacement_m[i] = output_signal(one, active, work[0], c, DISPLACEMENT_SIGNAL)

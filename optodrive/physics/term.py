@@ -28,11 +28,13 @@ TIME_S, SESSION_TIME, IS_TARGET, MEMBRANE_DRIVE_K = range(8, 12)
 """Entries of the context vector that kernels receive besides the states.
 
 Commanded power and full power; time since the last gate edge; dose so far over the recording's largest; index of the
-illuminated pixel; ambient temperature; heat flow through the bridge and temperature rise of its far end; time in the
-run, and in the session from −1 to 1; 1 if the light falls on this very pixel, else 0; gas rise that drives the
-membrane.
+illuminated pixel, or ELSEWHERE; ambient temperature; heat flow through the bridge and temperature rise of its far end;
+time in the run, and in the session from −1 to 1; 1 if the light falls on this very pixel, else 0; gas rise that drives
+the membrane.
 """
 CONTEXT_SIZE = 12
+ELSEWHERE = -1
+"""Illuminated pixel of a pulse that heats neither the pixel nor one of its neighbours: it only acts on the laser."""
 
 Modifier = Callable[[FloatArray, FloatArray, int, FloatArray, float], float]
 RateWriter = Callable[[FloatArray, FloatArray, int, FloatArray, FloatArray], None]
@@ -106,7 +108,8 @@ class Term:
 
     Identity: key, the term's name in files; label, a clause that completes "The nominal model is wrong because …".
     Physics: requires, keys of terms that it builds on; states, shared rows of the state vector that only it moves;
-    followers, names of its own state rows; kernels; in_pixel, False for a term that only the limiter's bound accounts
+    followers, names of its own state rows; has_laser_state, whether these belong to the laser, which all pixels share;
+    kernels; in_pixel, False for a term that only the limiter's bound accounts
     for; couples_neighbours, whether light on one pixel heats the pixels around it; is_fast, whether it acts within a
     gas time constant; cannot_add_heat, whether it never makes anything hotter, see also `bound_heat_gain`.
     Diagnosis: signature, where the effect shows in recorded data, empty if it is no possible cause of a discrepancy;
@@ -120,6 +123,7 @@ class Term:
     requires: tuple[str, ...] = ()
     states: tuple[int, ...] = ()
     followers: tuple[str, ...] = ()
+    has_laser_state: bool = False
     kernels: Kernels = Kernels()
     in_pixel: bool = True
     couples_neighbours: bool = False

@@ -9,6 +9,7 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.physics.terms import discover_terms
+from truth_file import write_truth
 
 MEASURED, BESIDE = 5, 6
 
@@ -36,6 +37,7 @@ FRAMES = {
         train(MEASURED, 3.8, 0.049, 1.6, width_s=0.05),
     ],
 }
+IN_TURN = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "18": 120.5}}]}
 NAMED = (
     *("ambient_drift", "bridge_conductivity", "clock_offset", "gas_leak", "heat_capacity", "laser_droop", "laser_lag"),
     *("laser_turn_on", "membrane_creep", "membrane_stiffening", "power_nonlinearity", "radiation", "sensor_lag"),
@@ -64,21 +66,21 @@ CASES = [
 ]
 
 
-def write_truth(path, key):
-    lines = ['format = "optodrive-parameters"', "version = 1", 'name = "hidden"', 'base = "calibrated"', 'claims = ""']
-    for part in (key, *discover_terms()[key].requires):
-        for item in discover_terms()[part].parameters:
-            value = float(MEASURED) if item.name == "pixel" else item.default * FACTORS.get(part, 1.0)
-            table = f"[terms.{part}.{item.name}]"
-            lines += [table, f"value = {value!r}", f'unit = "{item.unit}"', 'source = "hidden"']
-    path.write_text("\n".join(lines) + "\n")
-    return path
+def hide(key):
+    """Return a term and those that it requires, with their defaults: term → parameter → SI value."""
+    return {
+        part: {
+            item.name: MEASURED if item.name == "pixel" else item.default * FACTORS.get(part, 1.0)
+            for item in discover_terms()[part].parameters
+        }
+        for part in (key, *discover_terms()[key].requires)
+    }
 
 
 def simulate(folder, key, noise, seed):
     """Record one simulation; return the exit status and the file."""
     (folder / "frames.json").write_text(json.dumps(FRAMES))
-    truth, out = write_truth(folder / "truth.toml", key), folder / f"recording{seed}.h5"
+    truth, out = write_truth(folder / "truth.toml", hide(key)), folder / f"recording{seed}.h5"
     options = (
         "--pixels",
         f"{MEASURED},{BESIDE}" if key == "beam_misalignment" else str(MEASURED),
@@ -117,6 +119,22 @@ def test_a_truth_that_the_plan_does_not_show_gives_no_false_name(key, noise, tmp
     verdict, causes = find_causes(tmp_path, capsys, key, noise)
     imitates = {"gas_membrane": ["membrane_stiffening"]}.get(key, [key])
     assert verdict == "none" or causes == imitates, (verdict, causes)
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [("laser_lag", {"time": 5e-4}), ("laser_droop", {"share": 0.2, "time": 5e-3, "spread": 1.5})],
+)
+def test_a_laser_that_pulses_of_two_pixels_share_is_named(key, values, tmp_path, capsys):
+    """README's frames light two pixels in turn: what the light on one does to the laser shows on the other."""
+    (tmp_path / "frames.json").write_text(json.dumps(IN_TURN))
+    truth, out = write_truth(tmp_path / "truth.toml", {key: values}), tmp_path / "recording.h5"
+    arguments = ("simulate", tmp_path / "frames.json", "--truth", truth, "--out", out, "--repeats", 3, "--noise", 0)
+    assert run([str(item) for item in arguments]) == 0, capsys.readouterr().err
+    capsys.readouterr()
+    assert run(["diagnose", str(out), "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["verdict"], answer["causes"]) == ("cause", [key])
 
 
 @pytest.mark.parametrize("key", REFUSED)

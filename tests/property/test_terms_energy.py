@@ -42,7 +42,7 @@ def test_energy_closes(keys, data):
     states, context, rates = np.zeros(STATE_COUNT), np.zeros(CONTEXT_SIZE), np.zeros(STATE_COUNT)
     states[ABSORBER], states[WALL] = theta_k, wall_k
     context[POWER_W], context[FULL_W], context[AMBIENT_K], context[IS_TARGET] = power_w, 2.45, ROOM_K, 1.0
-    evaluate_rates(pixel, ActiveTerms.from_values(values), states, context, True, rates)
+    evaluate_rates(pixel, ActiveTerms.from_values(values), states, context, rates)
     capacity_j_per_k = pixel.c_j_per_k * (1.0 + values.get("heat_capacity", {}).get("slope", 0.0) * theta_k)
     stored_w = capacity_j_per_k * rates[ABSORBER]
     emitting_m2 = values.get("radiation", {}).get("emitting_area", 0.0)

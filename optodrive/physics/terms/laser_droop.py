@@ -32,6 +32,7 @@ class LaserDroop(Term):
         TermParameter("spread", "1", 1.5, 1.0, 30.0, "the mount's time over the chip's", is_shape=True),
     )
     followers = ("chip_1", "mount_1")
+    has_laser_state = True
     kernels = Kernels(rates=rates, optical_power=optical_power)
     cannot_add_heat = True
     signature = "long pulses and trains, but not in cooling"

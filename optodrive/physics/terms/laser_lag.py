@@ -47,6 +47,7 @@ class LaserLag(Term):
         TermParameter("time", "s", 5e-4, 1e-4, 4e-3, "drivers with a filter, 0.1 to 3 ms", starts=(2e-4, 6e-4, 2e-3)),
     )
     followers = ("emitted_w",)
+    has_laser_state = True
     kernels = Kernels(rates=rates, optical_power=optical_power, decaying_power=decaying_power)
     is_fast = True
     signature = "the first milliseconds after either edge of a pulse"

@@ -12,6 +12,7 @@ from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.pulse_for_height import DriveRange
+from optodrive.physics.term import ELSEWHERE
 from optodrive.physics.term_kernels import TERMS
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
@@ -30,11 +31,22 @@ def extended(*keys, at_s=0.0):
     return ExtendedThermalState(ARRAY, default_values(*keys), AMBIENT_K, FULL_W, SMALL, at_s)
 
 
-def some_pulses(seed, count=40, pixels=(0, 1, 5)):
+def some_pulses(seed, count=40, pixels=(0, 1, 5, 15)):
     generator = np.random.default_rng(seed)
     width_s = generator.integers(1, 60, count) * 2e-4
     start_s = np.cumsum(np.concatenate([[0.0], width_s[:-1]]) + generator.exponential(4e-3, count))
     return generator.choice(pixels, count), start_s, width_s, generator.uniform(0.2, FULL_W, count)
+
+
+def select_acting(keys, columns, pixel):
+    """Return the pulses [n] that act on a pixel: its own, its neighbours', and all others through the laser."""
+    terms = [term for term in TERMS if term.key in keys]
+    is_near = np.isin(columns[0], [pixel, *SMALL.indices[pixel]])
+    if not any(term.couples_neighbours for term in terms):
+        is_near = columns[0] == pixel
+    if any(term.has_laser_state for term in terms):
+        return (np.where(is_near, columns[0], ELSEWHERE), *columns[1:])
+    return tuple(column[is_near] for column in columns)
 
 
 def simulate_alone(keys, pixel, columns, until_s):
@@ -64,16 +76,14 @@ def test_without_terms_it_is_the_nominal_display(seed):
     assert ours.max_displacement_m(DRIVE) == pytest.approx(nominal.max_displacement_m(DRIVE), rel=2e-4)
 
 
-@pytest.mark.parametrize("key", [*SINGLE, "laser_droop+membrane_creep"])
+@pytest.mark.parametrize("key", [*SINGLE, "laser_droop+membrane_creep", "laser_lag+neighbour_crosstalk"])
 def test_each_pulse_brings_its_pixel_to_what_one_pixel_alone_does(key):
     keys = key.split("+")
-    near = "neighbour_crosstalk" in keys
     columns = some_pulses(3)
     index, start_s, *_ = columns
     peaks = extended(*keys).apply_pulses(*columns).displacement_m
     for pixel in (0, 1, 5):
-        acting = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
-        own = tuple(column[acting] for column in columns)
+        own = select_acting(keys, columns, pixel)
         t_s, _, displacement_m = simulate_alone(keys, pixel, own, start_s[-1] + 0.3)
         rows = np.flatnonzero(index == pixel)
         for row, after in zip(rows, [*rows[1:], None], strict=True):
@@ -127,23 +137,21 @@ def test_a_pulse_asked_to_be_wide_and_to_count_late_is(key):
 @pytest.mark.parametrize("key", ["", *SINGLE])
 def test_heights_from_the_heat_there_are_those_of_the_whole_run(key):
     keys = key.split("+")
-    near = "neighbour_crosstalk" in keys
-    index, *columns = some_pulses(9)
+    columns = some_pulses(9)
     for pixel in (0, 5):
-        acting = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
-        own = (index[acting], *(column[acting] for column in columns))
-        half = len(own[0]) // 2
+        own = select_acting(keys, columns, pixel)
+        half = int(np.flatnonzero(columns[0] == pixel)[3]) - 1
         heat = extended(*keys)
-        heat.apply_pulses(*(column[:half] for column in own))
-        pulses = np.column_stack([*own[1:], own[0]])
+        heat.apply_pulses(*(column[: half + 1] for column in columns))
+        pulses = np.column_stack([*columns[1:], columns[0]])
         t_s, _, displacement_m = simulate_alone(keys, pixel, own, pulses[-1, 0] + 0.1)
-        after = t_s > pulses[half - 1, :2].sum() + 1e-6
+        after = t_s > pulses[half, :2].sum() + 1e-6
         untouched = heat.copy()
-        ours_m = heat.simulate_displacement_m(pulses[half:], pixel, t_s[after])
+        ours_m = heat.simulate_displacement_m(pulses[half + 1 :], pixel, t_s[after])
         assert ours_m == pytest.approx(displacement_m[after], rel=1e-3, abs=5e-8)
         assert heat.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE) == untouched.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE)
     with pytest.raises(ValueError, match="lies before it"):
-        heat.simulate_displacement_m(pulses[half:], pixel, np.array([pulses[half - 1, 0]]))
+        heat.simulate_displacement_m(pulses[half + 1 :], pixel, np.zeros(1))
 
 
 def test_no_pulse_where_the_heat_left_reaches_the_height_and_the_longest_where_none_does():
@@ -167,7 +175,7 @@ def test_a_neighbours_light_lifts_a_pixel_only_where_they_exchange_heat():
         heat = extended(*keys)
         heat.apply_pulses(np.array([5]), np.zeros(1), np.array([0.05]), np.array([FULL_W]))
         beside = int(SMALL.indices[5][0])
-        assert (np.abs(heat.copy()._states[beside]).max() > min_k) == (min_k > 0)
+        assert (np.abs(heat.copy()._events.states[beside]).max() > min_k) == (min_k > 0)
 
 
 def test_copies_and_shifts_stand_alone():

@@ -13,9 +13,7 @@ from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.prediction import ParameterPoint
 from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.recording import read_recording
-from optodrive.physics.parameters import FORMAT, VERSION
-from optodrive.physics.terms import discover_terms
-from sound_files import write_toml
+from truth_file import write_truth
 
 FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "18": 120.5}}]}
 """The frames of README's chain."""
@@ -32,12 +30,7 @@ TOLERANCE = 1.0
 
 
 def record(folder, key, values):
-    stated = {
-        item.name: {"value": values[item.name], "unit": item.unit, "source": "hidden"}
-        for item in discover_terms()[key].parameters
-    }
-    head = {"format": FORMAT, "version": VERSION, "name": "hidden", "base": "calibrated", "claims": ""}
-    write_toml(folder / "truth.toml", head | {"terms": {key: stated}})
+    write_truth(folder / "truth.toml", {key: values})
     (folder / "frames.json").write_text(json.dumps(FRAMES))
     arguments = ("simulate", "frames.json", "--truth", "truth.toml", "--out", "h.h5", "--repeats", "3")
     assert run([str(folder / item) if "." in item else item for item in arguments] + ["--seed", str(SEED)]) == 0
