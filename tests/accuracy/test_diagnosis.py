@@ -16,10 +16,15 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.diagnose import diagnose
+from optodrive.lab.diagnosis.fitting import fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
+from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import assign_bins
+from optodrive.lab.diagnosis.prediction import ParameterPoint
+from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.diagnosis.report import build_report
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.terms import discover_terms
@@ -93,6 +98,30 @@ def test_without_repeats_nothing_is_named_for_certain():
     assert any("No run repeats another" in line for line in build_narrative(found))
 
 
+def round_temperature(terms, quantum_k):
+    """Return a recording without noise whose absorber temperature is in steps of quantum_k."""
+    runs = []
+    for item in lab(17, terms, noise=0.0).runs:
+        absorber = item.signals["absorber_temperature_K"]
+        value = np.round(absorber.value / quantum_k) * quantum_k if quantum_k else absorber.value
+        runs.append(replace(item, signals=item.signals | {"absorber_temperature_K": replace(absorber, value=value)}))
+    return Measurement(tuple(runs))
+
+
+@pytest.mark.parametrize(
+    ("resistance", "capacity"), [(34.05544665820724, 0.3), (14.817305218450562, 0.9462824584018701)]
+)
+def test_a_fit_that_still_improves_is_not_abandoned(resistance, capacity):
+    """From far away a linear prediction is pessimistic; the true cause was abandoned for one that had come close."""
+    measurement = round_temperature(WALL, 0.1)
+    prior, epsilon, _ = build_prior(measurement, None)
+    (data,) = build_dataset(measurement).split_subsystems()
+    problem, base = fit_nominal(data.select(split_runs(data)[0]), prior, epsilon)
+    (wall,) = (item for item in build_hypotheses(data) if item.key == "wall_heating")
+    start = ParameterPoint(base.point.base, {"wall_heating": {"resistance": resistance, "capacity": capacity}})
+    assert fit(problem, start, wall.free, chi2_abandon=1_000.0).chi2 < 1_000.0
+
+
 @pytest.mark.parametrize(
     ("terms", "quantum_k"),
     [
@@ -104,12 +133,7 @@ def test_without_repeats_nothing_is_named_for_certain():
     ids=lambda terms: "".join(terms) if isinstance(terms, dict) else None,
 )
 def test_data_without_noise_are_diagnosed_by_their_resolution(terms, quantum_k):
-    runs = []
-    for item in lab(17, terms, noise=0.0).runs:
-        absorber = item.signals["absorber_temperature_K"]
-        value = np.round(absorber.value / quantum_k) * quantum_k if quantum_k else absorber.value
-        runs.append(replace(item, signals=item.signals | {"absorber_temperature_K": replace(absorber, value=value)}))
-    found = diagnose(Measurement(tuple(runs)))
+    found = diagnose(round_temperature(terms, quantum_k))
     assert (found.verdict, found.causes) == ("cause" if terms else "none", tuple(terms))
     assert any("equal to the last digit" in line for line in found.remarks)
     assert all(item.low <= item.value <= item.high for item in found.parameters.values())

@@ -15,6 +15,7 @@ from optodrive.planning.stimuli.braille import DIGITS, PUNCTUATION
 from optodrive.planning.stimuli.frame_json import HEIGHT, HEIGHT_MIN_UM
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
+from optodrive.planning.stimuli.train_json import LONG_INTERVAL_S
 
 CONFIG = load_config("display-16")
 HEIGHTS = st.just(0.0) | st.floats(HEIGHT_MIN_UM, 2000)
@@ -59,7 +60,7 @@ def heights_of(entry):
         max_size=5,
     ),
     st.integers(1, 250),
-    st.floats(0, 1),
+    st.floats(0, LONG_INTERVAL_S, exclude_max=True),
     st.floats(0.01, 2.45),
 )
 def test_sequences_round_trip(frames, periods, gap_s, power_w):

@@ -129,7 +129,8 @@ def fit(
 ) -> ModelFit:
     """Minimise χ² from a point by Levenberg–Marquardt steps within the ranges of the parameters.
 
-    chi2_abandon: from the second step on, the fit ends early if its predicted χ² stays above this value.
+    chi2_abandon: from the second step on, the fit ends early if neither twice the predicted improvement nor as much as
+    the last one brings χ² below this value.
     """
     data, count = problem.data, len(BASE_PARAMETERS) + len(free)
     prediction = predict(data, point, problem.epsilon)
@@ -163,11 +164,12 @@ def fit(
             best = ModelFit(trial, tuple(free), cost, covariance, gram, prediction)
             limits = compute_step_limits(problem, trial, free)
             step = solve_within(hessian, gradient, *limits)
+            predicted = 2.0 * float(gradient @ covariance @ gradient)
             predicted_improvement = float(2.0 * gradient @ step - step @ hessian @ step)
             if (
                 predicted_improvement < CHI2_CONVERGED
                 or (improvement < CHI2_CONVERGED and not damping)
-                or (improvement < np.inf and cost - 2.0 * float(gradient @ covariance @ gradient) > chi2_abandon)
+                or (improvement < np.inf and cost - max(predicted, improvement) > chi2_abandon)
             ):
                 break
         step = solve_within(hessian, gradient, *limits, damping)
