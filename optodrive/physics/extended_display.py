@@ -205,8 +205,10 @@ class ExtendedThermalState:
         if at_s < self._events.at_s[pixel] - TIME_ROUNDING_S:
             raise self._time_order_error(pixel, at_s)
         context, work, laser = self._context.copy(), np.zeros((8, STATE_COUNT)), np.zeros((8, STATE_COUNT))
-        lit = int(self._events.lit[0])
-        set_light(context, pixel, lit if lit in (pixel, *self._neighbours[pixel].tolist()) else ELSEWHERE)
+        illuminated = int(self._events.illuminated[0])
+        set_light(
+            context, pixel, illuminated if illuminated in (pixel, *self._neighbours[pixel].tolist()) else ELSEWHERE
+        )
         advance_to(self._events, self._active, context, work, pixel, at_s)
         take_laser_rows(self._events, self._active, context, work, laser, at_s)
         return context, work, float(self._events.off_s[pixel] + max(0.0, at_s - self._events.at_s[pixel]))

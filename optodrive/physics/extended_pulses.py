@@ -27,26 +27,26 @@ class EventStates(NamedTuple):
     """States of every pixel and, in the last row, of the laser, at the last event of each; kernels change them.
 
     columns: [p, 6] the fields of `Pixel`; at_s, off_s: [p + 1] time of the last event, and time since gate off then;
-    states: [p + 1, STATE_COUNT]; lit: [1] pixel of the last pulse, −1 before the first
+    states: [p + 1, STATE_COUNT]; illuminated: [1] pixel of the last pulse, −1 before the first
     """
 
     columns: FloatArray
     at_s: FloatArray
     off_s: FloatArray
     states: FloatArray
-    lit: IntArray
+    illuminated: IntArray
 
     @classmethod
     def cold(cls, columns: FloatArray, at_s: float) -> "EventStates":
         """Return the cold states of pixels [p, 6] whose last event is at at_s."""
         count = len(columns) + 1
-        states, lit = np.zeros((count, STATE_COUNT)), np.full(1, -1)
-        return cls(columns, np.full(count, at_s), np.full(count, 1.0), states, lit)
+        states, illuminated = np.zeros((count, STATE_COUNT)), np.full(1, -1)
+        return cls(columns, np.full(count, at_s), np.full(count, 1.0), states, illuminated)
 
     def copy_shifted(self, offset_s: float) -> "EventStates":
         """Return a copy whose times are offset_s later."""
         at_s = self.at_s + offset_s
-        return EventStates(self.columns, at_s, self.off_s.copy(), self.states.copy(), self.lit.copy())
+        return EventStates(self.columns, at_s, self.off_s.copy(), self.states.copy(), self.illuminated.copy())
 
 
 @kernel
@@ -213,7 +213,7 @@ def apply_pulses(
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i >= 0 and start_s[row] - events.at_s[i] < -TIME_ROUNDING_S:
                 return row
-        before = events.lit[0]
+        before = events.illuminated[0]
         if len(active.laser_rows) and before >= 0 and before != pixel[row]:
             for side in range(-1, neighbours.shape[1]):
                 i = before if side < 0 else neighbours[before, side]
@@ -241,7 +241,7 @@ def apply_pulses(
             if last_pulse[i] >= 0:
                 peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], on_peak_m)
             _store(events, work, i, start_s[row] + width_s[row], 0.0)
-        events.lit[0] = pixel[row]
+        events.illuminated[0] = pixel[row]
         source = events.states[pixel[row]]
         for state in active.laser_rows:
             events.states[len(events.columns), state] = source[state]
@@ -264,7 +264,7 @@ def add_peaks_after_off(
     for i in range(begin, end):
         if last_pulse[i] >= 0:
             copy_states(events.states[i], work[0])
-            set_light(c, i, events.lit[0])
+            set_light(c, i, events.illuminated[0])
             off_peak_m = peak_after_off_m(pixel_at(events.columns, i), active, c, work, 0.0, 0.0)
             peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
 

@@ -48,7 +48,7 @@ def compute_snapshot(
             cache.event_s[i] = cache.at_s[i] = at_s[i]
             copy_states(events.states[i], cache.states[i])
         one, wait_s = pixel_at(events.columns, i), max(0.0, now_s - cache.at_s[i])
-        set_light(c, i, events.lit[0])
+        set_light(c, i, events.illuminated[0])
         copy_states(cache.states[i], work[0])
         advance_states(one, active, c, work, 0.0, events.off_s[i] + cache.at_s[i] - at_s[i], wait_s)
         copy_states(work[0], cache.states[i])

@@ -37,7 +37,7 @@ FRAMES = {
         train(MEASURED, 3.8, 0.049, 1.6, width_s=0.05),
     ],
 }
-IN_TURN = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "18": 120.5}}]}
+README_FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "18": 120.5}}]}
 NAMED = (
     *("ambient_drift", "bridge_conductivity", "clock_offset", "gas_leak", "heat_capacity", "laser_droop", "laser_lag"),
     *("laser_turn_on", "membrane_creep", "membrane_stiffening", "power_nonlinearity", "radiation", "sensor_lag"),
@@ -126,8 +126,8 @@ def test_a_truth_that_the_plan_does_not_show_gives_no_false_name(key, noise, tmp
     [("laser_lag", {"time": 5e-4}), ("laser_droop", {"share": 0.2, "time": 5e-3, "spread": 1.5})],
 )
 def test_a_laser_that_pulses_of_two_pixels_share_is_named(key, values, tmp_path, capsys):
-    """README's frames light two pixels in turn: what the light on one does to the laser shows on the other."""
-    (tmp_path / "frames.json").write_text(json.dumps(IN_TURN))
+    """README's frames light two pixels: what the light on one does to the laser shows on the other."""
+    (tmp_path / "frames.json").write_text(json.dumps(README_FRAMES))
     truth, out = write_truth(tmp_path / "truth.toml", {key: values}), tmp_path / "recording.h5"
     arguments = ("simulate", tmp_path / "frames.json", "--truth", truth, "--out", out, "--repeats", 3, "--noise", 0)
     assert run([str(item) for item in arguments]) == 0, capsys.readouterr().err
