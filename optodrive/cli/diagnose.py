@@ -152,10 +152,12 @@ def _diagnose_per_pixel(
 
 def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) -> None:
     """Write the requested files atomically, then print the narrative or the JSON document."""
+    from optodrive.core.files import create_folder
+
     if json is not None and json != STDOUT:
         _write_text(Path(json), _dump_json(output.document))
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
+        create_folder(out)
         _write_text(out / "report.html", output.report_html)
         _write_text(out / "diagnosis.json", _dump_json(output.document))
         if output.model_toml is not None:

@@ -88,7 +88,9 @@ def _find_page(name: str, paths: list[str]) -> str:
 
 
 def _copy_tree(source: Traversable, target: Path) -> None:
-    target.mkdir(parents=True)
+    from optodrive.core.files import create_folder
+
+    create_folder(target)
     for item in source.iterdir():
         if item.is_dir():
             if not item.name.startswith((".", "__")):

@@ -59,6 +59,14 @@ def check_output(option: str, path: Path | None, *suffixes: str, folder: bool = 
         raise InputError(option, str(path), f"a path in a folder that can be written; {parent} cannot")
 
 
+def create_folder(path: Path) -> None:
+    """Create a folder and its parents unless it exists. Raise InputError with the path if it cannot be created."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a folder that can be created") from None
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Return a TOML file as a table. Raise InputError if it cannot be read or parsed."""
     try:

@@ -51,7 +51,7 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
     """
     from json import dumps
 
-    from optodrive.core.files import atomic_write
+    from optodrive.core.files import atomic_write, create_folder
     from optodrive.core.types.stimuli import FrameSequence
     from optodrive.device.field_loader import load_scan_field
     from optodrive.device.pixel_map import max_aim_offset_m, remove_pixel_map, write_pixel_map
@@ -67,10 +67,7 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
             raise InputError(
                 "display.pitch_m", loaded.display.pitch_m, f"cells that contain the focus at {offset_mm:.2f} mm offset"
             )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("--sweep", str(folder), f"a folder ({error.strerror})") from None
+    create_folder(folder)
     field = load_scan_field(loaded)
     reached = [is_reachable(loaded, field, aim) for aim in aims]
     for aim, pixels in zip(aims, reached, strict=True):

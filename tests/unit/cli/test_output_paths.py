@@ -1,10 +1,12 @@
 """Outputs of commands: every path is checked before anything is read or computed, by its folder and its suffix."""
 
+from pathlib import Path
+
 import pytest
 
 from optodrive.cli.main import run
 from optodrive.core.errors import InputError
-from optodrive.core.files import check_output
+from optodrive.core.files import check_output, create_folder
 
 WRITERS = {
     "diagnose --out": (["diagnose", "absent.h5", "--out"], None),
@@ -71,3 +73,9 @@ def test_forms_of_an_output(tmp_path):
     ):
         with pytest.raises(InputError, match="--out"):
             check_output("--out", path, *suffixes, folder=folder)
+
+
+def test_a_folder_that_cannot_be_created_is_refused_by_name():
+    """Nothing can be created in /proc, whose permissions say otherwise."""
+    with pytest.raises(InputError, match="/proc/new: got 'No such file or directory', expected a folder"):
+        create_folder(Path("/proc/new"))
