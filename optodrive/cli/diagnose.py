@@ -197,6 +197,9 @@ def _read_recordings(paths: list[Path]) -> "Measurement":
 
     if len(paths) == 1:
         return read_recording(paths[0])
+    twice = next((path for row, path in enumerate(paths) if path in paths[:row]), None)
+    if twice is not None:
+        raise InputError("RECORDING", str(twice), "every recording once")
     runs = [replace(run, name=f"{path.stem}/{run.name}") for path in paths for run in read_recording(path).runs]
     return Measurement(tuple(runs))
 

@@ -21,6 +21,11 @@ def recording(tmp_path_factory):
     return path
 
 
+def test_a_recording_given_twice_is_refused(recording, capsys):
+    assert run(["diagnose", str(recording), str(recording)]) == 2
+    assert capsys.readouterr().err.strip().endswith("expected every recording once")
+
+
 def test_the_narrative_and_three_files(recording, tmp_path, capsys):
     out = tmp_path / "answer"
     assert run(["diagnose", str(recording), "--out", str(out)]) == 0

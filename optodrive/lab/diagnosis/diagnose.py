@@ -22,6 +22,7 @@ from optodrive.core.types.discrepancy import (
 )
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.candidate_judgement import judge_candidates, list_rivals
+from optodrive.lab.diagnosis.copied_runs import check_copied_runs
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset
 from optodrive.lab.diagnosis.detection import count_noise_degrees
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
@@ -90,10 +91,12 @@ def diagnose(
 ) -> Discrepancy:
     """Diagnose a recording.
 
-    Raises InputError if it has no data to compare with the model, or a quantity that is probably in a wrong unit.
+    Raises InputError if it has no data to compare with the model, a quantity that is probably in a wrong unit, or a
+    copy in place of a repeat.
     """
     began_s = perf_counter()
     check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel(epsilon))
+    check_copied_runs(measurement)
     subsystems: list[_SubsystemFit] = []
     for part in build_dataset(measurement).split_subsystems():
         timing_s = max((item.problem.noise.timing_sigma_s for item in subsystems), default=0.0)

@@ -146,9 +146,9 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
         members = [item for item in contrasts if item.kind == kind]
         if not members:
             members = build_residual_contrasts(data, residual, power, timing, kind)
-        quantum, span = _measure_steps(data, data.value - residual, kind)
-        quanta[kind] = quantum
-        coloured[kind] = _fit_coloured(members, max(quantum / sqrt(12.0), RESOLUTION_SHARE * span, EPS))
+        values, span = _collect_values(data, data.value - residual, kind)
+        quanta[kind] = _find_quantum(values)
+        coloured[kind] = _fit_coloured(members, estimate_resolution(values, span))
     if not contrasts:
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
     power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(contrasts, coloured, data.kinds)
@@ -184,16 +184,21 @@ def _minimize(function: Callable[[FloatArray], float], start: FloatArray, step: 
     return np.asarray(minimize(function, start, method="Nelder-Mead", options=options).x)
 
 
-def _measure_steps(data: Dataset, prediction: FloatArray, kind: int) -> tuple[float, float]:
-    """Return the quantisation step of the samples of one kind, 0 for none, and the range of data and prediction."""
+def estimate_resolution(values: FloatArray, span: float) -> float:
+    """Return the standard deviation that quantisation or a converter of that span gives to samples."""
+    return max(_find_quantum(values) / sqrt(12.0), RESOLUTION_SHARE * span, EPS)
+
+
+def _collect_values(data: Dataset, prediction: FloatArray, kind: int) -> tuple[FloatArray, float]:
+    """Return the samples of one kind, and the range of data and prediction."""
     parts = [block.part for block in data.blocks if block.kind == kind]
-    values = np.unique(np.concatenate([data.value[part] for part in parts]))
-    span = max(float(np.ptp(values)), float(np.ptp(np.concatenate([prediction[part] for part in parts]))))
-    return _find_quantum(values), span
+    values = np.concatenate([data.value[part] for part in parts])
+    return values, max(float(np.ptp(values)), float(np.ptp(np.concatenate([prediction[part] for part in parts]))))
 
 
 def _find_quantum(values: FloatArray) -> float:
-    """Return the step of which all sorted distinct values are multiples, or 0 if there is none."""
+    """Return the step of which all values are multiples, or 0 if there is none."""
+    values = np.unique(values)
     steps = np.diff(values)
     steps = steps[steps > ROUNDING_SHARE * float(np.abs(values).max())]
     if len(steps) < MIN_QUANTA:
