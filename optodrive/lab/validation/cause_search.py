@@ -19,6 +19,8 @@ FRACTION_STEP = 1e-3
 MAX_ITERATIONS = 25
 CHI2_CONVERGED = 1e-2
 """Decrease of χ² per iteration below which a fit ends."""
+CHI2_DIGITS = 2
+"""Decimal digits of χ² that are determined by then."""
 BEAM_WIDTH = 3
 """Number of sets of each size that are extended."""
 REQUIRED_ODDS = 20.0
@@ -94,8 +96,8 @@ class CauseSearch:
             < best.cost
         ):
             larger = {frozenset(fit.keys): fit for parent in beam for fit in self.fit_additions(parent)}
-            beam = sorted(larger.values(), key=lambda fit: fit.aicc)[:BEAM_WIDTH]
-            best = min([best, *beam], key=lambda fit: fit.cost)
+            beam = sorted(larger.values(), key=lambda fit: _rank(fit, fit.aicc))[:BEAM_WIDTH]
+            best = min([best, *beam], key=lambda fit: _rank(fit, fit.cost))
         return best
 
     def fit_additions(self, fit: CauseFit) -> list[CauseFit]:
@@ -207,6 +209,14 @@ class CauseSearch:
             shifted[number] += FRACTION_STEP if shifted[number] < 0.5 else -FRACTION_STEP
             columns.append((self._compute_residuals(keys, shifted) - residuals) / (shifted[number] - fractions[number]))
         return np.stack(columns, axis=1)
+
+
+def _rank(fit: CauseFit, criterion: float) -> tuple[float, list[int]]:
+    """Return a sorting key by a criterion; equal to within a fit's convergence, the order of CAUSES decides.
+
+    Two causes of one fact fit it equally well: the last digits, which depend on the processor, must not choose.
+    """
+    return round(criterion, CHI2_DIGITS), sorted(CAUSES.index(CAUSES_BY_KEY[key]) for key in fit.keys)
 
 
 def compute_aicc(chi2: float, cause_count: int, fact_count: int) -> float:
