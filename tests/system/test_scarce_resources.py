@@ -58,21 +58,23 @@ def starve(pid):
 
 
 def fill(rig, process):
-    """Send a process more than its memory holds: a long message, or to the web process a long body."""
+    """Send a process more than its memory holds: a long message, or to the web process a long body.
+
+    What it does on its own may have ended it before.
+    """
+    base = rig.daemon.client.base_url
     if process == "web":
-        base = rig.daemon.client.base_url
         head = f"POST /v1/plans HTTP/1.1\r\nHost: {base.host}:{base.port}\r\nAuthorization: Bearer {TOKEN}\r\n"
         head, body_bytes = head + "Content-Length: 7000000\r\n\r\n", 7_000_000
-        link = socket.create_connection((base.host, base.port), timeout=10.0)
+        family, address = socket.AF_INET, (base.host, base.port)
         data = head.encode() + bytes(body_bytes)
     else:
-        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        link.settimeout(10.0)
-        port = rig.daemon.client.base_url.port
-        folder = rig.daemon.config.parent / "optodrive" / f"daemon-{port}"
-        link.connect(os.path.realpath(folder) + f"/{process}.sock")
+        folder = rig.daemon.config.parent / "optodrive" / f"daemon-{base.port}"
+        family, address = socket.AF_UNIX, os.path.realpath(folder) + f"/{process}.sock"
         data = struct.pack("<II", 2 * FILLING_BYTES, 100) + bytes(FILLING_BYTES)
-    with link, suppress(OSError):
+    with socket.socket(family, socket.SOCK_STREAM) as link, suppress(OSError):
+        link.settimeout(10.0)
+        link.connect(address)
         link.sendall(data)
         link.recv(1)
 
