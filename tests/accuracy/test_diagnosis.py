@@ -15,16 +15,19 @@ from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dataset import build_dataset
+from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.fitting import fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_file import build_model_toml
+from optodrive.lab.diagnosis.model_selection import select_from
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import assign_bins
 from optodrive.lab.diagnosis.prediction import ParameterPoint
 from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.refitting import RefittedCandidate
 from optodrive.lab.diagnosis.report import build_report
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.terms import discover_terms
@@ -120,6 +123,25 @@ def test_a_fit_that_still_improves_is_not_abandoned(resistance, capacity):
     (wall,) = (item for item in build_hypotheses(data) if item.key == "wall_heating")
     start = ParameterPoint(base.point.base, {"wall_heating": {"resistance": resistance, "capacity": capacity}})
     assert fit(problem, start, wall.free, chi2_abandon=1_000.0).chi2 < 1_000.0
+
+
+def test_a_pair_is_not_named_for_a_cause_whose_own_fit_had_ended_elsewhere():
+    measurement = round_temperature(WALL, 0.1)
+    prior, epsilon, _ = build_prior(measurement, None)
+    (data,) = build_dataset(measurement).split_subsystems()
+    problem, base = fit_nominal(data, prior, epsilon)
+    hypotheses = [item for item in build_hypotheses(data) if item.key in ("wall_heating", "membrane_creep")]
+    singles = []
+    for item in hypotheses:
+        iterations = 1 if item.key == "wall_heating" else 60
+        start = ParameterPoint(base.point.base, {item.key: item.starts[-1]})
+        result = fit(problem, start, item.free, iterations)
+        singles.append(RefittedCandidate((item,), result, result.chi2))
+    singles.sort(key=lambda item: item.bic)
+    assert singles[0].causes == ("membrane_creep",)
+    detection = detect(problem, base, hypotheses, 0)
+    verdict = select_from(problem, base, hypotheses, detection, singles, 0, lambda stage: None)
+    assert (verdict.verdict, verdict.causes) == ("cause", ("wall_heating",))
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.lab.diagnosis.refitting import RefittedCandidate
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.terms import discover_terms
 
@@ -156,7 +157,7 @@ def test_a_lag_at_the_end_of_its_range_is_no_rival_of_a_late_clock():
         point, key = ParameterPoint(base.point.base, terms), next(iter(terms))
         free = tuple(discover_terms()[key].free(name) for name in names)
         fitted = ModelFit(point, free, 0.0, base.covariance, base.gram, predict(problem.data, point))
-        return model_selection.RefittedCandidate((), fitted, 0.0)
+        return RefittedCandidate((), fitted, 0.0)
 
     clock = candidate({"clock_offset": dict.fromkeys(CLOCKS, 0.0) | {"temperature": 8e-5}}, "temperature")
     lags = [

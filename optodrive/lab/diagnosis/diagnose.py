@@ -1,6 +1,5 @@
 """Diagnosis of a recording, separately for pixels and mirrors and then combined."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import exp
 from time import perf_counter
@@ -33,7 +32,6 @@ from optodrive.lab.diagnosis.model_selection import (
     BIC_INDISTINGUISHABLE,
     MAX_INTRA_PULSE_POWER_EXCESS,
     MAX_REPLICATE_EXCESS,
-    RefittedCandidate,
     Verdict,
     find_best_candidate,
     has_replicate_excess,
@@ -44,14 +42,13 @@ from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fi
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, ParameterPoint
+from optodrive.lab.diagnosis.refitting import ProgressCallback, RefittedCandidate
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 from optodrive.physics.terms import discover_terms
 
 LIMIT_SHARE = 1e-3
 """A fitted number within this share of a limit of its range counts as at the limit."""
-
-ProgressCallback = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,16 +1,21 @@
 """Selection of the causes: refits ranked by BIC, a verdict, a second cause where one is insufficient, and rivals."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.lab.diagnosis.detection import Detection, Score, detect, score_effects, simulate_effects
+from optodrive.lab.diagnosis.detection import Detection, detect, score_effects, simulate_effects
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
-from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity, fit
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
-from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
-from optodrive.physics.hypothesis import FreeParameter, Hypothesis
+from optodrive.lab.diagnosis.refitting import (
+    ProgressCallback,
+    RefittedCandidate,
+    refit_alone,
+    refit_pairs,
+    refit_strongest,
+)
+from optodrive.physics.hypothesis import Hypothesis
 
 FAMILY_ALPHA = 0.001
 """Significance level of the family of tests: keeps false alarms below 1 % although the noise model is an estimate."""
@@ -18,10 +23,6 @@ MAX_REPLICATE_EXCESS = 6.0
 """Maximum replicate excess, in σ, for runs of one group to count as repeats."""
 MAX_INTRA_PULSE_POWER_EXCESS = 25.0
 """Maximum significance, in σ, of power changes within pulses."""
-CHI2_ABANDON = 300.0
-"""A fit that is predicted to stay this far above the best χ² is abandoned."""
-MAX_REFITS = 9
-"""Number of the strongest hypotheses that are refitted."""
 BIC_INDISTINGUISHABLE = 10.0
 """Rivals within this BIC difference of the best cannot be told apart: odds below about 150.
 
@@ -38,31 +39,6 @@ A second node behind the absorber would otherwise pass for a wall that the gas f
 """
 MIN_EXPLAINED_OTHER_FORM = 0.985
 """A cause with significant residuals is still named if it explains this share of the excess."""
-MAX_STARTS, MAX_RESTARTS = 6, 6
-"""Number of starts refitted of a hypothesis with many, and maximum number of restarts of each."""
-MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
-"""Number of second causes refitted beside each of the best first causes, and number of those."""
-
-ProgressCallback = Callable[[str], None]
-
-
-@dataclass(frozen=True, eq=False)
-class RefittedCandidate:
-    """One or two hypotheses, refitted; bic: χ² plus ln samples per free parameter."""
-
-    hypotheses: tuple[Hypothesis, ...]
-    fit: ModelFit
-    bic: float
-
-    @property
-    def causes(self) -> tuple[str, ...]:
-        """Keys of the causes."""
-        return tuple(item.key for item in self.hypotheses)
-
-    @property
-    def label(self) -> str:
-        """Labels of the hypotheses, joined."""
-        return " and ".join(item.label for item in self.hypotheses)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +75,9 @@ def find_best_candidate(
     problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, on_progress: ProgressCallback
 ) -> RefittedCandidate | None:
     """Return the best refit of the strongest hypotheses, or None if none is promising."""
-    return next(iter(_refit(problem, base, (), detect(problem, base, hypotheses, seed).scores, on_progress)), None)
+    return next(
+        iter(refit_strongest(problem, base, (), detect(problem, base, hypotheses, seed).scores, on_progress)), None
+    )
 
 
 def select_causes(
@@ -112,9 +90,22 @@ def select_causes(
         return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
     if not is_rejected(nominal_detection):
         return Verdict("none", (), None, (), nominal_detection, None, 0.0)
-    singles = _refit(problem, base, (), nominal_detection.scores, on_progress)
+    singles = refit_strongest(problem, base, (), nominal_detection.scores, on_progress)
     if not singles:
         return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
+    return select_from(problem, base, hypotheses, nominal_detection, singles, seed, on_progress)
+
+
+def select_from(
+    problem: FitProblem,
+    base: ModelFit,
+    hypotheses: list[Hypothesis],
+    nominal_detection: Detection,
+    singles: list[RefittedCandidate],
+    seed: int,
+    on_progress: ProgressCallback,
+) -> Verdict:
+    """Return the verdict that follows from refitted single causes, best first."""
     best = singles[0]
     on_progress(f"testing the residuals of {best.label}")
     others = [item for item in hypotheses if item.key not in best.causes]
@@ -137,9 +128,12 @@ def select_causes(
         - basis_detection.residual_chi2
         - basis_columns.shape[1] * np.log(len(problem.data.value))
     )
-    candidates = _refit_pairs(problem, base, hypotheses, singles, residual_detection, seed, on_progress)
+    candidates = refit_pairs(problem, base, hypotheses, singles, residual_detection, seed, on_progress)
     pairs = [item for item in candidates if _is_pair_needed(item, singles, form_gain)]
     if pairs:
+        restarted = refit_alone(problem, base, pairs[0], singles, on_progress)
+        if singles[0].bic - restarted[0].bic > BIC_INDISTINGUISHABLE:
+            return select_from(problem, base, hypotheses, nominal_detection, restarted, seed, on_progress)
         pair = pairs[0]
         on_progress(f"testing the residuals of {pair.label}")
         others = [item for item in hypotheses if item.key not in pair.causes]
@@ -171,80 +165,6 @@ def select_causes(
     return Verdict("unexplained", (), None, (*pairs, *singles), nominal_detection, residual_detection, single_explained)
 
 
-def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
-    """Return the point of a score's start at the amplitude found, within its ranges."""
-    item = score.hypothesis
-    terms = {**point.terms, item.key: dict(score.start)}
-    if item.is_linear and item.degrees > 1:
-        values = dict.fromkeys(score.start, 0.0)
-        for free, amplitude, start in zip(item.free, score.amplitude, item.starts, strict=True):
-            number = amplitude * start[free.names[0]]
-            values[free.names[0]] = min(max(number, free.parameter.low), free.parameter.high)
-        return ParameterPoint(point.base, {**point.terms, item.key: values})
-    free = item.free[0]
-    scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], 0.2, 5.0))
-    value = score.start[free.names[0]] * scale
-    return ParameterPoint(point.base, free.with_value(terms, float(np.log(value)) if free.logarithmic else value))
-
-
-def _refit(
-    problem: FitProblem,
-    base: ModelFit,
-    given: tuple[Hypothesis, ...],
-    scores: Sequence[Score],
-    on_progress: ProgressCallback,
-) -> list[RefittedCandidate]:
-    """Refit the strongest scores in full, best first."""
-    samples = len(problem.data.value)
-    candidates: list[RefittedCandidate] = []
-    promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(6.0, 0.05 * scores[0].ratio)]
-    chi2_abandon = np.inf
-    for score in promising:
-        on_progress(f"fitting {score.hypothesis.label}")
-        free = (*base.free, *score.hypothesis.free)
-        start = _build_start(base.point, score)
-        if score.hypothesis.fit_every_start:
-            result = _refit_every_start(problem, base, score.hypothesis, free)
-        else:
-            result = fit(problem, start, free, chi2_abandon=chi2_abandon)
-        chi2_abandon = min(chi2_abandon, result.chi2 + CHI2_ABANDON)
-        candidates.append(
-            RefittedCandidate((*given, score.hypothesis), result, result.chi2 + len(free) * np.log(samples))
-        )
-    return sorted(candidates, key=lambda item: item.bic)
-
-
-def _refit_every_start(
-    problem: FitProblem, base: ModelFit, item: Hypothesis, free: Sequence[FreeParameter]
-) -> ModelFit:
-    """Return the best fit from the nearest starts, each restarted at its end until χ² is stationary.
-
-    Jitters act along the sensitivities at the start of a fit, so an end point is judged by a fit that starts there.
-    """
-    fits: list[ModelFit] = []
-    for point in _select_nearest_starts(problem, base, item):
-        for _ in range(MAX_RESTARTS):
-            first = fit(problem, point, free)
-            second = fit(problem, first.point, free, iterations=1)
-            fits.append(second)
-            if abs(second.chi2 - first.chi2) < 1.0:
-                break
-            point = second.point
-    return min(fits, key=lambda item: item.chi2)
-
-
-def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis) -> list[ParameterPoint]:
-    """Return the starts with the smallest χ² without a fit."""
-    zero = np.zeros(len(problem.data.value))
-
-    def cost(point: ParameterPoint) -> float:
-        residual = problem.data.value - predict(problem.data, point, problem.epsilon)
-        return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total[0, 0])
-
-    points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: values}) for values in item.starts)
-    return sorted(points, key=cost)[:MAX_STARTS]
-
-
 def _compute_excess(detection: Detection) -> float:
     return max(0.0, detection.omnibus_chi2 - detection.omnibus_degrees)
 
@@ -257,27 +177,6 @@ def _compute_explained_fraction(residual_detection: Detection, base: ModelFit, b
         0.0, _compute_excess(residual_detection) - 2.5 * np.sqrt(2.0 * residual_detection.omnibus_degrees), score - 12.0
     )
     return float(reduction / max(reduction + remaining, 1e-9))
-
-
-def _refit_pairs(
-    problem: FitProblem,
-    base: ModelFit,
-    hypotheses: list[Hypothesis],
-    singles: list[RefittedCandidate],
-    residual_detection: Detection,
-    seed: int,
-    on_progress: ProgressCallback,
-) -> list[RefittedCandidate]:
-    """Refit second causes beside each of the best first causes; best pairs first."""
-    candidates: list[RefittedCandidate] = []
-    for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
-        others = [item for item in hypotheses if item.key not in first.causes]
-        detection = residual_detection if row == 0 else detect(problem, first.fit, others, seed)
-        candidates += _refit(problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], on_progress)
-    unique: dict[frozenset[str], RefittedCandidate] = {}
-    for item in sorted(candidates, key=lambda candidate: candidate.bic):
-        unique.setdefault(frozenset(part.label for part in item.hypotheses), item)
-    return list(unique.values())
 
 
 def _is_pair_needed(pair: RefittedCandidate, singles: list[RefittedCandidate], form_gain: float) -> bool:

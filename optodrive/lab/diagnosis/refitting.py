@@ -1,0 +1,161 @@
+"""Refits of the hypotheses that a detection found strongest, alone and in pairs, ranked by BIC."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optodrive.lab.diagnosis.detection import Detection, Score, detect
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
+from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
+from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.physics.hypothesis import FreeParameter, Hypothesis
+
+CHI2_ABANDON = 300.0
+"""A fit that is predicted to stay this far above the best χ² is abandoned."""
+MAX_REFITS = 9
+"""Number of the strongest hypotheses that are refitted."""
+MAX_STARTS, MAX_RESTARTS = 6, 6
+"""Number of starts refitted of a hypothesis with many, and maximum number of restarts of each."""
+MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
+"""Number of second causes refitted beside each of the best first causes, and number of those."""
+
+ProgressCallback = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class RefittedCandidate:
+    """One or two hypotheses, refitted; bic: χ² plus ln samples per free parameter."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    fit: ModelFit
+    bic: float
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Keys of the causes."""
+        return tuple(item.key for item in self.hypotheses)
+
+    @property
+    def label(self) -> str:
+        """Labels of the hypotheses, joined."""
+        return " and ".join(item.label for item in self.hypotheses)
+
+
+def refit_strongest(
+    problem: FitProblem,
+    base: ModelFit,
+    given: tuple[Hypothesis, ...],
+    scores: Sequence[Score],
+    on_progress: ProgressCallback,
+) -> list[RefittedCandidate]:
+    """Refit the strongest scores in full, best first."""
+    samples = len(problem.data.value)
+    candidates: list[RefittedCandidate] = []
+    promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(6.0, 0.05 * scores[0].ratio)]
+    chi2_abandon = np.inf
+    for score in promising:
+        on_progress(f"fitting {score.hypothesis.label}")
+        free = (*base.free, *score.hypothesis.free)
+        start = _build_start(base.point, score)
+        if score.hypothesis.fit_every_start:
+            result = _refit_every_start(problem, base, score.hypothesis, free)
+        else:
+            result = fit(problem, start, free, chi2_abandon=chi2_abandon)
+        chi2_abandon = min(chi2_abandon, result.chi2 + CHI2_ABANDON)
+        candidates.append(
+            RefittedCandidate((*given, score.hypothesis), result, result.chi2 + len(free) * np.log(samples))
+        )
+    return sorted(candidates, key=lambda item: item.bic)
+
+
+def refit_pairs(
+    problem: FitProblem,
+    base: ModelFit,
+    hypotheses: list[Hypothesis],
+    singles: list[RefittedCandidate],
+    residual_detection: Detection,
+    seed: int,
+    on_progress: ProgressCallback,
+) -> list[RefittedCandidate]:
+    """Refit second causes beside each of the best first causes; best pairs first."""
+    candidates: list[RefittedCandidate] = []
+    for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
+        others = [item for item in hypotheses if item.key not in first.causes]
+        detection = residual_detection if row == 0 else detect(problem, first.fit, others, seed)
+        candidates += refit_strongest(
+            problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], on_progress
+        )
+    unique: dict[frozenset[str], RefittedCandidate] = {}
+    for item in sorted(candidates, key=lambda candidate: candidate.bic):
+        unique.setdefault(frozenset(part.label for part in item.hypotheses), item)
+    return list(unique.values())
+
+
+def refit_alone(
+    problem: FitProblem,
+    base: ModelFit,
+    pair: RefittedCandidate,
+    singles: list[RefittedCandidate],
+    on_progress: ProgressCallback,
+) -> list[RefittedCandidate]:
+    """Return the single causes with those of a pair refitted from where the pair ended; best first.
+
+    A fit alone may have ended in another minimum; the pair would then be named for what one of its causes explains.
+    """
+    best = {item.label: item for item in singles}
+    for item in pair.hypotheses:
+        on_progress(f"fitting {item.label} again")
+        point = ParameterPoint(pair.fit.point.base, {**base.point.terms, item.key: pair.fit.point.terms[item.key]})
+        free = (*base.free, *item.free)
+        result = fit(problem, point, free)
+        candidate = RefittedCandidate((item,), result, result.chi2 + len(free) * np.log(len(problem.data.value)))
+        best[item.label] = min(best.get(item.label, candidate), candidate, key=lambda each: each.bic)
+    return sorted(best.values(), key=lambda each: each.bic)
+
+
+def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
+    """Return the point of a score's start at the amplitude found, within its ranges."""
+    item = score.hypothesis
+    terms = {**point.terms, item.key: dict(score.start)}
+    if item.is_linear and item.degrees > 1:
+        values = dict.fromkeys(score.start, 0.0)
+        for free, amplitude, start in zip(item.free, score.amplitude, item.starts, strict=True):
+            number = amplitude * start[free.names[0]]
+            values[free.names[0]] = min(max(number, free.parameter.low), free.parameter.high)
+        return ParameterPoint(point.base, {**point.terms, item.key: values})
+    free = item.free[0]
+    scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], 0.2, 5.0))
+    value = score.start[free.names[0]] * scale
+    return ParameterPoint(point.base, free.with_value(terms, float(np.log(value)) if free.logarithmic else value))
+
+
+def _refit_every_start(
+    problem: FitProblem, base: ModelFit, item: Hypothesis, free: Sequence[FreeParameter]
+) -> ModelFit:
+    """Return the best fit from the nearest starts, each restarted at its end until χ² is stationary.
+
+    Jitters act along the sensitivities at the start of a fit, so an end point is judged by a fit that starts there.
+    """
+    fits: list[ModelFit] = []
+    for point in _select_nearest_starts(problem, base, item):
+        for _ in range(MAX_RESTARTS):
+            first = fit(problem, point, free)
+            second = fit(problem, first.point, free, iterations=1)
+            fits.append(second)
+            if abs(second.chi2 - first.chi2) < 1.0:
+                break
+            point = second.point
+    return min(fits, key=lambda item: item.chi2)
+
+
+def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis) -> list[ParameterPoint]:
+    """Return the starts with the smallest χ² without a fit."""
+    zero = np.zeros(len(problem.data.value))
+
+    def cost(point: ParameterPoint) -> float:
+        residual = problem.data.value - predict(problem.data, point, problem.epsilon)
+        return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total[0, 0])
+
+    points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: values}) for values in item.starts)
+    return sorted(points, key=cost)[:MAX_STARTS]
