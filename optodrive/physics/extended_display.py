@@ -16,9 +16,9 @@ from optodrive.physics.extended_pulses import (
     add_peaks_after_off,
     advance_to,
     apply_pulses,
+    copy_rows,
     set_light,
     simulate_displacement,
-    take_laser_rows,
 )
 from optodrive.physics.nominal_display import (
     TIME_ROUNDING_S,
@@ -210,7 +210,8 @@ class ExtendedThermalState:
             context, pixel, illuminated if illuminated in (pixel, *self._neighbours[pixel].tolist()) else ELSEWHERE
         )
         advance_to(self._events, self._active, context, work, pixel, at_s)
-        take_laser_rows(self._events, self._active, context, work, laser, at_s)
+        advance_to(self._events, self._active, context, laser, len(self.pixels), at_s)
+        copy_rows(self._active.laser_rows, laser[0], work[0])
         return context, work, float(self._events.off_s[pixel] + max(0.0, at_s - self._events.at_s[pixel]))
 
     def _select_acting(self, pulses: FloatArray, pixel: int) -> FloatArray:

@@ -156,27 +156,10 @@ def advance_to(
 
 
 @kernel
-def take_laser_rows(
-    events: EventStates, active: ActiveTerms, c: FloatArray, work: FloatArray, laser: FloatArray, now_s: float
-) -> None:
-    """Give the states work[0] of a pixel the laser's at now_s; laser: [8, STATE_COUNT], work space."""
-    if len(active.laser_rows):
-        advance_to(events, active, c, laser, len(events.columns), now_s)
-        for row in active.laser_rows:
-            work[0, row] = laser[0, row]
-
-
-@kernel
-def _finish_wait(
-    events: EventStates, active: ActiveTerms, c: FloatArray, work: FloatArray, i: int, now_s: float
-) -> float:
-    """Advance pixel i to now_s, when the light leaves it, and let it have no laser states any more; return the peak."""
-    peak_m = advance_to(events, active, c, work, i, now_s)
-    for row in active.laser_rows:
-        work[0, row] = 0.0
-    wait_s = max(0.0, now_s - events.at_s[i])
-    _store(events, work, i, events.at_s[i] + wait_s, events.off_s[i] + wait_s)
-    return peak_m
+def copy_rows(rows: IntArray, source: FloatArray, target: FloatArray) -> None:
+    """Copy some of the states [STATE_COUNT] of a pixel."""
+    for row in rows:
+        target[row] = source[row]
 
 
 @kernel
@@ -184,6 +167,13 @@ def _store(events: EventStates, work: FloatArray, i: int, at_s: float, off_s: fl
     """Make work[0] the states of pixel i at at_s, off_s after gate off."""
     copy_states(work[0], events.states[i])
     events.at_s[i], events.off_s[i] = at_s, off_s
+
+
+@kernel
+def _raise_peak(peak_m: FloatArray, last_pulse: IntArray, i: int, displacement_m: float) -> None:
+    """Raise the peak of the last pulse on pixel i, if it had one, to a displacement."""
+    if last_pulse[i] >= 0:
+        peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], displacement_m)
 
 
 @array_kernel
@@ -207,30 +197,33 @@ def apply_pulses(
     neighbours: [p, k] pixels that the light on a pixel also heats, −1 for none; last_pulse: [p] row of each pixel's
     last pulse so far, −1 for none
     """
-    work, laser, c = np.zeros((8, events.states.shape[1])), np.zeros((8, events.states.shape[1])), context.copy()
+    count = events.states.shape[1]
+    work, laser, dark, c = np.zeros((8, count)), np.zeros((8, count)), np.zeros(count), context.copy()
     for row in range(begin, end):
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i >= 0 and start_s[row] - events.at_s[i] < -TIME_ROUNDING_S:
                 return row
         before = events.illuminated[0]
-        if len(active.laser_rows) and before >= 0 and before != pixel[row]:
+        if len(active.laser_rows):
+            advance_to(events, active, c, laser, len(events.columns), start_s[row])
+        if len(active.laser_rows) and before >= 0 and before != pixel[row]:  # the light leaves it
             for side in range(-1, neighbours.shape[1]):
                 i = before if side < 0 else neighbours[before, side]
-                if i >= 0:
-                    set_light(c, i, before)
-                    off_peak_m = _finish_wait(events, active, c, work, i, start_s[row])
-                    if last_pulse[i] >= 0:
-                        peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
+                if i < 0:
+                    continue
+                set_light(c, i, before)
+                _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, work, i, start_s[row]))
+                copy_rows(active.laser_rows, dark, work[0])
+                wait_s = max(0.0, start_s[row] - events.at_s[i])
+                _store(events, work, i, events.at_s[i] + wait_s, events.off_s[i] + wait_s)
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i < 0:
                 continue
             set_light(c, i, pixel[row])
-            off_peak_m = advance_to(events, active, c, work, i, start_s[row])
-            if last_pulse[i] >= 0:
-                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
-            take_laser_rows(events, active, c, work, laser, start_s[row])
+            _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, work, i, start_s[row]))
+            copy_rows(active.laser_rows, laser[0], work[0])
             before_k = work[0, ABSORBER]
             c[POWER_W] = power_w[row]
             one = pixel_at(events.columns, i)
@@ -238,13 +231,10 @@ def apply_pulses(
             if side < 0:
                 last_pulse[i] = row
                 peak_k[row] = max(before_k, on_peak_k)
-            if last_pulse[i] >= 0:
-                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], on_peak_m)
+            _raise_peak(peak_m, last_pulse, i, on_peak_m)
             _store(events, work, i, start_s[row] + width_s[row], 0.0)
         events.illuminated[0] = pixel[row]
-        source = events.states[pixel[row]]
-        for state in active.laser_rows:
-            events.states[len(events.columns), state] = source[state]
+        copy_rows(active.laser_rows, events.states[pixel[row]], events.states[len(events.columns)])
         events.at_s[len(events.columns)], events.off_s[len(events.columns)] = start_s[row] + width_s[row], 0.0
     return end
 
@@ -266,7 +256,7 @@ def add_peaks_after_off(
             copy_states(events.states[i], work[0])
             set_light(c, i, events.illuminated[0])
             off_peak_m = peak_after_off_m(pixel_at(events.columns, i), active, c, work, 0.0, 0.0)
-            peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
+            _raise_peak(peak_m, last_pulse, i, off_peak_m)
 
 
 @array_kernel
