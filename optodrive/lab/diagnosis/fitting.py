@@ -164,12 +164,11 @@ def fit(
             best = ModelFit(trial, tuple(free), cost, covariance, gram, prediction)
             limits = compute_step_limits(problem, trial, free)
             step = solve_within(hessian, gradient, *limits)
-            predicted = 2.0 * float(gradient @ covariance @ gradient)
             predicted_improvement = float(2.0 * gradient @ step - step @ hessian @ step)
             if (
                 predicted_improvement < CHI2_CONVERGED
                 or (improvement < CHI2_CONVERGED and not damping)
-                or (improvement < np.inf and cost - max(predicted, improvement) > chi2_abandon)
+                or cost - max(2.0 * float(gradient @ covariance @ gradient), improvement) > chi2_abandon
             ):
                 break
         step = solve_within(hessian, gradient, *limits, damping)

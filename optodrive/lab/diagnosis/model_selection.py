@@ -75,9 +75,8 @@ def find_best_candidate(
     problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, on_progress: ProgressCallback
 ) -> RefittedCandidate | None:
     """Return the best refit of the strongest hypotheses, or None if none is promising."""
-    return next(
-        iter(refit_strongest(problem, base, (), detect(problem, base, hypotheses, seed).scores, on_progress)), None
-    )
+    scores = detect(problem, base, hypotheses, seed).scores
+    return next(iter(refit_strongest(problem, base, (), scores, on_progress)), None)
 
 
 def select_causes(
