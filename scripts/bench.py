@@ -69,7 +69,7 @@ def measure_child_cpu_s(arguments) -> float:
 
 def schedule_batches(display, sequence, heat):
     """Return an iterator over the batches of a plan without the limiter."""
-    scheduler = Scheduler(display.scan_head, sequence, display.build_cold_heat)
+    scheduler = Scheduler(display.scan_heads, display.build_assignment(sequence), sequence, display.build_cold_heat)
     return scheduler.run(heat.copy(), lambda batch: batch)
 
 

@@ -30,9 +30,8 @@ LOAD_HZ = 1250.0
 """Requests of the other clients per second. At 0, the load is what server and clients can do."""
 LEASE_S = 0.1
 LOAD = "kept alive GETs"
-UNLIMITED_RATES = (
-    (f"lease_s = {LEASE_S}", f"lease_s = {LEASE_S}\n[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000\n#"),
-)
+LEAD_S = 0.03
+UNLIMITED_RATES = "[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000"
 """The daemon must serve the load; its rate limit must not reject it."""
 
 BARE_SERVER = """
@@ -82,7 +81,7 @@ def measure_planning():
             target[rng.choice(PIXELS, active, replace=False)] = 60e-6
             sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, target),))
             begin_s = time.process_time()
-            planned_sequence = plan_sequence(display, sequence, heat, budget, initial_pixel=7)
+            planned_sequence = plan_sequence(display, sequence, heat, budget, initial_pixels=(7,))
             points = quantise(planned_sequence.plan, scale)
             decoded = decode(points.encode_payload(), scale)
             verify(planned_sequence.plan, points.row[decoded.index], decoded, budget, display.budget)
@@ -98,6 +97,7 @@ def measure_superseding():
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
     from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
+    from optodrive.daemon.engine.request_body import BuiltRequest
     from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
     from optodrive.device.config_file import load_config
     from optodrive.link.board_setup import build_board_requirements
@@ -111,10 +111,10 @@ def measure_superseding():
     for number in range(SUPERSEDING):
         target = np.zeros(PIXELS)
         target[rng.choice(PIXELS, ACTIVE, replace=False)] = 60e-6
-        sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, target),))
-        request = PlanningRequest(lambda: sequence, "bench", streamed=True)  # noqa: B023 - not called later
+        built = BuiltRequest(FrameSequence((TactileFrame("f", 0.0, 60.0, target),)))
+        request = PlanningRequest(lambda: built, "bench", streamed=True)  # noqa: B023 - not called later
         begin_s = time.process_time()
-        plan = make_plan(display, scale, request, sequence, snapshot, f"p{number}", lambda fraction: None)
+        plan = make_plan(display, scale, request, built, snapshot, f"p{number}", lambda fraction: None)
         planned_s = time.process_time()
         snapshot = build_cut_snapshot(plan, thermal, (number + 1) / RATE_HZ, display.budget)
         times.append((planned_s - begin_s, time.process_time() - planned_s))
@@ -182,7 +182,7 @@ def format_percentiles(name, values, unit="ms"):
     ]
 
 
-def measure_latency(load_hz=LOAD_HZ):
+def measure_latency(load_hz=LOAD_HZ, lead_s=LEAD_S):
     """Measure frames over REST under load, at the daemon and at a bare FastAPI; return the rows of the table."""
     with tempfile.TemporaryDirectory() as folder:
         bare_server, url = start_bare_server(folder, 8459)
@@ -192,8 +192,10 @@ def measure_latency(load_hz=LOAD_HZ):
             bare_server.terminate()
             bare_server.wait()
         board = Board(Path(folder), limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
+        lease = f"lease_s = {LEASE_S}"
+        keys = [(lease, f"{lease}\nstream_lead_s = {lead_s}\n{UNLIMITED_RATES}\n#")]
         try:
-            daemon = Daemon(Path(folder), board.port, "display-1511", UNLIMITED_RATES, lease_s=LEASE_S)
+            daemon = Daemon(Path(folder), board.port, "display-1511", keys, lease_s=LEASE_S)
             try:
                 daemon.arm()
                 (trips, _, state, plans), rate = push_frames_under_load(daemon.url, read_role_tokens(daemon), load_hz)
@@ -240,12 +242,13 @@ def main():
     parser.add_argument(
         "--load-hz", type=float, default=LOAD_HZ, help="requests per second of other clients, 0: no bound"
     )
+    parser.add_argument("--lead-s", type=float, default=LEAD_S, help="board.stream_lead_s, for the latency")
     parser.add_argument("--only", choices=("planning", "latency", "frames"), help="one part")
     options = parser.parse_args()
     duration_s = MINUTE_S * (options.minutes if options.hours is None else 60 * options.hours)
     parts = {
         "planning": lambda: measure_planning() + measure_superseding(),
-        "latency": lambda: measure_latency(options.load_hz),
+        "latency": lambda: measure_latency(options.load_hz, options.lead_s),
         "frames": lambda: measure_full_frames(duration_s),
     }
     for name, measure in parts.items():

@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -18,9 +18,9 @@ from optodrive.physics.terms import discover_terms
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
 CONFIGURATION_HEAD = f"""# Configuration
 
-Generated from `optodrive/device/config.py` by `scripts/reference`. A configuration is one TOML file per display, format
-version {VERSION}. `optodrive config check` checks it, and `optodrive config show --json` prints it with every
-default and derived number. Quantities are in SI units, named by the suffix of the key.
+Generated from `optodrive/device/config_sections.py` by `scripts/reference`. A configuration is one TOML file per
+display, format version {VERSION}. `optodrive config check` checks it, and `optodrive config show --json` prints it with
+every default and derived number. Quantities are in SI units, named by the suffix of the key.
 """
 TERMS_HEAD = """# Terms
 
@@ -39,6 +39,9 @@ def sections(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type
     """Yield every TOML table of a model with its path, depth first."""
     yield path, model
     for name, info in model.model_fields.items():
+        if get_origin(info.annotation) is tuple and is_table(info):  # tables of a list, with sections named above
+            yield f"[{name}]", get_args(info.annotation)[0]
+            continue
         for kind in (info.annotation, *get_args(info.annotation)):
             if isinstance(kind, type) and issubclass(kind, BaseModel):
                 yield from sections(kind, f"{path}.{name}".lstrip("."))

@@ -7,7 +7,7 @@ from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.openapi import ERROR_RESPONSES
-from optodrive.device import config
+from optodrive.device import config_sections
 from optodrive.device.config_file import load_config
 from optodrive.planning import effective_config
 from optodrive.planning.display_model import DisplayModel
@@ -45,7 +45,7 @@ def build_rest_reference():
             sections.append(format_route(f"{method.upper()} {path}", route))
     sections.append(MODELS_HEAD)
     schemas = document["components"]["schemas"]
-    configured = {name for name in schemas if is_section(getattr(config, name, None))}
+    configured = {name for name in schemas if is_section(getattr(config_sections, name, None))}
     sections += [
         format_model(name, schema, configured) for name, schema in sorted(schemas.items()) if name not in configured
     ]

@@ -14,6 +14,7 @@ from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
+from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.link.service import remote_session
 from optodrive.link.service.remote_session import RemoteSession
@@ -120,7 +121,7 @@ class PlannerRig(ServiceRig):
         """Plan a sequence; return its future."""
         arrived_s = self.remote.board_s()
         return self.planner.submit(
-            PlanningRequest(lambda: sequence, "push", "trim", "as_is", streamed, arrived_s, epoch, caller)
+            PlanningRequest(lambda: BuiltRequest(sequence), "push", "trim", "as_is", streamed, arrived_s, epoch, caller)
         )
 
     def ready(self):

@@ -57,6 +57,7 @@ def open_board(config: str | None, calibrated_field: bool = False) -> Iterator[B
     from optodrive.planning.display_model import DisplayModel
 
     loaded = load_config(config)
+    loaded.require_one_stage()
     if not calibrated_field:
         loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()

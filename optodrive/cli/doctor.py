@@ -81,6 +81,7 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
     findings = [host.check_python(), *host.check_packages()]
     try:
         loaded = load_config(config)
+        loaded.require_one_stage()
     except InputError as error:
         return [
             *findings,

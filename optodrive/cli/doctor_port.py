@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
-from optodrive.device.config import BoardSection
+from optodrive.device.config_sections import BoardSection
 from optodrive.link.transport.port_state import (
     ROOT,
     find_holders,

@@ -84,6 +84,9 @@ def load_run_config(
         if mirrors is None
         else apply_measured_servo(load_config(config, measured_servo=False), mirrors)
     )
+    if len(loaded.stages) > 1 and (field or mirrors):
+        option, path = ("--field", field) if field else ("--mirrors", mirrors)
+        raise InputError(option, str(path), "one stage; of several, each states its files in its [stages.scanner]")
     if field is not None:
         scanner = loaded.scanner.model_copy(update={"field": str(field)})
         loaded = loaded.model_copy(update={"scanner": scanner})

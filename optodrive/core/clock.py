@@ -4,9 +4,7 @@ Names distinguish three time bases: `host_s` (monotonic, this module), `plan_s` 
 (the board's counter).
 """
 
-import os
 import time
-from contextlib import suppress
 from typing import Protocol
 
 
@@ -45,18 +43,3 @@ class ManualClock:
     def sleep(self, duration_s: float) -> None:
         """Advance by `duration_s` without waiting."""
         self._now_s += duration_s
-
-
-def request_realtime_scheduling() -> None:
-    """Request real-time scheduling for this thread, so that it renews the board's lease in time.
-
-    Threads that it starts later inherit the policy; otherwise a preempted thread could hold the interpreter lock.
-    Without the permission, scheduling stays as it is, and the lease tolerates less load by other programs.
-    """
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-
-
-def has_realtime_scheduling() -> bool:
-    """Return whether this thread runs before all programs of usual priority."""
-    return os.sched_getscheduler(0) in (os.SCHED_RR, os.SCHED_FIFO)

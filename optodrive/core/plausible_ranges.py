@@ -15,12 +15,27 @@ FOCAL_LENGTH = PlausibleRange(5e-3, 3.0, "m")
 BRIDGE_WIDTH = PlausibleRange(1e-5, 5e-3, "m")
 PITCH = PlausibleRange(1e-4, 0.1, "m")
 DISTANCE = PlausibleRange(0.0, 0.5, "m")
+PANEL_SIDE = PlausibleRange(1e-3, 3.0, "m")
 PIXEL_OFFSET = PlausibleRange(0.0, 5e-3, "m")
 SMALL_ANGLE = PlausibleRange(0.0, 0.2, "rad")
 MIRROR_ANGLE = PlausibleRange(0.0, 0.9, "rad")
 UNCERTAINTY = PlausibleRange(0.0, 0.5, "1")
 TEMPERATURE = PlausibleRange(150.0, 3000.0, "K")
 DAY = PlausibleRange(0.0, 86_400.0, "s")
+
+STAGE: dict[str, PlausibleRange] = {
+    "laser.max_power_w": PlausibleRange(1e-3, 60.0, "W"),
+    "laser.pwm_hz": PlausibleRange(50.0, 1e7, "Hz"),
+    "laser.focus_width_m": PlausibleRange(1e-6, 0.05, "m"),
+    "laser.focus_height_m": PlausibleRange(1e-6, 0.05, "m"),
+    "scanner.focal_length_m": FOCAL_LENGTH,
+    "scanner.range_rad": PlausibleRange(1e-3, 0.8, "rad"),
+    "scanner.aim_error_m": PlausibleRange(1e-9, 5e-3, "m"),
+    **{f"scanner.{key}": item for key, item in SERVO.items()},
+    "board.lease_s": PlausibleRange(1e-3, 1.0, "s"),
+    "board.stream_lead_s": PlausibleRange(1e-3, 0.2, "s"),
+}
+"""Of the sections that a stage may state for itself."""
 
 RANGES: dict[str, dict[str, PlausibleRange]] = {
     "config": {
@@ -29,13 +44,12 @@ RANGES: dict[str, dict[str, PlausibleRange]] = {
         "display.bridge_width_m": BRIDGE_WIDTH,
         "display.absorber_width_m": PlausibleRange(5e-5, 0.05, "m"),
         "display.absorber_height_m": PlausibleRange(5e-5, 0.05, "m"),
-        "laser.max_power_w": PlausibleRange(1e-3, 60.0, "W"),
-        "laser.pwm_hz": PlausibleRange(50.0, 1e7, "Hz"),
-        "laser.focus_width_m": PlausibleRange(1e-6, 0.05, "m"),
-        "laser.focus_height_m": PlausibleRange(1e-6, 0.05, "m"),
-        "scanner.focal_length_m": FOCAL_LENGTH,
-        "scanner.range_rad": PlausibleRange(1e-3, 0.8, "rad"),
-        "scanner.aim_error_m": PlausibleRange(1e-9, 5e-3, "m"),
+        "panel.width_m": PANEL_SIDE,
+        "panel.height_m": PANEL_SIDE,
+        "panel.resistance_k_per_w": PlausibleRange(1e-3, 1e3, "K/W"),
+        "panel.capacity_j_per_k": PlausibleRange(0.1, 1e5, "J/K"),
+        **STAGE,
+        **{f"stages.{key}": item for key, item in STAGE.items()},
         "limits.absorber_max_c": PlausibleRange(1.0, 560.0, "°C"),
         "limits.wall_max_c": PlausibleRange(1.0, 200.0, "°C"),
         "limits.touch_max_c": PlausibleRange(1.0, 90.0, "°C"),
@@ -53,11 +67,10 @@ RANGES: dict[str, dict[str, PlausibleRange]] = {
             for name in (
                 *("absorbed_power", "bridge_resistance", "absorber_capacity", "exponent", "gas_lag"),
                 *("wall_resistance", "wall_capacity", "side_resistance", "touch_share", "touch_lag"),
+                *("panel_resistance", "panel_capacity"),
             )
         },
-        "board.lease_s": PlausibleRange(1e-3, 1.0, "s"),
-        "board.stream_lead_s": PlausibleRange(1e-3, 0.2, "s"),
-        **{f"scanner.{key}": item for key, item in SERVO.items()},
+        "limits.stage_skew_max_s": PlausibleRange(1e-7, 0.01, "s"),
     },
     "mirrors": {f"scanner.{key}": item for key, item in SERVO.items()},
     "field": {

@@ -7,7 +7,8 @@ from typing import Any
 
 from optodrive.core.errors import NotReadyError
 from optodrive.daemon.web.tokens import Token, Tokens, read_private_tokens
-from optodrive.device.config import Config, DaemonSection
+from optodrive.device.config import Config
+from optodrive.device.config_sections import DaemonSection
 from optodrive.link.protocol.states import LEASED_STATES
 
 RELOADABLE_KEYS = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
@@ -108,6 +109,7 @@ class ConfigReloader:
         if board_state in LEASED_STATES:
             return self._revoke_only(board_state)
         new = self._read_config()
+        new.require_one_stage()
         DisplayModel.from_config(new)  # validates the sections against each other, as at startup
         reloaded, waiting = split_changed_keys(self.config, new)
         running = merge_reloadable(self.config, new)

@@ -1,260 +1,33 @@
 """The configuration of one display as a model that is checked as a whole."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from optodrive.core.errors import InputError
 from optodrive.core.toml_model import Section
-from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
+from optodrive.device.config_sections import (
+    HALF_RANGE_CODES,
+    HELIOS_HALF_RANGE_CODES,
+    HELIOS_POWER_STEPS,
+    POWER_STEPS,
+    BoardSection,
+    DaemonSection,
+    DisplaySection,
+    LaserSection,
+    LimitsSection,
+    PanelSection,
+    PixelModelSection,
+    ScannerSection,
+    SensorSection,
+    StageSection,
+)
 
 FORMAT = "optodrive-config"
 VERSION = 4
-WIRE_ON_MAX_S = 65_535e-6
-"""Longest gate-on time that one point of the protocol can carry (16 bit, microseconds), s."""
-
-HALF_RANGE_CODES = 32_767
-"""Codes of the board's converter from the centre to the end of a mirror's range."""
-HELIOS_HALF_RANGE_CODES = 2_047
-"""Half range of a Helios, whose converter has 12 bits."""
-POWER_STEPS = 65_535
-"""Steps of the board's duty from zero to the laser's full power."""
-HELIOS_POWER_STEPS = 255
-HELIOS_TIMING_SLACK_POINTS = 5
-"""On a Helios a pulse starts up to two points late (rounding; the end of a frame) and ends up to three points early
-(the same, and the dark point before an immediately following pulse)."""
-HELIOS_POINT_EXCESS_S = 1e-8
-"""A point lasts up to one tick of the board's clock longer than requested, s."""
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-HalfWidth = Annotated[float, Field(ge=0, le=0.5)]
-UsbId = Annotated[int, Field(ge=0, le=0xFFFF)]
-
-
-class DisplaySection(Section):
-    """The pixel lattice: rows × columns at one pitch, centred on the optical axis, without the missing places."""
-
-    rows: Annotated[int, Field(ge=1, le=200)]
-    """Number of rows, counted from the bottom."""
-    columns: Annotated[int, Field(ge=1, le=200)]
-    """Number of columns, counted from the left."""
-    pitch_m: Positive
-    """Distance between neighbouring pixels, m."""
-    missing: tuple[tuple[int, int], ...] = ()
-    """Places without a pixel, as pairs of row and column."""
-    bridge_width_m: Positive
-    """Width of the bridges that hold the absorbers, m."""
-    absorber_width_m: Positive = 2.0e-3
-    """Width of an absorber in x, m."""
-    absorber_height_m: Positive = 1.5e-3
-    """Height of an absorber in y, m."""
-    pixel_map: Annotated[str, Field(min_length=1)] | None = None
-    """File with the measured gain, offset and state of every pixel, relative to the configuration's folder."""
-
-    @model_validator(mode="after")
-    def _check_missing_places(self) -> Self:
-        for row, column in self.missing:
-            if not (0 <= row < self.rows and 0 <= column < self.columns):
-                raise ValueError(
-                    f"missing place ({row}, {column}) lies outside {self.rows} rows × {self.columns} columns"
-                )
-        if len(set(self.missing)) != len(self.missing):
-            raise ValueError("a missing place is named twice")
-        if len(self.missing) >= self.rows * self.columns:
-            raise ValueError("every place is missing")
-        return self
-
-
-class PixelModelSection(Section):
-    """The thermal and mechanical model of the pixels."""
-
-    parameters: str = "calibrated"
-    """Name of a parameter set in configs/parameters."""
-
-
-class LaserSection(Section):
-    """The diode, its modulation and its focus."""
-
-    max_power_w: Positive
-    """Incident power at the sample at full duty, W."""
-    pwm_hz: Positive
-    """Frequency of the pulse-width modulation, Hz; pulses are whole periods wide."""
-    focus_width_m: Positive
-    """Width of the focus on the absorber in x, m."""
-    focus_height_m: Positive
-    """Height of the focus on the absorber in y, m."""
-
-
-class ServoSection(Section):
-    """The servo of either mirror: a delay, a slew-limited target, and two underdamped poles."""
-
-    bandwidth_hz: Annotated[float, Field(ge=100, le=100_000)]
-    """Natural frequency of the closed loop, Hz."""
-    damping: Annotated[float, Field(ge=0.3, le=0.9)]
-    """Damping ratio of the closed loop."""
-    delay_s: Annotated[float, Field(ge=0, le=0.01)]
-    """Time from a command to the first movement of the servo's target, s."""
-    slew_rad_per_s: Annotated[float, Field(ge=1, le=100_000)]
-    """Speed at which the servo's target moves to the command, rad/s."""
-
-
-class ScannerSection(ServoSection):
-    """The mirrors and the lens; without a calibrated field an ideal f-theta lens, x = f · 2 · angle."""
-
-    focal_length_m: Positive
-    """Focal length of the f-theta lens, m."""
-    range_rad: Annotated[float, Field(gt=0, lt=0.8)]
-    """Mechanical mirror angle at either end of the converter's range, rad."""
-    aim_error_m: NonNegative
-    """Largest distance of a settled beam from its target, m."""
-    field: Annotated[str, Field(min_length=1)] | None = None
-    """File of a calibrated scan field that replaces the ideal lens, relative to the configuration's folder."""
-    mirrors: Annotated[str, Field(min_length=1)] | None = None
-    """File of measured servos that replace the stated one, relative to the configuration's folder."""
-    half_range_codes: int = HALF_RANGE_CODES
-    """Codes of the converter from the centre to the end of the range: 32767, for a Helios 2047."""
-
-    @property
-    def rad_per_code(self) -> float:
-        """Mirror angle of one code of the converter, rad."""
-        return self.range_rad / self.half_range_codes
-
-
-class UncertaintySection(Section):
-    """Declared half-widths of the model's parameters, relative unless stated; the limiter covers the whole box."""
-
-    absorbed_power: HalfWidth = 0.03
-    """Absorbed power."""
-    bridge_resistance: HalfWidth = 0.02
-    """Thermal resistance of the bridges."""
-    absorber_capacity: HalfWidth = 0.05
-    """Heat capacity of an absorber."""
-    exponent: Annotated[float, Field(ge=0, le=0.5)] = 0.02
-    """Exponent of the bridge resistance in temperature, absolute."""
-    gas_lag: HalfWidth = 0.25
-    """Time constant of the gas."""
-    wall_resistance: HalfWidth = 0.02
-    """Thermal resistance from a wall to the surroundings."""
-    wall_capacity: HalfWidth = 0.1
-    """Heat capacity of a wall."""
-    side_resistance: HalfWidth = 0.1
-    """Thermal resistance between neighbouring walls."""
-    touch_share: HalfWidth = 0.02
-    """Shares of the gas and of the wall in the touch surface's temperature."""
-    touch_lag: HalfWidth = 0.1
-    """Time constant of the touch surface."""
-
-
-class LimitsSection(Section):
-    """Caps that no sequence of plans exceeds."""
-
-    power_share: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """Largest power of a pulse as a share of the laser's; `optodrive dim` lowers it further while the daemon runs."""
-    absorber_max_c: float
-    """Highest absorber temperature, °C."""
-    wall_max_c: float
-    """Highest wall temperature, °C, if the parameter set has walls."""
-    touch_max_c: float
-    """Highest temperature of the touch surface, °C, if the parameter set has one."""
-    galvo_acceleration_rms_max_rad_per_s2: Positive
-    """Root mean square of either mirror's angular acceleration, rad/s²."""
-    galvo_mean_s: Annotated[float, Field(ge=0.05, allow_inf_nan=False)]
-    """Averaging time of the galvo acceleration, s."""
-    pulse_energy_max_j: Positive
-    """Incident energy of a pulse, and of a pixel's leaky bucket, J."""
-    pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S)]
-    """Gate-on time of a pulse, s."""
-    pulse_gap_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
-    """Pulses on a pixel with a shorter gap count as one against pulse_width_max_s, s."""
-    pixel_mean_power_max_w: Positive
-    """Mean incident power of a pixel over its window, and leak rate of its energy bucket, W."""
-    pixel_mean_window_s: Positive
-    """Averaging window of a pixel's mean power, s."""
-    display_mean_power_max_w: Positive
-    """Mean incident power of the display over its window, W."""
-    display_mean_window_s: Positive
-    """Averaging window of the display's mean power, s."""
-    uncertainty: UncertaintySection = UncertaintySection()
-    """Declared uncertainty of the model."""
-
-
-class BoardSection(Section):
-    """The board and the way to reach it."""
-
-    transport: Literal["simulated", "serial", "usb", "helios"]
-    """The simulated board, a serial port, USB bulk endpoints, or a Helios laser DAC."""
-    port: str = ""
-    """Serial device, or link of the simulated board's pseudo-terminal."""
-    baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 1_000_000
-    """Bit rate of the serial port, 1/s."""
-    uid: str = ""
-    """The only board, or name of a Helios, that is accepted; empty: any."""
-    lease_s: Annotated[float, Field(ge=0.02, le=1.0)] = 0.1
-    """Time after the last lease until the board closes the gate, s."""
-    stream_lead_s: Annotated[float, Field(ge=0.01, le=0.2)] = 0.03
-    """Time for which points of a stream are sent ahead, s; a longer stall of this computer interrupts the stream."""
-    vendor_id: UsbId | None = None
-    """USB vendor of the board."""
-    product_id: UsbId | None = None
-    """USB product of the board."""
-    serial_number: str = ""
-    """USB serial number; empty: the only board of its kind."""
-    points_per_s: Annotated[int, Field(ge=20_000, le=50_000)] = 40_000
-    """Point rate of a Helios, 1/s."""
-    interlock_watched: bool = False
-    """Statement that an external interlock cuts the laser's supply; a Helios emits nothing without it."""
-
-    @model_validator(mode="after")
-    def _check_address(self) -> Self:
-        if self.transport == "serial" and not self.port:
-            raise ValueError("transport 'serial' needs port, for example \"/dev/ttyACM0\"")
-        if self.transport == "usb" and (self.vendor_id is None or self.product_id is None):
-            raise ValueError("transport 'usb' needs vendor_id and product_id, for example 0x1209 and 0x0001")
-        return self
-
-    @property
-    def timing_slack_s(self) -> float:
-        """Largest reduction of the interval between two planned times on this board, s; zero for ticks."""
-        point_s = 1.0 / self.points_per_s + HELIOS_POINT_EXCESS_S
-        return HELIOS_TIMING_SLACK_POINTS * point_s if self.transport == "helios" else 0.0
-
-
-class SensorSection(Section):
-    """A spot sensor on its own serial port (SENSOR.md); a simulated board includes one."""
-
-    port: Annotated[str, Field(min_length=1)]
-    """Serial device of the sensor."""
-    baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 115_200
-    """Bit rate of its port, 1/s."""
-
-
-class DaemonSection(Section):
-    """Addresses, access and files of the daemon."""
-
-    host: str = "127.0.0.1"
-    """Address to listen on."""
-    port: Annotated[int, Field(ge=0, le=65_535)] = 8450
-    """TCP port; 0: any free one."""
-    socket: str = ""
-    """Path of an additional Unix socket."""
-    hosts: tuple[str, ...] = ()
-    """Accepted names in the Host and Origin headers besides loopback."""
-    body_max_bytes: Annotated[int, Field(ge=1024, le=64_000_000)] = 8_000_000
-    """Largest request body, bytes."""
-    tokens: str = ""
-    """File of permanent tokens; empty: new tokens at each start."""
-    audit: str = ""
-    """File to which arming, stopping and pushing are appended."""
-    requests_per_s: Annotated[float, Field(ge=1, le=100_000)] = 500.0
-    """Sustained request rate of one client, 1/s; STOP is exempt."""
-    requests_burst: Annotated[int, Field(ge=1, le=100_000)] = 1000
-    """Requests of one client at once."""
-    record: str = ""
-    """Folder for a recording of each session."""
-    on_web_loss: Literal["dark", "finish"] = "dark"
-    """End of the web process while a plan runs: go dark at once, or finish the plan."""
 
 
 class Config(Section):
@@ -272,6 +45,8 @@ class Config(Section):
     """The pixel lattice."""
     pixel_model: PixelModelSection = PixelModelSection()
     """The pixel model."""
+    panel: PanelSection = PanelSection()
+    """The panel."""
     laser: LaserSection
     """The laser."""
     scanner: ScannerSection
@@ -282,22 +57,37 @@ class Config(Section):
     """The board."""
     sensor: SensorSection | None = None
     """The spot sensor."""
+    stages: Annotated[tuple[StageSection, ...], Field(max_length=8)] = ()
+    """Optical stages, if there are several."""
     daemon: DaemonSection = DaemonSection()
     """The daemon."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _complete_stages(cls, table: Any) -> Any:
+        """Fill in the keys that a stage does not state."""
+        stages = table.get("stages") if isinstance(table, dict) else None
+        if not isinstance(stages, list) or not all(isinstance(stage, dict) for stage in stages):
+            return table
+        completed = []
+        for stage in stages:
+            sections = {
+                key: table[key] | stage.get(key, {})
+                for key in ("laser", "scanner", "board")
+                if isinstance(table.get(key), dict) and isinstance(stage.get(key, {}), dict)
+            }
+            completed.append(stage | sections)
+        return table | {"stages": completed}
+
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
-        limits, laser = self.limits, self.laser
+        limits = self.limits
         for key in ("absorber_max_c", "wall_max_c", "touch_max_c"):
             if getattr(limits, key) <= self.ambient_c:
                 raise ValueError(f"limits.{key} {getattr(limits, key)} must lie above ambient_c {self.ambient_c}")
         if limits.wall_max_c > limits.absorber_max_c:
             raise ValueError(
                 f"limits.wall_max_c {limits.wall_max_c} must not exceed limits.absorber_max_c {limits.absorber_max_c}"
-            )
-        if limits.pulse_width_max_s < 1.0 / laser.pwm_hz:
-            raise ValueError(
-                f"limits.pulse_width_max_s {limits.pulse_width_max_s} must hold one PWM period, {1 / laser.pwm_hz}"
             )
         if limits.pixel_mean_power_max_w > limits.display_mean_power_max_w:
             raise ValueError(
@@ -312,18 +102,45 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _check_scan_range(self) -> Self:
-        layout = build_pixel_layout(self.display)
+    def _check_stages(self) -> Self:
+        for number, config in enumerate(self.list_stage_configs()):
+            try:
+                config.check_optics()
+            except ValueError as error:
+                raise ValueError(f"stages[{number}]: {error}" if self.stages else str(error)) from None
+        names = [stage.name for stage in self.stages]
+        addresses = [stage.board.address for stage in self.stages if stage.board.address]
+        for what, values in (("name", names), ("board", addresses)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"two stages have the same {what}")
+        unreached = np.flatnonzero(~np.any([stage.reach for stage in self.list_stage_configs()], axis=0))
+        if len(unreached):
+            raise ValueError(f"no stage reaches pixel {unreached[0]}; rows and columns of the stages must cover all")
+        return self
+
+    def check_optics(self) -> None:
+        """Check laser, scanner and board of the only stage, and that its beam has pixels; raises ValueError."""
+        if not self.reach.any():
+            raise ValueError("its rows and columns hold no pixel")
+        if self.limits.pulse_width_max_s < 1.0 / self.laser.pwm_hz:
+            raise ValueError(
+                f"limits.pulse_width_max_s {self.limits.pulse_width_max_s} must hold one PWM period, "
+                f"{1 / self.laser.pwm_hz}"
+            )
+        self._check_scan_range()
+        self._check_focus()
+        self._check_converter_codes()
+
+    def _check_scan_range(self) -> None:
+        layout, reach = build_pixel_layout(self.display), self.reach
         half_field_m = 2.0 * self.scanner.range_rad * self.scanner.focal_length_m
-        farthest_m = float(max(np.abs(layout.x_m).max(), np.abs(layout.y_m).max()))
+        farthest_m = float(max(np.abs(layout.x_m[reach]).max(), np.abs(layout.y_m[reach]).max()))
         if farthest_m > half_field_m:
             raise ValueError(
                 f"scanner reaches ±{half_field_m:.4f} m (range_rad, focal_length_m), a pixel lies at {farthest_m:.4f} m"
             )
-        return self
 
-    @model_validator(mode="after")
-    def _check_focus(self) -> Self:
+    def _check_focus(self) -> None:
         display, laser = self.display, self.laser
         min_rad = 2.0 * self.scanner.rad_per_code
         for side, tolerance_rad in zip(("width", "height"), self.tolerance_rad, strict=True):
@@ -333,17 +150,40 @@ class Config(Section):
                     f"{self.scanner.aim_error_m} on either side does not fit on display.absorber_{side}_m "
                     f"{getattr(display, f'absorber_{side}_m')} with two steps of the converter to spare"
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_converter_codes(self) -> Self:
+    def _check_converter_codes(self) -> None:
         steps = HELIOS_HALF_RANGE_CODES if self.board.transport == "helios" else HALF_RANGE_CODES
         if self.scanner.half_range_codes != steps:
             raise ValueError(
                 f"scanner.half_range_codes {self.scanner.half_range_codes} must be {steps}, "
                 f"the converter's steps behind board.transport '{self.board.transport}'"
             )
-        return self
+
+    def list_stage_configs(self) -> tuple["Config", ...]:
+        """Return one configuration per stage, whose sections and only stage are that one's; itself without stages."""
+        if not self.stages:
+            return (self,)
+        sections = ("laser", "scanner", "board")
+        return tuple(
+            self.model_copy(update={"stages": (stage,)} | {name: getattr(stage, name) for name in sections})
+            for stage in self.stages
+        )
+
+    def require_one_stage(self) -> None:
+        """Raise InputError for several stages, where one board is driven."""
+        if len(self.stages) > 1:
+            raise InputError("stages", len(self.stages), "one: `optodrive plan` takes several, one board is driven")
+
+    @property
+    def reach(self) -> BoolArray:
+        """Whether the beam of the only stage reaches each pixel, [p]."""
+        layout = build_pixel_layout(self.display)
+        within = np.ones(len(layout), dtype=np.bool_)
+        if self.stages:
+            for places, span in ((layout.row, self.stages[0].rows), (layout.column, self.stages[0].columns)):
+                if span is not None:
+                    within &= (places >= span[0]) & (places <= span[1])
+        return within
 
     @property
     def min_power_w(self) -> float:

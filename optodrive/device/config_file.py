@@ -11,7 +11,8 @@ from optodrive.core.files import read_toml
 from optodrive.core.plausibility import check_table
 from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_model import Section, build_input_error, check_format
-from optodrive.device.config import FORMAT, VERSION, Config, ServoSection
+from optodrive.device.config import FORMAT, VERSION, Config
+from optodrive.device.config_sections import ServoSection
 from optodrive.device.plausible_config import check_units
 
 RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
@@ -50,14 +51,32 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
         raise InputError(f"{path}: version", 3, f"{VERSION}: {renamed}")
     check_format(path, table, FORMAT, VERSION)
     check_units(path, table)
-    _resolve_paths(path, table.get("scanner"), ("field", "mirrors"))
+    stages = table.get("stages")
+    for section in (table, *(stages if isinstance(stages, list) else ())):
+        if isinstance(section, dict):
+            _resolve_paths(path, section.get("scanner"), ("field", "mirrors"))
     _resolve_paths(path, table.get("display"), ("pixel_map",))
     try:
         config = Config.model_validate(table)
     except ValidationError as error:
         raise build_input_error(error, str(path), Config) from None
-    mirrors = config.scanner.mirrors
-    return apply_measured_servo(config, Path(mirrors)) if measured_servo and mirrors is not None else config
+    if len(config.stages) == 1:
+        config = config.list_stage_configs()[0]
+    return _apply_measured_servos(config) if measured_servo else config
+
+
+def _apply_measured_servos(config: Config) -> Config:
+    """Return the configuration with the servos that it names, of every stage, and the smallest galvo cap they leave."""
+    if len(config.stages) < 2:
+        mirrors = config.scanner.mirrors
+        return config if mirrors is None else apply_measured_servo(config, Path(mirrors))
+    measured = [_apply_measured_servos(each.model_copy(update={"stages": ()})) for each in config.list_stage_configs()]
+    stages = tuple(
+        stage.model_copy(update={"scanner": each.scanner}) for stage, each in zip(config.stages, measured, strict=True)
+    )
+    cap = min(each.limits.galvo_acceleration_rms_max_rad_per_s2 for each in measured)
+    limits = config.limits.model_copy(update={"galvo_acceleration_rms_max_rad_per_s2": cap})
+    return config.model_copy(update={"stages": stages, "limits": limits})
 
 
 def _resolve_paths(path: Path, section: object, keys: tuple[str, ...]) -> None:

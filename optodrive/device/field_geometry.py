@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.config import HALF_RANGE_CODES
+from optodrive.device.config_sections import HALF_RANGE_CODES
 
 CENTRE_CODE = HALF_RANGE_CODES + 1
 CODE_MAX = 2 * HALF_RANGE_CODES + 1

@@ -8,7 +8,7 @@ from cmath import exp as cexp
 from cmath import phase
 from math import asin, cos, exp, pi, sqrt
 
-from optodrive.device.config import ScannerSection
+from optodrive.device.config_sections import ScannerSection
 from optodrive.device.servo import Servo
 
 BISECTION_STEPS = 50

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.types.arrays import IntArray, freeze_arrays
-from optodrive.device.config import DisplaySection, build_pixel_layout
+from optodrive.device.config import build_pixel_layout
+from optodrive.device.config_sections import DisplaySection
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,8 @@ from optodrive.core.plausibility import check_table
 from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.core.types.arrays import BoolArray, FloatArray, StrArray, freeze_arrays
-from optodrive.device.config import Config, DisplaySection, PixelLayout, build_pixel_layout
+from optodrive.device.config import Config, PixelLayout, build_pixel_layout
+from optodrive.device.config_sections import DisplaySection
 
 FORMAT = "optodrive-pixels"
 VERSION = 1

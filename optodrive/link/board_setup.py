@@ -4,7 +4,8 @@ from math import ceil
 
 import numpy as np
 
-from optodrive.device.config import BoardSection, Config
+from optodrive.device.config import Config
+from optodrive.device.config_sections import BoardSection
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.pixel_map import build_aim_layout
 from optodrive.link.protocol import messages as m

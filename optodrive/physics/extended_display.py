@@ -14,6 +14,7 @@ from optodrive.physics.extended_pulse_for_height import find_shortest_pulse
 from optodrive.physics.extended_pulses import (
     EventStates,
     add_peaks_after_off,
+    advance_shared,
     advance_to,
     apply_pulses,
     copy_rows,
@@ -123,12 +124,11 @@ class ExtendedThermalState:
         after the pulse's start, and not before its end. Raises ValueError for a time before the pixel's last event.
         """
         context, work, off_s = self._advance_copy(pixel, start_s)
-        set_light(context, pixel, pixel)
         on_states = np.zeros((drive.max_periods + 1, STATE_COUNT))
         span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
         one = self.pixels.elements[pixel]
         periods, duty = find_shortest_pulse(
-            one, self._active, context, work, on_states, off_s, target_m, *span, peak_after_s
+            one, self._active, context, pixel, work, on_states, off_s, target_m, *span, peak_after_s
         )
         return (periods, duty) if periods else None
 
@@ -200,24 +200,27 @@ class ExtendedThermalState:
     def _advance_copy(self, pixel: int, at_s: float) -> tuple[FloatArray, FloatArray, float]:
         """Return a context, work space whose first row has a pixel's states at at_s, and the time since gate off then.
 
+        With states of laser or panel, that is the time since the last pulse on any pixel.
+
         Raises ValueError for a time before the pixel's last event.
         """
         if at_s < self._events.at_s[pixel] - TIME_ROUNDING_S:
             raise self._time_order_error(pixel, at_s)
-        context, work, laser = self._context.copy(), np.zeros((8, STATE_COUNT)), np.zeros((8, STATE_COUNT))
+        context, work, shared = self._context.copy(), np.zeros((8, STATE_COUNT)), np.zeros((8, STATE_COUNT))
         illuminated = int(self._events.illuminated[0])
         set_light(
             context, pixel, illuminated if illuminated in (pixel, *self._neighbours[pixel].tolist()) else ELSEWHERE
         )
-        advance_to(self._events, self._active, context, work, pixel, at_s)
-        advance_to(self._events, self._active, context, laser, len(self.pixels), at_s)
-        copy_rows(self._active.laser_rows, laser[0], work[0])
-        return context, work, float(self._events.off_s[pixel] + max(0.0, at_s - self._events.at_s[pixel]))
+        advance_shared(self._events, self._active, context, shared, at_s)
+        advance_to(self._events, self._active, context, shared, work, pixel, at_s)
+        copy_rows(self._active.laser_rows, shared[0], work[0])
+        last = len(self.pixels) if self._active.has_shared_states else pixel
+        return context, work, float(self._events.off_s[last] + max(0.0, at_s - self._events.at_s[last]))
 
     def _select_acting(self, pulses: FloatArray, pixel: int) -> FloatArray:
-        """Return the pulses [n, 4] that heat a pixel or a neighbour, and those ELSEWHERE if they act on the laser."""
+        """Return the pulses [n, 4] that heat a pixel or a neighbour, and those ELSEWHERE if they act on all pixels."""
         is_near = np.isin(pulses[:, 3], [pixel, *self._neighbours[pixel].tolist()])
-        if not len(self._active.laser_rows):
+        if not self._active.has_shared_states:
             return np.array(pulses[is_near])
         return np.column_stack([pulses[:, :3], np.where(is_near, pulses[:, 3], ELSEWHERE)])
 

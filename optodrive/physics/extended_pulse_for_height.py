@@ -2,7 +2,7 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.extended_pulses import advance_states, copy_states, peak_after_off_m
+from optodrive.physics.extended_pulses import advance_states, copy_states, peak_after_off_m, set_light
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms
 from optodrive.physics.term import POWER_W
@@ -31,6 +31,7 @@ def find_shortest_pulse(
     pixel: Pixel,
     active: ActiveTerms,
     c: FloatArray,
+    index: int,
     work: FloatArray,
     on_states: FloatArray,
     off_s: float,
@@ -43,11 +44,13 @@ def find_shortest_pulse(
 ) -> tuple[int, float]:
     """Solve as `ExtendedThermalState.solve_pulse`, from the states work[0]; 0 periods if no pulse is needed.
 
+    Until the pulse the light is where the context says, then on this pixel, `index`.
     on_states: [max_periods + 1, STATE_COUNT], work space for the states after each period at full power
     """
     copy_states(work[0], on_states[0])
     if _peak_after_state_m(pixel, active, c, work, on_states[0], off_s, peak_after_s) >= target_m:
         return 0, 0.0
+    set_light(c, index, index)
     high, highest_m = max_periods, 0.0
     copy_states(on_states[0], work[0])
     for period in range(max_periods):
@@ -80,12 +83,17 @@ def _solve_duty(
     width_s: float,
     peak_after_s: float,
 ) -> float:
-    """Return the duty at which a pulse's peak is target_m, by the Illinois method; 1 if none is."""
+    """Return the duty at which a pulse's peak is target_m, by the Illinois method; 1 if none is.
+
+    0 if what the laser still emits after its last pulse reaches the target as soon as the light is on the pixel.
+    """
     low, high = 0.0, 1.0
     low_error_m = _peak_after_state_m(pixel, active, c, work, state, 0.0, peak_after_s) - target_m
     high_error_m = _pulse_peak_m(pixel, active, c, work, state, max_power_w, width_s, peak_after_s) - target_m
     if high_error_m <= 0.0:
         return 1.0
+    if low_error_m >= 0.0:
+        return 0.0
     retained_side = 0
     for _ in range(30):
         duty = (low * high_error_m - high * low_error_m) / (high_error_m - low_error_m)

@@ -12,7 +12,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.physics.nominal_display import TIME_ROUNDING_S, pixel_at
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, interpolate_states, next_step_s, output_signal, step
-from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, POWER_W
+from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, PANEL_HELD, POWER_W
 from optodrive.physics.term_kernels import STATE_COUNT
 
 DISPLACEMENT_SIGNAL = 1
@@ -24,7 +24,7 @@ COLD_K = 1e-6
 
 
 class EventStates(NamedTuple):
-    """States of every pixel and, in the last row, of the laser, at the last event of each; kernels change them.
+    """States of every pixel and, in the last row, of laser and panel, at the last event of each; kernels change them.
 
     columns: [p, 6] the fields of `Pixel`; at_s, off_s: [p + 1] time of the last event, and time since gate off then;
     states: [p + 1, STATE_COUNT]; illuminated: [1] pixel of the last pulse, −1 before the first
@@ -96,6 +96,13 @@ def copy_states(source: FloatArray, target: FloatArray) -> None:
 
 
 @kernel
+def copy_rows(rows: IntArray, source: FloatArray, target: FloatArray) -> None:
+    """Copy some of the states [STATE_COUNT] of a pixel."""
+    for row in rows:
+        target[row] = source[row]
+
+
+@kernel
 def _is_cold(state: FloatArray) -> bool:
     """Return whether no rise of a pixel's state [STATE_COUNT] is as large as COLD_K."""
     for rise_k in state:  # noqa: SIM110 — compiled as it is, without a generator
@@ -142,24 +149,30 @@ def set_light(c: FloatArray, index: int, illuminated: int) -> None:
 
 
 @kernel
-def advance_to(
-    events: EventStates, active: ActiveTerms, c: FloatArray, work: FloatArray, i: int, now_s: float
-) -> float:
-    """Write the states of pixel i at now_s to work[0], the gate off since its last event; return the peak meanwhile.
-
-    The context says on which pixel the light was. i may be the laser, which has the steps of the first pixel.
-    """
-    copy_states(events.states[i], work[0])
-    one = pixel_at(events.columns, i if i < len(events.columns) else 0)
+def advance_shared(events: EventStates, active: ActiveTerms, c: FloatArray, shared: FloatArray, now_s: float) -> None:
+    """Write the states of laser and panel at now_s to shared[0], the gate off since the last pulse on any pixel."""
+    last = len(events.columns)
+    copy_states(events.states[last], shared[0])
     c[POWER_W] = 0.0
-    return advance_states(one, active, c, work, 0.0, events.off_s[i], max(0.0, now_s - events.at_s[i]))[0]
+    wait_s = max(0.0, now_s - events.at_s[last])
+    advance_states(pixel_at(events.columns, 0), active, c, shared, 0.0, events.off_s[last], wait_s)
 
 
 @kernel
-def copy_rows(rows: IntArray, source: FloatArray, target: FloatArray) -> None:
-    """Copy some of the states [STATE_COUNT] of a pixel."""
-    for row in rows:
-        target[row] = source[row]
+def advance_to(
+    events: EventStates, active: ActiveTerms, c: FloatArray, shared: FloatArray, work: FloatArray, i: int, now_s: float
+) -> float:
+    """Write the states of pixel i at now_s to work[0], the gate off since its last event; return the peak meanwhile.
+
+    The context says on which pixel the light was, shared[0] how warm the panel is at now_s, which changes slowly.
+    """
+    copy_states(events.states[i], work[0])
+    copy_rows(active.panel_rows, shared[0], work[0])
+    c[POWER_W], c[PANEL_HELD] = 0.0, 1.0
+    wait_s = max(0.0, now_s - events.at_s[i])
+    peak_m = advance_states(pixel_at(events.columns, i), active, c, work, 0.0, events.off_s[i], wait_s)[0]
+    c[PANEL_HELD] = 0.0
+    return peak_m
 
 
 @kernel
@@ -198,22 +211,22 @@ def apply_pulses(
     last pulse so far, −1 for none
     """
     count = events.states.shape[1]
-    work, laser, dark, c = np.zeros((8, count)), np.zeros((8, count)), np.zeros(count), context.copy()
+    work, shared, dark, c = np.zeros((8, count)), np.zeros((8, count)), np.zeros(count), context.copy()
     for row in range(begin, end):
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i >= 0 and start_s[row] - events.at_s[i] < -TIME_ROUNDING_S:
                 return row
         before = events.illuminated[0]
-        if len(active.laser_rows):
-            advance_to(events, active, c, laser, len(events.columns), start_s[row])
+        if len(active.laser_rows) or len(active.panel_rows):
+            advance_shared(events, active, c, shared, start_s[row])
         if len(active.laser_rows) and before >= 0 and before != pixel[row]:  # the light leaves it
             for side in range(-1, neighbours.shape[1]):
                 i = before if side < 0 else neighbours[before, side]
                 if i < 0:
                     continue
                 set_light(c, i, before)
-                _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, work, i, start_s[row]))
+                _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, shared, work, i, start_s[row]))
                 copy_rows(active.laser_rows, dark, work[0])
                 wait_s = max(0.0, start_s[row] - events.at_s[i])
                 _store(events, work, i, events.at_s[i] + wait_s, events.off_s[i] + wait_s)
@@ -222,8 +235,8 @@ def apply_pulses(
             if i < 0:
                 continue
             set_light(c, i, pixel[row])
-            _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, work, i, start_s[row]))
-            copy_rows(active.laser_rows, laser[0], work[0])
+            _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, shared, work, i, start_s[row]))
+            copy_rows(active.laser_rows, shared[0], work[0])
             before_k = work[0, ABSORBER]
             c[POWER_W] = power_w[row]
             one = pixel_at(events.columns, i)
@@ -235,6 +248,7 @@ def apply_pulses(
             _store(events, work, i, start_s[row] + width_s[row], 0.0)
         events.illuminated[0] = pixel[row]
         copy_rows(active.laser_rows, events.states[pixel[row]], events.states[len(events.columns)])
+        copy_rows(active.panel_rows, events.states[pixel[row]], events.states[len(events.columns)])
         events.at_s[len(events.columns)], events.off_s[len(events.columns)] = start_s[row] + width_s[row], 0.0
     return end
 

@@ -96,20 +96,22 @@ class ActiveTerms(NamedTuple):
     """A set of terms as kernels take it.
 
     on: [terms], 1 for an active term; values: [terms, MAX_PARAMETERS] their parameters; state_rows: rows of the state
-    vector that move; laser_rows: those of them that all pixels share; is_fast: whether a term is faster than the gas
+    vector that move; laser_rows, panel_rows: those of them that all pixels share; is_fast: whether a term is faster
+    than the gas
     """
 
     on: IntArray
     values: FloatArray
     state_rows: IntArray
     laser_rows: IntArray
+    panel_rows: IntArray
     is_fast: bool
 
     @classmethod
     def from_values(cls, values: Mapping[str, TermValues]) -> "ActiveTerms":
         """Return the set for term → parameter → SI value; terms without kernels have no effect."""
         on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), MAX_PARAMETERS))
-        rows, laser_rows = [ABSORBER, GAS, NEIGHBOUR], list[int]()
+        rows, laser_rows, panel_rows = [ABSORBER, GAS, NEIGHBOUR], list[int](), list[int]()
         for key, term_values in values.items():
             row, term = TERM_ROW[key], discover_terms()[key]
             on[row] = 1
@@ -117,8 +119,15 @@ class ActiveTerms(NamedTuple):
             followers = range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(term.followers))
             rows += [*term.states, *followers]
             laser_rows += followers if term.has_laser_state else ()
+            panel_rows += followers if term.has_panel_state else ()
         is_fast = any(discover_terms()[key].is_fast for key in values)
-        return cls(on, v, np.array(rows), np.array(laser_rows, dtype=np.int64), is_fast)
+        shared = (np.array(laser_rows, dtype=np.int64), np.array(panel_rows, dtype=np.int64))
+        return cls(on, v, np.array(rows), *shared, is_fast)
+
+    @property
+    def has_shared_states(self) -> bool:
+        """Whether light on any pixel acts on all."""
+        return bool(len(self.laser_rows) or len(self.panel_rows))
 
 
 def simulate_signals(

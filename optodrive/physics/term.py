@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from itertools import product
 from typing import NamedTuple
 
+from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.servo import Servo
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis, RecordingScope, TermParameter
@@ -24,20 +25,26 @@ the followers of each term come after them.
 """
 
 POWER_W, FULL_W, SINCE_EDGE_S, DOSE, ILLUMINATED_PIXEL, AMBIENT_K, BRIDGE_FLOW_W, FAR_END_K = range(8)
-TIME_S, SESSION_TIME, IS_TARGET, MEMBRANE_DRIVE_K = range(8, 12)
+TIME_S, SESSION_TIME, IS_TARGET, MEMBRANE_DRIVE_K, PANEL_HELD = range(8, 13)
 """Entries of the context vector that kernels receive besides the states.
 
 Commanded power and full power; time since the last gate edge; dose so far over the recording's largest; index of the
 illuminated pixel, or ELSEWHERE; ambient temperature; heat flow through the bridge and temperature rise of its far end;
 time in the run, and in the session from −1 to 1; 1 if the light falls on this very pixel, else 0; gas rise that drives
-the membrane.
+the membrane; 1 while the states of the panel stay as they are, which light on other pixels has changed.
 """
-CONTEXT_SIZE = 12
+CONTEXT_SIZE = 13
 ELSEWHERE = -1
 """Illuminated pixel of a pulse that heats neither the pixel nor one of its neighbours: it only acts on the laser."""
 
 Modifier = Callable[[FloatArray, FloatArray, int, FloatArray, float], float]
 RateWriter = Callable[[FloatArray, FloatArray, int, FloatArray, FloatArray], None]
+
+
+@kernel
+def add_follower(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """Add the term's first follower, as a wall that stands on another warm part does."""
+    return float(x + y[s])
 
 
 class Kernels(NamedTuple):
@@ -71,13 +78,14 @@ class Kernels(NamedTuple):
 class OperatingEnvelope(NamedTuple):
     """Largest values that a display can reach.
 
-    absorber_k: rise of one absorber; summed_absorbers_k: sum of all absorbers' rises under one beam; full_w: power of
-    the laser.
+    absorber_k: rise of one absorber; summed_absorbers_k: sum of all absorbers' rises under all beams; full_w: power of
+    the strongest laser; all_power_w: that of all lasers together.
     """
 
     absorber_k: float
     summed_absorbers_k: float
     full_w: float
+    all_power_w: float
 
 
 class HeatGainBound(NamedTuple):
@@ -108,8 +116,8 @@ class Term:
 
     Identity: key, the term's name in files; label, a clause that completes "The nominal model is wrong because …".
     Physics: requires, keys of terms that it builds on; states, shared rows of the state vector that only it moves;
-    followers, names of its own state rows; has_laser_state, whether these belong to the laser, which all pixels share;
-    kernels; in_pixel, False for a term that only the limiter's bound accounts
+    followers, names of its own state rows; has_laser_state and has_panel_state, whether these belong to the laser or to
+    the panel, which all pixels share; kernels; in_pixel, False for a term that only the limiter's bound accounts
     for; couples_neighbours, whether light on one pixel heats the pixels around it; is_fast, whether it acts within a
     gas time constant; cannot_add_heat, whether it never makes anything hotter, see also `bound_heat_gain`.
     Diagnosis: signature, where the effect shows in recorded data, empty if it is no possible cause of a discrepancy;
@@ -124,6 +132,7 @@ class Term:
     states: tuple[int, ...] = ()
     followers: tuple[str, ...] = ()
     has_laser_state: bool = False
+    has_panel_state: bool = False
     kernels: Kernels = Kernels()
     in_pixel: bool = True
     couples_neighbours: bool = False

@@ -91,12 +91,13 @@ class BatchLimiter:
         of with missing pulses. Trains keep their times and leave such pulses to the limiter.
         """
         row = galvo_feasible_prefix(batch, self.state, self._budget)
-        averaging_s = self._budget.galvo.averaging_s
         if row == len(batch) or batch.source[row] >= self._frame_count:
             return None
+        stage = int(batch.stage[row])
+        averaging_s = float(self._budget.galvos.averaging_s[stage])
         cold_s = COLD_AFTER_AVERAGING_TIMES * averaging_s
         if row == self._paused_row and galvo_feasible_prefix(batch, self.state, self._budget, row, cold_s) == row:
             return None
         pause_s = self._pause_fraction * averaging_s
         self._pause_fraction = min(2.0 * self._pause_fraction, PAUSE_FRACTION_MAX)
-        return GalvoPause(row, ceil(1e6 * pause_s))
+        return GalvoPause(row, stage, ceil(1e6 * pause_s))

@@ -9,26 +9,28 @@ from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config import Config
 from optodrive.device.field_loader import build_settling_table
 from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import complete_panel
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
 from optodrive.physics.terms import discover_terms
-from optodrive.planning.limiter.budget import Budget, GalvoModel
+from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
-from optodrive.planning.limiter.worst_case import (
+from optodrive.planning.limiter.nominal_model import (
+    NominalPanel,
     NominalThermalModel,
     NominalTouch,
     NominalWalls,
     Uncertainty,
-    build_heat_bound,
 )
+from optodrive.planning.limiter.worst_case import build_heat_bound
 
 BOUNDED_TERMS = ("bridge_conductivity", "wall_heating", "lateral_conduction", "touch_surface")
-"""Terms that the thermal bound models explicitly."""
+"""Terms that the thermal bound models explicitly; with walls, also panel_heating."""
 
 
 def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -> Budget:
     """Build the budget; raises InputError if a cap is not above its base temperature or a term has no bound."""
-    limits, ambient_c = config.limits, config.ambient_c
+    limits, ambient_c, stages = config.limits, config.ambient_c, config.list_stage_configs()
     heat_gain = compute_heat_gain_bound(parameters, pixels, config)
     base_c = ambient_c + heat_gain.uniform_rise_k
     values = {}
@@ -46,17 +48,42 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
         pulse_gap_s=limits.pulse_gap_min_s,
         pixel_window_s=limits.pixel_mean_window_s,
         display_window_s=limits.display_mean_window_s,
-        min_power_w=config.min_power_w,
+        min_power_w=min(stage.min_power_w for stage in stages),
     )
-    model = build_nominal_model(
-        parameters, pixels, Neighbours.from_display(config.display), ambient_c + ZERO_CELSIUS_K, heat_gain
-    )
+    panel = build_nominal_panel(config, parameters, pixels)
+    neighbours = Neighbours.from_display(config.display)
+    model = build_nominal_model(parameters, pixels, neighbours, ambient_c + ZERO_CELSIUS_K, heat_gain, panel)
     uncertainty = Uncertainty(**limits.uncertainty.model_dump())
-    return Budget(caps, build_heat_bound(model, uncertainty, caps, config.laser.max_power_w), build_galvo_model(config))
+    skew_s = limits.stage_skew_max_s if len(stages) > 1 else 0.0
+    powers_w = (stage.laser.max_power_w for stage in stages)
+    heat = build_heat_bound(model, uncertainty, caps, *powers_w, skew_s=skew_s)
+    return Budget(caps, heat, GalvoModels.from_models(*map(build_galvo_model, stages)))
+
+
+def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelArray) -> NominalPanel | None:
+    """Build the panel without the walls, None without walls; raises InputError for less capacity than theirs.
+
+    A parameter set with panel_heating states it, else the configuration does. The bound heats it by what the absorbers
+    absorb: where the term has a larger share, resistance and capacity stand for the larger heat.
+    """
+    if "wall_heating" not in parameters.terms:
+        return None
+    walls_j_per_k = len(pixels) * parameters.term_values("wall_heating")["capacity"]
+    if "panel_heating" in parameters.terms:
+        values, where = parameters.term_values("panel_heating"), "terms.panel_heating.capacity"
+        more = max(1.0, values["share"] / float(pixels.epsilon.min()))
+        resistance_k_per_w, capacity_j_per_k = values["resistance"] * more, values["capacity"] / more
+    else:
+        panel, where = complete_panel(config), "panel.capacity_j_per_k"
+        resistance_k_per_w, capacity_j_per_k = panel.resistance_k_per_w, panel.capacity_j_per_k
+    if capacity_j_per_k <= walls_j_per_k:
+        expected = f"more than {walls_j_per_k:.3g}, the capacity of the walls of {len(pixels)} pixels"
+        raise InputError(where, float(f"{capacity_j_per_k:.3g}"), expected)
+    return NominalPanel(resistance_k_per_w, capacity_j_per_k - walls_j_per_k)
 
 
 def build_galvo_model(config: Config) -> GalvoModel:
-    """Build the model of the mirrors' servos, with the lead-in that every plan keeps."""
+    """Build the model of the servos of the only stage, with the lead-in that its plans keep."""
     scanner = config.scanner
     return GalvoModel(
         omega_rad_per_s=2.0 * np.pi * scanner.bandwidth_hz,
@@ -76,17 +103,18 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
     Raises InputError for a term without such a bound.
     """
     terms = {key: parameters.term_values(key) for key in parameters.terms}
-    cap_k, full_w = config.limits.absorber_max_c - config.ambient_c, config.laser.max_power_w
-    heat_gain = _combine_heat_gains(terms, OperatingEnvelope(cap_k, 0.0, full_w))
+    powers_w = [stage.laser.max_power_w for stage in config.list_stage_configs()]
+    envelope = OperatingEnvelope(config.limits.absorber_max_c - config.ambient_c, 0.0, max(powers_w), sum(powers_w))
+    heat_gain = _combine_heat_gains(terms, envelope)
     c_j_per_k, r_k_per_w = float(pixels.c_j_per_k.max()) * heat_gain.capacity_factor, float(pixels.r_k_per_w.max())
     display_rise_k = (
         heat_gain.power_factor
         * float(pixels.epsilon.max())
-        * full_w
+        * envelope.all_power_w
         * r_k_per_w
         * _compute_uncertainty_factor(config, terms, heat_gain.capacity_factor)
     )
-    uniform_rise_k = _combine_heat_gains(terms, OperatingEnvelope(cap_k, display_rise_k, full_w)).uniform_rise_k
+    uniform_rise_k = _combine_heat_gains(terms, envelope._replace(summed_absorbers_k=display_rise_k)).uniform_rise_k
     # A rise of the absorbers also warms walls and touch surfaces, with a delay; each adds a small part.
     factor = 1.0
     if "wall_heating" in terms:
@@ -102,7 +130,7 @@ def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnve
     power = capacity = 1.0
     uniform_rise_k = 0.0
     for key in terms:
-        if key in BOUNDED_TERMS:
+        if key in BOUNDED_TERMS or (key == "panel_heating" and "wall_heating" in terms):
             continue
         term_gain = discover_terms()[key].bound_heat_gain(terms[key], envelope)
         if term_gain is None:
@@ -141,10 +169,12 @@ def build_nominal_model(
     neighbours: Neighbours,
     ambient_k: float,
     heat_gain: HeatGainBound = NO_HEAT_GAIN,
+    panel: NominalPanel | None = None,
 ) -> NominalThermalModel:
     """Build the limiter's thermal model from a parameter set.
 
-    ambient_k: ambient temperature, K; heat_gain: bound on the terms outside the model
+    ambient_k: ambient temperature, K; heat_gain: bound on the terms outside the model; panel: None for one that stays
+    at ambient temperature, as it does without walls
     """
     terms = {key: parameters.term_values(key) for key in parameters.terms}
     wall, lateral, touch = (terms.get(key) for key in ("wall_heating", "lateral_conduction", "touch_surface"))
@@ -169,4 +199,5 @@ def build_nominal_model(
         frame_edges=neighbours.frame_edges,
         walls=walls,
         touch=NominalTouch(touch["gas_share"], touch["wall_share"], touch["lag"]) if touch else None,
+        panel=panel if walls else None,
     )

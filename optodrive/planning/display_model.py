@@ -5,8 +5,10 @@ from functools import cached_property
 
 import numpy as np
 
+from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.plans import BudgetState
+from optodrive.core.types.stimuli import FrameSequence
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 from optodrive.device.field_loader import build_settling_table, load_scan_field
@@ -18,13 +20,15 @@ from optodrive.planning.budget_setup import build_budget
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import build_cold_budget_state
 from optodrive.planning.scheduler.scan_head import ScanHead
+from optodrive.planning.scheduler.stage_assignment import LightEstimate, StageAssignment
 
 
 @dataclass(frozen=True, eq=False)
 class DisplayModel:
-    """A display, its scan head and its limits, as configured.
+    """A display, its optical stages and its limits, as configured.
 
-    layout: positions of the pixels; scan_head.layout holds the positions to which the beam is sent for them
+    layout: positions of the pixels; the layout of a scan head holds the positions to which its beam is sent for them
+    scan_heads: of all stages; reach: [k, p] whether a stage's beam reaches a pixel
     dead: [p] whether a pixel is known to be dead
     """
 
@@ -33,7 +37,8 @@ class DisplayModel:
     parameters: ParameterSet
     pixels: PixelArray
     dead: BoolArray
-    scan_head: ScanHead
+    scan_heads: tuple[ScanHead, ...]
+    reach: BoolArray
     budget: Budget
 
     @classmethod
@@ -42,16 +47,19 @@ class DisplayModel:
         layout, pixel_map = build_pixel_layout(config.display), load_pixel_map(config)
         parameters = load_parameters(config.pixel_model.parameters)
         pixels = build_display_pixels(config, parameters)
-        limits, laser = config.limits, config.laser
-        scan_head = ScanHead(
-            layout=build_aim_layout(config),
-            field=load_scan_field(config),
-            settling=build_settling_table(config),
-            drive=DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s),
-            pulse_gap_s=limits.pulse_gap_min_s,
-        )
+        stages = config.list_stage_configs()
+        scan_heads, reach = tuple(map(build_scan_head, stages)), np.stack([stage.reach for stage in stages])
         dead = np.zeros(len(layout), dtype=np.bool_) if pixel_map is None else pixel_map.dead
-        return cls(config, layout, parameters, pixels, dead, scan_head, build_budget(config, parameters, pixels))
+        if len(stages) > 1 and parameters.planner_terms:
+            expected = "a parameter set without planner terms: they are planned with one stage"
+            raise InputError("pixel_model.parameters", config.pixel_model.parameters, expected)
+        budget = build_budget(config, parameters, pixels)
+        return cls(config, layout, parameters, pixels, dead, scan_heads, reach, budget)
+
+    @property
+    def scan_head(self) -> ScanHead:
+        """The first stage's optics and mirrors."""
+        return self.scan_heads[0]
 
     @property
     def ambient_k(self) -> float:
@@ -64,9 +72,36 @@ class DisplayModel:
 
     @cached_property
     def max_displacement_m(self) -> FloatArray:
-        """Largest displacement that a single pulse reaches on a cold display, m, [p]."""
-        return self.build_cold_heat().max_displacement_m(self.scan_head.drive)
+        """Largest displacement that a single pulse of a stage reaches on a cold display, m, [p]."""
+        cold = self.build_cold_heat()
+        by_stage = [cold.max_displacement_m(scan_head.drive) for scan_head in self.scan_heads]
+        # A pixel may get any stage that reaches it.
+        reached = np.where(self.reach, np.stack(by_stage), np.inf)
+        return np.asarray(reached.min(axis=0), dtype=np.float64)
 
     def build_cold_state(self) -> tuple[ThermalState, BudgetState]:
         """Return the thermal state and the budget state of a display at ambient temperature."""
-        return self.build_cold_heat(), build_cold_budget_state(len(self.pixels))
+        return self.build_cold_heat(), build_cold_budget_state(len(self.pixels), stage_count=len(self.scan_heads))
+
+    @cached_property
+    def light(self) -> LightEstimate | None:
+        """Estimate of the light that a height takes, by which pixels are shared among stages; None with one."""
+        if len(self.scan_heads) == 1:
+            return None
+        return LightEstimate.from_cold(self.build_cold_heat(), self.max_displacement_m, self.scan_head.drive)
+
+    def build_assignment(self, sequence: FrameSequence) -> StageAssignment:
+        """Return the assignment of pixels to stages for a plan of a sequence."""
+        return StageAssignment(sequence, self.scan_heads, self.reach, self.light)
+
+
+def build_scan_head(config: Config) -> ScanHead:
+    """Build optics and mirrors of the only stage of a configuration."""
+    laser = config.laser
+    return ScanHead(
+        layout=build_aim_layout(config),
+        field=load_scan_field(config),
+        settling=build_settling_table(config),
+        drive=DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s),
+        pulse_gap_s=config.limits.pulse_gap_min_s,
+    )

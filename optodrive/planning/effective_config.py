@@ -3,7 +3,15 @@
 from typing import TYPE_CHECKING
 
 from optodrive.core.toml_model import Section
-from optodrive.device.config import Config, DisplaySection, LimitsSection, PixelModelSection, ScannerSection
+from optodrive.device.config import Config
+from optodrive.device.config_sections import (
+    DisplaySection,
+    LimitsSection,
+    PanelSection,
+    PixelModelSection,
+    ScannerSection,
+)
+from optodrive.device.panel import complete_panel
 from optodrive.planning.limiter.caps import CAPS
 
 if TYPE_CHECKING:
@@ -47,6 +55,15 @@ class EffectiveScanner(ScannerSection):
     settling_pitch_s: float
 
 
+class EffectivePanel(PanelSection):
+    """The section [panel], with an estimate for what it does not state."""
+
+    width_m: float
+    height_m: float
+    resistance_k_per_w: float
+    capacity_j_per_k: float
+
+
 class EffectivePixelModel(PixelModelSection):
     """The section [pixel_model] and the parameters of a pixel; `planner_terms` holds the parameters of each term."""
 
@@ -67,6 +84,7 @@ class EffectiveConfig(Config):
     limits: EffectiveLimits
     scanner: EffectiveScanner
     pixel_model: EffectivePixelModel
+    panel: EffectivePanel
 
 
 def build_effective_config(display: "DisplayModel") -> EffectiveConfig:
@@ -84,6 +102,7 @@ def build_effective_config(display: "DisplayModel") -> EffectiveConfig:
         dict(config)
         | {
             "display": dict(config.display) | {"pixels": places},
+            "panel": complete_panel(config)._asdict(),
             "limits": dict(config.limits) | {"caps": caps},
             "scanner": dict(config.scanner) | {"settling_pitch_s": settling_us * 1e-6},
             "pixel_model": {

@@ -16,7 +16,7 @@ from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain,
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.batch_limiter import BatchLimiter
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.limiter.limiter import build_cold_budget_state, concatenate
+from optodrive.planning.limiter.limiter import concatenate
 from optodrive.planning.limiter.usage import compute_usage
 from optodrive.planning.planned_sequence import (
     TIME_TOLERANCE_S,
@@ -61,7 +61,7 @@ def warm_up(display: DisplayModel) -> None:
         display.build_cold_heat().simulate_traces(np.zeros((0, 4)), [0], np.zeros(2))
     # The telemetry reads heat and budget while a plan runs.
     display.build_cold_heat().state_at(0.0)
-    compute_usage(build_cold_budget_state(len(display.pixels)), display.budget, 0.0)
+    compute_usage(display.build_cold_state()[1], display.budget, 0.0)
 
 
 def plan_sequence(
@@ -71,7 +71,7 @@ def plan_sequence(
     budget: BudgetState,
     policy: Policy = "trim",
     on_progress: Progress | None = None,
-    initial_pixel: int | None = None,
+    initial_pixels: tuple[int, ...] | None = None,
     visiting_orders: Mapping[int, IntArray] | None = None,
 ) -> PlannedSequence:
     """Plan and limit a sequence from the given heat and budget, which are on the plan's time line and not changed.
@@ -79,7 +79,7 @@ def plan_sequence(
     Under policy "delay", a pulse above a cap is delayed until it fits, together with everything after it: a train pulse
     by itself, a frame as a whole.
 
-    initial_pixel: pixel on which the mirrors stand at the plan's start, None while unknown
+    initial_pixels: pixel on which each stage's mirrors stand at the plan's start, None while unknown
     visiting_orders: by source, visiting orders that replace the scheduler's own
 
     Raises InputError for an unreachable height or peak-to-peak value. Raises RefusedError under "refuse" for a pulse
@@ -94,12 +94,13 @@ def plan_sequence(
             on_progress(done)
 
     scheduler = Scheduler(
-        display.scan_head,
+        display.scan_heads,
+        display.build_assignment(sequence),
         sequence,
         display.build_cold_heat,
         train_batch=1 if policy == "delay" else TRAIN_BATCH,
         on_progress=report_progress,
-        initial_pixel=initial_pixel,
+        initial_pixels=initial_pixels,
         visiting_orders=visiting_orders,
     )
     limiter = BatchLimiter(scheduler, display.budget, budget, len(sequence.frames), policy)
@@ -169,7 +170,7 @@ def _compute_frame_timings(
                 show_at_s=lead_in_s + frame.show_at_s,
                 deadline_s=deadline_s,
                 first_pulse_s=float(plan.start_s[rows[0]]),
-                end_s=float(end_s[rows[-1]]),
+                end_s=float(end_s[rows].max()),
                 pulses=len(rows),
                 on_time=int(np.count_nonzero(end_s[rows] <= deadline_s + TIME_TOLERANCE_S)),
             )

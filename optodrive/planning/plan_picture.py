@@ -6,7 +6,7 @@ import numpy as np
 
 from optodrive.core.quantity import format_quantity
 from optodrive.core.svg_plot import Axis, Scale
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.planned_sequence import PlannedSequence
 
@@ -89,7 +89,15 @@ def _draw_map(planned: PlannedSequence, display: DisplayModel) -> str:
 
 
 def _draw_path(planned: PlannedSequence, display: DisplayModel, x_scale: Scale, y_scale: Scale) -> str:
-    pixel = planned.plan.pixel[:PULSES_MAX]
+    """Draw the path of every stage's beam."""
+    plan, shown = planned.plan, slice(0, PULSES_MAX)
+    return "".join(
+        _draw_beam(plan.pixel[shown][plan.stage[shown] == stage], display, x_scale, y_scale)
+        for stage in range(planned.stage_count)
+    )
+
+
+def _draw_beam(pixel: IntArray, display: DisplayModel, x_scale: Scale, y_scale: Scale) -> str:
     if not len(pixel):
         return ""
     x = x_scale.place_all(display.layout.x_m[pixel]).tolist()
@@ -126,8 +134,9 @@ def _draw_legend(planned: PlannedSequence) -> str:
         f"<g transform='translate({x},{HEADER + 20 + 24 * row})'>{mark}<text x='26'>{escape(text)}</text></g>"
         for row, (mark, text) in enumerate(marks)
     ]
+    beams = f"{planned.stage_count} × " if planned.stage_count > 1 else ""
     facts = (
-        f"beam on {format_quantity(on_s, 's')} of {format_quantity(planned.duration_s, 's')}",
+        f"beam on {format_quantity(on_s, 's')} of {beams}{format_quantity(planned.duration_s, 's')}",
         f"{format_quantity(float(plan.energy_j.sum()), 'J')} incident",
     )
     top = HEADER + 40 + 24 * len(marks)
@@ -143,7 +152,7 @@ def _draw_timeline(planned: PlannedSequence, display: DisplayModel, top: int) ->
     plan, right, parts = planned.plan, WIDTH - MARGIN, []
     shown = slice(0, PULSES_MAX)
     start_s, width_s, power_w = plan.start_s[shown], plan.width_s[shown], plan.power_w[shown]
-    end_s = float(start_s[-1] + width_s[-1]) if len(start_s) else 1.0
+    end_s = float((start_s + width_s).max(initial=0.0)) or 1.0
     time = Scale(Axis("time", "s"), 0.0, end_s, LEFT, right)
     positions_m = {"x": display.layout.x_m[plan.pixel[shown]], "y": display.layout.y_m[plan.pixel[shown]]}
     half_m = float(max(np.abs(display.layout.x_m).max(), np.abs(display.layout.y_m).max())) or 1e-3
@@ -161,7 +170,9 @@ def _draw_timeline(planned: PlannedSequence, display: DisplayModel, top: int) ->
         if name == "gate":
             parts.append(_draw_pulses(start_s, width_s, power_w, plan.trimmed_j[shown], time, scale))
         else:
-            parts.append(_draw_steps(start_s, width_s, positions_m[name], time, scale))
+            for stage in range(planned.stage_count):
+                own = plan.stage[shown] == stage
+                parts.append(_draw_steps(start_s[own], width_s[own], positions_m[name][own], time, scale))
         top = bottom + LANE_GAP
     parts.append(f"<text x='{right}' y='{top + 8}' text-anchor='end'>{escape(time.label)}</text>")
     return "".join(parts)

@@ -39,7 +39,7 @@ def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | No
         pulses=len(plan),
         duration_s=planned.duration_s,
         beam_on_s=beam_on_s,
-        beam_on_fraction=beam_on_s / planned.duration_s if len(plan) else 0.0,
+        beam_on_fraction=beam_on_s / (planned.duration_s * planned.stage_count) if len(plan) else 0.0,
         settling_s=float(plan.settling_s.sum()),
         lead_in_s=planned.lead_in_s,
         galvo_pause_s=planned.galvo_pause_s,
@@ -174,25 +174,27 @@ PLAN_COLUMNS = (
     "trimmed_j",
     "reason",
     "predicted_um",
+    "stage",
 )
 
 
 def write_plan_csv(path: Path, planned: PlannedSequence, display: DisplayModel) -> None:
     """Write plan.csv, one row a pulse in order; whole or not at all."""
     plan = planned.plan
+    aims_m = zip(*((head.layout.x_m, head.layout.y_m) for head in display.scan_heads), strict=True)
     rows = zip(
         plan.start_s.tolist(),
         plan.width_s.tolist(),
         plan.power_w.tolist(),
         plan.pixel.tolist(),
-        display.scan_head.layout.x_m[plan.pixel].tolist(),
-        display.scan_head.layout.y_m[plan.pixel].tolist(),
+        *(np.stack(positions)[plan.stage, plan.pixel].tolist() for positions in aims_m),
         plan.x_rad.tolist(),
         plan.y_rad.tolist(),
         plan.energy_j.tolist(),
         plan.trimmed_j.tolist(),
         plan.reason.tolist(),
         m_to_um(planned.predicted_m).tolist(),
+        plan.stage.tolist(),
         strict=True,
     )
     with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

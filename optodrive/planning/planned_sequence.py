@@ -79,9 +79,14 @@ class PlannedSequence:
     dead_pixels: tuple[int, ...] = ()
 
     @property
+    def stage_count(self) -> int:
+        """Number of optical stages."""
+        return len(self.budget.beam_end_s)
+
+    @property
     def duration_s(self) -> float:
         """Time from the plan's start to the end of its last pulse, s."""
-        return float(self.plan.start_s[-1] + self.plan.width_s[-1]) if len(self.plan) else 0.0
+        return self.plan.end_s
 
     @property
     def train_lateness_max_s(self) -> float:

@@ -88,6 +88,7 @@ class PlanSummary(JsonModel):
     feasibility: None if it was not requested (a stream)
     predicted_max_pixel, predicted_max_um, predicted_max_target_um: the pulse with the largest predicted displacement
     target_max_um: the largest target
+    beam_on_s: of all stages together; beam_on_fraction: of the time of all stages
     """
 
     feasibility: FeasibilityReport | None

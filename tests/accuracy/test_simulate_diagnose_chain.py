@@ -51,6 +51,7 @@ NOT_SHOWN = {
     "gas_membrane": "no cause of its own: its stiffness is that of a membrane",
     "mirror_lag": "no mirror is recorded",
     "neighbour_crosstalk": "a neighbour's pulses heat by a few mK",
+    "panel_heating": "three seconds of light heat a panel by mK",
     "sensor_scale": "R, C and κ together",
 }
 """Terms that this plan does not show, or as another one; nothing false may be named beside them."""
@@ -135,6 +136,26 @@ def test_a_laser_that_pulses_of_two_pixels_share_is_named(key, values, tmp_path,
     assert run(["diagnose", str(out), "--json", "-"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["verdict"], answer["causes"]) == ("cause", [key])
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0, 1])
+def test_a_small_panel_that_one_pixel_heats_for_seconds_is_named(noise, tmp_path, capsys):
+    """The other pixel's light begins when the panel is warm; its wall is not."""
+    trains = [train(MEASURED, 0.0, 10.0, 2.0, gap_s=0.02), train(15, 10.5, 0.5, 2.0, gap_s=0.02)]
+    (tmp_path / "frames.json").write_text(json.dumps({"trains": trains}))
+    truth = write_truth(
+        tmp_path / "truth.toml", {"panel_heating": {"resistance": 55.0, "capacity": 3.3, "share": 0.66}}
+    )
+    out = tmp_path / "recording.h5"
+    arguments = ("simulate", tmp_path / "frames.json", "--config", "display-16", "--truth", truth, "--out", out)
+    options = ("--repeats", 3, "--noise", noise, "--pixels", f"{MEASURED},15")
+    assert run([str(item) for item in (*arguments, *options)]) in (0, 3), capsys.readouterr().err
+    capsys.readouterr()
+    assert run(["diagnose", str(out), "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["verdict"], answer["causes"]) == ("cause", ["panel_heating"])
 
 
 @pytest.mark.parametrize("key", REFUSED)

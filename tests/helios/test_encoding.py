@@ -113,7 +113,7 @@ def test_a_plan_at_the_galvo_cap_passes_verification():
 def test_without_the_interval_shrink_of_points_that_plan_is_rejected():
     """Mutant: a budget that ignores the shift of the mirror moves; verification finds the galvo cap exceeded."""
     display = build_display()
-    exact = display.budget._replace(galvo=display.budget.galvo._replace(timing_slack_s=0.0))
+    exact = display.budget._replace(galvos=display.budget.galvos._replace(timing_slack_s=np.zeros(1)))
     with pytest.raises(LocalProtocolError, match="galvo_acceleration"):
         build_verified(replace(display, budget=exact), FrameSequence(trains=AT_THE_CAP))
 
@@ -123,7 +123,7 @@ def test_without_the_interval_shrink_of_points_that_plan_is_rejected():
 def test_intervals_shrink_by_no_more_than_the_budget_assumes(sequence, rate):
     display = build_display(points_per_s=rate)
     plan, verified = build_verified(display, sequence)
-    shrink_s, pulses, row = display.budget.galvo.timing_slack_s, verified.pulses, verified.row
+    shrink_s, pulses, row = float(display.budget.galvos.timing_slack_s[0]), verified.pulses, verified.row
     begins, ends = np.unique(row, return_index=True)[1], len(row) - 1 - np.unique(row[::-1], return_index=True)[1]
     late_s = pulses.start_s[begins] - plan.start_s[row[begins]]
     early_s = (plan.start_s + plan.width_s)[row[ends]] - (pulses.start_s + pulses.width_s)[ends]

@@ -231,7 +231,7 @@ def test_in_the_experiments_of_the_paper(number):
 
 
 def with_settling(display, settling):
-    return replace(display, scan_head=replace(display.scan_head, settling=settling))
+    return replace(display, scan_heads=(replace(display.scan_head, settling=settling),))
 
 
 def shorten_settling(display):

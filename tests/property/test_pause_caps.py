@@ -80,12 +80,12 @@ def cap_fractions(kind, seed, commit=commit_until):
     caps = random_caps(rng)
     rows = build_sequence(rng, kind, len(model.epsilon), rng.uniform(0.5, 3.0))
     requested = build_plan(rows, FULL_W * rng.uniform(0.3, 1.0, len(rows)) ** rng.choice([0.0, 1.0]), display)
-    budget = build_budget(model, unsure, caps, random_mirrors(rng))
+    budget = build_budget(model, unsure, caps, [random_mirrors(rng)])
     if not len(requested):
         return {}
     executed = play_with_pauses(rng, requested, budget, len(model.epsilon), commit)
     real = build_true_display(model, upper_factors(unsure) if rng.random() < 0.3 else sample_factors(rng, unsure))
-    absorber, _, wall, touch = real.peaks(executed)
+    absorber, _, wall, touch, _ = real.peaks(executed)
     return {
         "absorber": absorber / caps.absorber_k,
         "wall": wall / caps.wall_k,

@@ -13,7 +13,8 @@ from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.preview.jobs import BuiltRequest, plan_dry_run
+from optodrive.daemon.engine.request_body import BuiltRequest
+from optodrive.daemon.preview.jobs import plan_dry_run
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from planner_rig import DISPLAY, PlannerRig
 

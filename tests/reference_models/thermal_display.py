@@ -10,10 +10,17 @@ import numba
 import numpy as np
 
 from optodrive.core.types.plans import EMPTY_PLAN, PulsePlan
-from optodrive.device.config import DisplaySection
+from optodrive.device.config_sections import DisplaySection
 from optodrive.device.neighbours import Neighbours
+from optodrive.planning.limiter.budget import select_galvo
 from optodrive.planning.limiter.caps import CapValues
-from optodrive.planning.limiter.worst_case import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
+from optodrive.planning.limiter.nominal_model import (
+    NominalPanel,
+    NominalThermalModel,
+    NominalTouch,
+    NominalWalls,
+    Uncertainty,
+)
 
 NO_CAPS = CapValues(
     **dict.fromkeys(CapValues._fields, inf)
@@ -22,54 +29,107 @@ NO_CAPS = CapValues(
     | {"min_power_w": 0.0}
 )
 """Caps that do not bind."""
+SETTLED_AFTER_S = 3.0
+"""Time after a pulse, s, after which absorbers and gas have settled to their walls: over twenty time constants."""
 
 
 @numba.njit(cache=False)
-def _rates(y, out, driven, power_w, numbers, neighbours, frame_edges):
-    """Compute dy/dt of y [4, p]: absorber, gas, wall and touch surface."""
-    eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, fg, fw, lag = numbers
+def _fill_leaving_w(y, leaving_w, numbers, neighbours, frame_edges):
+    """Fill in the heat flow from each wall [p], W, to the panel and to its neighbours; return that to the panel."""
+    rw, rx, rf, into_panel_w = numbers[6], numbers[8], numbers[9], 0.0
+    for i in range(y.shape[1]):
+        leaving_w[i] = (y[2, i] - y[4, 0]) * (1 / rw + frame_edges[i] / rf)
+        into_panel_w += leaving_w[i]
+        for k in range(4):
+            if neighbours[i, k] >= 0:
+                leaving_w[i] += (y[2, i] - y[2, neighbours[i, k]]) / rx
+    return into_panel_w
+
+
+@numba.njit(cache=False)
+def _rates(y, out, power_w, numbers, neighbours, frame_edges):
+    """Compute dy/dt of y [5, p], light power_w [p]: absorber, gas, wall and touch surface, and the panel in y[4, 0]."""
+    eps, r, c, ambient_k, n, tau_g, _, cw, _, _, fg, fw, lag, rp, cp = numbers
+    into_panel = _fill_leaving_w(y, out[2], numbers, neighbours, frame_edges)
     for i in range(y.shape[1]):
         theta, gas, wall, touch = y[0, i], y[1, i], y[2, i], y[3, i]
         mean = ambient_k + 0.5 * (theta + wall)
         flow = (theta - wall) / (r * (mean / ambient_k) ** n)
-        drive = eps * power_w if i == driven else 0.0
-        out[0, i] = (drive - flow) / c
+        out[0, i] = (eps * power_w[i] - flow) / c
         out[1, i] = (0.5 * (theta + wall) - gas) / tau_g
-        out[2, i] = 0.0
-        if cw > 0.0:
-            leaving = wall / rw + wall * frame_edges[i] / rf
-            for k in range(4):
-                if neighbours[i, k] >= 0:
-                    leaving += (wall - y[2, neighbours[i, k]]) / rx
-            out[2, i] = (flow - leaving) / cw
+        out[2, i] = (flow - out[2, i]) / cw if cw > 0.0 else 0.0
         out[3, i] = (fg * gas + fw * wall - touch) / lag if lag > 0.0 else 0.0
+    out[4] = 0.0
+    if cp > 0.0:
+        out[4, 0] = (into_panel - y[4, 0] / rp) / cp
 
 
 @numba.njit(cache=False)
-def _integrate(y, peak, start, width, pixel, power, until, numbers, neighbours, frame_edges, on_step, off_step):
-    """Integrate by the fourth-order Runge–Kutta method between events; peak [4] receives the maximum of each kind."""
+def _slow_rates(y, out, numbers, neighbours, frame_edges):
+    """Compute dy/dt of walls, touch surfaces and panel when absorbers and gas have settled to their walls."""
+    _, _, c, _, _, _, _, cw, _, _, fg, fw, lag, rp, cp = numbers
+    out[:] = 0.0
+    into_panel = _fill_leaving_w(y, out[2], numbers, neighbours, frame_edges)
+    for i in range(y.shape[1]):
+        out[2, i] = -out[2, i] / (cw + c) if cw > 0.0 else 0.0
+        out[3, i] = ((fg + fw) * y[2, i] - y[3, i]) / lag if lag > 0.0 else 0.0
+    if cp > 0.0:
+        out[4, 0] = (into_panel - y[4, 0] / rp) / cp
+
+
+@numba.njit(cache=False)
+def _rest(y, peak, time_s, numbers, neighbours, frame_edges):
+    """Integrate a rest with settled absorbers and gas by Heun's method."""
+    k1, k2 = np.empty_like(y), np.empty_like(y)
+    _, _, _, _, _, _, rw, cw, rx, rf, _, _, lag, _, _ = numbers
+    longest = 1.0
+    if cw > 0.0:
+        longest = min(longest, 0.1 * cw / (1 / rw + 4 / rx + 4 / rf))
+    if lag > 0.0:
+        longest = min(longest, 0.1 * lag)
+    steps = int(np.ceil(time_s / longest))
+    h = time_s / steps
+    for _ in range(steps):
+        _slow_rates(y, k1, numbers, neighbours, frame_edges)
+        _slow_rates(y + h * k1, k2, numbers, neighbours, frame_edges)
+        y += 0.5 * h * (k1 + k2)
+        for kind in range(2, 5):
+            peak[kind] = max(peak[kind], y[kind].max())
+    y[0] = y[1] = y[2]
+
+
+@numba.njit(cache=False)
+def _integrate(y, peak, at, pixel, watts, until, numbers, neighbours, frame_edges, on_step, off_step):
+    """Integrate by the fourth-order Runge–Kutta method between edges; peak [5] receives the maximum of each kind.
+
+    at, pixel, watts: [e] light on a pixel from an edge on
+    """
     k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
-    now = 0.0
-    for row in range(len(start) + 1):
-        begin = start[row] if row < len(start) else until
-        for phase in range(2):
-            end = begin if phase == 0 else (begin + width[row] if row < len(start) else begin)
-            driven = pixel[row] if phase == 1 and row < len(start) else -1
-            watts = power[row] if phase == 1 and row < len(start) else 0.0
-            if end <= now:
-                continue
-            steps = int(np.ceil((end - now) / (on_step if phase == 1 else off_step)))
+    power, now = np.zeros(y.shape[1]), 0.0
+    for edge in range(len(at) + 1):
+        end = at[edge] if edge < len(at) else until
+        if end > now:
+            is_on, slow_s = power.any(), 0.0
+            if not is_on and end - now > SETTLED_AFTER_S:
+                slow_s = end - now - SETTLED_AFTER_S
+                end = now + SETTLED_AFTER_S
+            steps = int(np.ceil((end - now) / (on_step if is_on else off_step)))
             h = (end - now) / steps
             for _ in range(steps):
-                _rates(y, k1, driven, watts, numbers, neighbours, frame_edges)
-                _rates(y + 0.5 * h * k1, k2, driven, watts, numbers, neighbours, frame_edges)
-                _rates(y + 0.5 * h * k2, k3, driven, watts, numbers, neighbours, frame_edges)
-                _rates(y + h * k3, k4, driven, watts, numbers, neighbours, frame_edges)
-                for kind in range(4):
-                    for i in range(y.shape[1]):
+                _rates(y, k1, power, numbers, neighbours, frame_edges)
+                _rates(y + 0.5 * h * k1, k2, power, numbers, neighbours, frame_edges)
+                _rates(y + 0.5 * h * k2, k3, power, numbers, neighbours, frame_edges)
+                _rates(y + h * k3, k4, power, numbers, neighbours, frame_edges)
+                for kind in range(5):
+                    for i in range(y.shape[1] if kind < 4 else 1):
                         y[kind, i] += h / 6 * (k1[kind, i] + 2 * k2[kind, i] + 2 * k3[kind, i] + k4[kind, i])
                         peak[kind] = max(peak[kind], y[kind, i])
             now = end
+            if slow_s > 0.0:
+                _rest(y, peak, slow_s, numbers, neighbours, frame_edges)
+                now += slow_s
+        if edge < len(at):
+            power[pixel[edge]] = watts[edge]
 
 
 @dataclass(frozen=True)
@@ -81,16 +141,19 @@ class TrueDisplay:
     frame_edges: np.ndarray
 
     def peaks(self, plan, dark_s=3.0):
-        """Return the largest rise of absorber, gas, wall and touch surface, K, over the plan and `dark_s` after it."""
+        """Return the largest rise of absorber, gas, wall, touch surface and panel, K, until `dark_s` after the plan."""
         lag_s = self.numbers[5]  # the fastest node; steps above 2.8 of its time constants would be unstable
-        y, peak = np.zeros((4, len(self.frame_edges))), np.zeros(4)
-        until = float(plan.start_s[-1] + plan.width_s[-1]) + dark_s
-        columns = (plan.start_s, plan.width_s, plan.pixel, plan.power_w)
+        y, peak = np.zeros((5, len(self.frame_edges))), np.zeros(5)
+        ends = plan.start_s + plan.width_s
+        # At one time a pulse ends before the next one on its pixel begins.
+        order = np.lexsort((np.repeat([1, 0], len(ends)), np.concatenate([plan.start_s, ends])))
         _integrate(
             y,
             peak,
-            *(np.array(column) for column in columns),
-            until,
+            np.concatenate([plan.start_s, ends])[order],
+            np.tile(plan.pixel, 2)[order],
+            np.concatenate([plan.power_w, np.zeros(len(ends))])[order],
+            float(ends.max()) + dark_s,
             self.numbers,
             self.neighbours,
             self.frame_edges,
@@ -103,7 +166,7 @@ class TrueDisplay:
 def build_true_display(model, factor=None):
     """Build the true display from a nominal model, with each parameter times its factor (the exponent: plus)."""
     f = dict.fromkeys(Uncertainty.__dataclass_fields__, 1.0) | {"exponent": 0.0} | (factor or {})
-    walls, touch = model.walls, model.touch
+    walls, touch, panel = model.walls, model.touch, model.panel
     numbers = (
         float(model.epsilon[0]) * f["absorbed_power"],
         float(model.r_k_per_w[0]) * f["bridge_resistance"],
@@ -118,6 +181,8 @@ def build_true_display(model, factor=None):
         touch.gas_share * f["touch_share"] if touch else 0.0,
         touch.wall_share * f["touch_share"] if touch else 0.0,
         touch.lag_s * f["touch_lag"] if touch else 0.0,
+        panel.r_k_per_w * f["panel_resistance"] if panel else 1.0,
+        panel.c_j_per_k * f["panel_capacity"] if panel else 0.0,
     )
     return TrueDisplay(numbers, np.array(model.neighbours), np.array(model.frame_edges))
 
@@ -161,13 +226,13 @@ def _coil(at_s, command_rad, until_s, omega, damping, delay_s, slew, mean_s):
     return maximum
 
 
-def galvo_peak(plan, budget):
-    """Return the peak mean-square acceleration of both mirrors' servos, rad²/s⁴.
+def galvo_peak(plan, budget, stage=0):
+    """Return the peak mean-square acceleration of both mirrors' servos of a stage, rad²/s⁴.
 
     Two cases are simulated: the mirrors leave at the end of the last pulse with power, or one lead-in before a pulse.
     """
-    galvo = budget.galvo
-    driven = np.flatnonzero(plan.power_w > 0)
+    galvo = select_galvo(budget.galvos, stage)
+    driven = np.flatnonzero((plan.power_w > 0) & (plan.stage == stage))
     if not len(driven):
         return 0.0
     ends_s = np.append(0.0, (plan.start_s + plan.width_s)[driven])
@@ -182,6 +247,8 @@ def galvo_peak(plan, budget):
 
 def window_peak_w(plan, window_s):
     """Return the largest mean power over any window, from the delivered energy at all pulse edges."""
+    if not len(plan):
+        return 0.0
     edges_s = np.stack([plan.start_s, plan.start_s + plan.width_s], axis=1).ravel()
     energy_j = np.repeat(np.cumsum(plan.power_w * plan.width_s), 2)
     energy_j[::2] -= plan.power_w * plan.width_s
@@ -214,6 +281,11 @@ def random_model(rng):
         )
     if rng.random() < 0.85:
         touch = NominalTouch(rng.uniform(0.05, 0.5), rng.uniform(0.1, 0.5), rng.uniform(0.5, 3.0))
+    panel = None
+    if walls is not None and rng.random() < 0.7:
+        slowest_s = max(walls.r_k_per_w * walls.c_j_per_k, touch.lag_s if touch else 0.0)
+        r_p = 10 ** rng.uniform(0.0, 2.0)
+        panel = NominalPanel(r_p, slowest_s * 10 ** rng.uniform(1.0, 2.5) / r_p)
     r = rng.uniform(95, 382)
     model = NominalThermalModel(
         epsilon=np.full(pixels, 0.66),
@@ -226,6 +298,7 @@ def random_model(rng):
         frame_edges=neighbours.frame_edges,
         walls=walls,
         touch=touch,
+        panel=panel,
     )
     unsure = Uncertainty(
         absorbed_power=rng.uniform(0, 0.1),
@@ -238,6 +311,8 @@ def random_model(rng):
         side_resistance=rng.uniform(0, 0.3),
         touch_share=rng.uniform(0, 0.1),
         touch_lag=rng.uniform(0, 0.3),
+        panel_resistance=rng.uniform(0, 0.3),
+        panel_capacity=rng.uniform(0, 0.3),
     )
     return display, model, unsure
 
@@ -255,7 +330,8 @@ def sample_factors(rng, unsure):
 
 def upper_factors(unsure):
     """Return the parameter factors with the highest steady temperatures."""
-    high = ("absorbed_power", "bridge_resistance", "wall_resistance", "side_resistance", "touch_share", "exponent")
+    high = ("absorbed_power", "bridge_resistance", "wall_resistance", "side_resistance", "panel_resistance")
+    high = (*high, "touch_share", "exponent")
     return {name: getattr(unsure, name) + (0.0 if name == "exponent" else 1.0) for name in high}
 
 
@@ -284,7 +360,36 @@ def build_sequence(rng, kind, pixels, span_s=3.0):
     return rows
 
 
-def build_plan(rows, power_w, display):
+def build_long_sequence(rng, pixels, panel_s):
+    """Draw rows as `build_sequence`: drives and rests of up to a few time constants of the panel, some for hours."""
+    now, rows, span_s = 0.001, [], panel_s * 10 ** rng.uniform(0.5, 1.5)
+    while now < span_s and len(rows) < 4000:
+        ring = rng.permutation(pixels)[: int(rng.integers(1, pixels + 1))]
+        width = float(rng.choice([5e-3, 20e-3, 50e-3]))
+        rest = float(rng.choice([5.2e-4, 5e-3, width]))
+        count = int(panel_s * 10 ** rng.uniform(-2.0, 0.5) / (width + rest)) + 1
+        for order in range(min(count, 4000 - len(rows))):
+            rows.append((int(ring[order % len(ring)]), round(now * 1e6) * 1e-6, width))
+            now += width + rest
+        now += panel_s * 10 ** rng.uniform(-3.0, 0.5)
+    return rows
+
+
+def build_stages(rng, stages, pixels, build_rows):
+    """Draw rows as `build_sequence` on the beam of every stage, each on pixels of its own, and the stage of each row.
+
+    build_rows: draws the rows of one beam for a number of pixels
+    """
+    groups = [group for group in np.array_split(rng.permutation(pixels), stages) if len(group)]
+    rows = [
+        (start, int(group[pixel]), width, stage)
+        for stage, group in enumerate(groups)
+        for pixel, start, width in build_rows(len(group))
+    ]
+    return [(pixel, start, width) for start, pixel, width, _ in sorted(rows)], [row[3] for row in sorted(rows)]
+
+
+def build_plan(rows, power_w, display, stage=0):
     """Build a plan from rows of (pixel, start_s, width_s) at one power, or at powers [n]."""
     pixel, start, width = (np.array(column) for column in zip(*rows, strict=True))
     n = len(rows)
@@ -298,5 +403,6 @@ def build_plan(rows, power_w, display):
             "x_rad": (pixel % side - side / 2) * display.pitch_m / 0.44,
             "y_rad": (pixel // side - side / 2) * display.pitch_m / 0.44,
             "power_w": np.broadcast_to(np.asarray(power_w, dtype=float), n).copy(),
+            "stage": np.broadcast_to(np.asarray(stage, dtype=np.int64), n).copy(),
         }
     )

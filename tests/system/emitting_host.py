@@ -12,7 +12,8 @@ import time
 
 import numpy as np
 
-from optodrive.core.clock import MonotonicClock, request_realtime_scheduling
+from optodrive.core.clock import MonotonicClock
+from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.device.config import Config
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
@@ -67,7 +68,7 @@ def train():
 
 
 def main(name, lease_s):
-    request_realtime_scheduling()  # as the daemon's loop does
+    set_realtime_priority(LIGHT)  # as the daemon's loop does
     table = load_config("display-16").model_dump()
     table["board"] |= {"baud": BAUD, "lease_s": lease_s}
     port = RecordingPort(name)

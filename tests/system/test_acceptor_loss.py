@@ -18,8 +18,8 @@ from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.daemon.web.web_process import WebProcess
-from optodrive.device.config import DaemonSection
 from optodrive.device.config_file import load_config
+from optodrive.device.config_sections import DaemonSection
 from optodrive.planning.display_model import DisplayModel
 
 PATIENCE_S = 5.0

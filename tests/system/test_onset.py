@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
+from optodrive.daemon.engine.request_body import BuiltRequest
 from rig import ended, wait_for
 
 LATE = FrameSequence((), (PulseTrain(17, 0.7, 0.2, 0.01, 0.03, 1.0),))
@@ -21,7 +22,7 @@ def read_gate_on_s(board):
 def test_the_onset_is_that_of_the_board_s_log_within_a_millisecond(armed, board):
     board.forget()
     unix_minus_monotonic_s = time.time() - time.monotonic()
-    submitted = armed.submit(lambda: LATE, "late").result(10)
+    submitted = armed.submit(lambda: BuiltRequest(LATE), "late").result(10)
     planned = submitted.onset
     assert not planned.executed
     assert planned.monotonic_s - time.monotonic() > 0.3
@@ -37,6 +38,6 @@ def test_the_onset_is_that_of_the_board_s_log_within_a_millisecond(armed, board)
 
 
 def test_a_plan_that_ends_before_its_onset_has_none(armed):
-    submitted = armed.submit(lambda: LATE, "late").result(10)
+    submitted = armed.submit(lambda: BuiltRequest(LATE), "late").result(10)
     armed.cancel(submitted.plan).result(10)
     assert ended(armed, submitted).onset is None

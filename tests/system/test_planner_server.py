@@ -54,10 +54,16 @@ class Web:
         return request_id
 
     def submit(self, sequence, epoch=None, streamed=False, fit="as_is"):
+        fields = self.fields(epoch, streamed, fit) | {"labels": {}, "parameters": {}}
+        return self.request("submit", encode_sequence(sequence), **fields)
+
+    def submit_body(self, body):
+        return self.request("submit_body", body, **self.fields(None, True, "as_is"))
+
+    def fields(self, epoch, streamed, fit):
         fields = {"name": "push", "policy": "trim", "fit": fit, "streamed": streamed, "caller": "token"}
-        fields |= {"lists_pulses": not streamed, "labels": {}, "parameters": {}}
         epoch = self.engine.web.status["epoch"] if epoch is None else epoch
-        return self.request("submit", encode_sequence(sequence), arrived_s=time.monotonic(), epoch=epoch, **fields)
+        return fields | {"lists_pulses": not streamed, "arrived_s": time.monotonic(), "epoch": epoch}
 
     def receive(self):
         self.socket.flush()
@@ -130,6 +136,15 @@ def test_a_plan_is_submitted_reported_and_ends_with_the_state_before_each_reply(
     assert (done.status, done.executed, done.pulses) == ("done", 1, None)
     assert web.report(web.request("get_plan", plan=report.plan, pulses=True)).pulses.pixel == [17]
     assert not web.of_kind("ended")  # only streamed plans
+
+
+def test_a_streamed_body_is_parsed_and_planned_with_its_labels(web):
+    frame = {"show_at_s": 0, "duration_s": 9, "target_um": {"17": 100, "20": 50}}
+    report = web.report(web.submit_body(json.dumps({"frames": [frame], "labels": {"trial": 7}}).encode()))
+    assert (report.planned, report.labels) == (2, {"trial": 7})
+    frame["target_um"]["437"] = 50
+    assert web.problem(web.submit_body(json.dumps({"frames": [frame]}).encode())) == (422, "unknown_pixel")
+    assert web.problem(web.submit_body(b"[" * 30_000)) == (422, "bad_json")
 
 
 def test_errors_are_problems(web):

@@ -15,12 +15,13 @@ from pathlib import Path
 import httpx
 import pytest
 
+from optodrive.core.scheduling import LIGHT, PLANNING
 from optodrive.daemon.priority import NICE
 from optodrive.daemon.supervisor.child import HANG_S
 from optodrive.daemon.web import acceptor
 from optodrive.daemon.web.acceptor_client import PERMITTED
 from optodrive.daemon.web.request_head import Rank
-from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, wait_for
+from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, read_proc, wait_for
 
 PROCESSES = ("link", "planner", "preview", "acceptor", "web", "supervisor")
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM)
@@ -52,6 +53,11 @@ DARK_S = {
     ("supervisor", signal.SIGTERM): AT_ONCE_S,
 }
 """Time from a signal to a process until the gate stays off, s. What is missing does not end a running plan."""
+
+
+def read_realtime_priority(pid, thread):
+    """Return the real-time priority of a thread, 0 for a usual one; the name in parentheses may contain spaces."""
+    return int(read_proc(pid, f"task/{thread}/stat").rpartition(")")[2].split()[37])
 
 
 def matrix(processes):
@@ -264,6 +270,19 @@ def test_every_process_has_the_priority_of_the_daemon(shared):
         pytest.skip("only the superuser may raise a priority")
     niceness = {name: os.getpriority(os.PRIO_PROCESS, shared.daemon.find_process(name)) for name in PROCESSES}
     assert niceness == dict.fromkeys(PROCESSES, NICE) | {"acceptor": acceptor.NICE}
+
+
+def test_what_makes_dark_runs_before_the_planning_of_streams_and_that_before_all_else(shared):
+    if os.geteuid():
+        pytest.skip("only the superuser may use real-time priorities")
+    shared.bring_to("streaming")
+    pids = {name: shared.daemon.find_process(name) for name in PROCESSES}
+    usual = dict.fromkeys(PROCESSES, 0)
+    priorities = {name: read_realtime_priority(pid, pid) for name, pid in pids.items()}
+    assert priorities == usual | {"link": LIGHT, "acceptor": LIGHT, "planner": PLANNING}
+    threads = [int(path.name) for path in Path(f"/proc/{pids['planner']}/task").iterdir()]
+    assert len(threads) > 2
+    assert {read_realtime_priority(pids["planner"], thread) for thread in threads[1:]} == {0}
 
 
 def test_the_supervisor_has_one_thread_and_children_hold_only_their_descriptors(shared):

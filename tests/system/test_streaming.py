@@ -10,6 +10,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import plan_making
 from optodrive.daemon.engine.planner import SPLICE_TRIES
 from optodrive.daemon.engine.planning_time import FACTOR
+from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 
@@ -24,7 +25,7 @@ def frame(pixels, height_um=100.0):
 
 
 def stream(armed, sequence):
-    return armed.submit(lambda: sequence, "stream", streamed=True).result(10)
+    return armed.submit(lambda: BuiltRequest(sequence), "stream", streamed=True).result(10)
 
 
 @pytest.mark.parametrize("reserved_s", [RESERVED_S, pytest.param(None, marks=pytest.mark.slow)])
@@ -102,8 +103,8 @@ def test_an_empty_frame_ends_the_previous_one(armed, board):
 
 def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
     train = FrameSequence((), (PulseTrain(200, 0.0, 5.0, 0.01, 0.01, 1.0),))
-    running = armed.submit(lambda: train, "train").result(10)
-    waiting = armed.submit(lambda: frame(range(50)), "waiting").result(10)
+    running = armed.submit(lambda: BuiltRequest(train), "train").result(10)
+    waiting = armed.submit(lambda: BuiltRequest(frame(range(50))), "waiting").result(10)
     wait_for(lambda: armed.get_plan(running.plan).executed >= 3, "a part of the train")
     newest = ended(armed, stream(armed, frame(range(5), 200.0)))
     assert newest.status == "done"
@@ -114,7 +115,7 @@ def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
 
 def test_a_plan_after_a_stream_waits_for_its_end(armed):
     first = stream(armed, frame(range(30)))
-    second = armed.submit(lambda: frame(range(30)), "second").result(10)
+    second = armed.submit(lambda: BuiltRequest(frame(range(30))), "second").result(10)
     records = [ended(armed, answer) for answer in (first, second)]
     assert [record.status for record in records] == ["done", "done"]
     for record in records:

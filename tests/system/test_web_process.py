@@ -113,7 +113,7 @@ def test_a_push_to_a_process_that_has_died_is_refused_in_one_line_and_the_next_i
 
 def test_a_dry_run_whose_caller_leaves_is_dropped(armed):
     _, daemon = armed
-    frames = [{"show_at_s": k * 2.0, "duration_s": 2.0, "target_um": [100.0] * 437} for k in range(300)]
+    frames = [{"show_at_s": k * 2.0, "duration_s": 2.0, "target_um": [100.0] * 437} for k in range(1500)]
     with pytest.raises(httpx.ReadTimeout):
         daemon.client.post("/v1/plans?dry_run=true", json={"frames": frames}, timeout=1.0)
     begin_s = time.monotonic()

@@ -19,7 +19,7 @@ from optodrive.daemon.web.listeners import open_tcp_listener
 from optodrive.daemon.web.server_state import ARRIVED_S, CALLER
 from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
 from optodrive.daemon.web.web_server import Server
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 GET = b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
 SECRET = "a-valid-secret-of-a-viewer"

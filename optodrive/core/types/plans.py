@@ -9,7 +9,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray, StrArray, freeze_a
 
 @dataclass(frozen=True, eq=False)
 class PulsePlan:
-    """Timed pulses of one beam before the limiter: one row per pulse, in order of time; all arrays [n].
+    """Timed pulses of all beams before the limiter: one row per pulse, in order of their starts; all arrays [n].
 
     start_s: gate-on time from the plan's start, whole microseconds; width_s: gate-on duration, whole PWM periods
     x_rad, y_rad: mechanical mirror angles (the beam turns by twice the angle)
@@ -19,6 +19,7 @@ class PulsePlan:
     interleaved sub-pulses of a frame but the last
     requested_start_s: time at which the request wants the pulse (frame: start of the frame; train: gate on)
     source: index of the frame, or number of frames + index of the train
+    stage: index of the optical stage whose beam it is; pulses of one stage do not overlap
     """
 
     start_s: FloatArray
@@ -31,12 +32,18 @@ class PulsePlan:
     target_m: FloatArray
     requested_start_s: FloatArray
     source: IntArray
+    stage: IntArray
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.start_s)
+
+    @property
+    def end_s(self) -> float:
+        """End of the last pulse of all stages, s; 0 without pulses."""
+        return float((self.start_s + self.width_s).max(initial=0.0))
 
 
 _NO_FLOATS: FloatArray = np.zeros(0)
@@ -54,6 +61,7 @@ EMPTY_PLAN = PulsePlan(
     target_m=_NO_FLOATS,
     requested_start_s=_NO_FLOATS,
     source=_NO_INTS,
+    stage=_NO_INTS,
 )
 """A plan without pulses."""
 
@@ -77,19 +85,22 @@ class LimitedPlan(PulsePlan):
 class BudgetState:
     """State of the limiter between plans; passed pulses count as executed until the board reports otherwise.
 
-    at_s: end of the last pulse, on the budget's time line
+    at_s: end of the last pulse of any stage, on the budget's time line; begun_s: start of the last one
     last_pulse_end_s: [p] end of each pixel's last pulse; the following [p] arrays hold at that time
     rise_k, lower_bound_k: [p] upper and lower bound of the absorber's rise over its wall
     bucket_j: [p] leaky bucket of energy; merged_width_s: [p] total width of the last pulses without a gap
     wall_k, touch_k: [p, 2] bounds on wall and touch surface at nodes_at_s [p]
     inflow_w: [p] upper bound on the heat flow from neighbouring walls since exchanged_at_s
-    mirror_rad: [2] mirror angles; galvo_mean_square, galvo_ringing: [2] bounds on the mirrors' mean-square
-    acceleration, rad²/s⁴, and on the root of the remaining integral of a², rad/s^1.5, at mirror_at_s, the arrival time
-    of their targets
-    recent_*: [r] start_s, width_s, power_w and pixel of pulses that a sliding window may still contain
+    panel_k: [2] bounds on the panel at panel_at_s; those of walls and touch surfaces are rises over it
+    beam_end_s: [k] end of each stage's last pulse
+    mirror_rad: [k, 2] mirror angles; galvo_mean_square, galvo_ringing: [k, 2] bounds on the mirrors' mean-square
+    acceleration, rad²/s⁴, and on the root of the remaining integral of a², rad/s^1.5, at mirror_at_s [k], the arrival
+    time of their targets
+    recent_*: [r] start_s, width_s, power_w, pixel and stage of pulses that a sliding window may still contain
     """
 
     at_s: float
+    begun_s: float
     last_pulse_end_s: FloatArray
     rise_k: FloatArray
     lower_bound_k: FloatArray
@@ -100,14 +111,18 @@ class BudgetState:
     nodes_at_s: FloatArray
     inflow_w: FloatArray
     exchanged_at_s: float
+    panel_k: FloatArray
+    panel_at_s: float
+    beam_end_s: FloatArray
     mirror_rad: FloatArray
     galvo_mean_square: FloatArray
     galvo_ringing: FloatArray
-    mirror_at_s: float
+    mirror_at_s: FloatArray
     recent_start_s: FloatArray
     recent_width_s: FloatArray
     recent_power_w: FloatArray
     recent_pixel: IntArray
+    recent_stage: IntArray
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

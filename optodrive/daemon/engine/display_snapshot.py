@@ -14,7 +14,7 @@ from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
 from optodrive.physics.nominal_display import DisplayState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_executed, shift_state
-from optodrive.planning.limiter.usage import Usage, compute_usage
+from optodrive.planning.limiter.usage import Usage, compute_panel_k, compute_usage
 
 
 class ExecutedBatch(NamedTuple):
@@ -69,7 +69,9 @@ class LiveThermalState:
             self._heat.apply_pulses(*columns)
         except ValueError:
             self.out_of_order += len(executed.row)
-        self._budget = commit_executed(executed.pixel, executed, self._budget, self._display.budget)
+        self._budget = commit_executed(
+            executed.pixel, np.zeros_like(executed.pixel), executed, self._budget, self._display.budget
+        )
 
     def shift_clock(self, delay_s: float) -> None:
         """Shift all past pulses by delay_s after a restart of the board's clock."""
@@ -82,3 +84,7 @@ class LiveThermalState:
     def compute_usage(self, board_s: float) -> tuple[Usage, ...]:
         """Compute the usage of every cap at a board time, s."""
         return compute_usage(self._budget, self._display.budget, board_s)
+
+    def compute_panel_c(self, board_s: float) -> float:
+        """Compute the bound on the panel's temperature at a board time, °C."""
+        return self._display.config.ambient_c + compute_panel_k(self._budget, self._display.budget, board_s)

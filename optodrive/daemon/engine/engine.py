@@ -15,17 +15,19 @@ import numpy as np
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError
+from optodrive.core.scheduling import use_usual_priority
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
-from optodrive.daemon.engine.plan_making import NEVER, NO_LABELS, LabelValues, ParameterValues, PlanningRequest
+from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
+from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.session_connection import SessionConnection
 from optodrive.daemon.engine.state_report import build_planner_state, build_state_report
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
@@ -81,8 +83,8 @@ class Engine:
         self._plan_store = PlanStore()
         self._plan_counters = PlanCounters()
         self._plan_store.end_callbacks.append(self._plan_counters.record_end)
-        self._simulation_executor = ThreadPoolExecutor(1, thread_name_prefix="simulation")
-        self._planning_executor = ThreadPoolExecutor(1, thread_name_prefix="planner")
+        self._simulation_executor = ThreadPoolExecutor(1, "simulation", use_usual_priority)
+        self._planning_executor = ThreadPoolExecutor(1, "planner", use_usual_priority)
         self._plan_queue = PlanQueue(display, session, self._plan_store, self._simulation_executor)
         self._memory = ThermalMemory() if memory is None else memory
         self._dimmer = Dimmer(display, self._memory)
@@ -183,7 +185,7 @@ class Engine:
 
     def submit(
         self,
-        build: Callable[[], FrameSequence],
+        build: Callable[[], BuiltRequest],
         name: str,
         policy: Policy = "trim",
         fit: FitMode = "as_is",
@@ -193,8 +195,6 @@ class Engine:
         caller: str = "",
         caller_left: threading.Event = NEVER,
         lists_pulses: bool = True,
-        labels: LabelValues = NO_LABELS,
-        parameters: ParameterValues = NO_LABELS,
     ) -> "Future[PlanReport]":
         """Plan the sequence that `build` returns, and queue the plan. Raise BusyError if too many requests wait.
 
@@ -203,7 +203,6 @@ class Engine:
         caller: name of the token that submitted it
         caller_left: set when the caller no longer waits, which ends the planning
         lists_pulses: whether the answer lists the pulses one by one
-        labels, parameters: of the caller and of the pattern, for report and recording
         """
         if streamed and fit != "as_is":
             raise InputError("fit", fit, "as_is for streamed plans: a stream has no time for a feasibility check")
@@ -222,8 +221,6 @@ class Engine:
                 caller,
                 caller_left,
                 lists_pulses,
-                labels,
-                parameters,
             )
         )
 
@@ -246,7 +243,11 @@ class Engine:
         """Drop the unsent rest of a stream's last plan after its client has disconnected."""
         blank_frame = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
         return self.submit(
-            lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True, epoch=epoch, caller=caller
+            lambda: BuiltRequest(FrameSequence((blank_frame,))),
+            "end of stream",
+            streamed=True,
+            epoch=epoch,
+            caller=caller,
         )
 
     def get_plan(self, plan_id: str, pulses: bool = True) -> PlanReport:

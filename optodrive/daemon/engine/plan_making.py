@@ -2,15 +2,15 @@
 
 import threading
 import zlib
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
-from typing import NamedTuple, Never
+from collections.abc import Callable
+from typing import NamedTuple
 
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import LargestTarget, PlanRecord
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
+from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.link.protocol.quantisation import WireScale, decode, quantise
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
@@ -26,23 +26,17 @@ NEVER = threading.Event()
 """Event of a caller that does not leave."""
 
 
-LabelValues = Mapping[str, str | int | float | bool]
-ParameterValues = Mapping[str, str | float | bool | None]
-NO_LABELS: Mapping[str, Never] = MappingProxyType({})
-
-
 class PlanningRequest(NamedTuple):
     """Request for a plan.
 
-    build: returns the sequence
+    build: returns the sequence, with labels and parameters for report and recording
     streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
     arrived_s: board time of the request's arrival; epoch: in which it arrived
     caller: name of the token that submitted it; caller_left: set when the caller no longer waits
     lists_pulses: whether the answer lists the pulses one by one
-    labels, parameters: of the caller and of the pattern, for report and recording
     """
 
-    build: Callable[[], FrameSequence]
+    build: Callable[[], BuiltRequest]
     name: str
     policy: Policy = "trim"
     fit: FitMode = "as_is"
@@ -52,15 +46,13 @@ class PlanningRequest(NamedTuple):
     caller: str = ""
     caller_left: threading.Event = NEVER
     lists_pulses: bool = True
-    labels: LabelValues = NO_LABELS
-    parameters: ParameterValues = NO_LABELS
 
 
 def make_plan(
     display: DisplayModel,
     scale: WireScale,
     request: PlanningRequest,
-    sequence: FrameSequence,
+    built: BuiltRequest,
     snapshot: PlanningSnapshot,
     plan_id: str,
     on_progress: Callable[[float], None],
@@ -69,7 +61,7 @@ def make_plan(
 
     Raises InputError and RefusedError as `plan_sequence` and `check_feasibility` do, and what on_progress raises.
     """
-    planned, feasibility = _plan(display, request, sequence, snapshot, on_progress)
+    planned, feasibility = _plan(display, request, built.sequence, snapshot, on_progress)
     on_progress(1.0)
     points = quantise(planned.plan, scale)
     on_progress(1.0)
@@ -88,8 +80,8 @@ def make_plan(
         start_s=snapshot.start_s,
         arrived_s=request.arrived_s,
         caller=request.caller,
-        labels=dict(request.labels),
-        parameters=dict(request.parameters),
+        labels=dict(built.labels),
+        parameters=dict(built.parameters),
         streamed=request.streamed,
         first_pulse_s=float(decoded.start_s[0]) if len(decoded.start_s) else None,
     )
@@ -118,7 +110,7 @@ def _plan(
         return check_feasibility(display, sequence, heat, budget, request.policy, on_progress, request.fit)
     if snapshot.refreshed is not None and can_split(sequence):
         sequence = stale_pixels_first(sequence, snapshot.refreshed)
-    initial_pixel = snapshot.initial_pixel
+    initial_pixels = None if snapshot.initial_pixel is None else (snapshot.initial_pixel,)
     return plan_sequence(
-        display, sequence, heat, budget, request.policy, on_progress, initial_pixel=initial_pixel
+        display, sequence, heat, budget, request.policy, on_progress, initial_pixels=initial_pixels
     ), None

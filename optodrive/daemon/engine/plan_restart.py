@@ -97,7 +97,7 @@ def _restart(
     heat_after = heat.copy()
     peaks = heat_after.apply_pulses(rest.pixel, rest.start_s, rest.width_s, rest.power_w, on_progress)
     after = ThermalEstimate.from_plan(heat_after, budget_after, start_s)
-    end_s = start_s + (float(rest.start_s[-1] + rest.width_s[-1]) if len(rest) else 0.0)
+    end_s = start_s + rest.end_s
     zero_s = start_s - plan.record.start_s if first else 0.0
     whole = replace_rest(planned.plan, first, rest, zero_s, budget_after, display.budget)
     plan_zero_s = start_s - zero_s

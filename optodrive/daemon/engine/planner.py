@@ -10,12 +10,13 @@ from typing import Any, Protocol, TypeVar
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import BusyError, InputError, LinkError, StoppedError
-from optodrive.core.types.stimuli import FrameSequence
+from optodrive.core.scheduling import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.planning_time import PlanningTime
+from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.service.remote_session import RemoteSession
 
@@ -25,6 +26,8 @@ SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
 PLANNING_MAX_S = 60.0
 """Processor time for the planning of one request at most, s; meanwhile all others wait."""
+REALTIME_MAX_S = 0.1
+"""Processor time for the planning of a streamed frame in real time at most, s; one of 1,511 pixels takes 13 ms."""
 REQUESTS_MAX = 16
 """Requests that wait for the planner at most."""
 T = TypeVar("T")
@@ -142,12 +145,25 @@ class Planner:
         return self._run_in_loop(commit)
 
     def _process(self, request: PlanningRequest) -> PlanReport:
+        """Plan one request; a streamed one before all programs of usual priority."""
+        if not request.streamed:
+            return self._plan(request)
+        set_realtime_priority(PLANNING)
+        try:
+            return self._plan(request)
+        finally:
+            use_usual_priority()
+
+    def _plan(self, request: PlanningRequest) -> PlanReport:
         began_s = thread_time()
 
         def check(_fraction: float) -> None:
             """Record progress, and end the work on a request that nobody waits for or that takes too long."""
             self._progress_at_s = self._clock.now_s()
-            if thread_time() - began_s > PLANNING_MAX_S:
+            used_s = thread_time() - began_s
+            if request.streamed and used_s > REALTIME_MAX_S:
+                use_usual_priority()
+            if used_s > PLANNING_MAX_S:
                 expected = f"a sequence that is planned within {PLANNING_MAX_S:g} s of processor time; send it in parts"
                 raise InputError("body", "a longer computation", expected, "too_slow")
             self._plan_queue.require_epoch(request.epoch)
@@ -163,7 +179,7 @@ class Planner:
             self._progress_at_s = self._clock.now_s()
 
     def _plan_until_committed(
-        self, sequence: FrameSequence, request: PlanningRequest, check: Callable[[float], None]
+        self, built: BuiltRequest, request: PlanningRequest, check: Callable[[float], None]
     ) -> ActivePlan:
         late_count = 0
         while True:
@@ -173,7 +189,7 @@ class Planner:
                 self._run_in_loop(self._plan_queue.pause.require_no_pause)
             if request.streamed and self._plan_queue.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
-            plan = self._plan_once(sequence, request, self._planning_time.compute_reserved_s(late_count), check)
+            plan = self._plan_once(built, request, self._planning_time.compute_reserved_s(late_count), check)
             if plan is not None:
                 return plan
             # The snapshot is stale: a predecessor was late, or has sent points beyond the splice.
@@ -189,7 +205,7 @@ class Planner:
 
     def _plan_once(
         self,
-        sequence: FrameSequence,
+        built: BuiltRequest,
         request: PlanningRequest,
         planning_time_s: float,
         check: Callable[[float], None],
@@ -198,7 +214,7 @@ class Planner:
         began_s, display = self._clock.now_s(), self._dimmer.display
         snapshot = self._plan_queue.make_snapshot(request.streamed, planning_time_s)
         plan_id = f"p{next(self._ids)}"
-        plan = make_plan(display, self._session.scale, request, sequence, snapshot, plan_id, check)
+        plan = make_plan(display, self._session.scale, request, built, snapshot, plan_id, check)
         self._planning_time.record(self._clock.now_s() - began_s)
 
         def commit() -> bool:

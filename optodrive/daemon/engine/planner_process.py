@@ -6,6 +6,7 @@ from pathlib import Path
 
 from optodrive.core.beat import BeatWriter, SupervisorGoneError
 from optodrive.core.clock import MonotonicClock
+from optodrive.core.scheduling import PLANNING, set_realtime_priority
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.planner_server import PlannerServer
 from optodrive.daemon.engine.session_recording import start_session_recorder
@@ -48,6 +49,7 @@ def run_planner(
         engine.on_loop, engine.on_beat = server.publish_state, beat.beat
         engine.message_loop.watch(beat, beat.receive)
         beat.report_ready()
+        set_realtime_priority(PLANNING)
         try:
             engine.run(lambda: bool(ending))
         except SupervisorGoneError:

@@ -13,9 +13,11 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.json_model import iterate_json
+from optodrive.core.scheduling import use_usual_priority
 from optodrive.daemon.engine.dry_run import build_dry_run_start
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.request_body import BuiltRequest, build_request
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
 from optodrive.daemon.message_loop import MessageServer
 from optodrive.daemon.responses.error_problem import build_error_problem
@@ -45,7 +47,7 @@ class PlannerServer:
         self._engine = engine
         self._clock = clock
         self._clients: dict[MessageSocket, _Client] = {}
-        self._report_executor = ThreadPoolExecutor(1, thread_name_prefix="reports")
+        self._report_executor = ThreadPoolExecutor(1, "reports", use_usual_priority)
         self._state_key: object = None
         self._state_sent_s = -inf
         self._server = MessageServer(engine.message_loop, path, self._on_message, self._on_lost)
@@ -71,6 +73,7 @@ class PlannerServer:
         fields = message.fields
         handlers: dict[str, Callable[[], object]] = {
             "submit": lambda: self._submit(connection, client, message),
+            "submit_body": lambda: self._submit(connection, client, message),
             "drop": lambda: self._drop(client, fields["id"]),
             "get_plan": lambda: self._answer(
                 connection, fields["id"], lambda: self._engine.get_plan(fields["plan"], fields["pulses"])
@@ -97,7 +100,7 @@ class PlannerServer:
     def _submit(self, connection: MessageSocket, client: _Client, message: Message) -> None:
         fields, request_id, caller_left = message.fields, message.fields["id"], threading.Event()
         future = self._engine.submit(
-            partial(decode_sequence, message.payload),
+            partial(self._build, message),
             fields["name"],
             fields["policy"],
             fields["fit"],
@@ -107,8 +110,6 @@ class PlannerServer:
             fields["caller"],
             caller_left,
             fields["lists_pulses"],
-            fields["labels"],
-            fields["parameters"],
         )
         client.requests[request_id] = caller_left, future
 
@@ -119,6 +120,13 @@ class PlannerServer:
             self._engine.commands.post(partial(self._finish, connection, client, request_id, *answer))
 
         future.add_done_callback(finish)
+
+    def _build(self, message: Message) -> BuiltRequest:
+        """Build the sequence of a push: that of a body, or one that the preview process has built."""
+        fields = message.fields
+        if message.kind == "submit_body":
+            return build_request(self._engine.display, "sequence", fields["name"], message.payload)
+        return BuiltRequest(decode_sequence(message.payload), fields["labels"], fields["parameters"])
 
     def _finish(
         self, connection: MessageSocket, client: _Client, request_id: int, status: int, payload: bytes, audit: Any

@@ -9,7 +9,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PulseBatch
-from optodrive.device.config import LimitsSection
+from optodrive.device.config_sections import LimitsSection
 from optodrive.physics.nominal_display import DisplayState
 from optodrive.planning.limiter.caps import CAPS_BY_KEY
 from optodrive.planning.limiter.usage import Usage

@@ -116,8 +116,9 @@ class TelemetryProducer:
             return
         self._publish_display(now_s, board_s)
         if self._is_due("budget", now_s, BUDGET_PERIOD_S):
-            usages = self._executed_state.compute_usage(board_s)
-            self._publish("budget", BudgetEvent(board_s=board_s, caps=describe_caps(usages, self._config.limits)))
+            caps = describe_caps(self._executed_state.compute_usage(board_s), self._config.limits)
+            panel_c = round(self._executed_state.compute_panel_c(board_s), 3)
+            self._publish("budget", BudgetEvent(board_s=board_s, caps=caps, panel_c=panel_c))
 
     def _estimate_board_s(self, now_s: float) -> float:
         """Estimate the board's time; it is extrapolated while there is no link."""

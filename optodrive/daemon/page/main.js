@@ -308,6 +308,7 @@ telemetry.addEventListener("fault", ({ detail }) => {
 });
 telemetry.addEventListener("budget", ({ detail }) => {
   gauges.show(detail.caps);
+  find("panel").textContent = `Panel: up to ${detail.panel_c.toFixed(1)} °C.`;
   if (hasLink) {
     freshness.see("budget"); // without a link nobody knows what the board executes
   }

@@ -59,10 +59,11 @@ class CapUsage(JsonModel):
 
 
 class BudgetEvent(JsonModel):
-    """The usage of every cap at a board time."""
+    """The usage of every cap at a board time, and the highest temperature that the panel may have."""
 
     board_s: float
     caps: list[CapUsage]
+    panel_c: float
 
 
 EVENTS: Mapping[str, type[JsonModel]] = {

@@ -25,7 +25,8 @@ from optodrive.daemon.supervisor.reload_handler import ReloadHandler
 from optodrive.daemon.supervisor.supervisor import Supervisor
 from optodrive.daemon.web.listeners import BACKLOG, open_tcp_listener
 from optodrive.daemon.web.tokens import Tokens, load_daemon_tokens
-from optodrive.device.config import Config, DaemonSection
+from optodrive.device.config import Config
+from optodrive.device.config_sections import DaemonSection
 from optodrive.link.board_setup import build_port_settings
 from optodrive.link.service.link_settings_builder import build_link_settings
 from optodrive.link.transport.registry import find_transport_factory
@@ -114,6 +115,7 @@ def _load_display(config: Config) -> "DisplayModel":
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.pipeline import warm_up
 
+    config.require_one_stage()
     display = DisplayModel.from_config(config)
     warm_up(display)
     release_compiler()

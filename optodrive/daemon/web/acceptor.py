@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from optodrive.core.beat import BeatWriter, SupervisorGoneError
-from optodrive.core.clock import request_realtime_scheduling
 from optodrive.core.ipc import IpcError, Message, MessageSocket
+from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.acceptor_protocol import BEAT, decode_permission, send_connection
@@ -27,7 +27,7 @@ from optodrive.daemon.web.reload_message import apply_reload
 from optodrive.daemon.web.request_head import Rank, parse_head, peek_head, rank_request
 from optodrive.daemon.web.tokens import Tokens
 from optodrive.daemon.web.waiting_room import Waiting, WaitingRoom
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 TURN_MAX_S = 0.05
 """Interval of the beats, and longest wait of the loop."""
@@ -44,7 +44,7 @@ def run_acceptor(
     """Keep the acceptor until SIGTERM or the end of the supervisor. listeners: sockets that listen already."""
     with suppress(OSError):  # not permitted to every user
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
-    request_realtime_scheduling()
+    set_realtime_priority(LIGHT)
     raise_descriptor_limit()
     acceptor = Acceptor(
         listeners, AccessPolicy(tokens, daemon), daemon, folder.acceptor_socket, folder.link_socket, beat

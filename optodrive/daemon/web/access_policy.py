@@ -19,7 +19,7 @@ from optodrive.daemon.web.route_table import STOP, Route, RouteTable
 from optodrive.daemon.web.socket_token import is_websocket_request, read_subprotocol_token
 from optodrive.daemon.web.static_files import is_page_request, read_cookie_token
 from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 DEFAULT_PORTS = {"http": "80", "https": "443"}

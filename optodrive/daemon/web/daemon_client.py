@@ -8,11 +8,11 @@ import time
 from bisect import bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from optodrive.core.ipc import Message
 from optodrive.core.types.policy import Policy
+from optodrive.daemon.engine.request_body import NO_LABELS, LabelValues, ParameterValues
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.runtime_folder import RuntimeFolder
@@ -28,6 +28,8 @@ EPOCHS_MAX = 1000
 ENDED_MAX = 1000
 NO_REQUEST = 0
 """Identifier of a request whose result nobody awaits."""
+STREAMED_BODY_MAX_BYTES = 32_768
+"""Largest body that the planner parses: a frame of 1,511 targets has 20 kB, and no such body takes over 10 ms."""
 NO_EPOCH = 0
 """Epoch without a link process."""
 
@@ -36,7 +38,6 @@ class PushFields(NamedTuple):
     """Fields of a push. arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token.
 
     lists_pulses: whether the answer lists the pulses one by one
-    labels: of the caller; parameters: of the pattern, all of them
     """
 
     name: str
@@ -47,8 +48,6 @@ class PushFields(NamedTuple):
     epoch: int
     caller: str
     lists_pulses: bool = True
-    labels: Mapping[str, str | int | float | bool] = MappingProxyType({})
-    parameters: Mapping[str, str | float | bool | None] = MappingProxyType({})
 
 
 class LinkClient:
@@ -162,10 +161,20 @@ class PlannerClient:
                 future.set_exception(self.peer.build_loss_error())
         self._waiting.clear()
 
-    async def submit(self, sequence: bytes, push: PushFields) -> Message:
-        """Plan an encoded sequence and return the result."""
-        fields = push._asdict() | {"labels": dict(push.labels), "parameters": dict(push.parameters)}
+    async def submit(
+        self,
+        sequence: bytes,
+        push: PushFields,
+        labels: LabelValues = NO_LABELS,
+        parameters: ParameterValues = NO_LABELS,
+    ) -> Message:
+        """Plan an encoded sequence and return the result. labels: of the caller; parameters: of the pattern, all."""
+        fields = push._asdict() | {"labels": dict(labels), "parameters": dict(parameters)}
         return await self.peer.call(Message("submit", fields, sequence))
+
+    async def submit_body(self, body: bytes, push: PushFields) -> Message:
+        """Parse and plan a streamed FRAMES.json and return the result."""
+        return await self.peer.call(Message("submit_body", push._asdict(), body))
 
     async def wait_for_end(self, plan: str) -> PlanReport:
         """Return the report of a streamed plan once it has ended."""
@@ -265,12 +274,16 @@ class DaemonClient:
         return await self.preview.call(Message("dry_run", fields, snapshot.payload + body))
 
     async def push(self, source: str, body: bytes, push: PushFields) -> Message:
-        """Build the sequence of a body, then plan it; return the result of the step that refuses it, or of the plan."""
+        """Build the sequence of a body, then plan it; return the result of the step that refuses it, or of the plan.
+
+        The planner itself parses a small streamed body, because it is there three hand-overs earlier.
+        """
+        if push.streamed and len(body) <= STREAMED_BODY_MAX_BYTES:
+            return await self.planner.submit_body(body, push)
         built = await self.build(source, push.name, body, push.caller)
         if built.fields["status"] != 200:
             return built
-        labels, parameters = built.fields["labels"], built.fields["parameters"]
-        return await self.planner.submit(built.payload, push._replace(labels=labels, parameters=parameters))
+        return await self.planner.submit(built.payload, push, built.fields["labels"], built.fields["parameters"])
 
     def revoke(self, caller: str) -> None:
         """End the plans of a caller whose token is no longer valid, and the arming if it has armed the board."""

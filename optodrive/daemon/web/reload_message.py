@@ -4,7 +4,7 @@ from typing import Any
 
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 
 def apply_reload(

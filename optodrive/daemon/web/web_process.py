@@ -23,7 +23,7 @@ from optodrive.daemon.web.listeners import describe_exposure
 from optodrive.daemon.web.reload_message import apply_reload
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.daemon.web.web_server import Server
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 from optodrive.planning.display_model import DisplayModel
 
 BEAT_INTERVAL_S = 0.05

@@ -12,7 +12,7 @@ from typing import Self
 
 import numpy as np
 
-from optodrive.core.clock import Clock, request_realtime_scheduling
+from optodrive.core.clock import Clock
 from optodrive.core.errors import (
     BoardFaultError,
     InputError,
@@ -23,6 +23,7 @@ from optodrive.core.errors import (
     Unquoted,
 )
 from optodrive.core.quantity import format_number, format_quantity
+from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config
@@ -96,7 +97,7 @@ class ExclusiveBoard:
     def connect(self) -> None:
         """Open the link and begin a session. Kernels are loaded first, because compilation would delay the lease."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        request_realtime_scheduling()
+        set_realtime_priority(LIGHT)
         limit(self._plan(0.0, 0.0, self.zero_duty_power_w), self._state, self._display.budget)
         gc.collect()
         gc.freeze()
@@ -233,6 +234,7 @@ class ExclusiveBoard:
             target_m=np.array([np.nan]),
             requested_start_s=np.array([self._settling_s]),
             source=np.array([0]),
+            stage=np.array([0]),
         )
 
     def _execute_point(self, x_code: int, y_code: int, power_w: float, gate_on: bool) -> None:

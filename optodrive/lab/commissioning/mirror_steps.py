@@ -97,6 +97,7 @@ def build_move_plan(run: StepRun, board: ExclusiveBoard) -> PulsePlan:
         target_m=np.full(count, np.nan),
         requested_start_s=start_s,
         source=np.zeros(count, dtype=np.int64),
+        stage=np.zeros(count, dtype=np.int64),
     )
 
 

@@ -180,6 +180,16 @@ CAUSES = (
         "displacement through a train of seconds",
     ),
     CauseHypothesis(
+        "panel_heating",
+        "the whole panel around the walls warms up",
+        "resistance",
+        "K/W",
+        0.0,
+        60.0,
+        "still air around 162 × 162 mm, 2 K/W, to a sample of 30 × 30 mm; 200 s with its capacity",
+        "displacement of a pixel without light through ten minutes of light on another",
+    ),
+    CauseHypothesis(
         "laser_late",
         "the light of every pulse starts late",
         "delay",

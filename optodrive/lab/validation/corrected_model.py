@@ -29,6 +29,8 @@ CauseValues = Mapping[str, float]
 
 WALL_TAU_S = 1.2
 """Relaxation time of the wall, as estimated in the shipped parameter set `surroundings`."""
+PANEL_TAU_S = 185.0
+"""Relaxation time of a panel in still air: heat capacity over loss, both per area, of `optodrive.device.panel`."""
 HALF_PERIOD_S = 2.5e-3
 """Half a period of 200 Hz."""
 MIN_PULSE_S = 1e-5
@@ -106,6 +108,11 @@ class CorrectedModel:
         if values.get("wall_heating", 0.0) > 0.0:
             resistance = values["wall_heating"]
             out["wall_heating"] = {"resistance": resistance, "capacity": WALL_TAU_S / resistance}
+        if values.get("panel_heating", 0.0) > 0.0:
+            resistance = values["panel_heating"]
+            share = self.base.epsilon.value * values.get("absorbed_power", 1.0)
+            capacity = PANEL_TAU_S / resistance
+            out["panel_heating"] = {"resistance": resistance, "capacity": capacity, "share": share}
         return freeze_terms(out)
 
     def _on_time_s(self, pulse_s: float) -> float:

@@ -14,7 +14,7 @@ import usb.util
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError
 from optodrive.core.quantity import format_quantity
-from optodrive.device.config import BoardSection
+from optodrive.device.config_sections import BoardSection
 from optodrive.link.helios.frames import HOST_LOSS_EMISSION_MAX_S, HeliosFrame
 from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
 

@@ -12,7 +12,8 @@ import numpy as np
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import LimitedPlan
-from optodrive.device.config import HELIOS_HALF_RANGE_CODES, Config
+from optodrive.device.config import Config
+from optodrive.device.config_sections import HELIOS_HALF_RANGE_CODES
 from optodrive.link.helios.frames import (
     CLOCK_HZ,
     FRAME_MAX_S,

@@ -15,7 +15,7 @@ from optodrive.core.types.plans import BudgetState
 from optodrive.planning.limiter.limiter import shift_state
 
 FORMAT = "optodrive-helios-memory"
-VERSION = 2
+VERSION = 4
 REMOVE_WHEN_COLD = "remove it once the display has cooled"
 ZERO_OFFSET_S = 1.0
 """Shift of a plan's zero when it is saved before emission, so that the stored state is never too cold."""

@@ -16,8 +16,9 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
-from optodrive.core.clock import Clock, MonotonicClock, request_realtime_scheduling
+from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import InputError, OptodriveError
+from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.link.service.client_sockets import ClientSockets
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.service.settings import LinkSettings
@@ -182,7 +183,7 @@ def main(arguments: list[str] | None = None) -> int:
         process.install_signals()
         gc.collect()
         gc.freeze()
-        request_realtime_scheduling()
+        set_realtime_priority(LIGHT)
         try:
             process.run()
         except MemoryError:

@@ -2,9 +2,10 @@
 
 from math import inf
 
-from optodrive.core.clock import Clock, has_realtime_scheduling
+from optodrive.core.clock import Clock
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message
+from optodrive.core.scheduling import has_realtime_priority
 from optodrive.link.service.control import Control
 from optodrive.link.service.epoch import Epoch
 from optodrive.link.service.pauses import Pauses
@@ -74,6 +75,6 @@ class StatusPublisher:
             "control": None if control is None else control.to_dict(now_s),
             "commands": commands,
             "stalled": stalled,
-            "is_realtime": has_realtime_scheduling(),
+            "is_realtime": has_realtime_priority(),
         }
         return Message("status", fields)

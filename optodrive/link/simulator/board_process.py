@@ -10,8 +10,8 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from optodrive.core.clock import request_realtime_scheduling
 from optodrive.core.errors import InputError
+from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings, load_settings
 from optodrive.link.simulator.pseudo_terminal import check_link_path
@@ -68,7 +68,7 @@ def main(
         options.pty, log, settings, script, options.baud, options.exit_when_closed, build_core, actions, optics
     )
     if simulated:
-        request_realtime_scheduling()  # not for an emulator, which this process would starve
+        set_realtime_priority(LIGHT)  # not for an emulator, which this process would starve
     signal.signal(signal.SIGTERM, board.stop)
     signal.signal(signal.SIGINT, board.stop)
     signal.signal(signal.SIGUSR1, board.on_signal)

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.device.config import HALF_RANGE_CODES, Config
+from optodrive.device.config import Config
+from optodrive.device.config_sections import HALF_RANGE_CODES
 from optodrive.device.gate_timing import build_servo
 from optodrive.device.servo import Servo
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
-from optodrive.device.config import HALF_RANGE_CODES, Config, build_pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.config_sections import HALF_RANGE_CODES
 
 CENTRE_CODE = HALF_RANGE_CODES + 1
 HALF_FIELD_MIN_M = 0.01

@@ -12,6 +12,7 @@ from optodrive.physics.term import (
     OperatingEnvelope,
     Term,
     TermValues,
+    add_follower,
 )
 
 
@@ -28,12 +29,6 @@ def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) ->
     x[s] = (v[2] * missing_w - y[s]) / v[3]
 
 
-@kernel
-def wall_rise(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """Add the wall's rise, K, to that of the bridge's far end."""
-    return float(x + y[s])
-
-
 class BeamMisalignment(Term):
     """P (1 − share) on one pixel; the rest heats its wall: time · dm/dt = resistance · share · P − m."""
 
@@ -46,12 +41,12 @@ class BeamMisalignment(Term):
         TermParameter("time", "s", 0.5, 0.02, 20.0, "the wall's, 0.1 to 10 s"),
     )
     followers = ("missed_k",)
-    kernels = Kernels(optical_power=optical_power, rates=rates, wall_rise=wall_rise)
+    kernels = Kernels(optical_power=optical_power, rates=rates, wall_rise=add_follower)
     signature = "a comparison of several pixels"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """Return the wall's steady rise under continuous full power as a rise of everything."""
-        return HeatGainBound(uniform_rise_k=values["resistance"] * values["share"] * envelope.full_w)
+        return HeatGainBound(uniform_rise_k=values["resistance"] * values["share"] * envelope.all_power_w)
 
     def affected_pixel(self, values: TermValues) -> int | None:
         """Return the index of the misaligned pixel."""

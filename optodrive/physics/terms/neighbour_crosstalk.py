@@ -3,19 +3,13 @@
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
-from optodrive.physics.term import NEIGHBOUR, HeatGainBound, Kernels, OperatingEnvelope, Term, TermValues
+from optodrive.physics.term import NEIGHBOUR, HeatGainBound, Kernels, OperatingEnvelope, Term, TermValues, add_follower
 
 
 @kernel
 def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
     """Let the wall follow a share of the neighbour's rise with a first-order lag."""
     x[s] = (v[0] * y[NEIGHBOUR] - y[s]) / v[1]
-
-
-@kernel
-def wall_rise(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """Add the wall's rise, K, to that of the bridge's far end."""
-    return float(x + y[s])
 
 
 class NeighbourCrosstalk(Term):
@@ -28,7 +22,7 @@ class NeighbourCrosstalk(Term):
         TermParameter("lag", "s", 0.02, 2.5e-3, 1.0, "conduction through one cell's wall", starts=(0.003, 0.03, 0.2)),
     )
     followers = ("crosstalk_k",)
-    kernels = Kernels(rates=rates, wall_rise=wall_rise)
+    kernels = Kernels(rates=rates, wall_rise=add_follower)
     couples_neighbours = True
     signature = "runs in which only a neighbour is illuminated"
 

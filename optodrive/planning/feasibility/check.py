@@ -159,7 +159,7 @@ def _search_other_orders(
     impossible, lower_bound_s = search.prove_infeasible(sequence, violation)
     if impossible:
         return None, "bound", lower_bound_s
-    if count_orders(sequence) > ORDERS_MAX:
+    if count_orders(sequence, search.stage_count) > ORDERS_MAX:
         return None, "not found", lower_bound_s
     orders = search.search_all_orders(sequence)
     return orders, "not found" if search.is_exhausted else "searched", lower_bound_s

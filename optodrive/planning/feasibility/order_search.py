@@ -46,7 +46,8 @@ class _PlanLimitError(Exception):
 class OrderSearch:
     """Search for feasible plans with a limit on the number of plans.
 
-    plans_tried: plans so far; is_exhausted: a plan beyond plans_max was needed; on_progress: progress callback.
+    stage_count: number of optical stages; plans_tried: plans so far; is_exhausted: a plan beyond plans_max was needed;
+    on_progress: progress callback.
 
     Results are visiting orders by source, from which `plan_sequence` makes the plan that was tried. An empty mapping
     stands for the planner's own order.
@@ -63,6 +64,7 @@ class OrderSearch:
         self.plans_tried = 0
         self.plans_max = plans_max
         self.is_exhausted = False
+        self.stage_count = len(display.scan_heads)
         self._display = display
         self._heat = heat
         self._budget = budget
@@ -74,7 +76,7 @@ class OrderSearch:
             violation = self._try_orders(sequence)
             if violation is None:
                 return {}
-            is_small = count_orders(sequence) <= ORDERS_MAX
+            is_small = count_orders(sequence, self.stage_count) <= ORDERS_MAX
             return (
                 self._search_depth_first(sequence)
                 if is_small and not self.prove_infeasible(sequence, violation)[0]
@@ -126,12 +128,13 @@ class OrderSearch:
 
     def prove_infeasible(self, sequence: FrameSequence, violation: Violation) -> tuple[bool, float | None]:
         """Return whether no order removes a violation, and the lower bound of its frame's beam time in s if known."""
-        if is_order_independent(violation, sequence):
+        # With several stages, a train that is late on one may not be on another.
+        if violation.reason == "unreachable" or (self.stage_count == 1 and is_order_independent(violation, sequence)):
             return True, None
-        if violation.reason != "deadline":
+        if violation.reason != "deadline" or violation.source >= len(sequence.frames):
             return False, None
         frame = sequence.frames[violation.source]
-        lead_in_s = self._display.scan_head.settling.lead_in_us * 1e-6
+        lead_in_s = max(head.settling.lead_in_us for head in self._display.scan_heads) * 1e-6
         lower_bound_s = beam_lower_bound_s(self._display, sequence, self._heat, violation.source, lead_in_s)
         # Pulses start on whole microseconds; a deadline need not lie on one.
         return (
@@ -161,7 +164,8 @@ class OrderSearch:
     ) -> Violation | None:
         """Plan batch by batch up to the first violation, with or without the limiter."""
         scheduler = Scheduler(
-            self._display.scan_head,
+            self._display.scan_heads,
+            self._display.build_assignment(sequence),
             sequence,
             self._display.build_cold_heat,
             on_progress=self.on_progress,
@@ -192,9 +196,9 @@ class OrderSearch:
                 return None
 
 
-def count_orders(sequence: FrameSequence) -> int:
-    """Return the number of visiting orders of all frames, or ORDERS_MAX + 1 if a frame is simultaneous."""
-    if any(frame.simultaneous for frame in sequence.frames):
+def count_orders(sequence: FrameSequence, stage_count: int) -> int:
+    """Return the number of visiting orders of all frames; ORDERS_MAX + 1 with simultaneous ones or several stages."""
+    if stage_count > 1 or any(frame.simultaneous for frame in sequence.frames):
         return ORDERS_MAX + 1
     return prod(factorial(int(np.count_nonzero(frame.target_m > 0))) for frame in sequence.frames)
 

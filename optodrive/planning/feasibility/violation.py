@@ -70,11 +70,14 @@ def beam_lower_bound_s(
     The bound sums the trains' pulses that lie within that time, the pulses of the frame's pixels that no earlier frame
     and no train drives, and the smallest settling time to all of these pixels but one. The thermal state of these
     pixels is known; if their displacement falls, the pulse at show_at is the shortest possible. With planner terms a
-    pulse may become shorter by waiting, and no bound holds.
+    pulse may become shorter by waiting, and no bound holds. Several stages share the light, at best equally and without
+    moves.
     """
     if display.parameters.planner_terms:
         return None
-    frame, scan_head = sequence.frames[source], display.scan_head
+    stages = len(display.scan_heads)
+    scan_head = max(display.scan_heads, key=lambda head: head.drive.max_power_w)
+    frame, is_one_drive = sequence.frames[source], len({head.drive for head in display.scan_heads}) == 1
     at_s = lead_in_s + round(frame.show_at_s * 1e6) * 1e-6
     deadline_s = lead_in_s + frame.show_at_s + frame.duration_s
     is_driven_before = np.zeros(len(frame.target_m), dtype=bool)
@@ -90,14 +93,18 @@ def beam_lower_bound_s(
     for pixel in fresh.tolist():
         pulse = heat.solve_pulse(pixel, at_s, float(frame.target_m[pixel]), scan_head.drive)
         if pulse is not None:
-            width_s[pixel] = round(pulse[0] * scan_head.drive.period_s * 1e6) * 1e-6
-    settling_s = _min_settling_s(scan_head, np.array(list(width_s), dtype=np.int64), np.concatenate([driven, origins]))
+            periods = pulse[0] if is_one_drive else pulse[0] - 1  # a finer PWM rounds less
+            width_s[pixel] = round(periods * scan_head.drive.period_s * 1e6) * 1e-6
+    settling_s = 0.0
+    if stages == 1:
+        drawn = np.array(list(width_s), dtype=np.int64)
+        settling_s = _min_settling_s(scan_head, drawn, np.concatenate([driven, origins]))
     train_s = 0.0
     for train in trains:
         starts_s = lead_in_s + train.pulse_starts_s()
         inside = (starts_s >= at_s) & (starts_s + lead_in_s + train.pulse_width_s <= deadline_s)
         train_s += train.pulse_width_s * int(np.count_nonzero(inside))
-    return sum(width_s.values()) + settling_s + train_s
+    return (sum(width_s.values()) + settling_s + train_s) / stages
 
 
 def _select_falling_pixels(heat: ThermalState, pixels: IntArray, at_s: float) -> IntArray:

@@ -5,6 +5,9 @@ The limiter shares no code with `optodrive.physics`, because tests compare the t
 
 from typing import NamedTuple
 
+import numpy as np
+
+from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.planning.limiter.caps import CapValues
 
@@ -32,6 +35,13 @@ class HeatBound(NamedTuple):
     touch_lag_s, touch_k_per_j: [2] smallest and largest lag, and rise per incident joule
     touch_per_wall_k: steady rise of the touch surface over the wall's bound; touch_specht_ratio
 
+    Panel:
+    panel_k_per_j, panel_tau_s: [2] rise per incident joule, delivered at once, and time constant, for the smallest and
+    the largest capacity; panel_specht_ratio
+    absorber_per_panel, wall_per_panel, touch_per_panel: rise of each by the panel's bound, which they follow with a lag
+    panel_k_per_s: fastest rise of the panel, by pulses of all stages; panel_floor_k: smallest cap of a wall over the
+    panel from which it cools faster than that
+
     In-transit heat credit:
     lower_bound_k_per_w: [p] lower bound on the steady rise of an absorber over its wall per incident watt
     lower_bound_rate_per_s: [p, 2] rate towards it, for warming and for cooling
@@ -40,7 +50,8 @@ class HeatBound(NamedTuple):
     the heat as arrived, and its temperature, per kelvin of the absorber's rise over its wall
     touch_deficit_k: reduction of the touch surface's credit by the gas
 
-    power_max_w: largest power of a pulse
+    power_max_w: [k] largest power of a pulse of each stage
+    skew_s: largest difference between the clocks of two stages
     """
 
     epsilon: FloatArray
@@ -61,13 +72,22 @@ class HeatBound(NamedTuple):
     touch_k_per_j: FloatArray
     touch_per_wall_k: float
     touch_specht_ratio: float
+    panel_k_per_j: FloatArray
+    panel_tau_s: FloatArray
+    panel_specht_ratio: float
+    absorber_per_panel: float
+    wall_per_panel: float
+    touch_per_panel: float
+    panel_k_per_s: float
+    panel_floor_k: float
     lower_bound_k_per_w: FloatArray
     lower_bound_rate_per_s: FloatArray
     deficit_k: float
     wall_transit_credit: float
     touch_transit_credit: float
     touch_deficit_k: float
-    power_max_w: float
+    power_max_w: FloatArray
+    skew_s: float
 
 
 class GalvoModel(NamedTuple):
@@ -89,9 +109,42 @@ class GalvoModel(NamedTuple):
     timing_slack_s: float
 
 
+class GalvoModels(NamedTuple):
+    """`GalvoModel` of every stage: its fields as arrays [k]."""
+
+    omega_rad_per_s: FloatArray
+    damping: FloatArray
+    delay_s: FloatArray
+    slew_rad_per_s: FloatArray
+    lead_in_s: FloatArray
+    averaging_s: FloatArray
+    rad_per_code: FloatArray
+    timing_slack_s: FloatArray
+
+    @classmethod
+    def from_models(cls, *models: GalvoModel) -> "GalvoModels":
+        """Return the models of all stages, in their order."""
+        return cls(*(np.array(column, dtype=np.float64) for column in zip(*models, strict=True)))
+
+
+@kernel
+def select_galvo(galvos: GalvoModels, stage: int) -> GalvoModel:
+    """Return the model of one stage."""
+    return GalvoModel(
+        galvos.omega_rad_per_s[stage],
+        galvos.damping[stage],
+        galvos.delay_s[stage],
+        galvos.slew_rad_per_s[stage],
+        galvos.lead_in_s[stage],
+        galvos.averaging_s[stage],
+        galvos.rad_per_code[stage],
+        galvos.timing_slack_s[stage],
+    )
+
+
 class Budget(NamedTuple):
     """All coefficients that the limiter needs."""
 
     caps: CapValues
     heat: HeatBound
-    galvo: GalvoModel
+    galvos: GalvoModels

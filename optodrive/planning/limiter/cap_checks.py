@@ -1,6 +1,5 @@
 """The computations of every cap: the largest power that it allows a pulse, and how much of it is in use. Kernels."""
 
-from math import exp
 from typing import NamedTuple
 
 import numpy as np
@@ -8,12 +7,18 @@ import numpy as np
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState
-from optodrive.planning.limiter.budget import TOLERANCE, Budget
+from optodrive.planning.limiter.budget import TOLERANCE, Budget, select_galvo
 from optodrive.planning.limiter.caps import CAP_NUMBERS, CAPS, WRONG_ORDER
 from optodrive.planning.limiter.energy_windows import max_window_power_w
 from optodrive.planning.limiter.galvo_load import mean_square_bound
 from optodrive.planning.limiter.galvo_moves import galvo_after_move, is_move
-from optodrive.planning.limiter.heat_bound import absorber_after_k, advance_pixel, exchange_wall_heat, wall_bound_k
+from optodrive.planning.limiter.heat_bound import (
+    absorber_after_k,
+    advance_pixel,
+    exchange_wall_heat,
+    panel_peak_k,
+    wall_bound_k,
+)
 from optodrive.planning.limiter.slow_nodes import PulseRequest, slow_node_limits_w, wall_peak_k
 from optodrive.planning.limiter.workspace import LimiterWorkspace, open_workspace
 
@@ -53,7 +58,8 @@ def max_power_w(
     A negative power marks a pulse that is infeasible at any power and under any policy.
     """
     caps, width_s = budget.caps, request.width_s
-    if request.start_s < workspace.budgets.end_s[0] - TOLERANCE:
+    begins_s = max(workspace.budgets.begun_s[0], workspace.budgets.end_s[request.stage])
+    if request.start_s < max(begins_s, workspace.nodes.last_pulse_end_s[request.pixel]) - TOLERANCE:
         return -1.0, WRONG_ORDER
     if width_s > caps.pulse_width_s * (1 + TOLERANCE):
         return -1.0, PULSE_WIDTH
@@ -62,11 +68,12 @@ def max_power_w(
         return 0.0, PULSE_WIDTH
     if is_move(workspace.budgets, request):
         galvo_state = galvo_after_move(budget, workspace.budgets, request)
-        mean_square = mean_square_bound(budget.galvo, galvo_state, request.start_s + width_s)
+        galvo = select_galvo(budget.galvos, request.stage)
+        mean_square = mean_square_bound(galvo, galvo_state, request.start_s + width_s)
         if mean_square > caps.galvo_rad2_per_s4 * (1 + TOLERANCE):
             return 0.0, GALVO_ACCELERATION
     max_w, binding = caps.pulse_energy_j / width_s, PULSE_ENERGY
-    dimmed_w = caps.power_share * budget.heat.power_max_w
+    dimmed_w = caps.power_share * budget.heat.power_max_w[request.stage]
     if caps.power_share < 1.0 and dimmed_w < max_w:
         max_w, binding = dimmed_w, DIM
     spot_w = (caps.pulse_energy_j - bucket_j) / width_s
@@ -83,17 +90,17 @@ def max_power_w(
     )
     if pixel_w < max_w:
         max_w, binding = pixel_w, PIXEL_MEAN_POWER
-    display_w = max_window_power_w(
-        workspace.display_chain,
-        0,
+    stage_w = max_window_power_w(
+        workspace.stage_chains,
+        request.stage,
         workspace.history,
         request.start_s,
         width_s,
         caps.display_window_s,
         caps.display_mean_w,
     )
-    if display_w < max_w:
-        max_w, binding = display_w, DISPLAY_MEAN_POWER
+    if stage_w < max_w:
+        max_w, binding = stage_w, DISPLAY_MEAN_POWER
     wall_w, touch_w = slow_node_limits_w(budget, workspace.nodes, request, lower_bound_k)
     if wall_w < max_w:
         max_w, binding = wall_w, WALL_TEMPERATURE
@@ -111,7 +118,8 @@ def absorber_peak_k(
 ) -> float:
     """Return the peak bound on the absorber's rise above ambient during a pulse."""
     own_k = max(rise_k, absorber_after_k(budget.heat, request.pixel, rise_k, power_w, request.width_s))
-    return own_k + budget.heat.absorber_wall_factor * wall_peak_k(budget, workspace.nodes, request, power_w)
+    wall_k = wall_peak_k(budget, workspace.nodes, request, power_w)
+    return own_k + budget.heat.absorber_wall_factor * wall_k + budget.heat.absorber_per_panel * request.panel_k
 
 
 @kernel
@@ -136,7 +144,7 @@ def compute_levels(state: BudgetState, budget: Budget, at_s: float) -> FloatArra
     """Return how much of each cap is in use at `at_s`, with the gate off since the state's own time.
 
     Returns an array [caps + 1, p] by cap number, in units of `CapValues`; a cap of the whole display has the same level
-    in every pixel, and a cap that does not accumulate is 0.
+    in every pixel, that of the stage with the highest, and a cap that does not accumulate is 0.
     """
     caps, pixels = budget.caps, len(state.rise_k)
     levels = np.zeros((len(CAPS) + 1, pixels))
@@ -144,10 +152,10 @@ def compute_levels(state: BudgetState, budget: Budget, at_s: float) -> FloatArra
     _fill_levels(budget, open_workspace(state, 0), at_s, levels)
     pixel_j = np.bincount(state.recent_pixel, _compute_window_energy_j(state, at_s, caps.pixel_window_s), pixels)
     levels[PIXEL_MEAN_POWER] = pixel_j / caps.pixel_window_s
-    display_j = float(_compute_window_energy_j(state, at_s, caps.display_window_s).sum())
-    levels[DISPLAY_MEAN_POWER] = display_j / caps.display_window_s
-    decay = exp(-max(0.0, at_s - state.mirror_at_s) / budget.galvo.averaging_s)
-    levels[GALVO_ACCELERATION] = float(state.galvo_mean_square.max()) * decay
+    stage_j = np.bincount(state.recent_stage, _compute_window_energy_j(state, at_s, caps.display_window_s), 1)
+    levels[DISPLAY_MEAN_POWER] = float(stage_j.max()) / caps.display_window_s
+    decay = np.exp(-np.maximum(0.0, at_s - state.mirror_at_s) / budget.galvos.averaging_s)
+    levels[GALVO_ACCELERATION] = float((state.galvo_mean_square.max(axis=1) * decay).max())
     return levels
 
 
@@ -163,14 +171,16 @@ def _fill_levels(budget: Budget, workspace: LimiterWorkspace, at_s: float, level
     """Advance the workspace to `at_s` with the gate off, and fill in the levels that are kept per pixel."""
     heat, nodes = budget.heat, workspace.nodes
     exchange_wall_heat(heat, nodes, at_s, 0.0)
+    panel_k = panel_peak_k(heat, nodes.panel_k, at_s - nodes.panel_at_s[0], 0.0)
     for pixel in range(levels.shape[1]):
         advance_pixel(heat, nodes, pixel, at_s)
         off_s = max(0.0, at_s - nodes.last_pulse_end_s[pixel])
         wall_k = wall_bound_k(heat, nodes, pixel)
         rise_k = absorber_after_k(heat, pixel, nodes.absorber_k[pixel], 0.0, off_s)
-        levels[ABSORBER_TEMPERATURE, pixel] = rise_k + heat.absorber_wall_factor * wall_k
-        levels[WALL_TEMPERATURE, pixel] = wall_k
-        levels[TOUCH_TEMPERATURE, pixel] = heat.touch_specht_ratio * max(
-            nodes.touch_k[pixel, 0], nodes.touch_k[pixel, 1]
+        touch_k = heat.touch_specht_ratio * max(nodes.touch_k[pixel, 0], nodes.touch_k[pixel, 1])
+        levels[ABSORBER_TEMPERATURE, pixel] = (
+            rise_k + heat.absorber_wall_factor * wall_k + heat.absorber_per_panel * panel_k
         )
+        levels[WALL_TEMPERATURE, pixel] = wall_k + heat.wall_per_panel * panel_k
+        levels[TOUCH_TEMPERATURE, pixel] = touch_k + heat.touch_per_panel * panel_k
         levels[SPOT_ENERGY, pixel] = max(0.0, workspace.budgets.bucket_j[pixel] - off_s * budget.caps.pixel_mean_w)

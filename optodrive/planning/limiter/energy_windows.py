@@ -1,6 +1,6 @@
 """Energy within every window of a given length, exact for pulses of constant power in order of time. Kernels.
 
-Pulses that may still lie inside a window form a linked chain: one chain per pixel and one for the display.
+Pulses that may still lie inside a window form a linked chain: one chain per pixel and one per stage.
 """
 
 from math import inf
@@ -17,6 +17,7 @@ class PulseHistory(NamedTuple):
     width_s: FloatArray
     power_w: FloatArray
     pixel: IntArray
+    stage: IntArray
     n_valid: IntArray
 
 

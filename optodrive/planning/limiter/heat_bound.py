@@ -22,6 +22,8 @@ class ThermalNodes(NamedTuple):
     absorber_k, lower_bound_k: [p] upper and lower bound of the absorber's rise over its wall at last_pulse_end_s [p]
     wall_k, touch_k: [p, 2] bounds for the smallest and the largest capacity or lag, at nodes_at_s [p]
     inflow_w: [p] upper bound on the heat flow from neighbours until the next exchange
+    panel_k: [2] bounds of the panel for its smallest and largest capacity, at panel_at_s [1]; walls and touch surfaces
+    are bounded over the panel
     exchanged_at_s: [1] time of the last exchange between walls; coarse_k, refined_k: [p] scratch arrays
     """
 
@@ -33,6 +35,8 @@ class ThermalNodes(NamedTuple):
     nodes_at_s: FloatArray
     inflow_w: FloatArray
     exchanged_at_s: FloatArray
+    panel_k: FloatArray
+    panel_at_s: FloatArray
     coarse_k: FloatArray
     refined_k: FloatArray
 
@@ -78,8 +82,39 @@ def lower_bound_after_k(heat: HeatBound, pixel: int, lower_bound_k: float, power
 
 
 @kernel
+def panel_peak_k(heat: HeatBound, panel_k: FloatArray, off_s: float, energy_j: float) -> float:
+    """Return the bound on the panel's rise during a pulse, and at all times after it with the gate off.
+
+    panel_k: [2] bounds off_s before the pulse
+    """
+    peak_k = 0.0
+    for capacity in range(2):
+        before_k = panel_k[capacity] * exp(-max(0.0, off_s) / heat.panel_tau_s[capacity])
+        peak_k = max(peak_k, before_k + heat.panel_k_per_j[capacity] * energy_j)
+    return float(heat.panel_specht_ratio * peak_k)
+
+
+@kernel
+def warm_panel(heat: HeatBound, nodes: ThermalNodes, start_s: float, width_s: float, energy_j: float) -> None:
+    """Advance the panel to the start of a pulse, with as much heat as leaves the pulse's own at its end."""
+    off_s = max(0.0, start_s - nodes.panel_at_s[0])
+    for capacity in range(2):
+        nodes.panel_k[capacity] *= exp(-off_s / heat.panel_tau_s[capacity])
+        own_k = heat.panel_k_per_j[capacity] * energy_j
+        nodes.panel_k[capacity] += own_k * exp(width_s / heat.panel_tau_s[capacity])
+    nodes.panel_at_s[0] = max(start_s, nodes.panel_at_s[0])
+
+
+@kernel
+def panel_rise_by_others_k(heat: HeatBound, stage: int, width_s: float) -> float:
+    """Return by how much the pulses of other stages may warm the panel during a pulse, K."""
+    all_w = heat.power_max_w.sum()
+    return float(heat.panel_k_per_s * (all_w - heat.power_max_w[stage]) / all_w * (width_s + heat.skew_s))
+
+
+@kernel
 def wall_bound_k(heat: HeatBound, nodes: ThermalNodes, pixel: int) -> float:
-    """Return the bound on the wall's rise at its own time for every capacity within the uncertainty."""
+    """Return the bound on the wall's rise over the panel at its own time for every capacity within the uncertainty."""
     return float(heat.wall_specht_ratio * max(nodes.wall_k[pixel, 0], nodes.wall_k[pixel, 1]))
 
 
@@ -166,16 +201,16 @@ def exchange_wall_heat(heat: HeatBound, nodes: ThermalNodes, to_s: float, pulse_
         remaining_s = to_s - now_s
         if remaining_s >= heat.exchange_step_s:
             step_s = min(COOLING_STEP_GROWTH * step_s, remaining_s)
-            _update_inflow(heat, nodes, step_s, 0.0)
+            _update_inflow(heat, nodes, now_s, step_s, 0.0)
         else:
-            horizon_s = heat.exchange_step_s + pulse_width_s
-            max_pulse_k = heat.wall_specht_ratio * heat.wall_k_per_j[0] * heat.power_max_w * horizon_s
-            _update_inflow(heat, nodes, horizon_s, max_pulse_k)
+            horizon_s = heat.exchange_step_s + pulse_width_s + heat.skew_s
+            max_pulse_k = heat.wall_specht_ratio * heat.wall_k_per_j[0] * heat.power_max_w.sum() * horizon_s
+            _update_inflow(heat, nodes, now_s, horizon_s, max_pulse_k)
 
 
 @kernel
-def _update_inflow(heat: HeatBound, nodes: ThermalNodes, horizon_s: float, pulses_k: float) -> None:
-    """Update the upper bound on the heat flow from neighbours during `horizon_s`.
+def _update_inflow(heat: HeatBound, nodes: ThermalNodes, now_s: float, horizon_s: float, pulses_k: float) -> None:
+    """Update the upper bound on the heat flow from neighbours from `now_s` on, during `horizon_s`.
 
     pulses_k: total rise of the walls by all pulses in that time.
 
@@ -185,18 +220,18 @@ def _update_inflow(heat: HeatBound, nodes: ThermalNodes, horizon_s: float, pulse
     pixels = len(nodes.inflow_w)
     warmest_k = pulses_k
     for pixel in range(pixels):
-        warmest_k = max(warmest_k, wall_bound_k(heat, nodes, pixel) + pulses_k)
+        warmest_k = max(warmest_k, _wall_since_k(heat, nodes, pixel, now_s) + pulses_k)
     for pixel in range(pixels):
         neighbour_count = 0
         for side in range(4):
             if heat.neighbours[pixel, side] >= 0:
                 neighbour_count += 1
         nodes.coarse_k[pixel] = _max_wall_k(
-            heat, nodes, pixel, heat.lateral_w_per_k * neighbour_count * warmest_k, horizon_s
+            heat, nodes, pixel, heat.lateral_w_per_k * neighbour_count * warmest_k, now_s, horizon_s
         )
     for pixel in range(pixels):
         nodes.refined_k[pixel] = _max_wall_k(
-            heat, nodes, pixel, _lateral_inflow_w(heat, nodes.coarse_k, pixel, pulses_k), horizon_s
+            heat, nodes, pixel, _lateral_inflow_w(heat, nodes.coarse_k, pixel, pulses_k), now_s, horizon_s
         )
     for pixel in range(pixels):
         nodes.inflow_w[pixel] = _lateral_inflow_w(heat, nodes.refined_k, pixel, pulses_k)
@@ -213,9 +248,23 @@ def _lateral_inflow_w(heat: HeatBound, walls_k: FloatArray, pixel: int, pulses_k
 
 
 @kernel
-def _max_wall_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, inflow_w: float, time_s: float) -> float:
+def _wall_since_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, now_s: float) -> float:
+    """Return the bound on a wall from `now_s` until its own time, the end of a pulse that another stage may overlap.
+
+    The pulse's heat counts as arrived at its end, and the wall was warmer before by what it lost meanwhile.
+    """
+    wall_k, ahead_s = wall_bound_k(heat, nodes, pixel), nodes.nodes_at_s[pixel] - now_s
+    if ahead_s <= 0.0:
+        return wall_k
+    return float(wall_k * exp(heat.wall_w_per_k[pixel] / heat.wall_j_per_k[0] * ahead_s))
+
+
+@kernel
+def _max_wall_k(
+    heat: HeatBound, nodes: ThermalNodes, pixel: int, inflow_w: float, now_s: float, time_s: float
+) -> float:
     """Return the largest rise that a wall reaches within `time_s` by its inflow alone."""
-    wall_k = wall_bound_k(heat, nodes, pixel)
+    wall_k = _wall_since_k(heat, nodes, pixel, now_s)
     steady_k = inflow_w / heat.wall_w_per_k[pixel]
     fraction = min(1.0, heat.wall_w_per_k[pixel] / heat.wall_j_per_k[0] * time_s)
     return float(wall_k + fraction * max(0.0, steady_k - wall_k))

@@ -47,7 +47,7 @@ class _EncodedPulses(NamedTuple):
 
 
 class TimedPulses(Protocol):
-    """Pulses of the beam in order of time; all arrays [n]."""
+    """Pulses in order of their starts; all arrays [n]."""
 
     @property
     def start_s(self) -> FloatArray:
@@ -75,8 +75,8 @@ MAX_WAIT_S = 3600.0
 WAIT_RESOLUTION_S = 1e-3
 
 
-def build_cold_budget_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
-    """Return the budget state of a cold display with its mirrors at their centre."""
+def build_cold_budget_state(pixel_count: int, at_s: float = 0.0, stage_count: int = 1) -> BudgetState:
+    """Return the budget state of a cold display with all mirrors at their centre."""
 
     def zero() -> FloatArray:
         return np.zeros(pixel_count)
@@ -84,6 +84,7 @@ def build_cold_budget_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
     since_s = np.full(pixel_count, at_s)
     return BudgetState(
         at_s=at_s,
+        begun_s=at_s,
         last_pulse_end_s=since_s,
         rise_k=zero(),
         lower_bound_k=zero(),
@@ -94,14 +95,18 @@ def build_cold_budget_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
         nodes_at_s=since_s.copy(),
         inflow_w=zero(),
         exchanged_at_s=-inf,
-        mirror_rad=np.zeros(2),
-        galvo_mean_square=np.zeros(2),
-        galvo_ringing=np.zeros(2),
-        mirror_at_s=at_s,
+        panel_k=np.zeros(2),
+        panel_at_s=at_s,
+        beam_end_s=np.full(stage_count, at_s),
+        mirror_rad=np.zeros((stage_count, 2)),
+        galvo_mean_square=np.zeros((stage_count, 2)),
+        galvo_ringing=np.zeros((stage_count, 2)),
+        mirror_at_s=np.full(stage_count, at_s),
         recent_start_s=np.zeros(0),
         recent_width_s=np.zeros(0),
         recent_power_w=np.zeros(0),
         recent_pixel=np.zeros(0, dtype=np.int64),
+        recent_stage=np.zeros(0, dtype=np.int64),
     )
 
 
@@ -110,9 +115,12 @@ def shift_state(state: BudgetState, offset_s: float) -> BudgetState:
     return replace(
         state,
         at_s=state.at_s + offset_s,
+        begun_s=state.begun_s + offset_s,
+        beam_end_s=state.beam_end_s + offset_s,
         last_pulse_end_s=state.last_pulse_end_s + offset_s,
         nodes_at_s=state.nodes_at_s + offset_s,
         exchanged_at_s=state.exchanged_at_s + offset_s,
+        panel_at_s=state.panel_at_s + offset_s,
         mirror_at_s=state.mirror_at_s + offset_s,
         recent_start_s=state.recent_start_s + offset_s,
     )
@@ -129,7 +137,7 @@ def limit(
     policy if a pulse is wider than the cap or starts before the state's time.
     """
     applied, power_w, cause, workspace = _apply_plan(
-        plan.pixel, plan, 0.0, state, budget, TRIM if policy == "trim" else STOP
+        plan.pixel, plan.stage, plan, 0.0, state, budget, TRIM if policy == "trim" else STOP
     )
     if applied < len(plan):
         raise _build_refusal(plan, applied, float(power_w[applied]), REASONS[cause[applied]], state, budget)
@@ -149,7 +157,7 @@ def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float
     """Compute the delay after which the plan fits without trimming, s; infinite if it never fits."""
 
     def fits(delay_s: float) -> bool:
-        return _apply_plan(plan.pixel, plan, delay_s, state, budget, STOP)[0] == len(plan)
+        return _apply_plan(plan.pixel, plan.stage, plan, delay_s, state, budget, STOP)[0] == len(plan)
 
     if fits(0.0):
         return 0.0
@@ -177,14 +185,15 @@ def galvo_feasible_prefix(
     budgets = PixelBudgets(
         bucket_j=empty,
         merged_width_s=empty,
-        end_s=np.array([state.at_s]),
+        begun_s=empty,
+        end_s=state.beam_end_s.copy(),
         peak_k=empty,
         mirror_rad=state.mirror_rad.copy(),
         galvo_mean_square=state.galvo_mean_square.copy(),
         galvo_ringing=state.galvo_ringing.copy(),
-        mirror_at_s=np.array([state.mirror_at_s]),
+        mirror_at_s=state.mirror_at_s.copy(),
     )
-    columns = (start_s, plan.width_s.copy(), plan.x_rad.copy(), plan.y_rad.copy())
+    columns = (plan.stage.copy(), start_s, plan.width_s.copy(), plan.x_rad.copy(), plan.y_rad.copy())
     return count_galvo_feasible(budget, budgets, *columns)
 
 
@@ -209,13 +218,16 @@ def commit_until(
     """Return the state after the pulses of a plan that start before `until_s`, which count in full."""
     count = int(np.searchsorted(plan.start_s, until_s))
     columns = {item.name: getattr(plan, item.name)[:count] for item in fields(PulsePlan)}
-    applied = _apply_plan(plan.pixel[:count], PulsePlan(**columns), 0.0, state, budget, COUNT_ONLY, on_progress)
+    first = PulsePlan(**columns)
+    applied = _apply_plan(first.pixel, first.stage, first, 0.0, state, budget, COUNT_ONLY, on_progress)
     return close_workspace(applied[3], budget)
 
 
-def commit_executed(pixel: IntArray, pulses: TimedPulses, state: BudgetState, budget: Budget) -> BudgetState:
-    """Return the state after executed pulses [n] in order of time, regardless of the caps."""
-    return close_workspace(_apply_plan(pixel, pulses, 0.0, state, budget, COUNT_ONLY)[3], budget)
+def commit_executed(
+    pixel: IntArray, stage: IntArray, pulses: TimedPulses, state: BudgetState, budget: Budget
+) -> BudgetState:
+    """Return the state after executed pulses [n] in order of their starts, regardless of the caps."""
+    return close_workspace(_apply_plan(pixel, stage, pulses, 0.0, state, budget, COUNT_ONLY)[3], budget)
 
 
 def verify(
@@ -242,9 +254,10 @@ def verify(
     ]
     power_w = np.concatenate([pulses.power_w, np.zeros(len(omitted))])
     encoded = _EncodedPulses(*(column[order] for column in (*columns, power_w)))
-    pixel = np.concatenate([plan.pixel[row], plan.pixel[omitted]])[order]
-    exact = budget._replace(galvo=budget.galvo._replace(rad_per_code=0.0, timing_slack_s=0.0))
-    stop_row, allowed_w, cause, _ = _apply_plan(pixel, encoded, 0.0, state, exact, STOP, on_progress)
+    pixel, stage = (np.concatenate([column[row], column[omitted]])[order] for column in (plan.pixel, plan.stage))
+    zero = np.zeros(len(budget.galvos.damping))
+    exact = budget._replace(galvos=budget.galvos._replace(rad_per_code=zero, timing_slack_s=zero))
+    stop_row, allowed_w, cause, _ = _apply_plan(pixel, stage, encoded, 0.0, state, exact, STOP, on_progress)
     if stop_row < len(pixel):
         raise LocalProtocolError(
             f"encoded pulse {order[stop_row]} on pixel {pixel[stop_row]} passes a cap ({REASONS[cause[stop_row]]}): "
@@ -254,6 +267,7 @@ def verify(
 
 def _apply_plan(
     pixel: IntArray,
+    stage: IntArray,
     pulses: TimedPulses,
     delay_s: float,
     state: BudgetState,
@@ -266,7 +280,7 @@ def _apply_plan(
     workspace = open_workspace(state, count)
     power_w, cause = np.zeros(count), np.zeros(count, dtype=np.int64)
     # Copies are contiguous: a kernel is compiled for one memory layout.
-    pixel = pixel.copy()
+    pixel, stage = pixel.copy(), stage.copy()
     start_s, width_s, requested_w = pulses.start_s + delay_s, pulses.width_s.copy(), pulses.power_w.copy()
     x_rad, y_rad = pulses.x_rad.copy(), pulses.y_rad.copy()
     while applied < count:
@@ -276,6 +290,7 @@ def _apply_plan(
             budget,
             workspace,
             pixel[chunk],
+            stage[chunk],
             start_s[chunk],
             width_s[chunk],
             x_rad[chunk],

@@ -12,8 +12,11 @@ from optodrive.planning.limiter.heat_bound import (
     advance_pixel,
     exchange_wall_heat,
     lower_bound_after_k,
+    panel_peak_k,
+    panel_rise_by_others_k,
     touch_after_k,
     wall_after_k,
+    warm_panel,
 )
 from optodrive.planning.limiter.slow_nodes import PulseRequest, wall_credited_peak_k
 from optodrive.planning.limiter.workspace import LimiterWorkspace
@@ -27,6 +30,7 @@ def apply_pulses(
     budget: Budget,
     workspace: LimiterWorkspace,
     pixel: IntArray,
+    stage: IntArray,
     start_s: FloatArray,
     width_s: FloatArray,
     x_rad: FloatArray,
@@ -36,13 +40,18 @@ def apply_pulses(
     granted_w: FloatArray,
     cause: IntArray,
 ) -> int:
-    """Apply n pulses in order of time; modifies the workspace, `granted_w` [n] and `cause` [n] (cap numbers).
+    """Apply n pulses in order of their starts; modifies the workspace, `granted_w` [n] and `cause` [n] (cap numbers).
 
     Returns the number of applied pulses. Under STOP it can be less than n; granted_w and cause of the following row
     then hold the power that would have been granted and the binding cap.
     """
     for row in range(len(pixel)):
-        request = PulseRequest(pixel[row], start_s[row], width_s[row], x_rad[row], y_rad[row], power_w[row])
+        panel_off_s = start_s[row] - workspace.nodes.panel_at_s[0]
+        panel_k = panel_peak_k(budget.heat, workspace.nodes.panel_k, panel_off_s, power_w[row] * width_s[row])
+        panel_k += panel_rise_by_others_k(budget.heat, stage[row], width_s[row])
+        request = PulseRequest(
+            pixel[row], stage[row], start_s[row], width_s[row], x_rad[row], y_rad[row], power_w[row], panel_k
+        )
         granted_w[row], cause[row] = request.power_w, NO_CAP
         before = _compute_start_state(budget, workspace, request)
         if request.power_w < budget.caps.min_power_w or request.power_w <= 0.0:
@@ -88,7 +97,8 @@ def _commit(
     nodes.lower_bound_k[pixel] = lower_bound_after_k(heat, pixel, lower_bound_k, power_w, request.width_s)
     if is_move(budgets, request):
         store_move(budgets, request, galvo_after_move(budget, budgets, request))
-    nodes.last_pulse_end_s[pixel] = budgets.end_s[0] = end_s
+    nodes.last_pulse_end_s[pixel] = budgets.end_s[request.stage] = end_s
+    budgets.begun_s[0] = max(request.start_s, budgets.begun_s[0])
 
     for lag in range(2):
         touch_k = touch_after_k(heat, nodes, pixel, lag, drive_k, request.width_s)
@@ -97,13 +107,14 @@ def _commit(
         wall_k = wall_after_k(heat, nodes, pixel, capacity, request.width_s)
         nodes.wall_k[pixel, capacity] = wall_k + heat.wall_k_per_j[capacity] * power_w * request.width_s
     nodes.nodes_at_s[pixel] = end_s
+    warm_panel(heat, nodes, request.start_s, request.width_s, power_w * request.width_s)
 
     budgets.bucket_j[pixel] = max(0.0, bucket_j + (power_w - budget.caps.pixel_mean_w) * request.width_s)
     budgets.merged_width_s[pixel] = merged_width_s + request.width_s
     history = workspace.history
     row = history.n_valid[0]
     history.start_s[row], history.width_s[row] = request.start_s, request.width_s
-    history.power_w[row], history.pixel[row] = power_w, pixel
+    history.power_w[row], history.pixel[row], history.stage[row] = power_w, pixel, request.stage
     history.n_valid[0] = row + 1
     append(workspace.pixel_chains, pixel, history, row)
-    append(workspace.display_chain, 0, history, row)
+    append(workspace.stage_chains, request.stage, history, row)

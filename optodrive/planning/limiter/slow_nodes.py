@@ -24,21 +24,38 @@ WALL_NODE, TOUCH_NODE = range(2)
 
 
 class PulseRequest(NamedTuple):
-    """A pulse as requested."""
+    """A pulse as requested. panel_k: bound on the panel's rise during it, which is left from the caps."""
 
     pixel: int
+    stage: int
     start_s: float
     width_s: float
     x_rad: float
     y_rad: float
     power_w: float
+    panel_k: float
 
 
 @kernel
-def _wall_cap_k(budget: Budget) -> float:
-    """Return the wall's cap, or the smaller rise at which the touch surface reaches its cap in steady state."""
-    per_wall = budget.heat.touch_per_wall_k * budget.heat.touch_specht_ratio
-    return min(budget.caps.wall_k, budget.caps.touch_k / per_wall) if per_wall > 0.0 else budget.caps.wall_k
+def _touch_cap_k(budget: Budget, panel_k: float) -> float:
+    """Return the touch surface's cap as a rise over what the panel warms it."""
+    return budget.caps.touch_k - budget.heat.touch_per_panel * panel_k
+
+
+@kernel
+def _wall_cap_k(budget: Budget, panel_k: float) -> float:
+    """Return the wall's cap over the panel, or the smaller rise at which the touch surface has its cap when steady.
+
+    Pulses on other pixels lower these caps while they warm the panel. A wall at its cap falls faster than that if the
+    cap is above a floor; below it no pulse is allowed. A touch surface falls as fast if its wall is lower by what the
+    panel rises within the touch surface's lag.
+    """
+    heat = budget.heat
+    cap_k = budget.caps.wall_k - heat.wall_per_panel * panel_k
+    if heat.touch_per_wall_k > 0.0:
+        touch_k = _touch_cap_k(budget, panel_k + heat.panel_k_per_s * heat.touch_lag_s[1])
+        cap_k = min(cap_k, touch_k / (heat.touch_per_wall_k * heat.touch_specht_ratio))
+    return cap_k if cap_k >= heat.panel_floor_k else -1.0
 
 
 @kernel
@@ -52,19 +69,20 @@ def slow_node_limits_w(
     """
     heat, pixel, width_s = budget.heat, request.pixel, request.width_s
     wall_w = touch_w = inf
-    cap_k = _wall_cap_k(budget) / heat.wall_specht_ratio
+    cap_k = _wall_cap_k(budget, request.panel_k) / heat.wall_specht_ratio
     for capacity in range(2):
         if heat.wall_k_per_j[capacity] > 0.0:
             off_k = wall_after_k(heat, nodes, pixel, capacity, width_s)
             wall_w = min(wall_w, (cap_k - off_k) / (heat.wall_k_per_j[capacity] * width_s))
     wall_k = wall_peak_k(budget, nodes, request, 0.0)
+    touch_cap_k = _touch_cap_k(budget, request.panel_k)
     wall_k_per_w = heat.wall_specht_ratio * heat.wall_k_per_j[0] * width_s
     for lag in range(2):
         if heat.touch_k_per_j[lag] > 0.0:
             response = 1.0 - exp(-width_s / heat.touch_lag_s[lag])
             off_k = touch_after_k(heat, nodes, pixel, lag, heat.touch_per_wall_k * wall_k, width_s)
             k_per_w = heat.touch_k_per_j[lag] * width_s + heat.touch_per_wall_k * wall_k_per_w * response
-            touch_w = min(touch_w, (budget.caps.touch_k / heat.touch_specht_ratio - off_k) / k_per_w)
+            touch_w = min(touch_w, (touch_cap_k / heat.touch_specht_ratio - off_k) / k_per_w)
     if wall_w < request.power_w:
         wall_w = _max_node_power_w(budget, nodes, request, lower_bound_k, WALL_NODE, max(0.0, wall_w))
     if touch_w < request.power_w:
@@ -96,8 +114,8 @@ def _is_within_cap(
     """Return whether a wall or touch surface stays within its cap during a pulse and at all times after it, gate off.
 
     After the pulse the node's bound y decays towards its drive d, and the in-transit heat h decays faster, so y − h
-    may rise. Only as much of h is credited as keeps y − h from rising: y falls at a rate of at least λ (y − d), h at
-    most at its own rate. By the time a larger drive replaces d, y itself is below the cap.
+    may rise. Only as much of h is credited as lets y − h fall as fast as the cap may with the panel: y falls at a rate
+    of at least λ (y − d), h at most at its own rate. By the time a larger drive replaces d, y itself is below the cap.
     """
     heat, pixel = budget.heat, request.pixel
     end_k = lower_bound_after_k(heat, pixel, lower_bound_k, power_w, request.width_s)
@@ -105,21 +123,24 @@ def _is_within_cap(
     neighbours_w = 0.0
     for side in range(4):
         if heat.neighbours[pixel, side] >= 0:
-            neighbours_w += heat.lateral_w_per_k * _wall_cap_k(budget)
+            neighbours_w += heat.lateral_w_per_k * _wall_cap_k(budget, request.panel_k)
     wall_k = wall_peak_k(budget, nodes, request, power_w)
     if node == WALL_NODE:
-        cap_k, credit = _wall_cap_k(budget), heat.wall_transit_credit
+        cap_k, credit = _wall_cap_k(budget, request.panel_k), heat.wall_transit_credit
         deficit_k = credit * heat.deficit_k
         peak_k, after_k = wall_credited_peak_k(budget, nodes, request, lower_bound_k, power_w), wall_k
         rate, drive_k = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[1], neighbours_w / heat.wall_w_per_k[pixel]
+        cap_fall_k_per_s = heat.wall_per_panel * heat.panel_k_per_s
     else:
-        cap_k, credit = budget.caps.touch_k, heat.touch_transit_credit
+        cap_k, credit = _touch_cap_k(budget, request.panel_k), heat.touch_transit_credit
         deficit_k = credit * heat.deficit_k + heat.touch_deficit_k
         peak_k, after_k = _touch_credited_peak_k(budget, nodes, request, lower_bound_k, power_w)
         wall_increase_k = neighbours_w / heat.wall_j_per_k[0] * LOOK_AHEAD_TAUS * min_tau_s
         rate = 1.0 / heat.touch_lag_s[1]
-        drive_k = heat.touch_per_wall_k * min(_wall_cap_k(budget), wall_k + wall_increase_k)
-    in_transit_k = min(credit * end_k - deficit_k, rate * min_tau_s * (after_k - drive_k))
+        drive_k = heat.touch_per_wall_k * min(_wall_cap_k(budget, request.panel_k), wall_k + wall_increase_k)
+        cap_fall_k_per_s = heat.touch_per_panel * heat.panel_k_per_s
+    fall_k_per_s = rate * (after_k - drive_k) - cap_fall_k_per_s
+    in_transit_k = min(credit * end_k - deficit_k, min_tau_s * fall_k_per_s)
     return bool(max(peak_k, after_k - max(0.0, in_transit_k)) <= cap_k)
 
 
@@ -212,7 +233,7 @@ def _credited_peak_k(
 
 @kernel
 def wall_peak_k(budget: Budget, nodes: ThermalNodes, request: PulseRequest, power_w: float) -> float:
-    """Return the peak bound on the pixel's wall during a pulse."""
+    """Return the peak bound on the pixel's wall over the panel during a pulse."""
     heat = budget.heat
     max_k = wall_bound_k(heat, nodes, request.pixel)
     for capacity in range(2):

@@ -6,6 +6,7 @@ from optodrive.core.types.plans import BudgetState
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.cap_checks import compute_levels
 from optodrive.planning.limiter.caps import CAP_NUMBERS, CAPS
+from optodrive.planning.limiter.heat_bound import panel_peak_k
 
 
 class Usage(NamedTuple):
@@ -27,3 +28,8 @@ def compute_usage(state: BudgetState, budget: Budget, at_s: float) -> tuple[Usag
             pixel = int(level.argmax()) if cap.is_per_pixel else None
             usages.append(Usage(cap.key, float(level.max()), getattr(budget.caps, cap.field), pixel))
     return tuple(usages)
+
+
+def compute_panel_k(state: BudgetState, budget: Budget, at_s: float) -> float:
+    """Return the bound on the panel's rise at `at_s`, K, with the gate off since the state; zero without a panel."""
+    return float(panel_peak_k(budget.heat, state.panel_k, at_s - state.panel_at_s, 0.0))

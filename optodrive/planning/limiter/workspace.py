@@ -16,15 +16,17 @@ T = TypeVar("T", bound=np.generic)
 
 
 class PixelBudgets(NamedTuple):
-    """Budgets of the pixels, and the state of the mirrors; the arrays are modified.
+    """Budgets of the pixels, and the state of every stage's beam; the arrays are modified.
 
     bucket_j, merged_width_s: [p] energy bucket, and total width of pulses without a gap, after the pixel's last pulse
-    end_s: [1] end of the display's last pulse; peak_k: [p] largest bound on the absorber so far
-    mirror_rad: [2] mirror angles; galvo_mean_square, galvo_ringing: [2], mirror_at_s: [1], see `GalvoState`
+    begun_s: [1] start of the last pulse; end_s: [k] end of each stage's last pulse
+    peak_k: [p] largest bound on the absorber so far
+    mirror_rad: [k, 2] mirror angles; galvo_mean_square, galvo_ringing: [k, 2], mirror_at_s: [k], see `GalvoState`
     """
 
     bucket_j: FloatArray
     merged_width_s: FloatArray
+    begun_s: FloatArray
     end_s: FloatArray
     peak_k: FloatArray
     mirror_rad: FloatArray
@@ -34,13 +36,13 @@ class PixelBudgets(NamedTuple):
 
 
 class LimiterWorkspace(NamedTuple):
-    """Everything that changes while a plan is applied; pixel_chains: one chain per pixel."""
+    """Everything that changes while a plan is applied; pixel_chains, stage_chains: one chain per pixel or stage."""
 
     nodes: ThermalNodes
     budgets: PixelBudgets
     history: PulseHistory
     pixel_chains: WindowChains
-    display_chain: WindowChains
+    stage_chains: WindowChains
 
 
 def open_workspace(state: BudgetState, capacity: int) -> LimiterWorkspace:
@@ -55,29 +57,32 @@ def open_workspace(state: BudgetState, capacity: int) -> LimiterWorkspace:
         nodes_at_s=state.nodes_at_s.copy(),
         inflow_w=state.inflow_w.copy(),
         exchanged_at_s=np.array([state.exchanged_at_s]),
+        panel_k=state.panel_k.copy(),
+        panel_at_s=np.array([state.panel_at_s]),
         coarse_k=np.zeros(pixels),
         refined_k=np.zeros(pixels),
     )
     budgets = PixelBudgets(
         bucket_j=state.bucket_j.copy(),
         merged_width_s=state.merged_width_s.copy(),
-        end_s=np.array([state.at_s]),
+        begun_s=np.array([state.begun_s]),
+        end_s=state.beam_end_s.copy(),
         peak_k=np.zeros(pixels),
         mirror_rad=state.mirror_rad.copy(),
         galvo_mean_square=state.galvo_mean_square.copy(),
         galvo_ringing=state.galvo_ringing.copy(),
-        mirror_at_s=np.array([state.mirror_at_s]),
+        mirror_at_s=state.mirror_at_s.copy(),
     )
     history = PulseHistory(
         start_s=_extend(state.recent_start_s, capacity),
         width_s=_extend(state.recent_width_s, capacity),
         power_w=_extend(state.recent_power_w, capacity),
         pixel=_extend(state.recent_pixel, capacity),
+        stage=_extend(state.recent_stage, capacity),
         n_valid=np.array([past]),
     )
-    workspace = LimiterWorkspace(
-        nodes, budgets, history, _build_chains(pixels, past + capacity), _build_chains(1, past + capacity)
-    )
+    chains = (_build_chains(count, past + capacity) for count in (pixels, len(state.beam_end_s)))
+    workspace = LimiterWorkspace(nodes, budgets, history, *chains)
     _replay_history(workspace)
     return workspace
 
@@ -99,11 +104,12 @@ def _build_chains(count: int, pulses: int) -> WindowChains:
 def close_workspace(workspace: LimiterWorkspace, budget: Budget) -> BudgetState:
     """Return the state for the next plan, without pulses that no future window contains."""
     nodes, budgets, history = workspace.nodes, workspace.budgets, workspace.history
-    at_s, count = float(budgets.end_s[0]), int(history.n_valid[0])
-    horizon_s = at_s - max(budget.caps.pixel_window_s, budget.caps.display_window_s)
+    at_s, count = float(budgets.end_s.max()), int(history.n_valid[0])
+    horizon_s = float(budgets.begun_s[0]) - max(budget.caps.pixel_window_s, budget.caps.display_window_s)
     recent = np.flatnonzero(history.start_s[:count] + history.width_s[:count] > horizon_s)
     return BudgetState(
         at_s=at_s,
+        begun_s=float(budgets.begun_s[0]),
         last_pulse_end_s=nodes.last_pulse_end_s,
         rise_k=nodes.absorber_k,
         lower_bound_k=nodes.lower_bound_k,
@@ -114,14 +120,18 @@ def close_workspace(workspace: LimiterWorkspace, budget: Budget) -> BudgetState:
         nodes_at_s=nodes.nodes_at_s,
         inflow_w=nodes.inflow_w,
         exchanged_at_s=float(nodes.exchanged_at_s[0]),
+        panel_k=nodes.panel_k,
+        panel_at_s=float(nodes.panel_at_s[0]),
+        beam_end_s=budgets.end_s,
         mirror_rad=budgets.mirror_rad,
         galvo_mean_square=budgets.galvo_mean_square,
         galvo_ringing=budgets.galvo_ringing,
-        mirror_at_s=float(budgets.mirror_at_s[0]),
+        mirror_at_s=budgets.mirror_at_s,
         recent_start_s=history.start_s[recent],
         recent_width_s=history.width_s[recent],
         recent_power_w=history.power_w[recent],
         recent_pixel=history.pixel[recent],
+        recent_stage=history.stage[recent],
     )
 
 
@@ -130,4 +140,4 @@ def _replay_history(workspace: LimiterWorkspace) -> None:
     """Append the pulses of earlier plans to the chains."""
     for row in range(workspace.history.n_valid[0]):
         append(workspace.pixel_chains, workspace.history.pixel[row], workspace.history, row)
-        append(workspace.display_chain, 0, workspace.history, row)
+        append(workspace.stage_chains, workspace.history.stage[row], workspace.history, row)

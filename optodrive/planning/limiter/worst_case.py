@@ -6,80 +6,21 @@ coupling. A smaller capacity warms faster and a larger one cools more slowly, so
 """
 
 from dataclasses import dataclass
-from math import e, inf, log
+from math import e, exp, inf, log
 
 import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.core.types.arrays import FloatArray
 from optodrive.planning.limiter.budget import HeatBound
 from optodrive.planning.limiter.caps import CapValues
+from optodrive.planning.limiter.nominal_model import NominalThermalModel, Uncertainty
 
 CHORDS = 8
+PANEL_LAG_RATIO = 4.0
 STEP_FRACTION = 0.07
 """Step of the heat exchange between walls, as a fraction of the fastest wall's time constant."""
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """Declared relative half-widths of the parameters; the exponent's half-width is absolute."""
-
-    absorbed_power: float
-    bridge_resistance: float
-    absorber_capacity: float
-    exponent: float
-    gas_lag: float
-    wall_resistance: float
-    wall_capacity: float
-    side_resistance: float
-    touch_share: float
-    touch_lag: float
-
-
-@dataclass(frozen=True, eq=False)
-class NominalWalls:
-    """One wall node per pixel: resistances to surroundings, neighbour and frame (infinite: none), and capacity."""
-
-    r_k_per_w: float
-    c_j_per_k: float
-    lateral_k_per_w: float
-    frame_k_per_w: float
-
-
-@dataclass(frozen=True)
-class NominalTouch:
-    """The touch surface: its fractions of the gas's and of the wall's rise, and its lag."""
-
-    gas_share: float
-    wall_share: float
-    lag_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class NominalThermalModel:
-    """Nominal parameters of the thermal model.
-
-    epsilon, r_k_per_w, c_j_per_k: [p] absorbed fraction, bridge resistance and heat capacity of the absorber
-    exponent: n in R = R₀ (T / T₀)ⁿ, with the bridge's mean temperature T
-    neighbours: [p, 4] neighbouring pixels, −1 for none; frame_edges: [p] number of edges at the frame
-    walls, touch: None if the model has no such node
-    hot_capacity_factor: factor by which the capacity of a hot absorber may exceed C
-    extra_rise_k: rise by terms outside the bound, already subtracted from the caps
-    """
-
-    epsilon: FloatArray
-    r_k_per_w: FloatArray
-    c_j_per_k: FloatArray
-    tau_g_s: float
-    ambient_k: float
-    exponent: float
-    neighbours: IntArray
-    frame_edges: IntArray
-    walls: NominalWalls | None
-    touch: NominalTouch | None
-    hot_capacity_factor: float = 1.0
-    extra_rise_k: float = 0.0
 
 
 def specht_ratio(ratio: float) -> float:
@@ -97,11 +38,12 @@ def specht_ratio(ratio: float) -> float:
 
 
 def build_heat_bound(
-    model: NominalThermalModel, uncertainty: Uncertainty, caps: CapValues, power_max_w: float
+    model: NominalThermalModel, uncertainty: Uncertainty, caps: CapValues, *power_max_w: float, skew_s: float = 0.0
 ) -> HeatBound:
     """Compute the worst-case coefficients.
 
-    power_max_w: largest power of a pulse. Raises InputError if a wall or touch surface is too fast for the absorber.
+    power_max_w: largest power of a pulse, by stage; skew_s: largest difference between the clocks of two stages. Raises
+    InputError if a wall or touch surface is too fast for the absorber, or the panel for the walls.
     """
     epsilon = model.epsilon * (1 + uncertainty.absorbed_power)
     r_high = model.r_k_per_w * (1 + uncertainty.bridge_resistance)
@@ -118,7 +60,8 @@ def build_heat_bound(
     touch = _build_touch_bound(
         model, uncertainty, epsilon_max, float(r_high.max()) * resistance_factor, tau_max_s, wall
     )
-    lower = _build_lower_bound(model, uncertainty, caps, c_low, c_high, wall, touch)
+    panel = _build_panel_bound(model, uncertainty, epsilon_max, lag_max_s, sum(power_max_w), wall, touch)
+    lower = _build_lower_bound(model, uncertainty, caps, c_low, c_high, wall, touch, panel.k_per_s)
     bound = HeatBound(
         epsilon=epsilon,
         r_k_per_w=r_high,
@@ -132,19 +75,29 @@ def build_heat_bound(
         wall_k_per_j=wall.k_per_j,
         wall_specht_ratio=wall.specht_ratio,
         neighbours=np.ascontiguousarray(model.neighbours),
-        lateral_w_per_k=wall.lateral_w_per_k,
+        # What another stage does later than planned has cooled less by the time it counts.
+        lateral_w_per_k=wall.lateral_w_per_k * exp(wall.rate_per_s * skew_s),
         exchange_step_s=wall.exchange_step_s,
         touch_lag_s=touch.lag_s,
         touch_k_per_j=touch.k_per_j,
         touch_per_wall_k=touch.per_wall_k,
         touch_specht_ratio=touch.specht_ratio,
+        panel_k_per_j=panel.k_per_j * np.exp(skew_s / panel.tau_s),
+        panel_tau_s=panel.tau_s,
+        panel_specht_ratio=panel.specht_ratio,
+        absorber_per_panel=panel.per_absorber,
+        wall_per_panel=panel.per_wall,
+        touch_per_panel=panel.per_touch,
+        panel_k_per_s=panel.k_per_s,
+        panel_floor_k=panel.floor_k,
         lower_bound_k_per_w=lower.k_per_w,
         lower_bound_rate_per_s=lower.rate_per_s,
         deficit_k=lower.deficit_k,
         wall_transit_credit=float(c_low.min()) / (wall.retained_fraction * float(wall.j_per_k[1])),
         touch_transit_credit=float(c_low.min()) * float(touch.k_per_j[1]) / epsilon_max,
         touch_deficit_k=lower.touch_deficit_k,
-        power_max_w=power_max_w,
+        power_max_w=np.array(power_max_w),
+        skew_s=skew_s,
     )
     for column in bound:
         if isinstance(column, np.ndarray):
@@ -285,6 +238,79 @@ def _build_touch_bound(
 
 
 @dataclass(frozen=True, eq=False)
+class _PanelBound:
+    """Worst-case coefficients of the panel; k_per_s: its fastest rise."""
+
+    k_per_j: FloatArray
+    tau_s: FloatArray
+    specht_ratio: float
+    per_absorber: float
+    per_wall: float
+    per_touch: float
+    k_per_s: float
+    floor_k: float
+
+
+def _build_panel_bound(
+    model: NominalThermalModel,
+    uncertainty: Uncertainty,
+    epsilon: float,
+    lag_max_s: float,
+    all_power_w: float,
+    wall: _WallBound,
+    touch: _TouchBound,
+) -> _PanelBound:
+    """Bound the panel as if all heat of a pulse arrived at once, and warmed the walls with it.
+
+    all_power_w: power of all stages together.
+
+    The walls are warmer than the panel on average, because all heat enters through them.
+
+    A node with a time constant τ that follows one that falls no faster than exp(−t / T) exceeds it at most by the
+    factor 1 / (1 − τ / T). The same factor covers heat that arrives at the panel later than it is counted.
+
+    The panel also rises by pulses on other pixels, at most at one rate. A wall at its cap over the panel, warmed by
+    neighbours that are no hotter, falls meanwhile at least at the rate cap / (R C), which is faster if the cap is above
+    a floor.
+    """
+    panel, walls = model.panel, model.walls
+    if panel is None or walls is None:
+        return _PanelBound(np.zeros(2), np.ones(2), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    signs, count = np.array([-1.0, 1.0]), len(model.epsilon)
+    capacities = panel.c_j_per_k * (1 + signs * uncertainty.panel_capacity)
+    capacities += count * walls.c_j_per_k * (1 + signs * uncertainty.wall_capacity)
+    tau_s = panel.r_k_per_w * (1 + uncertainty.panel_resistance) * capacities
+    wall_lag_s = walls.r_k_per_w * (1 + uncertainty.wall_resistance) * float(wall.j_per_k[1])
+    gas_lag_s, touch_lag_s = model.tau_g_s * (1 + uncertainty.gas_lag), float(touch.lag_s[1])
+    if tau_s[0] < PANEL_LAG_RATIO * max(wall_lag_s, touch_lag_s):
+        raise InputError(
+            "panel",
+            f"a time constant of {format_quantity(float(tau_s[0]), 's')}",
+            f"at least {PANEL_LAG_RATIO:g} times that of walls and touch surface, "
+            f"{format_quantity(max(wall_lag_s, touch_lag_s), 's')}",
+        )
+
+    def follow(*lags_s: float) -> float:
+        return float(np.prod([1.0 / (1.0 - lag_s / tau_s[0]) for lag_s in lags_s]))
+
+    per_wall, per_absorber = follow(wall_lag_s), follow(wall_lag_s, lag_max_s)
+    ratio = specht_ratio(capacities[1] / capacities[0])
+    k_per_j = epsilon * per_absorber / capacities
+    k_per_s = ratio * float(k_per_j[0]) * all_power_w
+    shares = 0.0 if model.touch is None else model.touch.gas_share + model.touch.wall_share
+    return _PanelBound(
+        k_per_j=k_per_j,
+        tau_s=tau_s,
+        specht_ratio=ratio,
+        per_absorber=per_absorber,
+        per_wall=per_wall,
+        per_touch=shares * (1 + uncertainty.touch_share) * follow(wall_lag_s, lag_max_s, gas_lag_s, touch_lag_s),
+        k_per_s=k_per_s,
+        floor_k=per_wall * k_per_s * wall_lag_s,
+    )
+
+
+@dataclass(frozen=True, eq=False)
 class _LowerBound:
     """Coefficients of the lower bound of an absorber's rise over its wall."""
 
@@ -302,18 +328,22 @@ def _build_lower_bound(
     c_high: FloatArray,
     wall: _WallBound,
     touch: _TouchBound,
+    panel_k_per_s: float,
 ) -> _LowerBound:
-    """Bound the absorber's rise over its wall from below: a wall that only the absorber's own heat warms."""
+    """Bound the absorber's rise over its wall from below: a wall that only the absorber's own heat warms.
+
+    panel_k_per_s: fastest rise of the panel
+    """
     r_low = model.r_k_per_w * (1 - uncertainty.bridge_resistance)
     coupling_factor = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
     rate_per_s = np.stack([coupling_factor / (r_low * c_high), coupling_factor / (r_low * c_low)], axis=1)
     k_per_w = model.epsilon * (1 - uncertainty.absorbed_power) * r_low / coupling_factor
-    if wall.lateral_w_per_k == 0.0:
-        return _LowerBound(k_per_w, rate_per_s, 0.0, 0.0)
-    max_wall_k = min(
-        caps.wall_k, caps.touch_k / (touch.per_wall_k * touch.specht_ratio) if touch.per_wall_k > 0.0 else inf
-    )
-    inflow_k_per_s = 4 * wall.lateral_w_per_k * max_wall_k / float(wall.j_per_k[0])
+    inflow_k_per_s = panel_k_per_s
+    if wall.lateral_w_per_k > 0.0:
+        max_wall_k = min(
+            caps.wall_k, caps.touch_k / (touch.per_wall_k * touch.specht_ratio) if touch.per_wall_k > 0.0 else inf
+        )
+        inflow_k_per_s += 4 * wall.lateral_w_per_k * max_wall_k / float(wall.j_per_k[0])
     deficit_k, gas_lag_s = inflow_k_per_s / float(rate_per_s.min()), model.tau_g_s * (1 + uncertainty.gas_lag)
     gas_deficit_k = gas_lag_s * inflow_k_per_s + 0.5 * deficit_k
     touch_deficit_k = touch.gas_s / float(touch.lag_s[0]) * gas_deficit_k if touch.gas_s > 0.0 else 0.0

@@ -84,7 +84,7 @@ def compute_simultaneity(
     heat: before the plan; last_round_start_s: start of the last round, before which no pixel reaches its target
     """
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])
-    end_s = float(plan.start_s[-1] + plan.width_s[-1])
+    end_s = plan.end_s
     after_s = PEAK_WINDOW_TAU_G * float(heat.pixels.tau_g_s.max())
     t_s = np.union1d(
         np.linspace(last_round_start_s, end_s, SAMPLES), np.linspace(float(plan.start_s[-1]), end_s + after_s, SAMPLES)

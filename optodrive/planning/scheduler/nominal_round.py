@@ -1,6 +1,6 @@
 """The pulses of a frame's round on nominal pixels, in one kernel.
 
-It states what `BatchPlanner.plan_round` does pulse by pulse, without train pulses; other threads run meanwhile.
+It states what `BatchPlanner.extend_round` does pulse by pulse, without train pulses; other threads run meanwhile.
 """
 
 from itertools import repeat
@@ -53,24 +53,26 @@ class RoundPulses(NamedTuple):
 
 def draft_round(
     draft: BatchDraft,
+    stage: int,
     heat: NominalThermalState,
     pixel: IntArray,
     target_m: FloatArray,
     requested_us: int,
+    earliest_us: int,
     source: int,
     drive: DriveRange,
-    max_rows: int | None,
+    max_count: int | None,
 ) -> None:
-    """Draft pulses to the heights target_m [n] on `pixel` [n], in this order, until the draft has max_rows pulses.
+    """Draft at most max_count pulses of a stage, to the heights target_m [n] on `pixel` [n], in this order.
 
-    Raises ValueError for a pulse before its pixel's last event.
+    earliest_us: no pulse starts before. Raises ValueError for a pulse before its pixel's last event.
     """
-    beam, pulses = draft.beam, RoundPulses.empty(len(pixel))
+    beam, pulses = draft.state.beams[stage], RoundPulses.empty(len(pixel))
     start = KernelBeam(beam.free_us, NO_PIXEL if beam.pixel is None else beam.pixel, beam.arrival_us, beam.dwell_us)
     span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods)
-    count = len(pixel) if max_rows is None else max_rows - len(draft.rows)
+    count = len(pixel) if max_count is None else max_count
     visited, *after = _solve_round(
-        *heat.kernel_state, draft.path.moves, pixel, target_m, requested_us + beam.delay_us, start, span, count, pulses
+        *heat.kernel_state, draft.paths[stage].moves, pixel, target_m, earliest_us, start, span, count, pulses
     )
     if visited < 0:
         row = -1 - visited
@@ -90,7 +92,8 @@ def draft_round(
         target_m[drawn],
     )
     draft.rows += map(
-        PlannedPulse._make, zip(*(column.tolist() for column in columns), repeat(requested_us), repeat(source))
+        PlannedPulse._make,
+        zip(*(column.tolist() for column in columns), repeat(requested_us), repeat(source), repeat(stage)),
     )
 
 

@@ -85,6 +85,14 @@ class BeamPath:
             self._x_rad[pixel] - self._x_rad[origin], self._y_rad[pixel] - self._y_rad[origin], dwell_us
         )
 
+    def orient(self, path: IntArray, origin: int | None) -> list[int]:
+        """Return a path over pixels [k] from its end that is nearer to `origin`, if that is known."""
+        visits: list[int] = path.tolist()
+        if origin is None or not visits:
+            return visits
+        first_us, last_us = (self.compute_settling_us(origin, pixel) for pixel in (visits[0], visits[-1]))
+        return visits[::-1] if last_us < first_us else visits
+
     def compute_order(self, active: IntArray, origin: int | None) -> list[int]:
         """Return a short visiting order of the pixels `active` [k], starting from `origin` if it is known."""
         layout = self._layout

@@ -1,13 +1,14 @@
-"""Schedule frames and trains onto one beam: start, width and power of every pulse, batch by batch.
+"""Schedule frames and trains onto the beams of all stages: start, width and power of every pulse, batch by batch.
 
-Trains keep their times; the pulses of a frame fill the beam time between them. Pulses requested by height are planned
-from the residual heat. All times inside the scheduler are whole microseconds.
+Trains keep their times; the pulses of a frame fill the beam time between them. Within a plan a pixel belongs to one
+stage. Pulses requested by height are planned from the residual heat. All times inside the scheduler are whole
+microseconds.
 """
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple, TypeVar
 
@@ -18,8 +19,8 @@ from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.physics.nominal_display import ignore_progress
 from optodrive.physics.thermal_state import ThermalState
-from optodrive.planning.scheduler.batch_draft import BatchDraft, BeamState, SkippedPulse
-from optodrive.planning.scheduler.batch_planner import BatchPlanner, Round
+from optodrive.planning.scheduler.batch_draft import BatchDraft, BeamState, PlanState, SkippedPulse
+from optodrive.planning.scheduler.batch_planner import BatchPlanner, Round, StageTools
 from optodrive.planning.scheduler.interleaving import (
     ROUND_COUNTS,
     CandidateSchedule,
@@ -32,6 +33,7 @@ from optodrive.planning.scheduler.interleaving import (
     split_pulses,
 )
 from optodrive.planning.scheduler.scan_head import BeamPath, ScanHead
+from optodrive.planning.scheduler.stage_assignment import StageAssignment
 from optodrive.planning.scheduler.train_pulses import TrainPulses
 
 TRAIN_BATCH = 1000
@@ -41,9 +43,10 @@ Granted = TypeVar("Granted", bound=PulsePlan)
 
 
 class GalvoPause(NamedTuple):
-    """A pause of the mirrors after the first `rows` pulses of a batch, in which their coils cool."""
+    """A pause of a stage's mirrors after the first `rows` pulses of a batch, in which their coils cool."""
 
     rows: int
+    stage: int
     pause_us: int
 
 
@@ -68,13 +71,14 @@ class Scheduler:
     the heat before the next batch is planned, so the next batch accounts for what the limiter removed. `run` drives
     this protocol.
 
+    assignment: of the pixels to the stages
     build_cold_heat: makes the heat of a cold display, for the pulse recipes of trains by height
     train_batch: maximum number of train pulses in one batch
     on_progress: called repeatedly while a batch is planned
-    initial_pixel: pixel on which the mirrors stand at the start, None while unknown
+    initial_pixels: pixel on which each stage's mirrors stand at the start, None while unknown
     visiting_orders: by source, the order [k] of a frame's active pixels; other frames follow a short path
-    lead_in_us: gate-off time before the sequence's zero, in which the mirrors reach the first pixel from anywhere; zero
-    if the initial pixel is known
+    lead_in_us: gate-off time before the sequence's zero, in which all mirrors reach their first pixel from anywhere;
+    zero if the initial pixels are known
     skipped, simultaneous: skipped pulses and interleaved frames of the plan so far
 
     Raises InputError for a train by height whose height or peak-to-peak value no cycle has, or that has no beam time.
@@ -82,33 +86,44 @@ class Scheduler:
 
     def __init__(
         self,
-        scan_head: ScanHead,
+        scan_heads: tuple[ScanHead, ...],
+        assignment: StageAssignment,
         sequence: FrameSequence,
         build_cold_heat: Callable[[], ThermalState],
         train_batch: int = TRAIN_BATCH,
         on_progress: Callable[[], None] = ignore_progress,
-        initial_pixel: int | None = None,
+        initial_pixels: tuple[int, ...] | None = None,
         visiting_orders: Mapping[int, IntArray] | None = None,
     ) -> None:
         self._sequence = sequence
-        self._scan_head = scan_head
+        self._scan_heads = scan_heads
+        self._assignment = assignment
         self._on_progress = on_progress
         self._visiting_orders = visiting_orders or {}
-        self.lead_in_us = scan_head.settling.lead_in_us if initial_pixel is None else 0
+        lead_ins_us = [scan_head.settling.lead_in_us for scan_head in scan_heads]
+        self.lead_in_us = max(lead_ins_us) if initial_pixels is None else 0
         self.skipped: list[SkippedPulse] = []
         self.simultaneous: list[SimultaneousFrame] = []
-        self._path = BeamPath(scan_head, self.lead_in_us)
-        trains = TrainPulses(
-            sequence.trains,
-            len(sequence.frames),
-            scan_head.drive,
-            round(scan_head.pulse_gap_s * 1e6),
-            self._path.compute_settling_us,
-            build_cold_heat,
-            on_progress,
-        )
-        self._planner = BatchPlanner(sequence, trains, self._path, scan_head.drive, train_batch, on_progress)
-        self._beam = BeamState(pixel=initial_pixel)
+        tools = []
+        for stage, scan_head in enumerate(scan_heads):
+            path = BeamPath(scan_head, self.lead_in_us)
+            trains = TrainPulses(
+                {
+                    source: train
+                    for source, train in enumerate(sequence.trains, len(sequence.frames))
+                    if assignment.stage_of[train.pixel] == stage
+                },
+                len(sequence.frames),
+                scan_head.drive,
+                round(scan_head.pulse_gap_s * 1e6),
+                path.compute_settling_us,
+                build_cold_heat,
+                on_progress,
+            )
+            tools.append(StageTools(path, scan_head.drive, trains))
+        self._tools = tuple(tools)
+        self._planner = BatchPlanner(sequence, self._tools, train_batch, on_progress)
+        self._state = PlanState([BeamState(pixel=pixel) for pixel in initial_pixels or (None,) * len(scan_heads)])
         self._steps: deque[_TrainsBefore | _Frame | Round] = deque(_list_steps(sequence))
         self._draft: BatchDraft | None = None
         self._kept: BatchDraft | None = None
@@ -137,21 +152,22 @@ class Scheduler:
             if isinstance(step, Round):
                 draft = self._draft_round(step, heat)
             else:
-                draft = self._planner.plan_trains(self._beam, step.until_us, heat)
+                draft = self._planner.plan_trains(self._state, step.until_us, heat)
             if draft.rows:
                 self._draft = draft
                 return draft.to_plan()
             self._commit(draft)
-            self._kept, self._beam.position = None, 0
+            self._kept = None
+            self._state.begin_order()
             self._steps.popleft()
         return None
 
     def _draft_round(self, step: Round, heat: ThermalState) -> BatchDraft:
         """Draft the pulses of a round; those before the batch's last pause are the ones that were proposed before."""
-        kept = self._kept or BatchDraft.begin(self._path, self._beam)
+        kept = self._kept or self._planner.begin(self._state)
         if self._pending_pause is not None:
             self._planner.extend_round(kept, step, heat, self._pending_pause.rows)
-            kept.beam.free_us += self._pending_pause.pause_us
+            kept.state.beams[self._pending_pause.stage].free_us += self._pending_pause.pause_us
             self._kept, self._pending_pause = kept, None
         draft = kept.copy()
         self._planner.extend_round(draft, step, heat)
@@ -166,8 +182,9 @@ class Scheduler:
         """Withdraw the proposed batch; it is planned again, and everything from it on starts `delay_us` later."""
         self._take_draft()
         self._kept = None
-        self._beam.free_us += delay_us
-        self._beam.delay_us += delay_us
+        for beam in self._state.beams:
+            beam.free_us += delay_us
+        self._state.delay_us += delay_us
 
     def pause(self, pause: GalvoPause) -> None:
         """Withdraw the proposed batch; it is planned again with a pause after its first pulses, which stay."""
@@ -181,34 +198,38 @@ class Scheduler:
         return draft
 
     def _commit(self, draft: BatchDraft) -> None:
-        self._beam = draft.beam
+        self._state = draft.state
         self.skipped += draft.skipped
 
     def _plan_frame(self, source: int, heat: ThermalState) -> list[Round]:
         """Decide the visiting order of a frame and, if it is simultaneous, its number of interleaved rounds."""
-        frame, drive = self._sequence.frames[source], self._scan_head.drive
-        if source in self._visiting_orders:
-            order = self._visiting_orders[source].tolist()
+        frame, state = self._sequence.frames[source], self._state
+        requested_us = self._planner.compute_requested_us(frame.show_at_s) + state.delay_us
+        free_us = [max(beam.free_us, state.begun_us, requested_us) for beam in state.beams]
+        stretches = self._assignment.assign(source, np.array(free_us) * 1e-6)
+        if stretches is None or source in self._visiting_orders:
+            orders = tuple(self._compute_order(source, stage) for stage in range(len(self._tools)))
         else:
-            order = self._path.compute_order(np.flatnonzero(frame.target_m > 0), self._beam.pixel)
-        if not frame.simultaneous or len(order) < 2:
-            return [Round(source, order)]
-        delay_us = self._beam.delay_us
-        begin_us = max(self._planner.compute_requested_us(frame.show_at_s) + delay_us, self._beam.free_us)
+            beams = zip(self._tools, state.beams, stretches, strict=True)
+            orders = tuple(tools.path.orient(stretch, beam.pixel) for tools, beam, stretch in beams)
+        if not frame.simultaneous or sum(map(len, orders)) < 2:
+            return [Round(source, orders)]
+        begin_us = max(free_us)
         single_pulses = {}
-        for pixel in order:
-            pulse = heat.solve_pulse(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), drive)
-            if pulse is not None:
-                single_pulses[pixel] = pulse
+        for tools, order in zip(self._tools, orders, strict=True):
+            for pixel in order:
+                pulse = heat.solve_pulse(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), tools.drive)
+                if pulse is not None:
+                    single_pulses[pixel] = pulse
         if not single_pulses:
-            return [Round(source, order)]
+            return [Round(source, orders)]
         rounds = {
-            count: _list_rounds(source, order, count, periods)
+            count: _list_rounds(source, orders, count, periods)
             for count in ROUND_COUNTS
             if (periods := split_pulses(single_pulses, count)) is not None
         }
         candidates = [self._evaluate_rounds(source, each, heat) for each in rounds.values()]
-        deadline_us = self._planner.compute_requested_us(frame.show_at_s + frame.duration_s) + delay_us
+        deadline_us = self._planner.compute_requested_us(frame.show_at_s + frame.duration_s) + state.delay_us
         selected, single = select_schedule(candidates, deadline_us * 1e-6), candidates[0]
         self.simultaneous.append(
             SimultaneousFrame(
@@ -216,6 +237,16 @@ class Scheduler:
             )
         )
         return rounds[selected.rounds]
+
+    def _compute_order(self, source: int, stage: int) -> list[int]:
+        """Return the visiting order of a frame's pixels that belong to a stage."""
+        stage_of = self._assignment.stage_of
+        if source in self._visiting_orders:
+            order = self._visiting_orders[source]
+            given: list[int] = order[stage_of[order] == stage].tolist()
+            return given
+        active = np.flatnonzero((self._sequence.frames[source].target_m > 0) & (stage_of == stage))
+        return self._tools[stage].path.compute_order(active, self._state.beams[stage].pixel)
 
     def _evaluate_rounds(self, source: int, rounds: list[Round], heat: ThermalState) -> CandidateSchedule:
         """Plan the rounds of a frame without the limiter, on copies of the beam state and the heat."""
@@ -226,16 +257,18 @@ class Scheduler:
             if np.isfinite(batch.target_m[batch.source == source]).any() and last_round_start_s == 0.0:
                 last_round_start_s = float(batch.start_s[0])
         plan = concatenate_batches(batches)
-        target_m = {pixel: float(self._sequence.frames[source].target_m[pixel]) for pixel in rounds[-1].order}
+        heights_m = self._sequence.frames[source].target_m
+        target_m = {pixel: float(heights_m[pixel]) for order in rounds[-1].orders for pixel in order}
         simultaneity = compute_simultaneity(heat, plan, target_m, last_round_start_s, self._on_progress)
-        end_s = float(plan.start_s[-1] + plan.width_s[-1])
-        is_separated = len(rounds) == 1 or has_min_gaps(plan, self._scan_head.pulse_gap_s)
+        end_s = plan.end_s
+        is_separated = len(rounds) == 1 or has_min_gaps(plan, self._scan_heads[0].pulse_gap_s)
         return CandidateSchedule(len(rounds), simultaneity, end_s, is_separated)
 
     def _fork(self, rounds: list[Round]) -> "Scheduler":
         """Return a scheduler that plans only `rounds` from the present state and leaves this one unchanged."""
         fork = copy(self)
-        fork._beam = replace(self._beam, position=0)
+        fork._state = self._state.copy()
+        fork._state.begin_order()
         fork._steps = deque(rounds)
         fork.skipped = []
         return fork
@@ -248,7 +281,7 @@ def _list_steps(sequence: FrameSequence) -> Iterator[_TrainsBefore | _Frame]:
     yield _TrainsBefore(inf)
 
 
-def _list_rounds(source: int, order: list[int], count: int, periods: PeriodsByPixel) -> list[Round]:
+def _list_rounds(source: int, orders: tuple[list[int], ...], count: int, periods: PeriodsByPixel) -> list[Round]:
     """Return `count` rounds: sub-pulses of fixed width in all but the last, which brings each pixel to its height."""
-    sub_pulses = Round(source, [pixel for pixel in order if pixel in periods], periods)
-    return [sub_pulses] * (count - 1) + [Round(source, order)]
+    split = tuple([pixel for pixel in order if pixel in periods] for order in orders)
+    return [Round(source, split, periods)] * (count - 1) + [Round(source, orders)]

@@ -1,6 +1,6 @@
 """The pulses of all trains in order of time, and the shape of each pulse."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -40,14 +40,14 @@ class TrainPulse(NamedTuple):
 
 
 def list_train_pulses(
-    trains: tuple[Train, ...], first_source: int, on_progress: Callable[[], None] = ignore_progress
+    trains: Mapping[int, Train], on_progress: Callable[[], None] = ignore_progress
 ) -> list[TrainPulse]:
-    """List the pulses of all trains in order of time, at equal times in that of the trains.
+    """List the pulses of all trains, by source, in order of time, at equal times in that of the trains.
 
-    first_source: source index of the first train; on_progress: called repeatedly
+    on_progress: called repeatedly
     """
-    starts_us, shapes = [], []
-    for train in trains:
+    starts_us, shapes, sources = [], [], list(trains)
+    for train in trains.values():
         starts_us.append(np.rint(train.pulse_starts_s() * 1e6).astype(np.int64))
         width_s, power_w = (0.0, 0.0) if isinstance(train, HeightTrain) else (train.pulse_width_s, train.power_w)
         shapes.append((train.pixel, round(width_s * 1e6), power_w))
@@ -60,7 +60,7 @@ def list_train_pulses(
     for first in range(0, len(order), PROGRESS_PULSES):
         chunk = order[first : first + PROGRESS_PULSES]
         for at_us, train_number in zip(start_us[chunk].tolist(), number[chunk].tolist(), strict=True):
-            pulses.append(TrainPulse(at_us, first_source + train_number, *shapes[train_number]))
+            pulses.append(TrainPulse(at_us, sources[train_number], *shapes[train_number]))
         on_progress()
     return pulses
 
@@ -114,8 +114,9 @@ def add_lead_periods(
 
 
 class TrainPulses:
-    """The pulses of all trains in order of time, with the pulse recipes of trains by height.
+    """The pulses of a stage's trains, by source, in order of time, with the pulse recipes of trains by height.
 
+    first_source: source index of the sequence's first train
     gap_us: gate-off time after which pulses on a pixel count separately
     build_cold_heat: makes the heat of a cold display; on_progress: called repeatedly
     Raises InputError for a train by height whose height or peak-to-peak value no cycle has, or that has no beam time.
@@ -123,7 +124,7 @@ class TrainPulses:
 
     def __init__(
         self,
-        trains: tuple[Train, ...],
+        trains: Mapping[int, Train],
         first_source: int,
         drive: DriveRange,
         gap_us: int,
@@ -135,8 +136,8 @@ class TrainPulses:
         self._gap_us = gap_us
         self._settling_us = settling_us
         self._period_us = round(drive.period_s * 1e6)
-        self._trains = {k: t for k, t in enumerate(trains, first_source) if isinstance(t, HeightTrain)}
-        self._pulses = list_train_pulses(trains, first_source, on_progress)
+        self._trains = {source: train for source, train in trains.items() if isinstance(train, HeightTrain)}
+        self._pulses = list_train_pulses(trains, on_progress)
         self._recipes: dict[int, PulseRecipe] = {}
         if self._trains:
             self._build_recipes(first_source, build_cold_heat(), on_progress)

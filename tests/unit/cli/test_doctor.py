@@ -18,8 +18,8 @@ from optodrive.cli.doctor_port import check_port
 from optodrive.cli.doctor_watch import INTERVAL_S, watch
 from optodrive.cli.main import run
 from optodrive.core.clock import ManualClock, MonotonicClock
-from optodrive.device.config import BoardSection
 from optodrive.device.config_file import load_config, locate_shipped
+from optodrive.device.config_sections import BoardSection
 
 
 @pytest.fixture

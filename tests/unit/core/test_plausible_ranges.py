@@ -31,6 +31,8 @@ UNITS = {
     "_per_rad2": "1/rad²",
     "_per_rad4": "1/rad⁴",
     "rad_per_s": "rad/s",
+    "_k_per_w": "K/W",
+    "_j_per_k": "J/K",
     "_um": "µm",
     "_m": "m",
     "_s": "s",
@@ -44,7 +46,7 @@ UNITS = {
     "_rad": "rad",
 }
 """Endings of names to units, longer ones first."""
-COUNTS = {"board.points_per_s", "daemon.requests_per_s"}
+COUNTS = {"board.points_per_s", "stages.board.points_per_s", "daemon.requests_per_s"}
 """Rates of events, of which each has its own bounds."""
 MODELS = {
     "config": Config,

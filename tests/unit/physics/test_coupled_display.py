@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from optodrive.device.config import DisplaySection
+from optodrive.device.config_sections import DisplaySection
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import PixelArray, load_parameters

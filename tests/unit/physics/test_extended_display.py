@@ -39,12 +39,12 @@ def some_pulses(seed, count=40, pixels=(0, 1, 5, 15)):
 
 
 def select_acting(keys, columns, pixel):
-    """Return the pulses [n] that act on a pixel: its own, its neighbours', and all others through the laser."""
+    """Return the pulses [n] that act on a pixel: its own, its neighbours', and all others through laser and panel."""
     terms = [term for term in TERMS if term.key in keys]
     is_near = np.isin(columns[0], [pixel, *SMALL.indices[pixel]])
     if not any(term.couples_neighbours for term in terms):
         is_near = columns[0] == pixel
-    if any(term.has_laser_state for term in terms):
+    if any(term.has_laser_state or term.has_panel_state for term in terms):
         return (np.where(is_near, columns[0], ELSEWHERE), *columns[1:])
     return tuple(column[is_near] for column in columns)
 
@@ -92,6 +92,27 @@ def test_each_pulse_brings_its_pixel_to_what_one_pixel_alone_does(key):
             assert peaks[row] == pytest.approx(displacement_m[during].max(), rel=2e-4, abs=2e-8), (pixel, row)
 
 
+@pytest.mark.parametrize("rest_s", [0.5, 30.0, 600.0])
+def test_every_pixel_sees_the_panel_that_light_on_others_warmed(rest_s):
+    """A pixel without light is a pixel alone, whose panel has the light of all: after minutes, and after a rest."""
+    values = {"panel_heating": {"resistance": 20.0, "capacity": 5.0, "share": 0.65}}
+    heat = ExtendedThermalState(ARRAY, values, AMBIENT_K, FULL_W, SMALL)
+    start_s = np.arange(400) * 0.1
+    columns = (np.tile([1, 15, 2, 7], 100), start_s, np.full(400, 0.02), np.full(400, FULL_W))
+    heat.apply_pulses(*columns)
+    at_s = start_s[-1] + rest_s
+    pulses = np.column_stack([*columns[1:], np.full(400, ELSEWHERE)])
+    t_s = np.array([at_s, at_s + 0.05])
+    scene = PixelExperiment(pulses, 5, AMBIENT_K, (t_s, t_s, t_s[:0]), dose_before=1.0)
+    absorber_k, displacement_m, _ = simulate_signals(scene, PIXEL, ActiveTerms.from_values(values))
+    state = heat.state_at(at_s)
+    assert state.displacement_m[5] == pytest.approx(displacement_m[0], rel=2e-3)
+    assert state.absorber_k[5] == pytest.approx(absorber_k[0], rel=2e-3)
+    assert heat.simulate_displacement_m(np.zeros((0, 4)), 5, t_s) == pytest.approx(displacement_m, rel=2e-3)
+    heat.apply_pulses(np.array([3]), np.array([at_s]), np.array([0.02]), np.array([FULL_W]))
+    assert heat.state_at(at_s + 0.05).displacement_m[5] > displacement_m[1]
+
+
 @pytest.mark.parametrize("key", [*SINGLE, "radiation+gas_leak"])
 def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
     keys = key.split("+")
@@ -112,6 +133,23 @@ def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
             shorter.apply_pulses(*before)
             columns = (np.array([5]), np.array([at_s]), np.array([(periods - 1) * DRIVE.period_s]), np.array([FULL_W]))
             assert shorter.apply_pulses(*columns).displacement_m[0] < target_m
+
+
+@pytest.mark.parametrize("key", ["laser_lag", "laser_droop"])
+@pytest.mark.parametrize("gap_s", [4e-4, 2e-3])
+@pytest.mark.parametrize("target_m", [4e-5, 2e-4])
+def test_a_pulse_asked_for_just_after_one_on_another_pixel_reaches_its_height(key, gap_s, target_m):
+    before = some_pulses(4, 10, pixels=(1,))
+    heat, at_s = extended(key), before[1][-1] + before[2][-1] + gap_s
+    heat.apply_pulses(*before)
+    periods, duty = heat.solve_pulse(5, at_s, target_m, DRIVE)
+    one = (np.array([5]), np.array([at_s]), np.array([periods * DRIVE.period_s]), np.array([duty * FULL_W]))
+    combined = tuple(np.concatenate(pair) for pair in zip(before, one, strict=True))
+    _, _, displacement_m = simulate_alone([key], 5, combined, at_s + 0.3)
+    assert displacement_m.max() == pytest.approx(target_m, rel=1e-3)
+    pulse = np.array([[at_s, one[2][0], one[3][0], 5.0]])
+    t_s = at_s + np.linspace(0.0, 0.08, 1601)
+    assert heat.simulate_displacement_m(pulse, 5, t_s).max() == pytest.approx(target_m, rel=1e-3)
 
 
 @pytest.mark.parametrize("key", ["", "laser_turn_on+membrane_creep", "gas_leak"])

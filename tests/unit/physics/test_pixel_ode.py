@@ -78,6 +78,11 @@ def with_wall(t, y):
     return [*nominal(t, y, wall=y[2]), (flow - y[2] / 8.0) / 0.05]
 
 
+def with_panel(t, y):
+    panel_rate = (0.6 * (power(t) + power(t, 1)) - y[2] / 20.0) / 0.05
+    return [*nominal(t, y, wall=y[2]), panel_rate]
+
+
 def with_wall_and_conductivity(t, y):
     r = PIXEL.r_k_per_w * ((AMBIENT_K + (y[0] + y[2]) / 2) / AMBIENT_K) ** 0.5
     return [*nominal(t, y, r=r, wall=y[2]), ((y[0] - y[2]) / r - y[2] / 8.0) / 0.05]
@@ -144,6 +149,7 @@ CASES = {
     "bridge_conductivity": ({"bridge_conductivity": {"exponent": 0.7}}, with_conductivity, 2, plain),
     "radiation": ({"radiation": {"emitting_area": 5e-6}}, with_radiation, 2, plain),
     "wall_heating": ({"wall_heating": {"resistance": 8.0, "capacity": 0.05}}, with_wall, 3, plain),
+    "panel_heating": ({"panel_heating": {"resistance": 20.0, "capacity": 0.05, "share": 0.6}}, with_panel, 3, plain),
     "wall_heating+bridge_conductivity": (
         {"wall_heating": {"resistance": 8.0, "capacity": 0.05}, "bridge_conductivity": {"exponent": 0.5}},
         with_wall_and_conductivity,

@@ -7,12 +7,18 @@ from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.device.config_sections import PanelSection
 from optodrive.physics.parameters import Parameter, load_parameters
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.term import HeatGainBound
 from optodrive.physics.terms import discover_terms
 from optodrive.planning import budget_setup
-from optodrive.planning.budget_setup import BOUNDED_TERMS, build_budget, compute_heat_gain_bound
+from optodrive.planning.budget_setup import (
+    BOUNDED_TERMS,
+    build_budget,
+    build_nominal_panel,
+    compute_heat_gain_bound,
+)
 from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
 
 DISPLAY = DISPLAYS["display-16"]
@@ -75,9 +81,9 @@ def build_hostile_plan(power_w, seed):
     angles_rad = DISPLAY.scan_head.field.angles_rad(DISPLAY.layout.x_m, DISPLAY.layout.y_m)
     x_rad, y_rad = (angle_rad[pixel] for angle_rad in angles_rad)
     zero, nothing = np.zeros(count), np.full(count, np.nan)
-    return PulsePlan(
-        start_s, width_s, x_rad, y_rad, np.full(count, power_w), pixel, zero, nothing, start_s, pixel.astype(np.int64)
-    )
+    stage, source = np.zeros(count, np.int64), pixel.astype(np.int64)
+    columns = (start_s, width_s, x_rad, y_rad, np.full(count, power_w), pixel, zero, nothing, start_s, source, stage)
+    return PulsePlan(*columns)
 
 
 def compute_peak_fraction(key, budget, plan):
@@ -137,3 +143,59 @@ def test_a_uniform_rise_is_subtracted_from_every_cap_with_its_effect_on_walls_an
     caps = build_budget(CONFIG, parameters, DISPLAY.pixels).caps
     for name in ("absorber_k", "wall_k", "touch_k"):
         assert getattr(plain, name) - getattr(caps, name) == pytest.approx(heat_gain.uniform_rise_k, rel=0.01)
+
+
+def build_with_panel(**values):
+    config = CONFIG.model_copy(update={"panel": PanelSection(**values)})
+    return build_budget(config, load_parameters("surroundings"), DISPLAY.pixels)
+
+
+def test_a_panel_with_less_capacity_than_its_walls_is_refused():
+    with pytest.raises(InputError, match=r"panel\.capacity_j_per_k: got 0\.5, expected more than 0\.96, .*16 pixels"):
+        build_with_panel(capacity_j_per_k=0.5)
+
+
+def test_a_panel_that_is_as_fast_as_its_walls_is_refused():
+    with pytest.raises(InputError, match=r"panel: got 'a time constant of .* s', expected at least 4 times"):
+        build_with_panel(resistance_k_per_w=0.5)
+
+
+def test_without_walls_there_is_no_panel():
+    heat = build_budget(CONFIG, load_parameters("calibrated"), DISPLAY.pixels).heat
+    assert not heat.panel_k_per_j.any()
+
+
+def with_panel(base="surroundings", **values):
+    return with_term("panel_heating", base, **{"resistance": 40.0, "capacity": 6.0, "share": 0.6, **values})
+
+
+def test_a_panel_that_the_parameter_set_states_replaces_that_of_the_configuration():
+    panel = PanelSection(resistance_k_per_w=40.0, capacity_j_per_k=6.0)
+    configured = build_budget(
+        CONFIG.model_copy(update={"panel": panel}), load_parameters("surroundings"), DISPLAY.pixels
+    )
+    stated = build_budget(CONFIG, with_panel(), DISPLAY.pixels)
+    assert stated.caps == configured.caps
+    for ours, theirs in zip(stated.heat, configured.heat, strict=True):
+        assert np.array_equal(ours, theirs)
+
+
+def test_a_panel_that_takes_more_light_than_the_absorbers_is_bounded_as_warmer():
+    epsilon = float(DISPLAY.pixels.epsilon.min())
+    usual, warmer = (build_nominal_panel(CONFIG, with_panel(share=share), DISPLAY.pixels) for share in (epsilon, 1.0))
+    assert warmer.r_k_per_w == pytest.approx(usual.r_k_per_w / epsilon)
+    assert warmer.c_j_per_k < usual.c_j_per_k * epsilon
+
+
+def test_a_stated_panel_below_the_capacity_of_its_walls_is_refused():
+    with pytest.raises(
+        InputError, match=r"terms\.panel_heating\.capacity: got 0\.1, expected more than .* of the walls"
+    ):
+        build_budget(CONFIG, with_panel(capacity=0.1), DISPLAY.pixels)
+
+
+def test_a_panel_without_walls_counts_as_a_rise_of_everything():
+    heat_gain = compute_heat_gain_bound(with_panel("calibrated", resistance=4.0), DISPLAY.pixels, CONFIG)
+    assert heat_gain.uniform_rise_k == pytest.approx(4.0 * 0.6 * CONFIG.laser.max_power_w)
+    with pytest.raises(InputError, match=r"limits\.touch_max_c: .* to which the terms of .* may warm it"):
+        build_budget(CONFIG, with_panel("calibrated"), DISPLAY.pixels)

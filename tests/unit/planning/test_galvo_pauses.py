@@ -86,7 +86,7 @@ def test_a_frame_between_trains_pauses_and_the_trains_are_not_delayed():
 
 def test_a_frame_with_pauses_waits_for_a_cap_as_a_whole():
     capped = with_galvo_cap(6e4)
-    caps = capped.budget.caps._replace(touch_k=0.1)
+    caps = capped.budget.caps._replace(touch_k=0.15)
     display = replace(capped, budget=capped.budget._replace(caps=caps))
     frames = tuple(replace(frame(20, 0.6, 200), show_at_s=0.6 * k) for k in range(3))
     planned = plan_sequence(display, FrameSequence(frames), *display.build_cold_state(), "delay")

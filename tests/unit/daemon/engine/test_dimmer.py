@@ -7,8 +7,9 @@ from optodrive.core.errors import InputError, OverBudgetError
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.plan_making import PlanningRequest
+from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
-from optodrive.daemon.preview.jobs import BuiltRequest, plan_dry_run
+from optodrive.daemon.preview.jobs import plan_dry_run
 from optodrive.planning.pipeline import resolve_policy
 from planner_rig import DISPLAY, build_frame, build_train
 
@@ -67,7 +68,11 @@ def test_without_the_comparison_at_the_commit_it_would_be_bright(rig, monkeypatc
 def test_under_refuse_a_dimmed_pulse_is_refused(rig):
     rig.dimmer.set_share(0.1)
     request = PlanningRequest(
-        build_frame, "push", resolve_policy("trim", strict=True), arrived_s=rig.remote.board_s(), epoch=rig.remote.epoch
+        lambda: BuiltRequest(build_frame()),
+        "push",
+        resolve_policy("trim", strict=True),
+        arrived_s=rig.remote.board_s(),
+        epoch=rig.remote.epoch,
     )
     with pytest.raises(OverBudgetError, match="the dim cap allows") as caught:
         rig.planner.submit(request).result()

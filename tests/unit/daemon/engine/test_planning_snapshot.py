@@ -7,6 +7,7 @@ from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
+from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.link.board_setup import build_board_requirements
 
@@ -19,10 +20,11 @@ START_S = 7.0
 def running():
     """Return the plan of a frame that the mirrors cannot draw without pauses."""
     sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, np.full(len(DISPLAY.layout), 20e-6)),))
+    built = BuiltRequest(sequence)
     thermal = ThermalEstimate(*DISPLAY.build_cold_state())
     snapshot = PlanningSnapshot(thermal, START_S, thermal.heat, thermal.budget)
-    request = PlanningRequest(lambda: sequence, "f", streamed=True)
-    return make_plan(DISPLAY, SCALE, request, sequence, snapshot, "p1", lambda fraction: None)
+    request = PlanningRequest(lambda: built, "f", streamed=True)
+    return make_plan(DISPLAY, SCALE, request, built, snapshot, "p1", lambda fraction: None)
 
 
 def cut(running, at_s):

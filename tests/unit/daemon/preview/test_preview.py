@@ -14,6 +14,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.beat import BeatWriter
 from optodrive.core.ipc import Message, MessageSocket
+from optodrive.daemon.engine import request_body
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.preview import jobs, worker
 from optodrive.daemon.preview.process import run_preview
@@ -171,10 +172,12 @@ def start(tmp_path, monkeypatch):
     """Return a function that starts a preview process; act: what building the body b"bad" does."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     warm_up(DISPLAY)
-    started, parse = [], jobs.parse_request
+    started, parse = [], request_body.parse_request
 
     def start_preview(act=build_slowly):
-        monkeypatch.setattr(jobs, "parse_request", lambda body, *more: act() if body == b"bad" else parse(body, *more))
+        monkeypatch.setattr(
+            request_body, "parse_request", lambda body, *more: act() if body == b"bad" else parse(body, *more)
+        )
         started.append(Preview())
         return started[-1]
 

@@ -12,8 +12,8 @@ from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.roles import ROLES
 from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.device.config import DaemonSection
 from optodrive.device.config_file import load_config
+from optodrive.device.config_sections import DaemonSection
 from optodrive.planning.display_model import DisplayModel
 
 

@@ -18,7 +18,7 @@ from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.listeners import open_tcp_listener
 from optodrive.daemon.web.request_head import Rank
 from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 SECRET = "a-valid-secret-of-a-viewer"
 BEARER = f"Authorization: Bearer {SECRET}"

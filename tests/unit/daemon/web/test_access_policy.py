@@ -20,7 +20,7 @@ from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
 from optodrive.daemon.web.audit import AuditLog
 from optodrive.daemon.web.route_table import Route, RouteTable
 from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 TOKENS = Tokens((Token("eve", "viewer", "eve"), Token("bob", "operator", "bob")))
 

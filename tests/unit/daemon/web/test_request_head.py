@@ -7,7 +7,7 @@ import pytest
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.request_head import HEAD_MAX_BYTES, Rank, is_complete, parse_head, peek_head, rank_request
 from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 SECRET = "a-valid-secret-of-a-viewer"
 

@@ -10,7 +10,7 @@ from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.route_table import RouteTable
 from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, read_cookie_token
 from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.device.config import DaemonSection
+from optodrive.device.config_sections import DaemonSection
 
 TOKEN = "the-token"
 POLICY = AccessPolicy(Tokens((Token("test", "viewer", TOKEN),)), DaemonSection())

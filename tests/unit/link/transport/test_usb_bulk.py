@@ -10,7 +10,7 @@ from usb_bridge import UsbBridge
 from displays import DISPLAYS
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError
-from optodrive.device.config import BoardSection
+from optodrive.device.config_sections import BoardSection
 from optodrive.link.board_setup import build_board_requirements, build_port_settings
 from optodrive.link.protocol.quantisation import quantise
 from optodrive.link.session.session import BoardSession

@@ -236,7 +236,7 @@ def test_progress_is_shown_while_orders_are_searched():
 
 def test_a_search_ends_at_its_limit_and_proves_nothing(monkeypatch):
     monkeypatch.setattr("optodrive.planning.feasibility.check.ORDERS_MAX", 5)
-    monkeypatch.setattr("optodrive.planning.feasibility.check.count_orders", lambda sequence: 1)
+    monkeypatch.setattr("optodrive.planning.feasibility.check.count_orders", lambda *_: 1)
     monkeypatch.setattr(order_search, "beam_lower_bound_s", lambda *given: None)
     _, report = check(build_frame(range(4), 100, duration_s=0.02))
     assert (report.fits, report.proof) == (False, "not found")

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from displays import DISPLAYS
-from optodrive.device.config import LimitsSection
+from optodrive.device.config_sections import LimitsSection
 from optodrive.planning.effective_config import build_effective_config
 from optodrive.planning.limiter import cap_checks
 from optodrive.planning.limiter.caps import CAP_NUMBERS, CAPS, REASONS, WRONG_ORDER, CapScale, CapValues

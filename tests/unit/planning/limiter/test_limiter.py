@@ -9,7 +9,7 @@ import pytest
 
 from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
 from optodrive.core.types.plans import PulsePlan
-from optodrive.planning.limiter.budget import Budget, GalvoModel
+from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.caps import CAPS
 from optodrive.planning.limiter.energy_windows import PulseHistory, WindowChains, append, max_window_power_w
 from optodrive.planning.limiter.limiter import (
@@ -20,14 +20,8 @@ from optodrive.planning.limiter.limiter import (
     shift_state,
     verify,
 )
-from optodrive.planning.limiter.worst_case import (
-    NominalThermalModel,
-    NominalTouch,
-    NominalWalls,
-    Uncertainty,
-    build_heat_bound,
-    specht_ratio,
-)
+from optodrive.planning.limiter.nominal_model import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
+from optodrive.planning.limiter.worst_case import build_heat_bound, specht_ratio
 from reference_models.thermal_display import NO_CAPS
 
 CERTAIN = Uncertainty(*[0.0] * len(Uncertainty.__dataclass_fields__))
@@ -58,7 +52,7 @@ SERVO = GalvoModel(
 def build_budget(**caps):
     """Build a budget in which only the given caps bind."""
     caps = NO_CAPS._replace(**caps)
-    return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), SERVO)
+    return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO))
 
 
 WITHOUT_CAPS = build_budget()
@@ -79,6 +73,7 @@ def pulses(*rows):
         target_m=np.full(len(rows), np.nan),
         requested_start_s=start,
         source=np.zeros(len(rows), dtype=np.int64),
+        stage=np.zeros(len(rows), dtype=np.int64),
     )
 
 
@@ -179,7 +174,7 @@ def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
 def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
     caps = NO_CAPS._replace(absorber_k=150.0)
     bare = replace(MODEL, walls=None, touch=None)
-    budget = Budget(caps, build_heat_bound(bare, CERTAIN, caps, 2.45), SERVO)
+    budget = Budget(caps, build_heat_bound(bare, CERTAIN, caps, 2.45), GalvoModels.from_models(SERVO))
     gentle = run(budget, (1, 0.0, 0.050, 1.0), (1, 9.0, 0.050, 1.0))
     assert gentle.trimmed_j.sum() == 0
     limited = run(budget, (1, 0.0, 0.050, 2.45), (0, 100.0, 0.050, 2.45))
@@ -291,7 +286,7 @@ def search_max_power_w(window_s, cap_j, rows, start, width):
 def test_the_energy_window_agrees_with_an_exhaustive_search():
     rng = np.random.default_rng(5)
     for _ in range(15):
-        history = PulseHistory(*np.zeros((3, 12)), np.zeros(12, dtype=np.int64), np.zeros(1, dtype=np.int64))
+        history = PulseHistory(*np.zeros((3, 12)), *np.zeros((2, 12), dtype=np.int64), np.zeros(1, dtype=np.int64))
         chain = WindowChains(np.full(1, -1), np.full(1, -1), np.zeros(1), np.full(12, -1), np.zeros(12))
         time, rows = 0.0, []
         for row in range(12):

@@ -149,7 +149,7 @@ def test_the_best_candidate_meets_the_deadline_and_has_gaps():
 
 
 def test_sub_pulses_without_a_gap_are_not_selected():
-    wide_gap = replace(DISPLAY, scan_head=replace(DISPLAY.scan_head, pulse_gap_s=0.01))
+    wide_gap = replace(DISPLAY, scan_heads=(replace(DISPLAY.scan_head, pulse_gap_s=0.01),))
     two = frame({200: 100, 201: 100})
     assert plan_frames(two).simultaneous[0].interleaved_rounds > 1
     assert plan_frames(two, display=wide_gap).simultaneous[0].interleaved_rounds == 1

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
+from optodrive.planning.scheduler.stage_assignment import LightEstimate, StageAssignment
 
 
 class PulseByPulse:
@@ -21,23 +22,26 @@ class PulseByPulse:
         return PulseByPulse(self._heat.copy())
 
 
-def plan_batches(display, frames, heat, initial_pixel, pause_count):
+def plan_batches(display, frames, heat, initial_pixel, pause_count, stage_count):
     """Return the batches of a scheduler, the first ones with pauses, and what it skipped."""
-    scheduler = Scheduler(
-        display.scan_head, FrameSequence(frames), display.build_cold_heat, initial_pixel=initial_pixel
-    )
+    sequence, scan_heads = FrameSequence(frames), display.scan_heads * stage_count
+    reach = np.ones((stage_count, len(display.pixels)), dtype=bool)
+    light = LightEstimate.from_cold(display.build_cold_heat(), display.max_displacement_m, display.scan_head.drive)
+    assignment = StageAssignment(sequence, scan_heads, reach, light)
+    initial_pixels = None if initial_pixel is None else (initial_pixel,) * stage_count
+    scheduler = Scheduler(scan_heads, assignment, sequence, display.build_cold_heat, initial_pixels=initial_pixels)
     batches, pauses = [], []
 
     def grant(batch):
         if len(pauses) < pause_count:
-            pauses.append(GalvoPause(len(batch) * (len(pauses) + 1) // 4, 1234))
+            pauses.append(GalvoPause(len(batch) * (len(pauses) + 1) // 4, len(pauses) % stage_count, 1234))
             scheduler.pause(pauses[-1])
             return None
         batches.append(batch)
         return batch
 
     list(scheduler.run(heat, grant))
-    return batches, scheduler.skipped, scheduler._beam
+    return batches, sorted(scheduler.skipped, key=lambda each: (each.source, each.pixel)), scheduler._state
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -46,8 +50,9 @@ def plan_batches(display, frames, heat, initial_pixel, pause_count):
     count=st.sampled_from([1, 2, 30, 400]),
     initial_pixel=st.sampled_from([None, 0, 200]),
     pause_count=st.integers(0, 3),
+    stage_count=st.integers(1, 4),
 )
-def test_the_kernel_plans_what_the_loop_plans(display, seed, count, initial_pixel, pause_count):
+def test_the_kernel_plans_what_the_loop_plans(display, seed, count, initial_pixel, pause_count, stage_count):
     rng = np.random.default_rng(seed)
     frames = []
     for number in range(2):  # the second frame meets warm pixels, of which some need no pulse
@@ -55,7 +60,7 @@ def test_the_kernel_plans_what_the_loop_plans(display, seed, count, initial_pixe
         target_m[rng.choice(len(display.layout), count, replace=False)] = rng.uniform(1e-6, 2e-4, count)
         frames.append(TactileFrame("f", 0.02 * number, 0.5, target_m))
     by_kernel, by_loop = (
-        plan_batches(display, tuple(frames), heat, initial_pixel, pause_count)
+        plan_batches(display, tuple(frames), heat, initial_pixel, pause_count, stage_count)
         for heat in (display.build_cold_heat(), PulseByPulse(display.build_cold_heat()))
     )
     assert by_kernel[1:] == by_loop[1:]

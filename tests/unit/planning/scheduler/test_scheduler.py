@@ -101,7 +101,8 @@ def cold(display):
 
 
 def start(display, *frames):
-    return Scheduler(display.scan_head, FrameSequence(frames), display.build_cold_heat)
+    sequence = FrameSequence(frames)
+    return Scheduler(display.scan_heads, display.build_assignment(sequence), sequence, display.build_cold_heat)
 
 
 def test_a_delayed_batch_and_everything_after_it_start_later(display):
@@ -121,10 +122,10 @@ def test_a_delayed_batch_and_everything_after_it_start_later(display):
 def test_a_pause_follows_the_first_pulses_of_a_batch(display):
     scheduler, heat = start(display, frame(display, {3: 50, 4: 50, 5: 50})), cold(display)
     whole = scheduler.next_batch(heat)
-    scheduler.pause(GalvoPause(2, 100_000))
+    scheduler.pause(GalvoPause(2, 0, 100_000))
     paused = scheduler.next_batch(heat)
     assert paused.start_s == pytest.approx(whole.start_s + np.array([0.0, 0.0, 0.1]))
-    scheduler.pause(GalvoPause(2, 50_000))
+    scheduler.pause(GalvoPause(2, 0, 50_000))
     again = scheduler.next_batch(heat)
     assert again.start_s == pytest.approx(paused.start_s + np.array([0.0, 0.0, 0.05]))
     scheduler.accept()
@@ -134,14 +135,14 @@ def test_a_pause_follows_the_first_pulses_of_a_batch(display):
 def test_a_pause_before_the_first_pulse_delays_the_batch(display):
     scheduler, heat = start(display, frame(display, {3: 50, 4: 50})), cold(display)
     whole = scheduler.next_batch(heat)
-    scheduler.pause(GalvoPause(0, 50_000))
+    scheduler.pause(GalvoPause(0, 0, 50_000))
     assert scheduler.next_batch(heat).start_s == pytest.approx(whole.start_s + 0.05)
 
 
 def test_a_delayed_batch_is_planned_without_its_pauses(display):
     scheduler, heat = start(display, frame(display, {3: 50, 4: 50})), cold(display)
     whole = scheduler.next_batch(heat)
-    scheduler.pause(GalvoPause(1, 50_000))
+    scheduler.pause(GalvoPause(1, 0, 50_000))
     scheduler.next_batch(heat)
     scheduler.delay(20_000)
     assert scheduler.next_batch(heat).start_s == pytest.approx(whole.start_s + 0.02)

@@ -12,17 +12,17 @@ TRAINS = (
 
 
 def test_the_pulses_of_all_trains_are_in_order_of_time_and_of_the_trains():
-    pulses = list_train_pulses(TRAINS, first_source=4)
+    pulses = list_train_pulses(dict(enumerate(TRAINS, 4)))
     assert len(pulses) == 50 + 50 + 143
     assert [pulse[:2] for pulse in pulses] == sorted(pulse[:2] for pulse in pulses)
     assert pulses[:2] == [(0, 4, 7, 10_000, 1.0), (0, 5, 2, 0, 0.0)]
     assert all(type(value) is int for value in pulses[0][:4])
-    assert list_train_pulses((), 0) == []
+    assert list_train_pulses({}) == []
 
 
 @pytest.mark.parametrize("pulses_per_report", [1, 100])
 def test_long_lists_report_progress(monkeypatch, pulses_per_report):
     monkeypatch.setattr(train_pulses, "PROGRESS_PULSES", pulses_per_report)
     reports = []
-    pulses = list_train_pulses(TRAINS, 0, lambda: reports.append(1))
+    pulses = list_train_pulses(dict(enumerate(TRAINS)), lambda: reports.append(1))
     assert len(reports) >= len(pulses) / pulses_per_report

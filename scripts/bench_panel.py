@@ -1,0 +1,71 @@
+"""Benchmark of the panel's cost: pixels raised to their height per second over an hour, at two room temperatures.
+
+Frames follow each other without a pause in virtual time, trimmed by the limiter where they must be. "without": a panel
+that stays at the room's temperature.
+"""
+
+import argparse
+import sys
+
+import numpy as np
+
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.device.config_file import load_config
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.limiter import shift_state
+from optodrive.planning.limiter.usage import compute_panel_k
+from optodrive.planning.pipeline import plan_sequence
+
+ROOMS_C = (23.0, 30.0)
+FULL_SHARE = 0.9
+"""Share of the requested height from which a pixel counts as raised."""
+COLD_PANEL = {"resistance_k_per_w": 1e-3, "capacity_j_per_k": 1e5}
+FINGERTIP = [700 + 39 * row + column for row in range(5) for column in range(5)]
+CASES = (
+    ("display-1511", "all pixels", None, 50.0),
+    ("display-1511", "all pixels", None, 100.0),
+    ("display-1511", "25 pixels under a fingertip", FINGERTIP, 50.0),
+    ("display-437", "all pixels", None, 50.0),
+    ("display-16", "all pixels", None, 50.0),
+)
+
+
+def build_display(name, room_c, has_panel):
+    """Build the display of a shipped configuration in a room."""
+    config = load_config(name).model_copy(update={"ambient_c": room_c})
+    if not has_panel:
+        config = config.model_copy(update={"panel": config.panel.model_copy(update=COLD_PANEL)})
+    return DisplayModel.from_config(config)
+
+
+def measure(display, pixels, height_um, duration_s):
+    """Show one frame after the other; return the raised pixels per second, and the panel's bound at the end, K."""
+    target_m = np.zeros(len(display.pixels))
+    target_m[slice(None) if pixels is None else pixels] = height_um * 1e-6
+    sequence = FrameSequence((TactileFrame("f", 0.0, duration_s, target_m),))
+    heat, budget = display.build_cold_state()
+    now_s, raised = 0.0, 0
+    while now_s < duration_s:
+        planned = plan_sequence(display, sequence, heat, budget)
+        end_s = float(planned.plan.start_s[-1] + planned.plan.width_s[-1])
+        raised += int(np.count_nonzero(planned.predicted_m >= FULL_SHARE * height_um * 1e-6))
+        heat, budget = planned.heat.copy_shifted(-end_s), shift_state(planned.budget, -end_s)
+        now_s += end_s
+    return raised / now_s, compute_panel_k(budget, display.budget, budget.at_s)
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="scripts/bench panel", description=__doc__)
+    parser.add_argument("--hours", type=float, default=1.0, help="time that is simulated")
+    options = parser.parse_args()
+    for name, what, pixels, height_um in CASES:
+        for room_c in ROOMS_C:
+            without, _ = measure(build_display(name, room_c, False), pixels, height_um, 3600.0 * options.hours)
+            rate, panel_k = measure(build_display(name, room_c, True), pixels, height_um, 3600.0 * options.hours)
+            case = f"{name}, {what} to {height_um:g} µm, room at {room_c:g} °C"
+            print(f"{case}: {without:.1f} → {rate:.1f} pixels/s, panel up to {panel_k:.1f} K", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""Several optical stages in a configuration."""
+
+import numpy as np
+import pytest
+
+from optodrive.cli.main import run
+from optodrive.core.errors import InputError
+from optodrive.device.config_file import load_config, locate_shipped
+
+TWO_STAGES = """
+[[stages]]
+name = "left"
+columns = [0, 1]
+board = { transport = "serial", port = "/dev/ttyACM0" }
+scanner = { aim_error_m = 1e-5 }
+
+[[stages]]
+name = "right"
+columns = [1, 3]
+board = { transport = "serial", port = "/dev/ttyACM1" }
+laser = { max_power_w = 1.5 }
+"""
+
+
+def load(folder, stages, replaced=("", "")):
+    text = locate_shipped("display-16.toml").read_text().replace(*replaced)
+    (folder / "display.toml").write_text(text + stages)
+    return load_config(folder / "display.toml")
+
+
+def test_a_stage_states_what_differs_from_the_sections(tmp_path):
+    config = load(tmp_path, TWO_STAGES)
+    left, right = config.list_stage_configs()
+    assert (left.board.port, right.board.port) == ("/dev/ttyACM0", "/dev/ttyACM1")
+    assert (left.laser, right.laser.max_power_w) == (config.laser, 1.5)
+    assert right.laser.pwm_hz == config.laser.pwm_hz
+    assert (left.scanner.aim_error_m, right.scanner) == (1e-5, config.scanner)
+    assert left.reach.tolist() == [column <= 1 for _ in range(4) for column in range(4)]
+
+
+def test_without_stages_the_sections_are_the_only_one():
+    config = load_config("display-16")
+    assert config.list_stage_configs() == (config,)
+    assert config.reach.all()
+
+
+def test_a_single_stage_is_the_configuration(tmp_path):
+    config = load(tmp_path, '[[stages]]\nname = "only"\nlaser = { max_power_w = 1.5 }\n')
+    assert config.laser.max_power_w == 1.5
+    config.require_one_stage()
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        (TWO_STAGES.replace('"right"', '"left"'), "two stages have the same name"),
+        (TWO_STAGES.replace("ttyACM1", "ttyACM0").replace("laser =", "#"), "two stages have the same board"),
+        (TWO_STAGES.replace("[1, 3]", "[2, 2]"), "no stage reaches pixel 3"),
+        (TWO_STAGES.replace("1e-5", "9e-4"), r"stages\[0\]: laser.focus_width_m .* does not fit"),
+        (TWO_STAGES.replace("1.5", "-1.5"), r"stages.1.laser.max_power_w: got -1.5"),
+        (TWO_STAGES.replace("max_power_w", "max_power"), r"stages.1.laser.max_power: got 'max_power', expected"),
+        (TWO_STAGES.replace("1.5", "1500"), r"stages\[1\].laser.max_power_w: got 1500"),
+        (TWO_STAGES.replace('name = "left"', ""), r"stages.0.name: got None, expected this key"),
+        (TWO_STAGES.replace("[0, 1]", "[1, 0]"), r"stages\[0\]: its rows and columns hold no pixel"),
+        (
+            TWO_STAGES.replace('port = "/dev/ttyACM1"', 'port = "/dev/ttyACM0", baud = 9600'),
+            "two stages have the same board",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_one_line(tmp_path, stages, message):
+    with pytest.raises(InputError, match=message) as refused:
+        load(tmp_path, stages)
+    assert "\n" not in str(refused.value)
+
+
+def test_stages_are_a_list_of_tables(tmp_path):
+    (tmp_path / "display.toml").write_text("stages = 3\n" + locate_shipped("display-16.toml").read_text())
+    with pytest.raises(InputError, match="stages: got 3"):
+        load_config(tmp_path / "display.toml")
+
+
+def test_each_stage_has_its_measured_servo_and_the_smallest_cap_holds(tmp_path):
+    (tmp_path / "right.toml").write_text(
+        'format = "optodrive-mirrors"\nversion = 1\n[scanner]\nbandwidth_hz = 1500.0\ndamping = 0.6\n'
+        "delay_s = 1e-4\nslew_rad_per_s = 200.0\n[galvo]\nshare = 0.8\n"
+    )
+    measured = TWO_STAGES + 'scanner = { mirrors = "right.toml" }\n'
+    config, plain = load(tmp_path, measured), load(tmp_path, TWO_STAGES)
+    left, right = config.list_stage_configs()
+    assert (left.scanner.bandwidth_hz, right.scanner.bandwidth_hz) == (plain.scanner.bandwidth_hz, 1500.0)
+    caps = [each.limits.galvo_acceleration_rms_max_rad_per_s2 for each in (config, plain)]
+    assert caps[0] == pytest.approx(0.8 * caps[1])
+
+
+@pytest.mark.parametrize("option", ["--field", "--mirrors"])
+def test_a_file_for_one_scanner_is_refused(tmp_path, option, capsys):
+    load(tmp_path, TWO_STAGES)
+    (tmp_path / "frames.json").write_text("{}")
+    arguments = ("plan", tmp_path / "frames.json", "--config", tmp_path / "display.toml", option, "given.toml")
+    assert run([str(each) for each in arguments]) == 2
+    assert f"{option}: got 'given.toml', expected one stage" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["serve", "simulate", "first-light", "home", "doctor"])
+def test_commands_that_drive_a_board_refuse_several_stages(tmp_path, command, capsys):
+    load(tmp_path, TWO_STAGES)
+    (tmp_path / "frames.json").write_text("{}")
+    own = {"simulate": [tmp_path / "frames.json", "--out", tmp_path / "out.h5"], "first-light": ["--yes"]}
+    arguments = (command, *own.get(command, ()), "--config", tmp_path / "display.toml")
+    assert run([str(each) for each in arguments]) != 0
+    printed = capsys.readouterr()
+    assert "stages: got 2, expected one" in printed.out + printed.err
+
+
+def test_rows_restrict_the_reach(tmp_path):
+    rows = TWO_STAGES.replace("columns = [0, 1]", "rows = [0, 1]").replace("columns = [1, 3]", "rows = [2, 3]")
+    lower, upper = load(tmp_path, rows).list_stage_configs()
+    assert np.flatnonzero(lower.reach).tolist() == list(range(8))
+    assert np.flatnonzero(upper.reach).tolist() == list(range(8, 16))
