@@ -85,7 +85,7 @@ class PlanQueue:
         """
         with self.lock:
             thermal = self._thermal.estimate
-            start_s = self._earliest_start_s(streamed, planning_time_s if streamed else 0.0)
+            start_s = self._earliest_start_s(streamed, planning_time_s)
             last = self._find_running_stream() if streamed else None
         if last is not None:
             snapshot = self._build_cut_snapshot(last, thermal, planning_time_s)
@@ -120,9 +120,11 @@ class PlanQueue:
 
     # --- accepting plans ----------------------------------------------------------------------------------------
 
-    def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot) -> bool:
-        """Accept a plan into the queue. Return False if its snapshot is stale or its splice too late.
+    def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot, cooling_max_m: float = inf) -> bool:
+        """Accept a plan into the queue. Return False if its snapshot is stale, or if the plan is too late.
 
+        A plan is too late if its splice has passed, or if it would start so much later than planned that a pixel's
+        displacement meanwhile decreases by more than cooling_max_m, m.
         Raise StoppedError if the epoch of its request has passed, or if the token of its caller was revoked.
         """
         self._session.receive()  # a STOP that has been answered is known from here on
@@ -136,7 +138,12 @@ class PlanQueue:
             if self._thermal.estimate is not snapshot.thermal:
                 return False
             if snapshot.predecessor is None:
-                record.start_s = max(record.start_s, self._earliest_start_s(record.streamed))
+                start_s = max(record.start_s, self._earliest_start_s(record.streamed))
+                if start_s > record.start_s:
+                    if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > cooling_max_m:
+                        return False
+                    plan.heat_before, plan.budget_before = snapshot.thermal.shift_to_plan(start_s)
+                record.start_s = start_s
                 self.waiting.append(plan)
             elif not self._splice(plan, snapshot.predecessor, snapshot.cut_row):
                 return False

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import suppress
 from itertools import count
+from math import inf
 from time import thread_time
 from typing import Any, Protocol, TypeVar
 
@@ -15,7 +16,7 @@ from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.planning_time import PlanningTime
+from optodrive.daemon.engine.planning_time import FACTOR, PlanningTime
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.service.remote_session import RemoteSession
@@ -24,6 +25,10 @@ STALL_TIMEOUT_S = 2.0
 """A planner without progress for this time counts as stalled, and the lease is no longer renewed."""
 SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
+COOLING_MAX_M = 1e-6
+"""A plan during whose delay a pixel's displacement decreases by more than this is made again, for the heat then."""
+LATE_MAX = 4
+"""Number of late attempts after which a plan starts as soon as it is ready."""
 PLANNING_MAX_S = 60.0
 """Processor time for the planning of one request at most, s; meanwhile all others wait."""
 REALTIME_MAX_S = 0.1
@@ -181,7 +186,7 @@ class Planner:
     def _plan_until_committed(
         self, built: BuiltRequest, request: PlanningRequest, check: Callable[[float], None]
     ) -> ActivePlan:
-        late_count = 0
+        late_count, took_s = 0, 0.0
         while True:
             check(0.0)
             self._require_armed()
@@ -189,13 +194,21 @@ class Planner:
                 self._run_in_loop(self._plan_queue.pause.require_no_pause)
             if request.streamed and self._plan_queue.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
-            plan = self._plan_once(built, request, self._planning_time.compute_reserved_s(late_count), check)
+            began_s = self._clock.now_s()
+            plan = self._plan_once(
+                built, request, late_count, self._compute_reserved_s(request, late_count, took_s), check
+            )
             if plan is not None:
                 return plan
-            # The snapshot is stale: a predecessor was late, or has sent points beyond the splice.
+            took_s = self._clock.now_s() - began_s
+            # The snapshot is stale: a predecessor was late, has sent points beyond the splice, or its heat is gone.
             late_count += 1
             if request.streamed and late_count == SPLICE_TRIES:
                 self._run_in_loop(self._plan_queue.truncate_stream)
+
+    def _compute_reserved_s(self, request: PlanningRequest, late_count: int, took_s: float) -> float:
+        """Return the time to reserve for an attempt after late ones, of which the last took took_s."""
+        return self._planning_time.compute_reserved_s(late_count) if request.streamed else FACTOR * late_count * took_s
 
     def _preempt(self, request: PlanningRequest) -> None:
         """Make room for a streamed plan, unless its epoch has passed."""
@@ -207,17 +220,20 @@ class Planner:
         self,
         built: BuiltRequest,
         request: PlanningRequest,
-        planning_time_s: float,
+        late_count: int,
+        reserved_s: float,
         check: Callable[[float], None],
     ) -> ActivePlan | None:
-        """Plan once. Return None if the snapshot became stale, or the display was dimmed, meanwhile."""
+        """Plan once. Return None if the plan is late, the snapshot stale, or the display was dimmed meanwhile."""
         began_s, display = self._clock.now_s(), self._dimmer.display
-        snapshot = self._plan_queue.make_snapshot(request.streamed, planning_time_s)
+        cooling_max_m = COOLING_MAX_M if late_count < LATE_MAX else inf
+        snapshot = self._plan_queue.make_snapshot(request.streamed, reserved_s)
         plan_id = f"p{next(self._ids)}"
         plan = make_plan(display, self._session.scale, request, built, snapshot, plan_id, check)
-        self._planning_time.record(self._clock.now_s() - began_s)
+        if request.streamed:
+            self._planning_time.record(self._clock.now_s() - began_s)
 
         def commit() -> bool:
-            return self._dimmer.display is display and self._plan_queue.commit(plan, snapshot)
+            return self._dimmer.display is display and self._plan_queue.commit(plan, snapshot, cooling_max_m)
 
         return plan if self._run_in_loop(commit) else None

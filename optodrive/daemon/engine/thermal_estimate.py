@@ -25,6 +25,11 @@ class ThermalEstimate:
         """Return both on the time line of a plan whose zero is board time start_s."""
         return self.heat.copy_shifted(-start_s), shift_state(self.budget, -start_s)
 
+    def compute_cooling_m(self, from_s: float, to_s: float) -> float:
+        """Return the largest decrease of a pixel's displacement between two board times, m."""
+        before_m, after_m = (self.heat.state_at(at_s).displacement_m for at_s in (from_s, to_s))
+        return float(np.max(before_m - after_m))
+
     @classmethod
     def from_plan(cls, heat: ThermalState, budget: BudgetState, start_s: float) -> "ThermalEstimate":
         """Build the estimate from states on the time line of a plan whose zero is board time start_s."""

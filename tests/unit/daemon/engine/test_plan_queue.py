@@ -1,6 +1,7 @@
 """Queue and planner over a real link service in virtual time: epochs, streams, cancelling, clocks."""
 
 import threading
+from math import inf
 
 import pytest
 
@@ -9,7 +10,7 @@ from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.daemon.engine import planner
 from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.planner import PLANNING_MAX_S, REQUESTS_MAX
+from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from planner_rig import PlannerRig, build_frame, build_train
@@ -46,6 +47,48 @@ def test_a_streamed_plan_replaces_the_unsent_rest_without_a_pause(rig):
     assert (first.status, second.status) == ("superseded", "done")
     assert first.executed_count + first.dropped == 16
     assert rig.session.board.underruns == 0
+
+
+def show_after_another(rig, delays_s, streamed):
+    """Show a frame on a warm pixel, with delays between planning and commit; return its record."""
+    first = submit(rig, build_frame(300.0, (5,), 0.02), streamed)
+    rig.until(lambda: first.executed_count == 1)
+    left = list(delays_s)
+
+    def sleep():
+        if left:
+            ServiceRig.run(rig, left.pop(0))
+
+    rig.before_loop_action = sleep
+    return finish(rig, submit(rig, build_frame(300.0, (5,), 0.02), streamed))
+
+
+@pytest.mark.parametrize("streamed", [True, False])
+def test_a_plan_whose_pixels_have_cooled_is_made_again(rig, streamed):
+    record = show_after_another(rig, [0.08], streamed)
+    assert record.plan_id == "p3"
+    assert record.execution.simulated_m == pytest.approx([300e-6], rel=0.01)
+
+
+@pytest.mark.parametrize("streamed", [True, False])
+def test_on_cold_pixels_a_late_plan_is_as_good(rig, streamed):
+    rig.before_loop_action = lambda: ServiceRig.run(rig, 0.5)
+    record = finish(rig, submit(rig, build_frame(300.0, (5,), 0.02), streamed))
+    assert record.plan_id == "p1"
+    assert record.execution.simulated_m == pytest.approx([300e-6], rel=0.01)
+
+
+def test_a_plan_that_is_always_late_starts_all_the_same(rig, monkeypatch):
+    monkeypatch.setattr(planner, "COOLING_MAX_M", -1.0)  # as on a display that never stops cooling
+    record = show_after_another(rig, [1.0] * 20, streamed=True)
+    assert (record.status, record.plan_id) == ("done", f"p{LATE_MAX + 2}")
+
+
+@pytest.mark.parametrize("streamed", [True, False])
+def test_without_the_bound_on_cooling_a_late_bump_is_too_low_and_telemetry_says_so(rig, monkeypatch, streamed):
+    monkeypatch.setattr(planner, "COOLING_MAX_M", inf)
+    record = show_after_another(rig, [0.08], streamed)
+    assert record.execution.simulated_m < 0.97 * 300e-6
 
 
 def test_stop_ends_running_and_waiting_plans_and_says_so(rig):
