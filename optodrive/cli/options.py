@@ -79,14 +79,12 @@ def load_run_config(
     from optodrive.device.pixel_map import replace_pixel_map
 
     # mirrors.toml lowers a cap: the given file replaces that of the configuration instead of lowering the cap twice.
-    loaded = (
-        load_config(config)
-        if mirrors is None
-        else apply_measured_servo(load_config(config, measured_servo=False), mirrors)
-    )
+    loaded = load_config(config, measured_servo=mirrors is None)
     if len(loaded.stages) > 1 and (field or mirrors):
         option, path = ("--field", field) if field else ("--mirrors", mirrors)
         raise InputError(option, str(path), "one stage; of several, each states its files in its [stages.scanner]")
+    if mirrors is not None:
+        loaded = apply_measured_servo(loaded, mirrors)
     if field is not None:
         scanner = loaded.scanner.model_copy(update={"field": str(field)})
         loaded = loaded.model_copy(update={"scanner": scanner})

@@ -5,13 +5,13 @@ from rig import Board, Daemon, wait_for
 INTERLOCK = """
 [[step]]
 from = "light"
-at_s = 0.5
+at_s = 2.0
 set = "interlock"
 value = false
 
 [[step]]
 from = "light"
-at_s = 1.5
+at_s = 3.0
 set = "interlock"
 value = true
 """

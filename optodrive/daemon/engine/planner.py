@@ -186,7 +186,7 @@ class Planner:
     def _plan_until_committed(
         self, built: BuiltRequest, request: PlanningRequest, check: Callable[[float], None]
     ) -> ActivePlan:
-        late_count, took_s = 0, 0.0
+        late_count, took_s, plan_id = 0, 0.0, f"p{next(self._ids)}"
         while True:
             check(0.0)
             self._require_armed()
@@ -195,9 +195,8 @@ class Planner:
             if request.streamed and self._plan_queue.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
             began_s = self._clock.now_s()
-            plan = self._plan_once(
-                built, request, late_count, self._compute_reserved_s(request, late_count, took_s), check
-            )
+            reserved_s = self._compute_reserved_s(request, late_count, took_s)
+            plan = self._plan_once(built, request, plan_id, late_count, reserved_s, check)
             if plan is not None:
                 return plan
             took_s = self._clock.now_s() - began_s
@@ -220,6 +219,7 @@ class Planner:
         self,
         built: BuiltRequest,
         request: PlanningRequest,
+        plan_id: str,
         late_count: int,
         reserved_s: float,
         check: Callable[[float], None],
@@ -228,7 +228,6 @@ class Planner:
         began_s, display = self._clock.now_s(), self._dimmer.display
         cooling_max_m = COOLING_MAX_M if late_count < LATE_MAX else inf
         snapshot = self._plan_queue.make_snapshot(request.streamed, reserved_s)
-        plan_id = f"p{next(self._ids)}"
         plan = make_plan(display, self._session.scale, request, built, snapshot, plan_id, check)
         if request.streamed:
             self._planning_time.record(self._clock.now_s() - began_s)
