@@ -100,11 +100,11 @@ def measure_superseding():
     from optodrive.daemon.engine.request_body import BuiltRequest
     from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
     from optodrive.device.config_file import load_config
-    from optodrive.link.board_setup import build_board_requirements
+    from optodrive.link.board_setup import build_scales
     from optodrive.planning.display_model import DisplayModel
 
     display = DisplayModel.from_config(load_config("display-1511"))
-    scale = build_board_requirements(display.config).scale
+    scales = build_scales(display.config)
     thermal = ThermalEstimate(*display.build_cold_state())
     snapshot = PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
     rng, times = np.random.default_rng(7), []
@@ -114,9 +114,9 @@ def measure_superseding():
         built = BuiltRequest(FrameSequence((TactileFrame("f", 0.0, 60.0, target),)))
         request = PlanningRequest(lambda: built, "bench", streamed=True)  # noqa: B023 - not called later
         begin_s = time.process_time()
-        plan = make_plan(display, scale, request, built, snapshot, f"p{number}", lambda fraction: None)
+        plan = make_plan(display, scales, request, built, snapshot, f"p{number}", lambda fraction: None)
         planned_s = time.process_time()
-        snapshot = build_cut_snapshot(plan, thermal, (number + 1) / RATE_HZ, display.budget)
+        snapshot = build_cut_snapshot(plan, thermal, (number + 1) / RATE_HZ, display.budget, scales[0].tick_s)
         times.append((planned_s - begin_s, time.process_time() - planned_s))
     name = f"frame of {ACTIVE} pixels that truncates the one before it"
     make_s, cut_s = np.array(times[10:]).T

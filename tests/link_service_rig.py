@@ -8,6 +8,7 @@ from optodrive.core.ipc import Message
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.service.link_service import LinkService
+from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
@@ -24,14 +25,18 @@ class ServiceRig:
     def __init__(self, on_web_loss="dark", link_type=MemoryLink, settings=None, requirements=REQUIREMENTS):
         self.log = []
         self.clock = ManualClock(5.0)
-        self.core = BoardCore(settings, sink=self.log.append, seed=3)
-        self.link = link_type(self.core, self.clock)
-        self.session = BoardSession(self.link, self.clock, requirements)
-        self.service = LinkService(self.session, self.clock, self.open_port, on_web_loss)
+        self.boards = self.build_boards(link_type, settings, requirements)
+        self.service = LinkService(self.boards, self.clock, self.open_port, on_web_loss)
         self.received = {}
         self.alive = {}
         self.request_ids = itertools.count(1)
         self.job_numbers = itertools.count(1)
+
+    def build_boards(self, link_type, settings, requirements):
+        self.core = BoardCore(settings, sink=self.log.append, seed=3)
+        self.link = link_type(self.core, self.clock)
+        self.session = BoardSession(self.link, self.clock, requirements)
+        return BoardGroup([self.session], self.clock)
 
     def open_port(self):
         self.link.open()
@@ -93,7 +98,7 @@ class ServiceRig:
     def until(self, condition, patience_s=12.0):
         give_up_s = self.clock.now_s() + patience_s
         while not (result := condition()):
-            assert self.clock.now_s() < give_up_s, f"timed out: {self.session.board}"
+            assert self.clock.now_s() < give_up_s, f"timed out: {self.boards.board}"
             self.run()
         return result
 
@@ -103,7 +108,7 @@ class ServiceRig:
     # --- scenes
 
     def connect(self):
-        self.until(lambda: self.session.connected)
+        self.until(lambda: self.boards.connected)
         return self
 
     def arm(self, client=WEB, **fields):
@@ -123,7 +128,7 @@ class ServiceRig:
         """Hand points over as the planner does; return the number of the job."""
         number, payload = next(self.job_numbers), points.encode_payload()
         fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "ahead_s": ahead_s}
-        fields |= {"pause": self.pause_number if pause is None else pause}
+        fields |= {"pause": self.pause_number if pause is None else pause, "counts": [len(points)]}
         fields |= {"start_s": self.session.board_s() + start_in_s, "crc": zlib.crc32(payload) if crc is None else crc}
         self.send(PLANNER, "begin", payload, **fields)
         return number
@@ -131,8 +136,8 @@ class ServiceRig:
     def splice(self, points, kept_points, epoch=None, ahead_s=None, pause=None):
         number, payload = next(self.job_numbers), points.encode_payload()
         fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "ahead_s": ahead_s}
-        fields |= {"pause": self.pause_number if pause is None else pause}
-        fields |= {"kept_points": kept_points, "crc": zlib.crc32(payload)}
+        fields |= {"pause": self.pause_number if pause is None else pause, "counts": [len(points)]}
+        fields |= {"kept_points": [kept_points], "crc": zlib.crc32(payload)}
         return number, self.find_result(PLANNER, self.request(PLANNER, "splice", payload, **fields))
 
     def list_emitted(self):

@@ -16,6 +16,7 @@ from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
+from optodrive.link.board_setup import build_scales
 from optodrive.link.service import remote_session
 from optodrive.link.service.remote_session import RemoteSession
 
@@ -80,17 +81,17 @@ class PlannerRig(ServiceRig):
     and commit
     """
 
-    def __init__(self, monkeypatch, queue_type=PlanQueue, **options):
+    def __init__(self, monkeypatch, queue_type=PlanQueue, display=DISPLAY, **options):
         super().__init__(**options)
         # A reply is there as soon as the request has been sent.
         monkeypatch.setattr(remote_session, "select", SimpleNamespace(select=lambda *_: ([], [], [])))
         self.hello_all()
-        self.remote = DirectSession(self.session.scale, self.clock)
+        self.remote = DirectSession(build_scales(display.config), self.clock)
         self.remote.attach(ServiceChannel(self))
         self.store = PlanStore()
-        self.queue = queue_type(DISPLAY, self.remote, self.store, InlineExecutor())
+        self.queue = queue_type(display, self.remote, self.store, InlineExecutor())
         self.before_loop_action = lambda: None
-        self.dimmer = Dimmer(DISPLAY, ThermalMemory())
+        self.dimmer = Dimmer(display, ThermalMemory())
         self.planner = Planner(
             self.dimmer, self.remote, self.queue, self.clock, InlineExecutor(), self._run_in_loop, lambda: None
         )
@@ -131,8 +132,8 @@ class PlannerRig(ServiceRig):
         return self
 
 
-def build_frame(height_um=60.0, pixels=range(16), duration_s=1.0):
-    target_m = np.zeros(16)
+def build_frame(height_um=60.0, pixels=range(16), duration_s=1.0, count=16):
+    target_m = np.zeros(count)
     target_m[list(pixels)] = height_um * 1e-6
     return FrameSequence((TactileFrame("f", 0.0, duration_s, target_m),))
 

@@ -38,9 +38,10 @@ class BoardAccess(NamedTuple):
 
 
 @contextmanager
-def open_board(config: str | None, calibrated_field: bool = False) -> Iterator[BoardAccess]:
+def open_board(config: str | None, calibrated_field: bool = False, stage: str | None = None) -> Iterator[BoardAccess]:
     """Open the configured board and sensor; on exit, send ABORT and close both.
 
+    stage: name of the stage whose board it is, None for the only one
     calibrated_field: aim by the field of the configuration; by default by the nominal one, for an invalid field.toml
     must not prevent a new calibration.
     SIGTERM and SIGHUP end the block like Ctrl-C. Raises InputError for a configuration that cannot be used, and
@@ -56,13 +57,12 @@ def open_board(config: str | None, calibrated_field: bool = False) -> Iterator[B
     from optodrive.link.transport.serial_port import SerialPort
     from optodrive.planning.display_model import DisplayModel
 
-    loaded = load_config(config)
-    loaded.require_one_stage()
+    loaded = load_config(config).select_stage(stage)
     if not calibrated_field:
         loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()
     board, clock = loaded.board, MonotonicClock()
-    transport, sensor_port = build_bench_transport(build_port_settings(board), config or DEFAULT_CONFIG)
+    transport, sensor_port = build_bench_transport(build_port_settings(board), config or DEFAULT_CONFIG, stage)
     for signal_number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(signal_number, signal.default_int_handler)
     with ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import DEFAULT_URL, HoldOption, JsonOption, UrlOption
+from optodrive.cli.options import DEFAULT_URL, HoldOption, JsonOption, StageOption, UrlOption
 from optodrive.cli.output import print_json
-from optodrive.core.errors import NotReadyError, OptodriveError
+from optodrive.core.errors import InputError, NotReadyError, OptodriveError
 from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
-    from optodrive.daemon.responses.state import StateReport
+    from optodrive.daemon.responses.state import BoardReport, StageReport, StateReport
     from optodrive.planning.effective_config import EffectiveLimits
 
 
@@ -25,15 +25,31 @@ def register(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def status(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Show the board, the link with its error counters, the queue, and the limits in effect."""
+def status(url: UrlOption = DEFAULT_URL, stage: StageOption = None, json: JsonOption = False) -> None:
+    """Show the boards, the link with its error counters, the queue, and the limits in effect."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import READ_CONFIG, READ_STATE
 
     client = DaemonClient(url)
-    _print_state(client.call(READ_STATE), json)
+    state = client.call(READ_STATE)
+    if stage is not None:
+        _print_stage(state, stage, json)
+        return
+    _print_state(state, json)
     if not json:
         print(f"limits    {_format_limits(client.call(READ_CONFIG).limits)}")
+
+
+def _print_stage(state: "StateReport", name: str, as_json: bool) -> None:
+    """Print one of several stages. Raise InputError if the daemon drives none of this name."""
+    names = [stage.name for stage in state.stages]
+    if name not in names:
+        raise InputError("--stage", name, f"one of {', '.join(names)}" if names else "none: the daemon drives one")
+    stage = state.stages[names.index(name)]
+    if as_json:
+        print_json(stage)
+    else:
+        print(_format_stage(stage))
 
 
 def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption = False) -> None:
@@ -123,6 +139,17 @@ def _format_limits(limits: "EffectiveLimits") -> str:
     return "; ".join(f"{cap.label} {format_quantity(values[cap.setting], cap.unit, 6)}" for cap in limits.caps.values())
 
 
+def _format_board(board: "BoardReport") -> str:
+    return board.state + (f", fault {board.fault}: {board.hint}" if board.fault else "")
+
+
+def _format_stage(stage: "StageReport") -> str:
+    clock = "clock unknown"
+    if stage.clock_error_us is not None and stage.clock_drift_ppm is not None:
+        clock = f"clock known to {stage.clock_error_us:.0f} µs, drifts {stage.clock_drift_ppm:+.1f} ppm"
+    return f"{stage.name} at {stage.port}: {_format_board(stage.board)}; {clock}"
+
+
 def _print_state(state: "StateReport", as_json: bool) -> None:
     if as_json:
         print_json(state)
@@ -130,7 +157,9 @@ def _print_state(state: "StateReport", as_json: bool) -> None:
     board, link, queue, totals = state.board, state.link, state.queue, state.totals
     print(f"display   {state.display}, {state.pixels} pixels")
     print(f"link      {link.port}: {link.state}")
-    print(f"board     {board.state}" + (f", fault {board.fault}: {board.hint}" if board.fault else ""))
+    print(f"board     {_format_board(board)}")
+    for stage in state.stages:
+        print(f"stage     {_format_stage(stage)}")
     if state.control is not None:
         held = ", held by its connection" if state.control.hold else ""
         print(f"control   armed by {state.control.caller} {state.control.armed_for_s:.0f} s ago{held}")

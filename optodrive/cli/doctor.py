@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.cli.output import print_json
 
 if TYPE_CHECKING:
     from optodrive.cli.doctor_finding import Finding
+    from optodrive.core.clock import Clock
+    from optodrive.device.config import Config
 
 MARKS = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
 
@@ -23,14 +25,15 @@ def register(app: typer.Typer) -> None:
 
 def doctor(
     config: ConfigOption = None,
+    stage: StageOption = None,
     watch: Annotated[bool, typer.Option("--watch", help="Repeat the checks until Ctrl-C and show changes.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Check computer, port and board without arming; exit status 1 where there is a problem."""
     if watch:
-        _report_changes(config, json)
+        _report_changes(config, stage, json)
         return
-    findings = examine(config)
+    findings = examine(config, stage=stage)
     problems = sum(finding.status == "problem" for finding in findings)
     warnings = sum(finding.status == "warning" for finding in findings)
     if json:
@@ -50,14 +53,14 @@ def _print_findings(findings: "list[Finding]") -> None:
             print(f"{'':9}{'':14} {finding.remedy}")
 
 
-def _report_changes(config: str | None, json: bool) -> None:
+def _report_changes(config: str | None, stage: str | None, json: bool) -> None:
     """Print all findings and then, with the time of day, those that change; with `json`, one line per change."""
     from json import dumps
 
     from optodrive.cli.doctor_watch import watch
     from optodrive.core.clock import MonotonicClock
 
-    for number, changed in enumerate(watch(lambda: examine(config), MonotonicClock())):
+    for number, changed in enumerate(watch(lambda: examine(config, stage=stage), MonotonicClock())):
         if json:
             print(dumps({"unix_s": time.time(), "findings": [finding._asdict() for finding in changed]}), flush=True)
             continue
@@ -67,12 +70,10 @@ def _report_changes(config: str | None, json: bool) -> None:
         sys.stdout.flush()
 
 
-def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
-    """Return all findings in order; `root` replaces / in tests."""
+def examine(config: str | None, root: Path = Path("/"), stage: str | None = None) -> list["Finding"]:
+    """Return all findings in order; `root` replaces / in tests. stage: the only one to examine, of several."""
     from optodrive.cli import doctor_host as host
-    from optodrive.cli.doctor_board import check_board
     from optodrive.cli.doctor_finding import report_problem
-    from optodrive.cli.doctor_port import check_port
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.errors import InputError
     from optodrive.device.config_file import load_config
@@ -81,17 +82,30 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
     findings = [host.check_python(), *host.check_packages()]
     try:
         loaded = load_config(config)
-        loaded.require_one_stage()
+        stages = loaded.list_stage_configs() if stage is None else (loaded.select_stage(stage),)
     except InputError as error:
         return [
             *findings,
             report_problem("configuration", str(error), "correct it; `optodrive config check` checks it again"),
         ]
-    findings += [host.check_clock(clock, loaded.board.lease_s), host.check_governor(root)]
+    findings += [host.check_clock(clock, loaded.lease_s), host.check_governor(root)]
     findings += [*host.check_disk(), host.check_kernels()]
-    if loaded.board.transport == "helios":
+    for one in stages:
+        found = _examine_board(one, clock, root)
+        if len(loaded.stages) > 1:
+            found = [item._replace(check=f"{one.stages[0].name} {item.check}") for item in found]
+        findings += found
+    return findings
+
+
+def _examine_board(config: "Config", clock: "Clock", root: Path) -> list["Finding"]:
+    """Return the findings on port and board of one stage."""
+    from optodrive.cli.doctor_board import check_board
+    from optodrive.cli.doctor_port import check_port
+
+    if config.board.transport == "helios":
         from optodrive.cli.doctor_helios import check_helios
 
-        return [*findings, *check_helios(loaded, clock)]
-    port, free = check_port(loaded.board, root)
-    return [*findings, *port, *(check_board(loaded, clock) if free else [])]
+        return list(check_helios(config, clock))
+    port, free = check_port(config.board, root)
+    return [*port, *(check_board(config, clock) if free else [])]

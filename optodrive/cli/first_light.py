@@ -6,7 +6,7 @@ import typer
 
 from optodrive.cli.board_access import confirm_emission
 from optodrive.cli.commissioning_steps import report_steps
-from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 
@@ -28,6 +28,7 @@ def first_light(
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Arm and emit without asking.")] = False,
     config: ConfigOption = None,
+    stage: StageOption = None,
     json: JsonOption = False,
 ) -> None:
     """Check the board, centre the mirrors and emit single weak pulses there; ends disarmed in every case."""
@@ -36,7 +37,7 @@ def first_light(
     from optodrive.lab.commissioning.exclusive_board import check_spot_power, spot_width_s
     from optodrive.lab.commissioning.first_light import PULSES_MAX, default_power_w, emit_first_light
 
-    loaded = load_config(config)
+    loaded = load_config(config).select_stage(stage)
     power_w = default_power_w(loaded) if power_mw is None else power_mw * 1e-3
     check_spot_power(loaded, power_w, "--power-mw")
     if not 1 <= pulses <= PULSES_MAX:
@@ -48,5 +49,8 @@ def first_light(
         f"this arms the board and emits {pulses} pulse{'s' if pulses > 1 else ''} of {light} at the centre of the "
         "display. The enclosure is closed, the beam ends on the display or in a beam dump, and goggles are on",
     )
-    with report_steps("first_light", json, {"power_w": power_w}) as report_step, open_board(config) as (board, _):
+    with (
+        report_steps("first_light", json, {"power_w": power_w}) as report_step,
+        open_board(config, stage=stage) as (board, _),
+    ):
         emit_first_light(board, power_w, pulses, acknowledge, report_step)

@@ -97,7 +97,7 @@ def play(
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
     display, clock = DisplayModel.from_config(load_run_config(config, model)), MonotonicClock()
-    display.config.require_one_stage()
+    display.config.select_stage(None)
     helios = Helios(display.config.board, clock)
     helios.require_interlock()
     sequence = load_sequence(frames, display.config)

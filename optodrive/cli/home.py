@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from optodrive.cli.commissioning_steps import report_steps
-from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 
 
 def register(app: typer.Typer) -> None:
@@ -15,6 +15,7 @@ def register(app: typer.Typer) -> None:
 
 def home(
     config: ConfigOption = None,
+    stage: StageOption = None,
     spot_power_mw: Annotated[
         float, typer.Option("--spot-power-mw", metavar="POWER_MW", min=0.0, help="Power of the spot; 0: gate off.")
     ] = 0.0,
@@ -29,7 +30,7 @@ def home(
     from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.homing import Homing
 
-    with report_steps("home", json) as report_step, open_board(config) as (board, spot_reader):
+    with report_steps("home", json) as report_step, open_board(config, stage=stage) as (board, spot_reader):
         if spot_power_mw:
             check_spot_power(board.config, spot_power_mw * 1e-3)
         Homing(board, spot_reader, spot_power_mw * 1e-3, acknowledge).run(report_step)

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 ConfigOption = Annotated[
     str | None, typer.Option("--config", metavar="FILE", help="Configuration file, or a shipped name.")
 ]
+StageOption = Annotated[
+    str | None, typer.Option("--stage", metavar="NAME", help="The stage to drive, of several over one display.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else on stdout.")]
 ModelOption = Annotated[
     Path | None,

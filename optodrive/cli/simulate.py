@@ -101,7 +101,6 @@ def simulate(
         raise InputError("--post-pulse", post_pulse_s, "a time between 0.001 and 10 s")
     check_output("--out", out, *HDF5_SUFFIXES, folder=True)
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
-    display.config.require_one_stage()
     sampled_pixels = None if pixel_seed is None else GroundTruthPixels.sample(pixel_seed, display.config)
     is_nominal = truth is None and sampled_pixels is None
     true_terms, ignored_terms = _select_true_terms(load_run_config(config, truth or model), truth)

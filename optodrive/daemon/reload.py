@@ -109,7 +109,6 @@ class ConfigReloader:
         if board_state in LEASED_STATES:
             return self._revoke_only(board_state)
         new = self._read_config()
-        new.require_one_stage()
         DisplayModel.from_config(new)  # validates the sections against each other, as at startup
         reloaded, waiting = split_changed_keys(self.config, new)
         running = merge_reloadable(self.config, new)

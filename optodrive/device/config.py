@@ -169,10 +169,25 @@ class Config(Section):
             for stage in self.stages
         )
 
-    def require_one_stage(self) -> None:
-        """Raise InputError for several stages, where one board is driven."""
-        if len(self.stages) > 1:
-            raise InputError("stages", len(self.stages), "one: `optodrive plan` takes several, one board is driven")
+    @property
+    def lease_s(self) -> float:
+        """Longest time after the last lease until a board closes its gate, s."""
+        return max(stage.board.lease_s for stage in self.list_stage_configs())
+
+    @property
+    def stream_lead_s(self) -> float:
+        """Time for which points of a stream are sent ahead, s."""
+        return max(stage.board.stream_lead_s for stage in self.list_stage_configs())
+
+    def select_stage(self, name: str | None) -> "Config":
+        """Return the configuration of the stage of this name; None for the only one. Raise InputError without it."""
+        if name is None and len(self.stages) < 2:
+            return self
+        for stage, config in zip(self.stages, self.list_stage_configs(), strict=False):
+            if stage.name == name:
+                return config
+        names = ", ".join(stage.name for stage in self.stages)
+        raise InputError("--stage", name, f"one of {names}" if names else "none: the display has one stage")
 
     @property
     def reach(self) -> BoolArray:

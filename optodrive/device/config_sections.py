@@ -188,8 +188,8 @@ class LimitsSection(Section):
     """Mean incident power of the display over its window, W."""
     display_mean_window_s: Positive
     """Averaging window of the display's mean power, s."""
-    stage_skew_max_s: Annotated[float, Field(ge=0, le=0.01)] = 1e-4
-    """Largest difference between the clocks of two stages, s."""
+    stage_skew_max_s: Annotated[float, Field(ge=0, le=0.01)] = 1e-3
+    """Largest error of the clock of one of several stages, s; a plan starts on none if one may be further off."""
     uncertainty: UncertaintySection = UncertaintySection()
     """Declared uncertainty of the model."""
 

@@ -30,16 +30,24 @@ def build_port_settings(board: BoardSection) -> PortSettings:
     )
 
 
+def build_scales(config: Config) -> tuple[WireScale, ...]:
+    """Return the scale factors of the board of each stage. The DAC codes span the whole range of the scanner."""
+    return tuple(
+        WireScale(
+            rad_per_code=stage.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
+            full_power_w=stage.laser.max_power_w,
+            tick_s=1.0 / TICK_HZ,
+        )
+        for stage in config.list_stage_configs()
+    )
+
+
 def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CODES) -> BoardRequirements:
-    """Derive the requirements of a configuration. The DAC codes span the whole range of the scanner.
+    """Derive the requirements of a configuration with one stage.
 
     margin_codes: DAC codes by which the permitted range extends beyond the outermost pixels
     """
-    scale = WireScale(
-        rad_per_code=config.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
-        full_power_w=config.laser.max_power_w,
-        tick_s=1.0 / TICK_HZ,
-    )
+    (scale,) = build_scales(config)
     return BoardRequirements(
         limits=_build_limits(config, scale, margin_codes),
         scale=scale,

@@ -121,7 +121,7 @@ class Interleaving:
             self.last_count = 20 if result["error"] is None and result["start_tick"] is not None else self.last_count
 
     def truncate(self):
-        self.rig.request(PLANNER, "truncate", kept_points=self.random.choice((0, 20, 50)))
+        self.rig.request(PLANNER, "truncate", kept_points=[self.random.choice((0, 20, 50))])
 
     def flush(self):
         self.rig.send(PLANNER, "flush")

@@ -107,7 +107,7 @@ class Interleaving:
         queue = self.rig.queue
         accepted = (*queue.waiting, *(run.plan for run in queue.running))
         (points,) = (plan.points for plan in accepted if plan.record.plan_id == report.plan)
-        for duty in points.table[:, 4].tolist():
+        for duty in points.stages[0].table[:, 4].tolist():
             self.epochs_by_duty.setdefault(duty, set()).add(push.epoch)
 
     def run(self):
@@ -156,7 +156,7 @@ class Interleaving:
         fields = {"name": "dry", "policy": "trim", "fit": "as_is"}
         sequence = build_pattern("all", {"height_um": 20}, DISPLAY.config)
         start = DryRunStart(snapshot.heat, snapshot.budget, 0.1)
-        assert plan_dry_run(DISPLAY, self.rig.remote.scale, BuiltRequest(sequence), start, fields).status == "planned"
+        assert plan_dry_run(DISPLAY, self.rig.remote.scales, BuiltRequest(sequence), start, fields).status == "planned"
         assert [record.plan_id for record in self.rig.store.list_recent()] == before
 
     def interfere(self):

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from link_process_rig import BEAT_INTERVAL_S, Client, LinkProcess
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
-from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.board_setup import build_scales
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.service.results import build_error
 from optodrive.planning.display_model import DisplayModel
@@ -64,7 +64,7 @@ class RiggedEngine(Engine):
     def __init__(self, folder, config, port):
         display = DisplayModel.from_config(config)
         self.link = LinkProcess(folder, port, lease_s=PATIENT_LEASE_S, config=config)
-        session = RemoteSession(build_board_requirements(config).scale, MonotonicClock())
+        session = RemoteSession(build_scales(config), MonotonicClock())
         super().__init__(display, session, self.link.path, MonotonicClock())
         self.failure = None
         self.web = WebStandIn(self.link.path)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.ipc import IpcError, Message, MessageSocket
 from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_scales
 from optodrive.link.service.link_settings_builder import build_link_settings
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.transport.port_settings import PortSettings
@@ -29,12 +30,11 @@ class LinkProcess:
     def __init__(self, folder, port, lease_s=1.0, config=CONFIG, **settings):
         self.path = folder / "link.sock"
         built = build_link_settings(config, self.path, 0o600, settings.pop("capture_path", None))
-        requirements = replace(
-            built.requirements,
-            lease_s=lease_s,
-            limits=replace(built.requirements.limits, lease_ms=round(lease_s * 1e3)),
-        )
-        built = replace(built, port=PortSettings("serial", str(port)), requirements=requirements, **settings)
+        (board,) = built.boards
+        limits = replace(board.requirements.limits, lease_ms=round(lease_s * 1e3))
+        requirements = replace(board.requirements, lease_s=lease_s, limits=limits)
+        board = replace(board, port=PortSettings("serial", str(port)), requirements=requirements)
+        built = replace(built, boards=(board,), **settings)
         file = folder / "link.json"
         file.write_text(built.to_json())
         self.supervisor, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -57,9 +57,7 @@ class LinkProcess:
         return json.loads(packet) if packet else {"kind": "end"}
 
     def open_planner(self):
-        self.planner = RemoteSession(
-            build_link_settings(CONFIG, self.path, 0, None).requirements.scale, MonotonicClock()
-        )
+        self.planner = RemoteSession(build_scales(CONFIG), MonotonicClock())
         self.planner.connect(self.path)
         return self.planner
 

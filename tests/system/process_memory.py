@@ -18,7 +18,10 @@ def list_processes(pid):
     """Return the processes of a daemon by name; a number tells those of one name apart."""
     processes = {}
     for process in list_tree(pid):
-        name = Path(f"/proc/{process}/comm").read_text().strip()
+        try:
+            name = Path(f"/proc/{process}/comm").read_text().strip()
+        except OSError:  # it has ended meanwhile
+            continue
         processes[name if name not in processes else f"{name} {process}"] = process
     return processes
 

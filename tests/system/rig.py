@@ -143,7 +143,10 @@ class Command:
 
 
 class Daemon:
-    """Process of `optodrive serve` on a board's port. is_fresh: in an interpreter of its own, as a user starts it."""
+    """Process of `optodrive serve` on a board's port. is_fresh: in an interpreter of its own, as a user starts it.
+
+    stages: text of further sections
+    """
 
     def __init__(
         self,
@@ -155,8 +158,9 @@ class Daemon:
         lease_s=PATIENT_LEASE_S,
         runtime=None,
         is_fresh=False,
+        stages="",
     ):
-        text = config_text(port, name, lease_s=lease_s)
+        text = config_text(port, name, lease_s=lease_s) + stages
         for old, new in replace:
             assert old in text
             text = text.replace(old, new)

@@ -9,14 +9,16 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from link_process_rig import LinkProcess
 from optodrive.core.errors import LinkError
+from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.operator_client import stop_board
 from rig import PATIENT_LEASE_S, wait_for
-from wire_points import build_points
+from wire_points import build_stage_points
 
 FORBIDDEN = ("numba", "pydantic", "fastapi", "uvicorn", "scipy")
 RSS_MAX_BYTES = 40 << 20
@@ -59,7 +61,7 @@ def begin(link, points, **options):
 def emit(link, board, count=5000):
     """Arm and start a plan of seconds; return when pulses are emitted."""
     arm(link)
-    begin(link, build_points(count, DUTY))
+    begin(link, build_stage_points(count, DUTY))
     link.until(lambda: link.planner.board.state == BoardState.RUNNING)
     link.run(0.3)
 
@@ -93,11 +95,12 @@ def test_it_imports_no_heavy_package():
 
 def test_a_plan_runs_through_the_planners_view(link, board):
     arm(link)
-    job = begin(link, build_points(300, DUTY))
+    job = begin(link, build_stage_points(300, DUTY))
     link.until(lambda: job.is_finished)
     assert (job.sent_count, job.executed_count) == (300, 300)
-    reported = job.read_reported(0, 300)
-    assert set(reported.duty.tolist()) == {DUTY}
+    reported = job.read_reported(0, 300, link.planner.scales)
+    full_power_w = link.planner.scales[0].full_power_w
+    assert reported.power_w == pytest.approx(np.full(300, DUTY / DUTY_MAX * full_power_w))
     assert job.first_sent_tick < reported.on_tick[0]
     link.until(lambda: link.planner.is_ready)
     assert link.planner.stats["round_trip_ms"] > 0
@@ -106,10 +109,10 @@ def test_a_plan_runs_through_the_planners_view(link, board):
 
 def test_splice_and_truncation_through_the_planners_view(link, board):
     arm(link)
-    first = begin(link, build_points(400, DUTY), send_ahead_s=0.05)
+    first = begin(link, build_stage_points(400, DUTY), send_ahead_s=0.05)
     link.run(0.2)
-    second = link.planner.splice(build_points(300, 2 * DUTY, dark_us=8000), 250, link.planner.epoch, 0.05)
-    assert second.start_tick == first.end_tick_after(250)
+    second = link.planner.splice(build_stage_points(300, 2 * DUTY, dark_us=8000), [250], 0.0, link.planner.epoch, 0.05)
+    assert second.zero_tick == first.parts[0].end_tick_after(250)
     link.until(lambda: first.is_finished)
     assert link.planner.truncate(200)
     assert not link.planner.truncate(1)
@@ -122,10 +125,10 @@ def test_points_of_an_older_epoch_are_refused(link, board):
     older = link.planner.epoch
     link.await_result(link.web, "stop")
     arm(link)
-    link.planner.begin(build_points(10, DUTY), link.planner.board_s() + 0.05, older)
+    link.planner.begin(build_stage_points(10, DUTY), link.planner.board_s() + 0.05, older)
     refusal = link.until(link.planner.pop_refusal)
     assert "ended by stop" in refusal
-    assert link.planner.splice(build_points(10, DUTY), 0, older, 0.05) is None
+    assert link.planner.splice(build_stage_points(10, DUTY), [0], 0.0, older, 0.05) is None
     assert not board.of("pulse")
 
 

@@ -17,7 +17,7 @@ from optodrive.cli.calibrate.field_report import (
     check_calibration_outputs,
     write_calibration,
 )
-from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.core.errors import InputError
 from optodrive.core.units import m_to_um, um_to_m
 
@@ -66,6 +66,7 @@ def board(
     ] = 5.0,
     yes: Annotated[bool, typer.Option("--yes", help="Arm and emit without asking.")] = False,
     config: ConfigOption = None,
+    stage: StageOption = None,
     json: JsonOption = False,
 ) -> None:
     """Measure spots on the board with a sensor or by eye, and fit the field to them."""
@@ -73,15 +74,17 @@ def board(
     request = BoardCalibrationRequest(manual, target_rms_um, spots_max, readings, spot_power_mw)
     places = f"up to {spots_max} places with a spot of {spot_power_mw:g} mW"
     confirm_emission(yes, f"this arms the board, lights {places}, and writes {out}")
-    write_calibration(calibrate_on_board(config, out, request), out, report, json)
+    write_calibration(calibrate_on_board(config, stage, out, request), out, report, json)
     delete_session(out)
 
 
-def calibrate_on_board(config: str | None, out: Path, request: BoardCalibrationRequest) -> FieldCalibration:
+def calibrate_on_board(
+    config: str | None, stage: str | None, out: Path, request: BoardCalibrationRequest
+) -> FieldCalibration:
     """Measure spots, fit a field, and write the spots beside `out` as input of `calibrate field`."""
     from optodrive.lab.calibration.spots import write_spots
 
-    measured = measure_on_board(config, out, request)
+    measured = measure_on_board(config, stage, out, request)
     path = out.with_suffix(".spots.csv")
     write_spots(path, measured.fit.spots)
     return FieldCalibration(
@@ -96,7 +99,9 @@ def delete_session(out: Path) -> None:
     session_path_for(out).unlink(missing_ok=True)
 
 
-def measure_on_board(config: str | None, out: Path, request: BoardCalibrationRequest) -> "MeasurementResult":
+def measure_on_board(
+    config: str | None, stage: str | None, out: Path, request: BoardCalibrationRequest
+) -> "MeasurementResult":
     """Arm the board, measure spots and fit them; the board ends with the gate off and disarmed in every case.
 
     The session file beside `out` receives every spot before the next one. Raises InputError for options that cannot
@@ -113,7 +118,7 @@ def measure_on_board(config: str | None, out: Path, request: BoardCalibrationReq
 
     power_w, target_rms_m = request.spot_power_mw * 1e-3, um_to_m(request.target_rms_um)
     # The board closes first on exit: it receives ABORT before the worker process is joined.
-    with WorkerProcess() as worker, open_board(config) as (exclusive_board, spot_reader):
+    with WorkerProcess() as worker, open_board(config, stage=stage) as (exclusive_board, spot_reader):
         check_spot_power(exclusive_board.config, power_w)
         session = CalibrationSession.load_or_create(out, exclusive_board.config)
         if not request.manual and spot_reader is None:

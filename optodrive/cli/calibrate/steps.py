@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.cli.output import print_json
 from optodrive.core.errors import InputError
 
@@ -24,6 +24,7 @@ def steps(
         float, typer.Option("--pause", metavar="SECONDS", help="Pause between sizes, in which a scope rearms.")
     ] = 2.0,
     config: ConfigOption = None,
+    stage: StageOption = None,
     json: JsonOption = False,
 ) -> None:
     """Play steps of both mirrors in three sizes with the gate off, for a recording of their position outputs."""
@@ -45,7 +46,7 @@ def steps(
             size = f"{x_rad:.4f} rad in x and {y_rad:.4f} rad in y"
             print(f"{run.name:<17}{len(commands) - 1} steps of {size}, {commands[-1, 0]:.2f} s", flush=True)
 
-    with open_board(config) as (board, _):
+    with open_board(config, stage=stage) as (board, _):
         runs = plan_step_runs(board, step_count)
         board.connect()
         board.arm()

@@ -132,25 +132,25 @@ class BudgetState:
 class ExecutedPulses:
     """Pulses that the board reports as executed, one row per pulse in order; all arrays [n].
 
-    on_tick: board tick of gate on; width_ticks: gate-on duration; index: index of the point on the wire
-    pixel, power_w: of the plan's row; start_s: on_tick counted from the tick of the plan's start, s
+    on_tick: tick of gate on, of the board, or of the host if there are several stages; width_ticks: gate-on duration
+    pixel, stage: of the plan's row; start_s: on_tick counted from the tick of the plan's start, s
     complete: whether no report is missing
     """
 
-    index: IntArray
     on_tick: IntArray
     width_ticks: IntArray
     pixel: IntArray
     power_w: FloatArray
     start_s: FloatArray
     width_s: FloatArray
+    stage: IntArray
     complete: bool
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
     def __len__(self) -> int:
-        return len(self.index)
+        return len(self.on_tick)
 
 
 def concatenate_executed(first: ExecutedPulses, second: ExecutedPulses) -> ExecutedPulses:

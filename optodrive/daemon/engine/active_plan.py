@@ -9,7 +9,7 @@ from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses, concatenate_executed
 from optodrive.daemon.engine.plan_record import Execution, PlanRecord
 from optodrive.daemon.responses.plan import PlanStatus
-from optodrive.link.protocol.quantisation import WirePoints
+from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.planned_sequence import PlannedSequence
 
@@ -32,7 +32,7 @@ class ActivePlan:
 
     record: PlanRecord
     planned: PlannedSequence
-    points: WirePoints
+    points: StagePoints
     heat_before: ThermalState
     budget_before: BudgetState
     epoch: int

@@ -3,6 +3,7 @@
 The planner's thermal state is ahead of emission; this one follows it. It is not thread-safe.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.progress import PlanProgress
-from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
+from optodrive.link.protocol.quantisation import WireScale
 from optodrive.physics.nominal_display import DisplayState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_executed, shift_state
@@ -32,22 +33,24 @@ class ExecutedBatch(NamedTuple):
     power_w: FloatArray
     x_rad: FloatArray
     y_rad: FloatArray
+    stage: IntArray
 
     @classmethod
-    def from_progress(cls, progress: PlanProgress, scale: WireScale) -> "ExecutedBatch":
-        """Build the batch from the board's reports."""
+    def from_progress(cls, progress: PlanProgress, scales: Sequence[WireScale]) -> "ExecutedBatch":
+        """Build the batch from the boards' reports. scales: of each stage."""
         active, job = progress.run
-        plan, reported = active.planned.plan, job.read_reported(progress.begin, progress.end)
-        row = reported.row
+        plan, reported = active.planned.plan, job.read_reported(progress.begin, progress.end, scales)
+        row, tick_s = reported.row, scales[0].tick_s
         return cls(
             plan=active,
             row=row,
             pixel=plan.pixel[row],
-            start_s=np.asarray(reported.on_tick * scale.tick_s, dtype=np.float64),
-            width_s=np.asarray(reported.on_ticks * scale.tick_s, dtype=np.float64),
-            power_w=np.asarray(reported.duty / DUTY_MAX * scale.full_power_w, dtype=np.float64),
+            start_s=np.asarray(reported.on_tick * tick_s, dtype=np.float64),
+            width_s=np.asarray(reported.on_ticks * tick_s, dtype=np.float64),
+            power_w=reported.power_w,
             x_rad=plan.x_rad[row],
             y_rad=plan.y_rad[row],
+            stage=reported.stage,
         )
 
 
@@ -69,9 +72,7 @@ class LiveThermalState:
             self._heat.apply_pulses(*columns)
         except ValueError:
             self.out_of_order += len(executed.row)
-        self._budget = commit_executed(
-            executed.pixel, np.zeros_like(executed.pixel), executed, self._budget, self._display.budget
-        )
+        self._budget = commit_executed(executed.pixel, executed.stage, executed, self._budget, self._display.budget)
 
     def shift_clock(self, delay_s: float) -> None:
         """Shift all past pulses by delay_s after a restart of the board's clock."""

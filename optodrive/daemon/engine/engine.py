@@ -293,9 +293,9 @@ class Engine:
         return self._session.connected
 
     @property
-    def scale(self) -> WireScale:
-        """Scale factors between SI units and this board's integers."""
-        return self._session.scale
+    def scales(self) -> tuple[WireScale, ...]:
+        """Scale factors between SI units and the integers of each stage's board."""
+        return self._session.scales
 
     @property
     def plan_queue(self) -> PlanQueue:
@@ -337,4 +337,4 @@ class Engine:
 
     def render_metrics(self) -> str:
         """Render the response of GET /metrics."""
-        return render_metrics(self.snapshot(), self._plan_counters, self._session, self.display.config.board.lease_s)
+        return render_metrics(self.snapshot(), self._plan_counters, self._session, self.display.config.lease_s)

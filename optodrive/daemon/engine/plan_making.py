@@ -2,7 +2,7 @@
 
 import threading
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from optodrive.core.types.policy import Policy
@@ -11,7 +11,8 @@ from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import LargestTarget, PlanRecord
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.link.protocol.quantisation import WireScale, decode, quantise
+from optodrive.link.protocol.quantisation import WireScale
+from optodrive.link.protocol.stage_points import StagePoints, decode_stages
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.feasibility.report import FeasibilityReport, FitMode
@@ -50,7 +51,7 @@ class PlanningRequest(NamedTuple):
 
 def make_plan(
     display: DisplayModel,
-    scale: WireScale,
+    scales: Sequence[WireScale],
     request: PlanningRequest,
     built: BuiltRequest,
     snapshot: PlanningSnapshot,
@@ -63,11 +64,11 @@ def make_plan(
     """
     planned, feasibility = _plan(display, request, built.sequence, snapshot, on_progress)
     on_progress(1.0)
-    points = quantise(planned.plan, scale)
+    points = StagePoints.from_plan(planned.plan, scales)
     on_progress(1.0)
     payload = points.encode_payload()
-    decoded = decode(payload, scale)
-    verify(planned.plan, points.row[decoded.index], decoded, snapshot.budget, display.budget, lambda: on_progress(1.0))
+    row, decoded = decode_stages(payload, points, scales)
+    verify(planned.plan, row, decoded, snapshot.budget, display.budget, lambda: on_progress(1.0))
     on_progress(1.0)
     record = PlanRecord(
         plan_id=plan_id,
@@ -83,7 +84,7 @@ def make_plan(
         labels=dict(built.labels),
         parameters=dict(built.parameters),
         streamed=request.streamed,
-        first_pulse_s=float(decoded.start_s[0]) if len(decoded.start_s) else None,
+        first_pulse_s=float(decoded.start_s.min()) if len(decoded.start_s) else None,
     )
     return ActivePlan(
         record=record,
@@ -110,7 +111,5 @@ def _plan(
         return check_feasibility(display, sequence, heat, budget, request.policy, on_progress, request.fit)
     if snapshot.refreshed is not None and can_split(sequence):
         sequence = stale_pixels_first(sequence, snapshot.refreshed)
-    initial_pixels = None if snapshot.initial_pixel is None else (snapshot.initial_pixel,)
-    return plan_sequence(
-        display, sequence, heat, budget, request.policy, on_progress, initial_pixels=initial_pixels
-    ), None
+    pixels = snapshot.initial_pixels
+    return plan_sequence(display, sequence, heat, budget, request.policy, on_progress, initial_pixels=pixels), None

@@ -28,6 +28,7 @@ from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.daemon.responses.plan import PlanStatus
+from optodrive.link.protocol.point_cut import PointCut
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.fault_hints import get_fault_hint
@@ -109,14 +110,14 @@ class PlanQueue:
     @property
     def _stream_lead_s(self) -> float:
         """Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
-        lead_s = self._display.config.board.stream_lead_s
+        lead_s = self._display.config.stream_lead_s
         return lead_s if self._session.is_realtime else max(lead_s, SHARED_STREAM_LEAD_S)
 
     def _build_cut_snapshot(
         self, running: ActivePlan, thermal: ThermalEstimate, planning_time_s: float
     ) -> PlanningSnapshot | None:
         min_start_s = self._session.board_s() + self._stream_lead_s + planning_time_s
-        return build_cut_snapshot(running, thermal, min_start_s, self._display.budget)
+        return build_cut_snapshot(running, thermal, min_start_s, self._display.budget, self._session.tick_s)
 
     # --- accepting plans ----------------------------------------------------------------------------------------
 
@@ -145,7 +146,7 @@ class PlanQueue:
                     plan.heat_before, plan.budget_before = snapshot.thermal.shift_to_plan(start_s)
                 record.start_s = start_s
                 self.waiting.append(plan)
-            elif not self._splice(plan, snapshot.predecessor, snapshot.cut_row):
+            elif snapshot.cut is None or not self._splice(plan, snapshot.predecessor, snapshot.cut):
                 return False
             self._thermal.append(plan)
             self.accounts.totals["planned"] += record.pulse_count
@@ -159,14 +160,14 @@ class PlanQueue:
         if epoch != self._session.epoch:
             raise StoppedError(f"the request was stopped before it was carried out ({self._session.epoch_reason})")
 
-    def _splice(self, plan: ActivePlan, predecessor: ActivePlan, cut_row: int) -> bool:
+    def _splice(self, plan: ActivePlan, predecessor: ActivePlan, cut: PointCut) -> bool:
         if not self.running or self.running[-1].plan is not predecessor:
             return False
-        kept_points = predecessor.points.count_before(cut_row)
-        job = self._session.splice(plan.points, kept_points, plan.epoch, self._stream_lead_s, plan.crc)
+        zero_s, ahead_s = plan.record.start_s, self._stream_lead_s
+        job = self._session.splice(plan.points, cut.kept_points, zero_s, plan.epoch, ahead_s, plan.crc)
         if job is None:
             return False
-        predecessor.record.dropped = predecessor.record.pulse_count - cut_row
+        predecessor.record.dropped = predecessor.record.pulse_count - cut.row
         self.running.append(PlanRun(plan, job))
         return True
 
@@ -199,12 +200,12 @@ class PlanQueue:
             if last is None:
                 return
             snapshot = self._build_cut_snapshot(last, self._thermal.estimate, planning_time_s=0.0)
-            if snapshot is None or not self._session.truncate(last.points.count_before(snapshot.cut_row)):
+            if snapshot is None or snapshot.cut is None or not self._session.truncate(snapshot.cut.kept_points):
                 return
-            last.record.dropped = last.record.pulse_count - snapshot.cut_row
+            last.record.dropped = last.record.pulse_count - snapshot.cut.row
             estimate = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
             self._thermal.set(estimate, snapshot.start_s)
-            self._refresh_cycle = RefreshCycle(estimate, mark_refreshed(last, snapshot.cut_row))
+            self._refresh_cycle = RefreshCycle(estimate, mark_refreshed(last, snapshot.cut.row))
 
     def _supersede(self, plan: ActivePlan) -> None:
         plan.record.dropped = plan.rest_count
@@ -332,7 +333,7 @@ class PlanQueue:
             for plan in (*(run.plan for run in self.running), *self.waiting):
                 plan.record.start_s += delay_s
             for run in self.running:
-                run.job.delay(round(delay_s / self._session.scale.tick_s))
+                run.job.delay(round(delay_s / self._session.tick_s))
 
     def end_running(self, status: PlanStatus, error: str | None, clock_shift_s: float = 0.0) -> None:
         """End all running plans and record what they executed. clock_shift_s: as for fail_all."""

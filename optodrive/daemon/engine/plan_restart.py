@@ -9,7 +9,8 @@ import numpy as np
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import LargestTarget
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.link.protocol.quantisation import WirePoints, WireScale, decode, quantise
+from optodrive.link.protocol.quantisation import WireScale
+from optodrive.link.protocol.stage_points import StagePoints, decode_stages
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.limiter.rest import delay_rest, limit_rest, replace_rest
@@ -32,7 +33,7 @@ class RestartedPlan:
     start_s: float
     zero_s: float
     planned: PlannedSequence
-    points: WirePoints
+    points: StagePoints
     crc: int
     summary_json: bytes
     before: ThermalEstimate
@@ -58,7 +59,7 @@ class RestartedPlan:
 
 def restart_plans(
     display: DisplayModel,
-    scale: WireScale,
+    scales: Sequence[WireScale],
     plans: Sequence[ActivePlan],
     before: ThermalEstimate,
     start_s: float,
@@ -73,14 +74,14 @@ def restart_plans(
     restarted = []
     for plan in plans:
         start_s = max(start_s, before.budget.at_s)
-        restarted.append(_restart(display, scale, plan, before, start_s, on_progress))
+        restarted.append(_restart(display, scales, plan, before, start_s, on_progress))
         before, start_s = restarted[-1].after, restarted[-1].end_s + gap_s
     return restarted
 
 
 def _restart(
     display: DisplayModel,
-    scale: WireScale,
+    scales: Sequence[WireScale],
     plan: ActivePlan,
     before: ThermalEstimate,
     start_s: float,
@@ -89,11 +90,11 @@ def _restart(
     first, planned = plan.first_row, plan.planned
     heat, budget = before.shift_to_plan(start_s)
     rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)
-    points = quantise(rest, scale)
+    points = StagePoints.from_plan(rest, scales)
     on_progress()
     payload = points.encode_payload()
-    decoded = decode(payload, scale)
-    verify(rest, points.row[decoded.index], decoded, budget, display.budget, on_progress)
+    row, decoded = decode_stages(payload, points, scales)
+    verify(rest, row, decoded, budget, display.budget, on_progress)
     heat_after = heat.copy()
     peaks = heat_after.apply_pulses(rest.pixel, rest.start_s, rest.width_s, rest.power_w, on_progress)
     after = ThermalEstimate.from_plan(heat_after, budget_after, start_s)
@@ -113,7 +114,7 @@ def _restart(
         start_s=start_s,
         zero_s=zero_s,
         planned=whole_planned,
-        points=WirePoints(points.table, np.where(points.row >= 0, points.row + first, -1)),
+        points=points.shift_rows(first),
         crc=zlib.crc32(payload),
         summary_json=_summarize_again(whole_planned, plan.record.summary_json),
         before=before,

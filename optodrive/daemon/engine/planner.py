@@ -228,7 +228,7 @@ class Planner:
         began_s, display = self._clock.now_s(), self._dimmer.display
         cooling_max_m = COOLING_MAX_M if late_count < LATE_MAX else inf
         snapshot = self._plan_queue.make_snapshot(request.streamed, reserved_s)
-        plan = make_plan(display, self._session.scale, request, built, snapshot, plan_id, check)
+        plan = make_plan(display, self._session.scales, request, built, snapshot, plan_id, check)
         if request.streamed:
             self._planning_time.record(self._clock.now_s() - began_s)
 

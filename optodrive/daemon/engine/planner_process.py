@@ -13,7 +13,7 @@ from optodrive.daemon.engine.session_recording import start_session_recorder
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.board_setup import build_scales
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
 
@@ -36,7 +36,7 @@ def run_planner(
     with ExitStack() as exit_stack:
         log = open_daemon_log()
         exit_stack.callback(log.close)
-        session = RemoteSession(build_board_requirements(display.config).scale, clock)
+        session = RemoteSession(build_scales(display.config), clock)
         engine = Engine(display, session, folder.link_socket, clock, memory)
         engine.on_warning = log.warn
         recorder = start_session_recorder(engine, session_path, log)

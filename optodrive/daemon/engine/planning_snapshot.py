@@ -9,6 +9,7 @@ from optodrive.core.types.arrays import BoolArray
 from optodrive.core.types.plans import BudgetState
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.link.protocol.point_cut import PointCut
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import commit_until, shift_state
@@ -21,8 +22,8 @@ class PlanningSnapshot:
     thermal: estimate from which the snapshot was derived; the snapshot is stale once the queue has another one
     start_s: board time of the plan's zero
     heat, budget: state at that time, on the plan's own time line
-    predecessor, cut_row: running plan that the new one truncates, and the first row that it drops
-    initial_pixel: pixel at which the mirrors point at the plan's zero
+    predecessor, cut: running plan that the new one truncates, and where
+    initial_pixels: pixel at which the mirrors of each stage point at the plan's zero; None if one is unknown
     refreshed: [p] pixels that the current refresh cycle of a stream has drawn
     """
 
@@ -31,8 +32,8 @@ class PlanningSnapshot:
     heat: ThermalState
     budget: BudgetState
     predecessor: ActivePlan | None = None
-    cut_row: int = 0
-    initial_pixel: int | None = None
+    cut: PointCut | None = None
+    initial_pixels: tuple[int, ...] | None = None
     refreshed: BoolArray | None = None
 
 
@@ -47,33 +48,30 @@ class RefreshCycle(NamedTuple):
 
 
 def build_cut_snapshot(
-    running: ActivePlan, thermal: ThermalEstimate, min_start_s: float, budget: Budget
+    running: ActivePlan, thermal: ThermalEstimate, min_start_s: float, budget: Budget, tick_s: float
 ) -> PlanningSnapshot | None:
     """Build the snapshot for truncating a running plan before its first point after board time min_start_s.
 
     Return None if no pulse would be left, or none would be dropped.
     """
     plan, zero_s = running.planned.plan, running.record.start_s
-    # A pulse's point begins at the end of the pulse before it, and may hold a long pause of the mirrors.
-    cut_row = 1 + int(np.searchsorted(plan.start_s + plan.width_s, min_start_s - zero_s))
-    # The mirrors point at the last pulse's pixel only if that pulse emits.
-    while 0 < cut_row < len(plan) and plan.power_w[cut_row - 1] == 0.0:
-        cut_row += 1
-    if not 0 < cut_row < len(plan):
+    cut = PointCut.find(running.points, (min_start_s - zero_s) / tick_s)
+    if not 0 < cut.row < len(plan):
         return None
-    end_s = float(plan.start_s[cut_row - 1] + plan.width_s[cut_row - 1])
+    end_s = cut.end_tick * tick_s
+    kept = slice(cut.row)
     heat = running.heat_before.copy()
-    heat.apply_pulses(plan.pixel[:cut_row], plan.start_s[:cut_row], plan.width_s[:cut_row], plan.power_w[:cut_row])
-    state = commit_until(plan, float(plan.start_s[cut_row]), running.budget_before, budget)
+    heat.apply_pulses(plan.pixel[kept], plan.start_s[kept], plan.width_s[kept], plan.power_w[kept])
+    state = commit_until(plan, float(plan.start_s[cut.row]), running.budget_before, budget)
     return PlanningSnapshot(
         thermal=thermal,
         start_s=zero_s + end_s,
         heat=heat.copy_shifted(-end_s),
         budget=shift_state(state, -end_s),
         predecessor=running,
-        cut_row=cut_row,
-        initial_pixel=int(plan.pixel[cut_row - 1]),
-        refreshed=mark_refreshed(running, cut_row),
+        cut=cut,
+        initial_pixels=None if -1 in cut.aim_rows else tuple(plan.pixel[cut.aim_rows].tolist()),
+        refreshed=mark_refreshed(running, cut.row),
     )
 
 

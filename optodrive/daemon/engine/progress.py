@@ -4,14 +4,14 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.staged_job import StagedJob
 
 
 class PlanRun(NamedTuple):
     """Running plan with its job."""
 
     plan: ActivePlan
-    job: PlanJob
+    job: StagedJob
 
 
 class PlanProgress(NamedTuple):

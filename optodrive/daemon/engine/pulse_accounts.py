@@ -39,24 +39,25 @@ class PulseAccounts:
     def _record_onset(self, progress: PlanProgress) -> None:
         """Convert the time of the first gate on as soon as it is reported: later, the clocks would have drifted."""
         (plan, job), begin, end = progress
-        reported, clocks = job.read_reported(begin, end), self._session.read_clocks()
+        reported, clocks = job.read_reported(begin, end, self._session.scales), self._session.read_clocks()
         on_tick = reported.on_tick[reported.on_ticks > 0]
         if len(on_tick) and clocks is not None:
-            plan.record.onset = clocks.convert(float(on_tick[0]) * self._session.scale.tick_s)
+            plan.record.onset = clocks.convert(float(on_tick[0]) * self._session.tick_s)
 
     def collect_executed(self, run: PlanRun) -> None:
         """Take what a job has executed into its plan. It ends with that, or is interrupted."""
         self.count_progress(run)  # reports may have arrived with what ends the job
         plan, job = run
-        record, start_s, scale = plan.record, plan.planned.plan.start_s, self._session.scale
+        record, start_s, scales = plan.record, plan.planned.plan.start_s, self._session.scales
         if job.executed_count < job.pulse_count:
             self.events.append(PlanProgress(run, job.executed_count, job.pulse_count))
-        executed = job.build_executed(plan.planned.plan, scale.full_power_w, scale.tick_s)
+        executed = job.build_executed(plan.planned.plan, scales)
         plan.add_executed(executed, job.list_executed_rows())
         if job.first_sent_tick is not None and record.first_byte_after_s is None:
-            record.first_byte_after_s = job.first_sent_tick * scale.tick_s - record.arrived_s
+            record.first_byte_after_s = job.first_sent_tick * self._session.tick_s - record.arrived_s
         if plan.executed is not None and plan.executed_rows is not None and len(plan.executed):
             executed, rows = plan.executed, plan.executed_rows
             record.first_light_after_s = record.start_s + float(executed.start_s[0]) - record.arrived_s
-            record.delay_s = float(executed.start_s[-1] - start_s[rows[-1]])
+            if len(scales) == 1:  # several boards drop what would come late
+                record.delay_s = float(executed.start_s[-1] - start_s[rows[-1]])
             record.timing_error = compute_timing_error(start_s[rows], executed.start_s)

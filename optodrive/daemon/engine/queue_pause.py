@@ -83,8 +83,8 @@ class QueuePause:
                 return None
         start_s = self._session.board_s() + START_LEAD_S + planning_time_s
         before = estimate_before_rest(plans[0], display.budget, on_progress)
-        scale = self._session.scale
-        restarted = restart_plans(display, scale, plans, before, start_s, START_LEAD_S, on_progress)
+        scales = self._session.scales
+        restarted = restart_plans(display, scales, plans, before, start_s, START_LEAD_S, on_progress)
         return Restart(plans, restarted, off_s)
 
     def commit_restart(self, restart: Restart) -> bool:

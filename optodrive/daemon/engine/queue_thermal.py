@@ -29,7 +29,7 @@ class QueueThermal:
         self.estimate = ThermalEstimate(*display.build_cold_state())
         self.end_s = 0.0
         self._budget = display.budget
-        self._lease_s = display.config.board.lease_s
+        self._lease_s = display.config.lease_s
         self._session = session
         self._on_progress = on_progress
 

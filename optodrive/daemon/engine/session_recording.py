@@ -82,7 +82,7 @@ def start_session_recorder(engine: Engine, path: Path | None, log: DaemonLog) ->
     recorder = SessionRecorder(path, describe_display(engine.display), log.warn)
 
     def record_plan(plan: ActivePlan) -> None:
-        recorder.record(lambda: build_plan_entry(plan, engine.scale.tick_s, engine.board_s()))
+        recorder.record(lambda: build_plan_entry(plan, engine.scales[0].tick_s, engine.board_s()))
 
     engine.add_plan_end_callback(record_plan)
     return recorder

@@ -13,6 +13,7 @@ from optodrive.daemon.responses.state import (
     PulseTotals,
     StateReport,
     build_control_report,
+    build_stage_reports,
 )
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
@@ -42,6 +43,7 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
             **session.stats,
         ),
         board=_build_board_report(session),
+        stages=build_stage_reports(session.stages if session.connected else ()),
         control=build_control_report(session.control),
         queue=planner_state.queue,
         totals=planner_state.totals,

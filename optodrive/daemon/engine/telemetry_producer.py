@@ -151,7 +151,7 @@ class TelemetryProducer:
             if isinstance(event, ClockShift):
                 self._executed_state.shift_clock(event.delay_s)
                 continue
-            executed = ExecutedBatch.from_progress(event, self._engine.scale)
+            executed = ExecutedBatch.from_progress(event, self._engine.scales)
             if len(executed.row):
                 self._executed_state.apply(executed)
                 columns = (executed.start_s, executed.width_s, executed.power_w)

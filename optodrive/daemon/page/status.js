@@ -20,6 +20,7 @@ export class Status {
       "Laser on": `${board.laser_on_s.toFixed(2)} s`,
       "Pulses executed": totals.executed,
       "Board temperature": board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`,
+      ...Object.fromEntries(state.stages.map((stage) => [`Stage ${stage.name}`, describeStage(stage)])),
     };
     this.stats.replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [createElement("dt", name), createElement("dd", value)]));
   }
@@ -63,6 +64,12 @@ export class Status {
       this.onControlAdded();
     }
   }
+}
+
+// One of several stages: the state of its board, and its clock against the host's.
+function describeStage({ board, clock_error_us: error, clock_drift_ppm: drift }) {
+  const state = board.fault === null ? board.state : `${board.state} ${board.fault}`;
+  return error === null ? `${state}, clock unknown` : `${state}, clock ±${error.toFixed(0)} µs, ${drift > 0 ? "+" : ""}${drift.toFixed(1)} ppm`;
 }
 
 function createElement(name, text) {

@@ -1,6 +1,7 @@
 """The jobs of the preview process: parse and build a pushed body, or plan it without executing it."""
 
 import pickle
+from collections.abc import Sequence
 from typing import Any
 
 from optodrive.core.errors import OptodriveError
@@ -22,7 +23,7 @@ DRY_RUN_PLAN = "dry-run"
 """Plan id of every dry run."""
 
 
-def run_job(display: DisplayModel, scale: WireScale, job: Message) -> Message:
+def run_job(display: DisplayModel, scales: Sequence[WireScale], job: Message) -> Message:
     """Do a job and return its result: status and payload, or the status and the document of a problem."""
     try:
         body, start = _split_payload(job)
@@ -30,7 +31,7 @@ def run_job(display: DisplayModel, scale: WireScale, job: Message) -> Message:
         if start is None:
             fields = {"status": 200, "labels": dict(built.labels), "parameters": dict(built.parameters)}
             return Message("result", fields, encode_sequence(built.sequence))
-        report = plan_dry_run(display, scale, built, start, job.fields)
+        report = plan_dry_run(display, scales, built, start, job.fields)
         audit = {"plan": report.plan, "pattern": report.name, "pulses": report.planned, "plan_status": report.status}
         return Message("result", {"status": 200, "audit": audit}, b"".join(iterate_json(report)))
     except OptodriveError as error:
@@ -53,12 +54,12 @@ def _split_payload(job: Message) -> tuple[bytes, DryRunStart | None]:
 
 
 def plan_dry_run(
-    display: DisplayModel, scale: WireScale, built: BuiltRequest, start: DryRunStart, fields: dict[str, Any]
+    display: DisplayModel, scales: Sequence[WireScale], built: BuiltRequest, start: DryRunStart, fields: dict[str, Any]
 ) -> PlanReport:
     """Plan and prove a sequence without executing it. Raise InputError or RefusedError as the planner does."""
     request = PlanningRequest(lambda: built, fields["name"], fields["policy"], fields["fit"])
     thermal = ThermalEstimate(start.heat, start.budget)
     snapshot = PlanningSnapshot(thermal, start.starts_in_s, start.heat, start.budget)
     dimmed = dim_display(display, start.power_share)
-    plan = make_plan(dimmed, scale, request, built, snapshot, DRY_RUN_PLAN, lambda fraction: None)
+    plan = make_plan(dimmed, scales, request, built, snapshot, DRY_RUN_PLAN, lambda fraction: None)
     return plan.record.build_report(0.0)

@@ -15,7 +15,7 @@ from optodrive.daemon.preview.job_queue import Job, JobQueue
 from optodrive.daemon.preview.jobs import build_refusal, run_job
 from optodrive.daemon.preview.worker import JobRunner, Worker, build_timeout_error
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.board_setup import build_scales
 from optodrive.planning.display_model import DisplayModel
 
 RUNNING_MAX, DRY_RUNS_MAX = 2, 1
@@ -137,9 +137,9 @@ class PreviewServer:
 
 def run_preview(display: DisplayModel, folder: RuntimeFolder, beat: BeatWriter) -> None:
     """Serve previews until SIGTERM or the end of the supervisor."""
-    scale = build_board_requirements(display.config).scale
+    scales = build_scales(display.config)
     loop = MessageLoop()
-    server = PreviewServer(loop, folder, lambda job: run_job(display, scale, job))
+    server = PreviewServer(loop, folder, lambda job: run_job(display, scales, job))
     ending: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: ending.append(number))
     loop.watch(beat, beat.receive)

@@ -1,6 +1,6 @@
 """The response of GET /v1/state, and of arm, disarm and stop."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from optodrive.core.json_model import JsonModel
@@ -49,6 +49,16 @@ class BoardReport(JsonModel):
     def is_armed(self) -> bool:
         """Whether the board accepts plans."""
         return self.state in ARMED_STATES
+
+
+class StageReport(JsonModel):
+    """One of several stages: its board, and how well its clock is known against the host's; None before that."""
+
+    name: str
+    port: str
+    board: BoardReport
+    clock_error_us: float | None
+    clock_drift_ppm: float | None
 
 
 class ControlReport(JsonModel):
@@ -128,12 +138,17 @@ class PlannerState(JsonModel):
 
 
 class StateReport(JsonModel):
-    """The daemon's state: display, link, board, queue, totals, planner and limits; `control` is null unless armed."""
+    """The daemon's state: display, link, board, queue, totals, planner and limits; `control` is null unless armed.
+
+    `board` is the sum of all boards, with the state of the one nearest to light; `stages` has each of several, and is
+    empty with one.
+    """
 
     display: str
     pixels: int
     link: LinkReport
     board: BoardReport
+    stages: list[StageReport]
     control: ControlReport | None
     queue: QueueReport
     totals: PulseTotals
@@ -146,3 +161,8 @@ def build_control_report(control: Mapping[str, Any] | None) -> ControlReport | N
     if control is None:
         return None
     return ControlReport(caller=control["caller"], armed_for_s=control["armed_for_s"], hold=control["hold"])
+
+
+def build_stage_reports(stages: Sequence[Mapping[str, Any]]) -> list[StageReport]:
+    """Build the reports of several stages from the status of the link process."""
+    return [StageReport(**{**stage, "board": BoardReport(**stage["board"])}) for stage in stages]

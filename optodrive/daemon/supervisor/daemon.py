@@ -54,7 +54,8 @@ def run(
     with ExitStack() as exit_stack:  # closes in reverse order: the processes first
         log = open_daemon_log()
         exit_stack.callback(log.close)
-        find_transport_factory(build_port_settings(config.board))  # refuses a Helios
+        for stage in config.list_stage_configs():
+            find_transport_factory(build_port_settings(stage.board))  # refuses a Helios
         if capture_path is not None and capture_path.exists():
             raise InputError("--capture", str(capture_path), "a name that is free: nothing is overwritten")
         raise_priority()  # every process inherits it, link while it still loads
@@ -115,7 +116,6 @@ def _load_display(config: Config) -> "DisplayModel":
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.pipeline import warm_up
 
-    config.require_one_stage()
     display = DisplayModel.from_config(config)
     warm_up(display)
     release_compiler()

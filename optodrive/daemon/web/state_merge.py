@@ -13,6 +13,7 @@ from optodrive.daemon.responses.state import (
     QueueReport,
     StateReport,
     build_control_report,
+    build_stage_reports,
 )
 from optodrive.link.session.board_view import BoardView
 
@@ -64,6 +65,7 @@ def merge_state(
         pixels=pixels,
         link=link,
         board=BoardReport(**board),
+        stages=build_stage_reports(status["stages"] if status is not None and status["connected"] else ()),
         control=build_control_report(control),
         queue=_merge_queue(planner.queue, ends_in_s),
         totals=planner.totals,

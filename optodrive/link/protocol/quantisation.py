@@ -1,6 +1,7 @@
 """Quantisation of limited plans to wire points, and decoding of the wire bytes for verification before emission."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -13,6 +14,7 @@ DAC = BipolarDac(16)
 CENTRE_CODE, CODE_MAX = DAC.centre, DAC.code_max
 DUTY_MAX = 65535
 TICKS_MAX = 65535
+PADDING_TICKS = 10_000
 GATE_OFF_STEP_TICKS = 60_000
 """A pause longer than one point can hold is split into gate-off points of this length."""
 
@@ -39,7 +41,7 @@ class WirePoints:
     """Points of a plan on the wire.
 
     table: uint16 [n, 5] of x, y, gate-off ticks, gate-on ticks and duty
-    row: [n] row of the pulse in the plan, -1 for a point inserted into a long pause
+    row: [n] row of the pulse in the plan, -1 for a point inserted into a long pause or after the last pulse
     """
 
     table: np.ndarray[tuple[int, ...], np.dtype[np.uint16]]
@@ -60,8 +62,36 @@ class WirePoints:
         return np.cumsum(self.table[:, 2:4].astype(np.int64).sum(axis=1))
 
     def count_before(self, row: int) -> int:
-        """Return the number of points before the pause that precedes the plan's pulse `row`."""
-        return int(np.searchsorted(np.maximum.accumulate(self.row), row - 1)) + 1 if row else 0
+        """Return the number of points up to the last pulse before the plan's row `row`."""
+        pulses = np.flatnonzero(self.row >= 0)
+        count = int(np.searchsorted(self.row[pulses], row))
+        return int(pulses[count - 1]) + 1 if count else 0
+
+    def extend(self, end_tick: int) -> Self:
+        """Return the points with the gate off behind the last one, until end_tick from the plan's zero.
+
+        The added points are short, so that other points may soon take their place.
+        """
+        ticks = end_tick - (int(self.compute_end_ticks()[-1]) if len(self) else 0)
+        count = -(-ticks // PADDING_TICKS)
+        aim = self.table[-1, :2] if len(self) else (CENTRE_CODE, CENTRE_CODE)
+        added = np.zeros((count, 5), dtype=np.uint16)
+        added[:, :2], added[:, 2] = aim, PADDING_TICKS
+        if count:
+            added[-1, 2] = ticks - (count - 1) * PADDING_TICKS
+        row = np.concatenate([self.row, np.full(count, -1, dtype=np.int64)])
+        return type(self)(np.concatenate([self.table, added]), row)
+
+    def add_pause(self, ticks: int) -> Self:
+        """Return the points behind a further pause of `ticks`, with the gate off; gate-off points hold a long one."""
+        if not len(self):
+            return self
+        count = max(0, -(-(int(self.table[0, 2]) + ticks - TICKS_MAX) // GATE_OFF_STEP_TICKS))
+        inserted = np.tile(self.table[:1], (count, 1))
+        inserted[:, 2:] = GATE_OFF_STEP_TICKS, 0, 0
+        table = np.concatenate([inserted, self.table])
+        table[count, 2] = int(self.table[0, 2]) + ticks - count * GATE_OFF_STEP_TICKS
+        return type(self)(table, np.concatenate([np.full(count, -1, dtype=np.int64), self.row]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,32 +106,35 @@ class DecodedPulses:
     power_w: FloatArray
 
 
-def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
-    """Quantise a plan to points. Raise LocalProtocolError if a pulse does not fit a point, or pulses overlap.
+def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
+    """Quantise a stage's pulses of a plan to points.
+
+    Raise LocalProtocolError if a pulse does not fit a point, or pulses overlap.
 
     Starts are rounded from absolute times, so rounding errors do not accumulate. Duty is rounded down. A pulse trimmed
     to zero power becomes a gate-off point of the same length; its mirror position is that of the next pulse.
     """
-    start = np.rint(plan.start_s / scale.tick_s).astype(np.int64)
-    width = np.rint(plan.width_s / scale.tick_s).astype(np.int64)
-    duty = np.floor(plan.power_w / scale.full_power_w * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
-    if len(plan) and (width.max() > TICKS_MAX or width.min() < 1 or duty.max() > DUTY_MAX or duty.min() < 0):
+    rows = np.flatnonzero(plan.stage == stage)
+    start = np.rint(plan.start_s[rows] / scale.tick_s).astype(np.int64)
+    width = np.rint(plan.width_s[rows] / scale.tick_s).astype(np.int64)
+    duty = np.floor(plan.power_w[rows] / scale.full_power_w * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
+    if len(rows) and (width.max() > TICKS_MAX or width.min() < 1 or duty.max() > DUTY_MAX or duty.min() < 0):
         raise LocalProtocolError("a pulse does not fit a point of the wire")
-    aim_row = _find_next_gate_on(duty)
+    aim_row = rows[_find_next_gate_on(duty)]
     x, y = scale.to_codes(plan.x_rad[aim_row]), scale.to_codes(plan.y_rad[aim_row])
     gate_off = start - np.concatenate([[0], (start + width)[:-1]])
-    if len(plan) and gate_off.min() < 0:
+    if len(rows) and gate_off.min() < 0:
         raise LocalProtocolError("pulses overlap, or the first begins before the plan")
     off_ticks, on_ticks = np.where(duty == 0, gate_off + width, gate_off), np.where(duty == 0, 0, width)
     pauses = np.maximum(0, -(-(off_ticks - TICKS_MAX) // GATE_OFF_STEP_TICKS))  # points inserted before each pulse
     last = np.cumsum(pauses + 1) - 1
-    point_row = np.repeat(np.arange(len(plan)), pauses + 1)
+    point_row = np.repeat(np.arange(len(rows)), pauses + 1)
     table = np.zeros((len(point_row), 5), dtype=np.uint16)
     table[:, 0], table[:, 1], table[:, 2] = x[point_row], y[point_row], GATE_OFF_STEP_TICKS
     table[last, 2] = off_ticks - pauses * GATE_OFF_STEP_TICKS
     table[last, 3], table[last, 4] = on_ticks, duty
     row = np.full(len(point_row), -1, dtype=np.int64)
-    row[last] = np.arange(len(plan))
+    row[last] = rows
     return WirePoints(table, row)
 
 

@@ -22,8 +22,8 @@ from optodrive.link.service.results import build_result
 from optodrive.link.service.settings import OnWebLoss
 from optodrive.link.service.status import StatusPublisher
 from optodrive.link.service.waiters import StateWaiters
+from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.fault_hints import get_fault_hint
-from optodrive.link.session.session import BoardSession
 
 RETRY_INTERVAL_S = 1.0
 CONNECTING = "connecting"
@@ -51,7 +51,7 @@ class LinkService:
 
     def __init__(
         self,
-        session: BoardSession,
+        boards: BoardGroup,
         clock: Clock,
         open_port: Callable[[], bool],
         on_web_loss: OnWebLoss = "dark",
@@ -60,14 +60,14 @@ class LinkService:
         self.epoch = Epoch(first_epoch)
         self.link_error: OptodriveError | None = LinkError("the board is not reached yet")
         self.link_error.code = CONNECTING
-        self._session = session
+        self._boards = boards
         self._clock = clock
         self._open_port = open_port
         self._clients = Clients(on_web_loss, clock)
         self._waiters = StateWaiters()
-        self._status = StatusPublisher(session, clock)
+        self._status = StatusPublisher(boards, clock)
         self.pauses = Pauses(clock)
-        self._handover = PointHandover(session, clock, self.epoch, self.pauses, self._send_to_planner)
+        self._handover = PointHandover(boards, clock, self.epoch, self.pauses, self._send_to_planner)
         self._connecting: Iterator[float] | None = None
         self._connecting_wait_s = 0.0
         self._retry_at_s = -inf
@@ -149,10 +149,10 @@ class LinkService:
                 self._end_epoch("ended by disarm")
             self._require_link()
             if command == "disarm":
-                self._session.disarm()
+                self._boards.disarm()
             elif command == "arm":
                 self._clients.require_lease()
-                self._session.arm()
+                self._boards.arm()
                 self._arm_requested = True
                 self._control = self._build_control(message.fields)
             elif command == "pause":
@@ -171,11 +171,11 @@ class LinkService:
         """Turn the gate off, and permit no points until the light is resumed."""
         self._require_armed("paused")
         if not self.pauses.is_paused:
-            self.pauses.begin(self._session.board_s())
+            self.pauses.begin(self._boards.board_s())
             self._handover.pause()
 
     def _require_armed(self, purpose: str) -> None:
-        board = self._session.board
+        board = self._boards.board
         if board.state not in ARMED_STATES:
             raise NotReadyError(f"the board is {board.state}; only an armed board can be {purpose}")
 
@@ -201,29 +201,29 @@ class LinkService:
             self.go_dark(f"the token {caller!r}, which armed the board, was revoked")
 
     def _require_link(self) -> None:
-        if not self._session.connected:
+        if not self._boards.connected:
             raise LinkError(self._describe_link_error() or "no link to the board")
 
     def _describe_link_error(self) -> str:
         return "" if self.link_error is None else str(self.link_error)
 
     def _reply(self, client: int, request_id: int, error: OptodriveError | None) -> None:
-        fields: dict[str, Any] = {"board": self._session.board.to_dict(), "epoch": self.epoch.number}
+        fields: dict[str, Any] = {"board": self._boards.board.to_dict(), "epoch": self.epoch.number}
         fields["pause"] = self.pauses.to_dict()
         self._outgoing.append(Outgoing((client,), build_result(request_id, error, fields)))
 
     def go_dark(self, reason: str) -> None:
         """End the epoch and abort: gate off, queue dropped, DISARMED. reason: for people, as the end of a sentence."""
         self._end_epoch(reason)
-        if self._session.connected:
-            self._session.abort()
+        if self._boards.connected:
+            self._boards.abort()
 
     def _end_epoch(self, reason: str) -> None:
         self.epoch.end(reason)
         self._arm_requested = self._was_armed = False
         self._control = None
         self.pauses.end()
-        self._session.hold_points()
+        self._boards.hold_points()
         self._handover.clear()
         for waiter in self._waiters.pop_ended():
             self._reply(waiter.client, waiter.request_id, NotReadyError(f"the board is not armed: {reason}"))
@@ -232,25 +232,25 @@ class LinkService:
 
     def compute_wait_s(self) -> float:
         """Return the longest time for which the loop may wait for bytes of port and clients before step(), s."""
-        if self._session.connected:
-            return min(self._session.compute_wait_s(), WAIT_MAX_S)
+        if self._boards.connected:
+            return min(self._boards.compute_wait_s(), WAIT_MAX_S)
         return WAIT_MAX_S if self._connecting is None else min(self._connecting_wait_s, WAIT_MAX_S)
 
     def step(self, wait_s: float = 0.0) -> None:
         """Send what is due to the board and process what it has sent. wait_s: longest wait for its first byte."""
-        if self._session.connected:
+        if self._boards.connected:
             self._step_session(wait_s)
         else:
             self._step_connecting(wait_s)
         stalled = self._clients.find_stalled()
-        control = self._control if self._session.board.state in LEASED_STATES else None
+        control = self._control if self._boards.board.state in LEASED_STATES else None
         commands = self._handover.commands
         status = self._status.build_if_due(self.epoch, self.link_error, control, self.pauses, commands, stalled)
         if status is not None:  # before the results: who knows of ARMED from one may push to the planner at once
             self._outgoing.append(Outgoing(self._clients.list_observers(), status))
-        refusal = self._session.pop_refusal()
+        refusal = self._boards.pop_refusal()
         now_s = self._clock.now_s()
-        for waiter, error in self._waiters.pop_results(self._session, refusal, self._describe_link_error(), now_s):
+        for waiter, error in self._waiters.pop_results(self._boards, refusal, self._describe_link_error(), now_s):
             self._reply(waiter.client, waiter.request_id, error)
         if refusal is not None:
             self._send_to_planner(Message("refusal", {"reason": refusal}))
@@ -260,34 +260,39 @@ class LinkService:
     def _step_session(self, wait_s: float) -> None:
         stalled = self._clients.find_stalled()
         try:
-            self._session.step(wait_s, renew_lease=not stalled, stalled=stalled)
+            self._boards.step(wait_s, renew_lease=not stalled, stalled=stalled)
             self._watch_board()
             self._end_unattended()
             self._end_abandoned()
             self._end_long_pause()
         except (LinkError, InputError) as error:
-            message = self._session.on_lost(error)
+            message = self._boards.on_lost(error)
             self.link_error = LinkError(message) if isinstance(error, LinkError) else error
             self._retry_at_s = self._clock.now_s() + RETRY_INTERVAL_S
             self._end_epoch(f"the link to the board was lost: {message}")
 
     def _watch_board(self) -> None:
         """End the epoch when the board has left the armed states, or has a new fault."""
-        board = self._session.board
+        board = self._boards.board
         if self._arm_requested and board.state in ARMED_STATES:
             self._was_armed = True
-        if (board.fault and board.fault != self._seen_fault) or (self._was_armed and board.state in UNARMED_STATES):
-            reason = self._session.last_event_reason
+        split = self._boards.describe_split() if self._was_armed else ""
+        if split:
+            self.go_dark(split)
+        elif (board.fault and board.fault != self._seen_fault) or (self._was_armed and board.state in UNARMED_STATES):
+            reason = self._boards.last_event_reason
             if board.fault:
-                cause = self._session.likely_cause if board.fault == "LINK" else None
+                cause = self._boards.likely_cause if board.fault == "LINK" else None
                 reason = f"{board.fault}: {get_fault_hint(board.fault) if cause is None else cause.message}"
             self._end_epoch(f"the board went to {board.state} ({reason})")
+            if self._boards.has_several:
+                self._boards.abort()
         self._seen_fault = board.fault
 
     def _end_unattended(self) -> None:
         """Go dark when a plan that was allowed to finish without the web process has ended, and none has come back."""
         now_s = self._clock.now_s()
-        if not self._was_armed or self._session.has_points or self._clients.is_attended:
+        if not self._was_armed or self._boards.has_points or self._clients.is_attended:
             self._attended_s = now_s
         elif now_s - self._attended_s > UNATTENDED_MAX_S:
             self.go_dark("nobody could disarm: the web process has ended")
@@ -320,10 +325,10 @@ class LinkService:
             while not self._open_port():
                 yield WAIT_MAX_S
         except (LinkError, InputError):
-            self._session.on_connect_failed()
+            self._boards.on_connect_failed()
             raise
-        yield from self._session.connect_step_by_step()
+        yield from self._boards.connect_step_by_step()
 
     def close(self) -> None:
         """Send ABORT and close the port permanently."""
-        self._session.close()
+        self._boards.close()

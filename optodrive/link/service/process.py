@@ -12,6 +12,7 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -21,7 +22,8 @@ from optodrive.core.errors import InputError, OptodriveError
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.link.service.client_sockets import ClientSockets
 from optodrive.link.service.link_service import LinkService
-from optodrive.link.service.settings import LinkSettings
+from optodrive.link.service.settings import BoardSettings, LinkSettings
+from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
 from optodrive.link.transport.capturing_transport import CapturingTransport
@@ -35,15 +37,15 @@ CAPTURES_MAX = 1000
 
 
 class PortOpener:
-    """Opens a port in a thread, because a driver, or the start of a simulated board, may block for seconds."""
+    """Opens all ports in a thread, because a driver, or the start of a simulated board, may block for seconds."""
 
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
+    def __init__(self, transports: Sequence[Transport]) -> None:
+        self._transports = transports
         self._thread: threading.Thread | None = None
         self._error: Exception | None = None
 
     def __call__(self) -> bool:
-        """Return whether the port is open, False while it needs more time. Raise the error of a failure."""
+        """Return whether the ports are open, False while it needs more time. Raise the error of a failure."""
         if self._thread is None:
             self._error = None
             self._thread = threading.Thread(target=self._open, name="open-port", daemon=True)
@@ -58,20 +60,23 @@ class PortOpener:
 
     def _open(self) -> None:
         try:
-            self._transport.open()
+            for transport in self._transports:
+                transport.open()
         except Exception as error:  # raised in the loop's thread
             self._error = error
 
 
 class LinkProcess:
-    """Loop over the port, the clients, the supervisor and signals."""
+    """Loop over the ports, the clients, the supervisor and signals."""
 
-    def __init__(self, settings: LinkSettings, transport: Transport, clock: Clock, supervisor: BeatWriter) -> None:
-        session = BoardSession(transport, clock, settings.requirements)
+    def __init__(
+        self, settings: LinkSettings, transports: Sequence[Transport], clock: Clock, supervisor: BeatWriter
+    ) -> None:
+        boards = build_board_group(settings, transports, clock)
         # Later than every epoch of an earlier link process, which began at most once per microsecond.
         first_epoch = int(clock.now_s() * 1e6)
-        self._service = LinkService(session, clock, PortOpener(transport), settings.on_web_loss, first_epoch)
-        self._transport = transport
+        self._service = LinkService(boards, clock, PortOpener(transports), settings.on_web_loss, first_epoch)
+        self._transports = transports
         self._supervisor = supervisor
         self._clients = ClientSockets(settings.socket_path, settings.socket_mode, self._service)
         self._wakeup, self._wakeup_write = socket.socketpair()
@@ -103,12 +108,10 @@ class LinkProcess:
                 return
 
     def _run_once(self) -> None:
-        port = self._transport.fileno()
         poll = select.poll()
-        for descriptor in (self._supervisor.fileno(), self._wakeup.fileno()):
+        ports = [port for transport in self._transports if (port := transport.fileno()) is not None]
+        for descriptor in (self._supervisor.fileno(), self._wakeup.fileno(), *ports):
             poll.register(descriptor, select.POLLIN)
-        if port is not None:
-            poll.register(port, select.POLLIN)
         self._clients.register(poll)
         ready = {descriptor for descriptor, _ in poll.poll(self._service.compute_wait_s() * 1e3)}
         if self._wakeup.fileno() in ready:
@@ -125,7 +128,7 @@ class LinkProcess:
             self._supervisor.receive()
 
     def close(self) -> None:
-        """Send ABORT to the board and close everything."""
+        """Send ABORT to the boards and close everything."""
         self._service.close()
         self._clients.close()
         signal.set_wakeup_fd(-1)
@@ -151,6 +154,23 @@ def open_capture(path: Path, clock: Clock, supervisor: BeatWriter) -> LinkCaptur
     raise InputError("--capture", str(path), "a name that is free: nothing is overwritten")
 
 
+def build_transport(settings: LinkSettings, board: BoardSettings, clock: Clock, supervisor: BeatWriter) -> Transport:
+    """Return the unopened transport to a board. The capture of one of several has the stage in its name."""
+    transport = ThreadedTransport(find_transport_factory(board.port)())
+    path = settings.capture_path
+    if path is None:
+        return transport
+    path = path.with_stem(f"{path.stem}-{board.stage}") if board.stage else path
+    return CapturingTransport(transport, open_capture(path, clock, supervisor), clock)
+
+
+def build_board_group(settings: LinkSettings, transports: Sequence[Transport], clock: Clock) -> BoardGroup:
+    """Build the sessions with the boards of all stages."""
+    pairs, has_several = zip(transports, settings.boards, strict=True), len(transports) > 1
+    sessions = [BoardSession(transport, clock, board.requirements, has_several) for transport, board in pairs]
+    return BoardGroup(sessions, clock, [board.stage for board in settings.boards], settings.skew_max_s)
+
+
 def read_settings(path: Path) -> LinkSettings:
     """Read the settings that the supervisor wrote. Raise InputError if that is impossible."""
     try:
@@ -171,11 +191,8 @@ def main(arguments: list[str] | None = None) -> int:
         exit_stack.callback(supervisor.close)
         try:
             settings, clock = read_settings(options.settings), MonotonicClock()
-            transport: Transport = ThreadedTransport(find_transport_factory(settings.port)())
-            if settings.capture_path is not None:
-                capture = open_capture(settings.capture_path, clock, supervisor)
-                transport = CapturingTransport(transport, capture, clock)
-            process = LinkProcess(settings, transport, clock, supervisor)
+            transports = [build_transport(settings, board, clock, supervisor) for board in settings.boards]
+            process = LinkProcess(settings, transports, clock, supervisor)
         except OptodriveError as error:
             supervisor.report_failure(str(error), error.exit_status)
             return error.exit_status

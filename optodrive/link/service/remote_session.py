@@ -7,7 +7,7 @@ import select
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from math import inf
 from pathlib import Path
@@ -20,12 +20,14 @@ from optodrive.core.errors import LinkError
 from optodrive.core.histogram import Histogram
 from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
 from optodrive.link.protocol.messages import Executed
-from optodrive.link.protocol.quantisation import WirePoints, WireScale
+from optodrive.link.protocol.quantisation import WireScale
+from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.lease_renewal import AGE_BUCKETS_S
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.staged_job import StagedJob
 
 REPLY_TIMEOUT_S = 0.2
 NO_EPOCH = 0
@@ -34,14 +36,36 @@ EXECUTED_RECORD = np.dtype([("on_tick", "<u8"), ("on_ticks", "<u4"), ("duty", "<
 """Record of an executed point in a message of kind `executed`."""
 
 
-class RemoteJob(PlanJob):
-    """Points of one plan in the link process, updated from its messages. Indices are the board's once it has begun."""
+class RemoteJob(StagedJob):
+    """Points of one plan in the link process, updated from its messages. Indices are the boards' once it has begun.
+
+    start_ticks: at which the points of each stage begin
+    """
 
     def __init__(
-        self, session: "RemoteSession", number: int, points: WirePoints, start_tick: int, ahead_ticks: float
+        self,
+        session: "RemoteSession",
+        number: int,
+        points: StagePoints,
+        zero_tick: int,
+        start_ticks: Sequence[int] | None = None,
     ) -> None:
-        super().__init__(number, points, 0, start_tick, ahead_ticks)
+        starts = [zero_tick] * len(points.stages) if start_ticks is None else start_ticks
+        pairs = zip(points.stages, starts, strict=True)
+        super().__init__(number, [PlanJob(number, one, 0, start_tick) for one, start_tick in pairs], zero_tick)
         self._session = session
+        self._first_sent_tick: float | None = None
+
+    @property
+    def first_sent_tick(self) -> float | None:
+        """Tick of board_s() at which the first point of all was sent, None before."""
+        return self._first_sent_tick
+
+    def update(self, first_index: Sequence[int], sent_points: Sequence[int], first_sent_tick: float | None) -> None:
+        """Take over what the link process reports."""
+        self._first_sent_tick = first_sent_tick
+        for part, first, sent in zip(self.parts, first_index, sent_points, strict=True):
+            part.first_index, part.next_to_send = first, first + sent
 
     def delay(self, ticks: int) -> None:
         """Shift the plan's zero, here and in the link process."""
@@ -60,16 +84,19 @@ class LeaseStats:
 class RemoteSession:
     """Connection of the planner to the link process.
 
+    scales: of the board of each stage
     epoch: latest epoch, NO_EPOCH without a link process; epoch_reason: what raised it, as an end of a sentence
     connected: whether the link process is reached and its link to the board is up
     port: name of the board's port; board: latest reported state of the board; stats: link statistics
+    stages: of several, name, port, board and clock of each
     control: who armed the board, None while it is not armed
     pause_ends_in_s: time until the pause ends disarmed, None if the light is not paused
     is_realtime: whether the link process runs before all programs of usual priority
     """
 
-    def __init__(self, scale: WireScale, clock: Clock) -> None:
-        self.scale = scale
+    def __init__(self, scales: Sequence[WireScale], clock: Clock) -> None:
+        self.scales = tuple(scales)
+        self.tick_s = scales[0].tick_s
         self.epoch = NO_EPOCH
         self.epoch_reason = ""
         self.connected = False
@@ -78,6 +105,7 @@ class RemoteSession:
         self.port = ""
         self.board = BoardView()
         self.stats: dict[str, Any] = {}
+        self.stages: list[dict[str, Any]] = []
         self.faults: Counter[str] = Counter()
         self.lease = LeaseStats()
         self.is_acknowledged = self.is_realtime = False
@@ -231,7 +259,7 @@ class RemoteSession:
         self.link_error, self.link_error_code = fields["link_error"], fields["link_error_code"]
         board = {name: value for name, value in fields["board"].items() if name != "hint"}
         self.board = BoardView(**{**board, "fault": board["fault"] or ""})
-        self.stats, self.faults = fields["stats"], Counter(fields["faults"])
+        self.stats, self.faults, self.stages = fields["stats"], Counter(fields["faults"]), fields["stages"]
         self.lease.ages.load(fields["lease"]["counts"], fields["lease"]["sum_s"])
         self.lease.slack_s = fields["lease"]["slack_s"]
         self.is_acknowledged, self._reported_ready = fields["is_acknowledged"], fields["is_ready"]
@@ -253,9 +281,7 @@ class RemoteSession:
         job = self._jobs.get(fields["job"])
         if job is None:
             return
-        job.first_index = fields["first_index"]
-        job.next_to_send = job.first_index + fields["sent_points"]
-        job.first_sent_tick = fields["first_sent_tick"]
+        job.update(fields["first_index"], fields["sent_points"], fields["first_sent_tick"])
         if fields["finished"]:
             del self._jobs[fields["job"]]
 
@@ -269,7 +295,8 @@ class RemoteSession:
         job = self._jobs.get(fields["job"])
         if job is not None:
             records = tuple(np.frombuffer(payload, EXECUTED_RECORD).tolist())
-            job.record_executed(Executed(job.first_index + fields["first_point"], records))
+            part = job.parts[fields["stage"]]
+            part.record_executed(Executed(part.first_index + fields["first_point"], records))
 
     # --- state --------------------------------------------------------------------------------------------------
 
@@ -317,7 +344,7 @@ class RemoteSession:
     # --- commands -----------------------------------------------------------------------------------------------
 
     def begin(
-        self, points: WirePoints, start_s: float, epoch: int, send_ahead_s: float = inf, crc: int | None = None
+        self, points: StagePoints, start_s: float, epoch: int, send_ahead_s: float = inf, crc: int | None = None
     ) -> RemoteJob:
         """Start to stream a plan whose zero is board time start_s. A refusal arrives later, see pop_refusal().
 
@@ -325,13 +352,15 @@ class RemoteSession:
         crc: CRC-32 of the bytes that were verified, computed from the points if None
         """
         payload = points.encode_payload()
-        job = self._add_job(points, max(1, round(start_s / self.scale.tick_s)), send_ahead_s)
+        self._job_number += 1
+        job = RemoteJob(self, self._job_number, points, max(1, round(start_s / self.tick_s)))
+        self._jobs[job.number] = job
         fields = {
             "job": job.number,
             "epoch": epoch,
             "pause": self._drained_number,
             "start_s": start_s,
-            **_build_points_fields(payload, send_ahead_s, crc),
+            **_build_points_fields(points, payload, send_ahead_s, crc),
         }
         try:
             self._send_command("begin", fields, payload)
@@ -340,38 +369,53 @@ class RemoteSession:
         return job
 
     def splice(
-        self, points: WirePoints, kept_points: int, epoch: int, send_ahead_s: float, crc: int | None = None
+        self,
+        points: StagePoints,
+        kept_points: Sequence[int],
+        zero_s: float,
+        epoch: int,
+        send_ahead_s: float,
+        crc: int | None = None,
     ) -> RemoteJob | None:
-        """Truncate the last job to `kept_points` points and continue with `points` without a pause.
+        """Truncate the last job to `kept_points` points of each stage and continue with `points` without a pause.
 
+        zero_s: time of board_s() of the new plan's zero; on one board it is where the kept points end
         Return None if it is too late for that, if the epoch has passed, or if the link process does not answer.
         """
-        payload, last = points.encode_payload(), self._find_last_job()
+        last = self._find_last_job()
         if last is None:
             return None
+        start_ticks = [part.end_tick_after(kept) for part, kept in zip(last.parts, kept_points, strict=True)]
+        zero_tick = round(zero_s / self.tick_s)
+        if len(self.scales) > 1:
+            points, crc = points.add_pauses([zero_tick - tick for tick in start_ticks]), None
+        payload = points.encode_payload()
         self._job_number += 1
         number = self._job_number
-        fields = {"job": number, "epoch": epoch, "pause": self._drained_number, "kept_points": kept_points}
+        fields = {"job": number, "epoch": epoch, "pause": self._drained_number, "kept_points": list(kept_points)}
 
         added: list[RemoteJob] = []
 
         def add_job(result: dict[str, Any]) -> None:
             if result["start_tick"] is not None:
                 last.truncate(kept_points)
-                job = RemoteJob(self, number, points, result["start_tick"], send_ahead_s / self.scale.tick_s)
-                job.first_index = job.next_to_send = result["first_index"]
+                if len(self.scales) > 1:
+                    job = RemoteJob(self, number, points, zero_tick, start_ticks)
+                else:
+                    job = RemoteJob(self, number, points, result["start_tick"])
+                job.update(result["first_index"], [0] * len(job.parts), None)
                 self._jobs[number] = job
                 added.append(job)  # a job without points may be finished, and forgotten, before the next line is read
 
-        self._request("splice", fields | _build_points_fields(payload, send_ahead_s, crc), payload, add_job)
+        self._request("splice", fields | _build_points_fields(points, payload, send_ahead_s, crc), payload, add_job)
         return added[0] if added and self._socket is not None else None
 
-    def truncate(self, kept_points: int) -> bool:
-        """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
+    def truncate(self, kept_points: Sequence[int]) -> bool:
+        """Truncate the last job to `kept_points` points of each stage. Return False, unchanged, if more were sent."""
         last = self._find_last_job()
         results: list[dict[str, Any]] = []
         if last is not None:
-            self._request("truncate", {"kept_points": kept_points}, b"", results.append)
+            self._request("truncate", {"kept_points": list(kept_points)}, b"", results.append)
         return last is not None and bool(results) and results[0]["done"] and last.truncate(kept_points)
 
     def flush(self) -> None:
@@ -390,16 +434,10 @@ class RemoteSession:
         with suppress(LinkError):
             self._send_command("delay", {"job": number, "ticks": ticks})
 
-    def _add_job(self, points: WirePoints, start_tick: int, send_ahead_s: float) -> RemoteJob:
-        self._job_number += 1
-        job = RemoteJob(self, self._job_number, points, start_tick, send_ahead_s / self.scale.tick_s)
-        self._jobs[job.number] = job
-        return job
-
     def _find_last_job(self) -> RemoteJob | None:
         return next(reversed(self._jobs.values()), None)
 
 
-def _build_points_fields(payload: bytes, send_ahead_s: float, crc: int | None) -> dict[str, Any]:
+def _build_points_fields(points: StagePoints, payload: bytes, send_ahead_s: float, crc: int | None) -> dict[str, Any]:
     ahead_s = None if send_ahead_s == inf else send_ahead_s
-    return {"ahead_s": ahead_s, "crc": zlib.crc32(payload) if crc is None else crc}
+    return {"counts": points.counts, "ahead_s": ahead_s, "crc": zlib.crc32(payload) if crc is None else crc}

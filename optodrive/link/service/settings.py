@@ -14,15 +14,36 @@ OnWebLoss = Literal["dark", "finish"]
 
 
 @dataclass(frozen=True)
+class BoardSettings:
+    """Address and requirements of the board of one stage. stage: its name, '' if there is only one."""
+
+    port: PortSettings
+    requirements: BoardRequirements
+    stage: str = ""
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Return the settings whose fields asdict() wrote."""
+        requirements = values["requirements"]
+        requirements |= {
+            "limits": m.Limits(**requirements["limits"]),
+            "scale": WireScale(**requirements["scale"]),
+            "values": ConfiguredValues(**requirements["values"]),
+        }
+        return cls(PortSettings(**values["port"]), BoardRequirements(**requirements), values["stage"])
+
+
+@dataclass(frozen=True)
 class LinkSettings:
     """Settings of the link process.
 
+    boards: of all stages; skew_max_s: largest error of a board's clock with which a plan may start on several
     socket_path, socket_mode: of the socket on which it listens; capture_path: new file for a capture of the link
     on_web_loss: whether the loss of the web process ends the running plan at once, or lets it run to its end
     """
 
-    port: PortSettings
-    requirements: BoardRequirements
+    boards: tuple[BoardSettings, ...]
+    skew_max_s: float
     socket_path: Path
     socket_mode: int = 0o600
     capture_path: Path | None = None
@@ -36,16 +57,9 @@ class LinkSettings:
     def from_json(cls, text: str) -> Self:
         """Return the settings that to_json() wrote. Raise ValueError, KeyError or TypeError for other text."""
         values: dict[str, Any] = json.loads(text)
-        requirements = values["requirements"]
-        requirements |= {
-            "limits": m.Limits(**requirements["limits"]),
-            "scale": WireScale(**requirements["scale"]),
-            "values": ConfiguredValues(**requirements["values"]),
-        }
         capture_path = values["capture_path"]
         values |= {
-            "port": PortSettings(**values["port"]),
-            "requirements": BoardRequirements(**requirements),
+            "boards": tuple(BoardSettings.from_dict(board) for board in values["boards"]),
             "socket_path": Path(values["socket_path"]),
             "capture_path": None if capture_path is None else Path(capture_path),
         }

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from optodrive.core.errors import BoardFaultError, LinkError, NotReadyError, OptodriveError
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
+from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.fault_hints import get_fault_hint
-from optodrive.link.session.session import BoardSession
 
 TIMEOUT_S = 5.0
 AWAITED_STATES = {
@@ -49,26 +49,26 @@ class StateWaiters:
         return ended
 
     def pop_results(
-        self, session: BoardSession, refusal: str | None, link_error: str | None, now_s: float
+        self, boards: BoardGroup, refusal: str | None, link_error: str | None, now_s: float
     ) -> Iterator[tuple[Waiter, OptodriveError | None]]:
         """Remove and yield the waiters that have a result. refusal: reason of a refusal since the last call."""
         for waiter in self._waiters.copy():
-            error = _find_error(waiter, session, refusal, link_error, now_s)
-            if error is not None or _is_fulfilled(waiter, session):
+            error = _find_error(waiter, boards, refusal, link_error, now_s)
+            if error is not None or _is_fulfilled(waiter, boards):
                 self._waiters.remove(waiter)
                 yield waiter, error
 
 
-def _is_fulfilled(waiter: Waiter, session: BoardSession) -> bool:
-    has_confirmed = session.is_acknowledged or (waiter.command == "stop" and session.abort_confirmed)
-    return session.board.state in AWAITED_STATES[waiter.command] and has_confirmed
+def _is_fulfilled(waiter: Waiter, boards: BoardGroup) -> bool:
+    has_confirmed = boards.is_acknowledged or (waiter.command == "stop" and boards.abort_confirmed)
+    return boards.board.state in AWAITED_STATES[waiter.command] and has_confirmed
 
 
 def _find_error(
-    waiter: Waiter, session: BoardSession, refusal: str | None, link_error: str | None, now_s: float
+    waiter: Waiter, boards: BoardGroup, refusal: str | None, link_error: str | None, now_s: float
 ) -> OptodriveError | None:
-    board = session.board
-    if not session.connected:
+    board = boards.board
+    if not boards.connected:
         return LinkError(link_error or "no link to the board")
     if refusal is not None:
         return NotReadyError(f"the board refuses to {waiter.command}: {refusal}")

@@ -4,17 +4,47 @@ Every exchange brackets a board tick between its request and its reply.
 """
 
 import secrets
+from collections.abc import Sequence
+from typing import NamedTuple
 
 SAMPLES_MAX = 16
+"""Number of recent exchanges, unless stated otherwise."""
 PENDING_MAX = 64
+WIDTH_MIN_S = 1e-6
+WANDER_MAX = 2e-6
+"""Largest change of a crystal's relative rate over the recent exchanges."""
 DRIFT_MAX = 2e-4
 """Maximum relative drift of two crystals. A bracket widens at this rate with age."""
 
 
-class ClockSync:
-    """Map from host time to board time (ticks / tick_hz). One thread adds samples, any thread may read."""
+class ClockFit(NamedTuple):
+    """Straight line through recent exchanges: at host time host_s the board's clock reads board_s, and runs at rate.
 
-    def __init__(self) -> None:
+    uncertainty_s: bound on the error of board_s: half the width of an exchange, and what the clocks drift since then
+    """
+
+    host_s: float
+    board_s: float
+    rate: float
+    uncertainty_s: float
+
+    def to_board_s(self, host_s: float) -> float:
+        """Return the board time at a host time, s."""
+        return self.board_s + self.rate * (host_s - self.host_s)
+
+    def to_host_s(self, board_s: float) -> float:
+        """Return the host time at a board time, s."""
+        return self.host_s + (board_s - self.board_s) / self.rate
+
+
+class ClockSync:
+    """Map from host time to board time (ticks / tick_hz). One thread adds samples, any thread may read.
+
+    samples_max: number of recent exchanges that count
+    """
+
+    def __init__(self, samples_max: int = SAMPLES_MAX) -> None:
+        self._samples_max = samples_max
         self._request_s: dict[int, float] = {}
         # An immutable tuple, because another thread may be reading it.
         self._samples: tuple[tuple[float, float, float], ...] = ()
@@ -33,7 +63,7 @@ class ClockSync:
         if request_s is None:
             return
         sample = (reply_s - request_s, (request_s + reply_s) / 2, board_s)
-        self._samples = (*self._samples[1 - SAMPLES_MAX :], sample)
+        self._samples = (*self._samples[1 - self._samples_max :], sample)
 
     @property
     def is_synchronised(self) -> bool:
@@ -53,6 +83,29 @@ class ClockSync:
         best = min(samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
         return best[1:]
 
+    def fit(self, host_s: float) -> ClockFit | None:
+        """Fit the line to the recent exchanges, None before the first.
+
+        An exchange counts by the inverse square of its width. With few of them, the rate stays near 1.
+        """
+        samples = self._samples
+        if not samples:
+            return None
+        weights = [1.0 / max(width_s, WIDTH_MIN_S) ** 2 for width_s, _, _ in samples]
+        total = sum(weights)
+        mean_s = sum(w * midpoint_s for w, (_, midpoint_s, _) in zip(weights, samples, strict=True)) / total
+        ahead_s = [board_s - midpoint_s for _, midpoint_s, board_s in samples]
+        mean_ahead_s = sum(w * each for w, each in zip(weights, ahead_s, strict=True)) / total
+        spread = covariance = 0.0
+        for w, (_, midpoint_s, _), each in zip(weights, samples, ahead_s, strict=True):
+            spread += w * (midpoint_s - mean_s) ** 2
+            covariance += w * (midpoint_s - mean_s) * (each - mean_ahead_s)
+        rate = 1.0 + covariance / (spread + 1.0 / DRIFT_MAX**2)
+        at_s = samples[-1][1]
+        drift = _bound_drift(samples)
+        uncertainty_s = min(width_s / 2 + drift * (host_s - midpoint_s) for width_s, midpoint_s, _ in samples)
+        return ClockFit(at_s, mean_s + mean_ahead_s + rate * (at_s - mean_s), rate, uncertainty_s)
+
     def board_s(self, host_s: float) -> float:
         """Return the board time at host time host_s, s, or 0 before the first exchange."""
         sample = self.find_best_sample(host_s)
@@ -60,3 +113,13 @@ class ClockSync:
             return 0.0
         midpoint_s, board_s = sample
         return board_s + (host_s - midpoint_s)
+
+
+def _bound_drift(samples: Sequence[tuple[float, float, float]]) -> float:
+    """Return a bound on the error of the rate: both ends of a line lie within the exchanges of either half."""
+    half = len(samples) // 2
+    if not half:
+        return DRIFT_MAX
+    first, last = (min(each, key=lambda sample: sample[0]) for each in (samples[:half], samples[half:]))
+    span_s = max(last[1] - first[1], WIDTH_MIN_S)
+    return min(DRIFT_MAX, 0.5 * (first[0] + last[0]) / span_s + WANDER_MAX)

@@ -1,6 +1,7 @@
 """Points of one plan on their way through the board, with the board's report of their execution."""
 
-from math import floor, inf
+from collections.abc import Callable
+from math import ceil, floor, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,12 @@ import numpy as np
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import ExecutedPulses, PulsePlan
 from optodrive.link.protocol.messages import Executed
-from optodrive.link.protocol.quantisation import WirePoints
+from optodrive.link.protocol.quantisation import TICKS_MAX, WirePoints
+
+RETIMING_RATE_MAX = 2e-4
+"""Largest relative shift of points by which a job follows the host's clock, that of two crystals."""
+RETIMING_MAX_TICKS = 5
+"""Largest shift of one point: that much of its settling time may be missing."""
 
 
 class ReportedPulses(NamedTuple):
@@ -20,6 +26,16 @@ class ReportedPulses(NamedTuple):
     duty: IntArray
 
 
+class PointTiming(NamedTuple):
+    """Times of a job's points by the host's clock, to which the boards of several stages keep.
+
+    start_tick: at which the points begin, in ticks of the host; to_board_tick: converts a tick of the host as of now
+    """
+
+    start_tick: int
+    to_board_tick: Callable[[int], float]
+
+
 class PlanJob:
     """Points of one plan on their way through the board.
 
@@ -27,10 +43,17 @@ class PlanJob:
     start_tick: board tick of the plan's zero
     send_ahead_ticks: maximum time from sending a point to its start
     first_sent_tick: board tick at which the first point was sent
+    timing: times by the host's clock, which the points follow; None if they keep to the board's own clock
     """
 
     def __init__(
-        self, number: int, points: WirePoints, first_index: int, start_tick: int, send_ahead_ticks: float = inf
+        self,
+        number: int,
+        points: WirePoints,
+        first_index: int,
+        start_tick: int,
+        send_ahead_ticks: float = inf,
+        timing: PointTiming | None = None,
     ) -> None:
         self.number = number
         self.first_index = first_index
@@ -38,9 +61,11 @@ class PlanJob:
         self.next_to_send = first_index
         self.first_sent_tick: float | None = None
         self._send_ahead_ticks = send_ahead_ticks
-        self._points = points
+        self._table = points.table.astype("<u2")
         self._count = len(points)
-        self._end_tick = start_tick + points.compute_end_ticks()
+        self._timing = timing
+        self._planned_end_tick = points.compute_end_ticks()
+        self._end_tick = start_tick + self._planned_end_tick
         self._row = points.row
         self._pulse_points = np.flatnonzero(points.row >= 0)
         self._on_tick = np.full(len(points), -1, dtype=np.int64)
@@ -56,6 +81,11 @@ class PlanJob:
     def end_tick_after(self, count: int) -> int:
         """Return the scheduled end tick of the first `count` points."""
         return int(self._end_tick[count - 1]) if count else self.start_tick
+
+    def find_host_end_tick(self, count: int) -> int:
+        """Return the tick of the host at which the first `count` points end. Only for a job with timing."""
+        start_tick = 0 if self._timing is None else self._timing.start_tick
+        return start_tick + (int(self._planned_end_tick[count - 1]) if count else 0)
 
     def delay(self, ticks: int) -> None:
         """Shift the plan's zero because an earlier job was late."""
@@ -90,12 +120,34 @@ class PlanJob:
         if self.first_sent_tick is None:
             self.first_sent_tick = now_tick
         position = self.next_to_send - self.first_index
+        if self._timing is not None:
+            self._follow_host(self._timing, position)
         self.next_to_send += count
-        return self._points.encode_payload(position, count)
+        return self._table[position : position + count].tobytes()
+
+    def _follow_host(self, timing: PointTiming, position: int) -> None:
+        """Shift the points from a position on by what the board's clock has drifted since the last were sent."""
+        off_ticks, on_ticks = (int(value) for value in self._table[position, 2:4])
+        planned_tick = timing.start_tick + int(self._planned_end_tick[position]) - on_ticks
+        error = timing.to_board_tick(planned_tick) - float(self._end_tick[position] - on_ticks)
+        limit = min(RETIMING_MAX_TICKS, ceil(RETIMING_RATE_MAX * (off_ticks + on_ticks)), off_ticks)
+        shift = round(max(-limit, min(limit, error)))
+        if off_ticks + shift <= TICKS_MAX:
+            self._table[position, 2] = off_ticks + shift
+            self._end_tick[position:] += shift
+
+    def find_start_tick(self) -> int | None:
+        """Return the board tick at which the next point's gate is due to turn on, None if all were sent."""
+        position = self.next_to_send - self.first_index
+        return int(self._end_tick[position]) - int(self._table[position, 3]) if position < self._count else None
+
+    def can_truncate(self, kept_points: int) -> bool:
+        """Return whether no more than `kept_points` points were sent."""
+        return self.first_index + kept_points >= self.next_to_send
 
     def truncate(self, kept_points: int) -> bool:
         """Truncate the job to `kept_points` points. Return False, unchanged, if more were sent."""
-        if self.first_index + kept_points < self.next_to_send:
+        if not self.can_truncate(kept_points):
             return False
         self._count = min(kept_points, self._count)
         return True
@@ -136,6 +188,19 @@ class PlanJob:
         """Number of pulses among the points."""
         return len(self._pulse_points)
 
+    @property
+    def pulse_rows(self) -> IntArray:
+        """The plan rows of all pulses, in order."""
+        return self._row[self._pulse_points]
+
+    def read_reports(self, pulses: IntArray) -> ReportedPulses:
+        """Return what was reported of pulses [n], given as their positions among all; on_tick is −1 without a report.
+
+        Any thread may call it.
+        """
+        points = self._pulse_points[pulses]
+        return ReportedPulses(self._row[points], self._on_tick[points], self._on_ticks[points], self._duty[points])
+
     def read_reported(self, begin: int, end: int) -> ReportedPulses:
         """Return the reports so far of pulses begin to end, in order of the points. Any thread may call it."""
         pulse_points = self._pulse_points[begin:end]
@@ -153,12 +218,18 @@ class PlanJob:
         row = self.list_executed_rows()
         on_tick, width_ticks = self._on_tick[done], self._on_ticks[done]
         return ExecutedPulses(
-            index=self.first_index + done,
             on_tick=on_tick,
             width_ticks=width_ticks,
             pixel=plan.pixel[row],
             power_w=self._duty[done] / 65535.0 * full_power_w,
             start_s=np.asarray((on_tick - self.start_tick) * tick_s, dtype=np.float64),
             width_s=np.asarray(width_ticks * tick_s, dtype=np.float64),
-            complete=len(done) == int(np.searchsorted(self._pulse_points, self._count)),
+            stage=np.zeros(len(row), dtype=np.int64),
+            complete=self.is_complete,
         )
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no report of a pulse is missing from the untruncated part."""
+        done = self._on_tick[self._pulse_points] >= 0
+        return int(np.count_nonzero(done)) == int(np.searchsorted(self._pulse_points, self._count))

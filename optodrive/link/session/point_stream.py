@@ -9,7 +9,7 @@ from math import inf
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints
-from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.plan_job import PlanJob, PointTiming
 
 MISSING_REPORT_RETRY_S = 0.1
 WATERMARK_POINTS = 48
@@ -36,42 +36,62 @@ class PointStream:
         """Restart the point indices at 0 for a new session."""
         self._next_index = self._sent_index = 0
 
-    def begin(self, points: WirePoints, start_tick: int, send_ahead_ticks: float = inf) -> PlanJob:
+    def begin(
+        self,
+        points: WirePoints,
+        start_tick: int,
+        send_ahead_ticks: float = inf,
+        timing: PointTiming | None = None,
+    ) -> PlanJob:
         """Start a job whose zero is board tick start_tick.
 
-        send_ahead_ticks: maximum time from sending a point to its start
+        send_ahead_ticks: maximum time from sending a point to its start; timing: as for `PlanJob`
         """
         self._number += 1
         self._started = self._end_sent = False
-        return self._append(points, start_tick, send_ahead_ticks)
+        return self._append(points, start_tick, send_ahead_ticks, timing)
+
+    @property
+    def last(self) -> PlanJob | None:
+        """The last job, None without any."""
+        return self._jobs[-1] if self._jobs else None
+
+    def can_truncate(self, kept_points: int) -> bool:
+        """Return whether the last job can be truncated to `kept_points` points: no more were sent, nor END."""
+        return bool(self._jobs) and not self._end_sent and self._jobs[-1].can_truncate(kept_points)
+
+    def can_splice(self, kept_points: int, min_end_tick: float) -> bool:
+        """Return whether other points may follow the first `kept_points` of the last job without a pause.
+
+        They may not if more were sent, or if the kept points end before min_end_tick, where the board might run out of
+        points.
+        """
+        if not self._started or not self.can_truncate(kept_points):
+            return False
+        return self._jobs[-1].end_tick_after(kept_points) >= min_end_tick
 
     def splice(
-        self, points: WirePoints, kept_points: int, send_ahead_ticks: float, min_end_tick: float
-    ) -> PlanJob | None:
-        """Truncate the last job to `kept_points` points and append others without a pause.
+        self, points: WirePoints, kept_points: int, send_ahead_ticks: float, timing: PointTiming | None = None
+    ) -> PlanJob:
+        """Truncate the last job to `kept_points` points and append others without a pause, if can_splice().
 
-        Return None if more points were sent, or if the kept points end before min_end_tick, where the board might run
-        out of points.
+        timing: as for `PlanJob`
         """
-        last = self._jobs[-1] if self._jobs else None
-        if (
-            last is None
-            or not self._started
-            or last.end_tick_after(kept_points) < min_end_tick
-            or not self.truncate(kept_points)
-        ):
-            return None
-        return self._append(points, last.end_tick_after(kept_points), send_ahead_ticks)
+        self.truncate(kept_points)
+        return self._append(points, self._jobs[-1].end_tick_after(kept_points), send_ahead_ticks, timing)
 
     def truncate(self, kept_points: int) -> bool:
         """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
-        if not self._jobs or self._end_sent or not self._jobs[-1].truncate(kept_points):
+        if not self.can_truncate(kept_points):
             return False
+        self._jobs[-1].truncate(kept_points)
         self._next_index = self._jobs[-1].end_index
         return True
 
-    def _append(self, points: WirePoints, start_tick: int, send_ahead_ticks: float) -> PlanJob:
-        job = PlanJob(self._number, points, self._next_index, start_tick, send_ahead_ticks)
+    def _append(
+        self, points: WirePoints, start_tick: int, send_ahead_ticks: float, timing: PointTiming | None
+    ) -> PlanJob:
+        job = PlanJob(self._number, points, self._next_index, start_tick, send_ahead_ticks, timing)
         self._next_index = job.end_index
         self._jobs.append(job)
         return job
@@ -111,6 +131,10 @@ class PointStream:
         if self._jobs and not self._end_sent and link.outstanding < link.window:
             link.send(m.End(self._number, self._next_index))
             self._end_sent = True
+
+    def find_start_tick(self) -> int | None:
+        """Return the board tick at which the gate of the next unsent point is due, None if all were sent."""
+        return next((job.find_start_tick() for job in self._jobs if not job.is_fully_sent), None)
 
     def find_due_tick(self) -> float | None:
         """Return the board tick from which the next point may be sent, None if no point waits for its time."""

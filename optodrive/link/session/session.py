@@ -22,7 +22,7 @@ from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import ClockSync
 from optodrive.link.session.lease_renewal import RENEWAL_FRACTION, LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
-from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.plan_job import PlanJob, PointTiming
 from optodrive.link.session.point_drain import PointDrain
 from optodrive.link.session.point_stream import PointStream
 from optodrive.link.transport.base import Transport
@@ -33,6 +33,9 @@ HANDSHAKE_INTERVAL_S = 0.02
 """Interval between two requests of the handshake; a board that answers only some of them is not polled faster."""
 STATUS_INTERVAL_S = 0.2
 CLOCK_INTERVAL_S = 1.0
+STAGE_CLOCK_INTERVAL_S = 0.25
+CLOCK_SPAN_S = 16.0
+"""Time over which the clocks are compared."""
 CLOCK_INITIAL_SAMPLES = 8
 SILENCE_TIMEOUT_S = 2.0
 """The link counts as lost after this time without a message from the board."""
@@ -50,14 +53,25 @@ class BoardSession:
     lease: schedule and statistics of the lease renewals
     board: latest reported state of the board
     on_executed: called with every report of executed points
+    is_one_of_several: whether other boards share its display. It is then asked often: for its clock, because all keep
+    the host's time, and for its status, because its silence must end the light of the others within a lease.
     """
 
-    def __init__(self, transport: Transport, clock: Clock, requirements: BoardRequirements) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        clock: Clock,
+        requirements: BoardRequirements,
+        is_one_of_several: bool = False,
+    ) -> None:
         self._transport = transport
         self._clock = clock
         self._requirements = requirements
         self._connection = HostConnection()
-        self._clock_sync = ClockSync()
+        self._is_one_of_several = is_one_of_several
+        self._clock_interval_s = STAGE_CLOCK_INTERVAL_S if is_one_of_several else CLOCK_INTERVAL_S
+        self._status_interval_s = RENEWAL_FRACTION * requirements.lease_s if is_one_of_several else STATUS_INTERVAL_S
+        self._clock_sync = self._build_clock_sync()
         self._points = PointStream()
         self._points_held = False
         self._drain: PointDrain | None = None
@@ -85,6 +99,14 @@ class BoardSession:
     def scale(self) -> WireScale:
         """Scale factors between SI units and this board's integers."""
         return self._requirements.scale
+
+    def _build_clock_sync(self) -> ClockSync:
+        return ClockSync(round(CLOCK_SPAN_S / self._clock_interval_s))
+
+    @property
+    def clock_sync(self) -> ClockSync:
+        """Comparison of the board's clock with the host's."""
+        return self._clock_sync
 
     def board_s(self) -> float:
         """Return the present board time, s."""
@@ -190,7 +212,7 @@ class BoardSession:
 
     def _reset(self) -> None:
         self._connection = HostConnection(self._requirements.rto_s)
-        self._clock_sync = ClockSync()
+        self._clock_sync = self._build_clock_sync()
         self._arm_nonce = None
         self._refusal = None
         self.board = BoardView()
@@ -209,7 +231,7 @@ class BoardSession:
         if isinstance(error, LinkError):
             now_s = self._clock.now_s()
             cause = self._watch.on_lost(
-                now_s, self._last_received_s, silent=now_s - self._last_received_s > SILENCE_TIMEOUT_S
+                now_s, self._last_received_s, silent=now_s - self._last_received_s > self._silence_max_s
             )
             message = f"{message}; likely cause: {cause.message}"
         self.disconnect()
@@ -221,6 +243,12 @@ class BoardSession:
             self._send_abort()
         self.connected = False
         self._transport.release()
+
+    def leave(self) -> None:
+        """Send ABORT if possible and close the link. It may be opened again."""
+        if self.connected:
+            self._send_abort()
+        self.disconnect()
 
     def _send_abort(self) -> None:
         with suppress(LinkError):  # without ABORT the board turns the gate off when its lease expires
@@ -244,17 +272,21 @@ class BoardSession:
             self.lease.pause()
         elif renew_lease:
             self._send_lease(now_s)
-        if now_s - self._status_requested_s >= STATUS_INTERVAL_S:
+        if now_s - self._status_requested_s >= self._status_interval_s:
             self._request_status()
-        if now_s - self._clock_requested_s >= CLOCK_INTERVAL_S:
+        if now_s - self._clock_requested_s >= self._clock_interval_s:
             self._request_clock()
         self._retry_hello()
         self._stream_points()
         self._exchange(wait_s)
-        if now_s - self._last_received_s > SILENCE_TIMEOUT_S:
-            raise LinkError(
-                f"{self.port}: the board sent nothing for {SILENCE_TIMEOUT_S:g} s; {self._describe_errors()}"
-            )
+        silence_max_s = self._silence_max_s
+        if now_s - self._last_received_s > silence_max_s:
+            raise LinkError(f"{self.port}: the board sent nothing for {silence_max_s:g} s; {self._describe_errors()}")
+
+    @property
+    def _silence_max_s(self) -> float:
+        is_short = self._is_one_of_several and self.board.state in LEASED_STATES
+        return self._requirements.lease_s if is_short else SILENCE_TIMEOUT_S
 
     def _send_lease(self, now_s: float) -> None:
         renewal = self.lease.renew(now_s)
@@ -346,14 +378,18 @@ class BoardSession:
 
     def arm(self) -> None:
         """Request arming. The board shows its indicator and is ARMED two seconds after the confirmation."""
-        if self.board.state != BoardState.DISARMED:
-            fault = f" {self.board.fault}" if self.board.fault else ""
-            raise NotReadyError(f"the board is {self.board.state}{fault}; only a DISARMED board can be armed")
+        self.require_disarmed()
         self._refusal = None
         self._drop_held_points()
         self._points_held = False
         self._arm_nonce = secrets.randbits(32)
         self._connection.send(m.ArmReq(host_nonce=self._arm_nonce))
+
+    def require_disarmed(self, which: str = "") -> None:
+        """Raise NotReadyError unless the board can be armed. which: prefix of the message."""
+        if self.board.state != BoardState.DISARMED:
+            fault = f" {self.board.fault}" if self.board.fault else ""
+            raise NotReadyError(f"{which}the board is {self.board.state}{fault}; only a DISARMED board can be armed")
 
     def disarm(self) -> None:
         """Disarm the board, or acknowledge its fault in FAULT."""
@@ -412,22 +448,44 @@ class BoardSession:
 
     # --- streaming ----------------------------------------------------------------------------------------------
 
-    def begin(self, points: WirePoints, start_s: float, send_ahead_s: float = inf) -> PlanJob:
+    def begin(
+        self, points: WirePoints, start_s: float, send_ahead_s: float = inf, timing: PointTiming | None = None
+    ) -> PlanJob:
         """Start to stream a plan whose zero is board time start_s.
 
-        send_ahead_s: maximum time from sending a point to its start
+        send_ahead_s: maximum time from sending a point to its start; timing: as for `PlanJob`
         """
-        return self._points.begin(points, max(1, round(start_s / self.scale.tick_s)), send_ahead_s / self.scale.tick_s)
+        start_tick = max(1, round(start_s / self.scale.tick_s))
+        return self._points.begin(points, start_tick, send_ahead_s / self.scale.tick_s, timing)
 
-    def splice(self, points: WirePoints, kept_points: int, send_ahead_s: float) -> PlanJob | None:
+    def can_splice(self, kept_points: int) -> bool:
+        """Return whether it is early enough to continue without a pause after `kept_points` points of the last job."""
+        return self._points.can_splice(kept_points, (self.board_s() + SPLICE_LEAD_S) / self.scale.tick_s)
+
+    def splice(
+        self, points: WirePoints, kept_points: int, send_ahead_s: float, timing: PointTiming | None = None
+    ) -> PlanJob | None:
         """Truncate the last job to `kept_points` points and continue with `points` without a pause.
 
-        Return None if it is too late for that.
+        Return None if it is too late for that. timing: as for `PlanJob`
         """
-        tick_s = self.scale.tick_s
-        return self._points.splice(
-            points, kept_points, send_ahead_s / tick_s, (self.board_s() + SPLICE_LEAD_S) / tick_s
-        )
+        if not self.can_splice(kept_points):
+            return None
+        return self._points.splice(points, kept_points, send_ahead_s / self.scale.tick_s, timing)
+
+    @property
+    def last_job(self) -> PlanJob | None:
+        """The last job of those that are not finished."""
+        return self._points.last
+
+    def find_lateness_s(self) -> float:
+        """Return by how much the next unsent point is late, s; at most 0 while there is time to send it."""
+        start_tick = self._points.find_start_tick()
+        return -inf if start_tick is None else self.board_s() - start_tick * self.scale.tick_s
+
+    def can_truncate(self, kept_points: int) -> bool:
+        """Return whether the last job can be truncated to `kept_points` points."""
+        return not self.is_draining and self._points.can_truncate(kept_points)
 
     def truncate(self, kept_points: int) -> bool:
         """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""

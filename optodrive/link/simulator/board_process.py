@@ -1,6 +1,7 @@
 """The simulated board as a process on a pseudo-terminal.
 
 python -m optodrive.link.simulator.board_process --pty LINK [--log FILE] [--limits FILE] [--script FILE] [--baud N]
+    [--clock-ppm N] [--clock-wander-ppm N]
     [--sensor LINK [--geometry SEED] [--config FILE] [--sensor-noise-um N] [--outlier-share N] [--no-readback]]
 """
 
@@ -12,6 +13,7 @@ from pathlib import Path
 
 from optodrive.core.errors import InputError
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
+from optodrive.link.simulator.board_clock import BoardClock
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings, load_settings
 from optodrive.link.simulator.pseudo_terminal import check_link_path
@@ -20,12 +22,17 @@ from optodrive.link.simulator.script import load_script
 from optodrive.link.simulator.sensor_options import add_sensor_options, build_optics
 
 BAUD_MIN = 300
+CLOCK_PPM_MAX = 200
 
 
 def _check_options(options: argparse.Namespace) -> None:
     check_link_path("--pty", options.pty)
     if options.baud < BAUD_MIN:
         raise InputError("--baud", options.baud, f"at least {BAUD_MIN}")
+    for name in ("clock_ppm", "clock_wander_ppm"):
+        if not abs(getattr(options, name)) <= CLOCK_PPM_MAX:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(option, getattr(options, name), f"-{CLOCK_PPM_MAX} to {CLOCK_PPM_MAX}")
 
 
 def main(
@@ -46,6 +53,10 @@ def main(
         metavar="SECONDS",
         help="exit when no host has had the port open for this time",
     )
+    parser.add_argument("--clock-ppm", type=float, default=0.0, metavar="N", help="error of the board's oscillator")
+    parser.add_argument(
+        "--clock-wander-ppm", type=float, default=0.0, metavar="N", help="its amplitude over ten minutes"
+    )
     parser.add_argument("--seed", type=int, help="seed of the nonces, for a session that can be replayed")
     add_sensor_options(parser)
     options = parser.parse_args(arguments)
@@ -61,11 +72,12 @@ def main(
     except OSError as error:
         print(f"optodrive.link.simulator.board_process: --log {options.log}: {error.strerror}", file=sys.stderr)
         return 2
+    clock = BoardClock(1e-6 * options.clock_ppm, 1e-6 * options.clock_wander_ppm)
     simulated = build_core is BoardCore
     if simulated:
         build_core = partial(BoardCore, seed=options.seed, mirror_sink=optics.galvos.move_to if optics else None)
     board = PtyBoard(
-        options.pty, log, settings, script, options.baud, options.exit_when_closed, build_core, actions, optics
+        options.pty, log, settings, script, options.baud, options.exit_when_closed, build_core, actions, optics, clock
     )
     if simulated:
         set_realtime_priority(LIGHT)  # not for an emulator, which this process would starve

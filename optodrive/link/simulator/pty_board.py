@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
+from optodrive.link.simulator.board_clock import EXACT_CLOCK, BoardClock
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.faulty_link import FaultyLink
@@ -72,6 +73,7 @@ class PtyBoard:
         build_core: BackendFactory = BoardCore,
         actions: ScriptActions = NO_ACTIONS,
         optics: "SimulatedOptics | None" = None,
+        clock: BoardClock = EXACT_CLOCK,
     ) -> None:
         self.failure = ""
         self._actions = actions
@@ -84,8 +86,11 @@ class PtyBoard:
         self._signal_count = 0
         self._exit_when_closed_s = exit_when_closed_s
         self._started_s = time.monotonic()
+        self._clock = clock
         self._running = True
         self._core = build_core(settings, self._log)
+        if clock != EXACT_CLOCK:
+            self._log({"t_us": 0, "event": "clock", "monotonic_s": self._started_s})
         self._faults = FaultyLink()
         self._input_rate, self._output_rate = LineRate(baud), LineRate(baud)
         self._output = b""
@@ -136,7 +141,7 @@ class PtyBoard:
                 self._optics.close()
 
     def _now_us(self) -> int:
-        return int(self._now_s() * 1e6)
+        return int(self._clock.read_s(self._now_s()) * 1e6)
 
     def _run_once(self) -> None:
         if self._is_open and self._now_us() - self._due_us > LATE_LOOP_US:
@@ -244,7 +249,9 @@ class PtyBoard:
     def _run_due_steps(self) -> None:
         while self._script and self._script[0].at_s <= self._now_s():
             step = self._script.pop(0)
-            self._run_step(step, int(step.at_s * 1e6))  # the scripted time, not the time of this poll
+            self._run_step(
+                step, int(self._clock.read_s(step.at_s) * 1e6)
+            )  # the scripted time, not the time of this poll
         while self._signal_count:
             self._signal_count -= 1
             if self._steps_on_signal:

@@ -23,6 +23,7 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
         "--geometry", type=int, default=DEMO_GEOMETRY, metavar="SEED", help="seed of the ground-truth optics"
     )
     sensor.add_argument("--config", metavar="FILE", help="display under the beam: a file or a shipped name")
+    sensor.add_argument("--stage", metavar="NAME", help="stage whose scanner moves the spot, of several")
     sensor.add_argument("--sensor-noise-um", type=float, default=10.0, metavar="N", help="noise, one sigma per axis")
     sensor.add_argument(
         "--outlier-share",
@@ -52,7 +53,7 @@ def build_optics(options: argparse.Namespace, settings: BoardSettings) -> "Simul
 
     return SimulatedOptics(
         options.sensor,
-        load_config(options.config),
+        load_config(options.config).select_stage(options.stage),
         settings,
         options.geometry,
         um_to_m(options.sensor_noise_um),

@@ -1,13 +1,16 @@
-"""Execution of a plan on the simulated board in virtual time, through the real session and protocol."""
+"""Execution of a plan on simulated boards in virtual time, through the real sessions and protocol."""
 
 from collections.abc import Callable
 
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import BoardFaultError
 from optodrive.core.types.plans import ExecutedPulses
-from optodrive.link.board_setup import build_board_requirements
-from optodrive.link.protocol.quantisation import quantise
+from optodrive.device.config import Config
+from optodrive.link.board_setup import build_scales
+from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
+from optodrive.link.service.link_settings_builder import build_board_settings
+from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
@@ -21,30 +24,38 @@ START_LEAD_S = 0.05
 def execute(
     display: DisplayModel, prepared: PlannedSequence, on_progress: Callable[[float], None] | None = None
 ) -> ExecutedPulses:
-    """Arm a new simulated board, stream the plan, and return the pulses that the board reports.
+    """Arm new simulated boards, stream the plan, and return the pulses that they report.
 
-    Raise BoardFaultError if the board disarms or enters FAULT.
+    Raise BoardFaultError if a board disarms or enters FAULT.
     """
-    clock = ManualClock(1.0)
-    core = BoardCore(seed=1)
-    session = BoardSession(MemoryLink(core, clock), clock, build_board_requirements(display.config))
-    session.connect()
-    session.arm()
-    while session.board.state != BoardState.ARMED:
-        _step(session)
-    scale = session.scale
-    points = quantise(prepared.plan, scale)
-    job = session.begin(points, session.board_s() + START_LEAD_S)
-    while len(points) and not job.is_finished:
-        _step(session)
+    boards = _build_boards(display.config)
+    for _ in boards.connect_step_by_step():
+        pass
+    boards.arm()
+    while boards.board.state != BoardState.ARMED:
+        _step(boards)
+    scales = build_scales(display.config)
+    points = StagePoints.from_plan(prepared.plan, scales)
+    job = boards.begin(points, boards.board_s() + START_LEAD_S)
+    while sum(points.counts) and not job.is_finished:
+        _step(boards)
         if on_progress is not None:
             on_progress(job.executed_count / len(prepared.plan))
-    session.close()
-    return job.build_executed(prepared.plan, scale.full_power_w, scale.tick_s)
+    boards.close()
+    return job.build_executed(prepared.plan, scales)
 
 
-def _step(session: BoardSession) -> None:
-    session.step(STEP_S, renew_lease=True)
-    board = session.board
-    if board.state in IDLE_STATES and session.last_event_reason not in ("", "boot", "hello"):
-        raise BoardFaultError(f"the simulated board went to {board.state} {board.fault} ({session.last_event_reason})")
+def _build_boards(config: Config) -> BoardGroup:
+    clock, settings = ManualClock(1.0), build_board_settings(config)
+    sessions = [
+        BoardSession(MemoryLink(BoardCore(seed=1 + stage), clock), clock, one.requirements, len(settings) > 1)
+        for stage, one in enumerate(settings)
+    ]
+    return BoardGroup(sessions, clock, [one.stage for one in settings])
+
+
+def _step(boards: BoardGroup) -> None:
+    boards.step(STEP_S, renew_lease=True)
+    board = boards.board
+    if board.state in IDLE_STATES and boards.last_event_reason not in ("", "boot", "hello"):
+        raise BoardFaultError(f"the simulated board went to {board.state} {board.fault} ({boards.last_event_reason})")

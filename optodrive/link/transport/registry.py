@@ -37,12 +37,12 @@ def find_transport_factory(port: PortSettings) -> Callable[[], Transport]:
     )
 
 
-def build_bench_transport(port: PortSettings, display: str) -> tuple[Transport, str]:
+def build_bench_transport(port: PortSettings, display: str, stage: str | None = None) -> tuple[Transport, str]:
     """Return an unopened transport and the port of its simulated spot sensor, '' without one.
 
-    display: file or shipped name of the configuration
+    display: file or shipped name of the configuration; stage: whose board it is, None for the only one
     """
     if port.transport == "simulated":
-        simulated = SimulatedBoard(port.port, port.baud, display)
+        simulated = SimulatedBoard(port.port, port.baud, display, stage)
         return simulated, simulated.sensor_port
     return find_transport_factory(port)(), ""

@@ -19,16 +19,17 @@ class SimulatedBoard(SerialPort):
     """Serial port of a board process that open() starts if none is running.
 
     display: file or shipped name of the configuration; with it the process also simulates a spot sensor
+    stage: whose scanner moves the spot, None for the only one
     log: path of the board's log
     sensor_port: port of the spot sensor
     """
 
-    def __init__(self, port: str, baud: int, display: str | None = None) -> None:
+    def __init__(self, port: str, baud: int, display: str | None = None, stage: str | None = None) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="optodrive-board-")
         super().__init__(port or str(Path(self._folder.name) / "tty"), baud)
         self.log = Path(self._folder.name) / "board.jsonl"
         self.sensor_port = str(Path(self._folder.name) / "sensor")
-        self._display = display
+        self._display, self._stage = display, stage
         self._process: subprocess.Popen[bytes] | None = None
 
     def open(self) -> None:
@@ -50,6 +51,8 @@ class SimulatedBoard(SerialPort):
         arguments = ["--pty", self.name, "--log", str(self.log), "--baud", str(self._baud)]
         if self._display is not None:
             arguments += ["--sensor", self.sensor_port, "--config", self._display]
+        if self._stage is not None:
+            arguments += ["--stage", self._stage]
         self._process = subprocess.Popen(
             [
                 sys.executable,

@@ -1,4 +1,4 @@
-"""Parse pulse trains and height trains from JSON, and validate them for one beam."""
+"""Parse pulse trains and height trains from JSON, and validate them for the beams of a display."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,6 +9,7 @@ import numpy as np
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import guess_unit
 from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain, Train
 from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config
@@ -147,7 +148,7 @@ def _validate_pulse_train(train: PulseTrain, where: str, config: Config) -> Puls
 
 
 def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
-    """Check the number of pulses and that no two pulses overlap, since there is one beam.
+    """Check the number of pulses, and that no more of them overlap than there are beams, and none on one pixel.
 
     Abutting pulses are allowed. A height train's pulse, of unknown width, counts as one PWM period; the scheduler
     accounts for settling times. Raises InputError (too_many, overlapping_trains).
@@ -165,18 +166,45 @@ def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
     owner = np.repeat(np.arange(len(trains)), counts)
     width_s = [1 / config.laser.pwm_hz if isinstance(train, HeightTrain) else train.pulse_width_s for train in trains]
     end_s = start_s + np.array(width_s)[owner]
-    order = np.argsort(start_s, kind="stable")
-    # Of pulses sorted by start, some two overlap only if two neighbours do.
-    clash = np.flatnonzero(start_s[order][1:] < end_s[order][:-1] - OVERLAP_TOLERANCE_S)
-    if len(clash):
-        first, second = (int(pulse) for pulse in order[clash[0] : clash[0] + 2])
+    beams = len(config.list_stage_configs())
+    clash = _find_clash(start_s, end_s, beams)
+    if beams > 1 and clash is None:  # no two beams on one pixel
+        pixel = np.array([train.pixel for train in trains])[owner]
+        found = (_find_clash(start_s[mine], end_s[mine], 1, mine) for mine in _list_by_value(pixel))
+        clash, beams = next((one for one in found if one is not None), None), 1
+    if clash is not None:
+        first, second = clash
+        use = f"the beam is in use by {where.rpartition(' ')[2]}[{owner[first]}], from {start_s[first]:.9g} s"
         raise InputError(
             f"{where}[{owner[second]}]",
             round(float(start_s[second]), 9),
-            f"a pulse after {end_s[first]:.9g} s: until then the beam is in use by {where.rpartition(' ')[2]}"
-            f"[{owner[first]}], from {start_s[first]:.9g} s",
+            f"a pulse after {end_s[first]:.9g} s: until then {use if beams == 1 else f'all {beams} beams are in use'}",
             code="overlapping_trains",
         )
+
+
+def _list_by_value(values: IntArray) -> list[IntArray]:
+    order = np.argsort(values, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(values[order])) + 1)
+
+
+def _find_clash(
+    start_s: FloatArray, end_s: FloatArray, beams: int, number: IntArray | None = None
+) -> tuple[int, int] | None:
+    """Return the first of the pulses [n] that finds all beams in use, behind the one that ends first; None without.
+
+    number: [n] by which the pulses are returned, by default their position
+    """
+    order = np.argsort(start_s, kind="stable")
+    ended = np.searchsorted(np.sort(end_s), start_s[order] + OVERLAP_TOLERANCE_S, side="right")
+    clash = np.flatnonzero(np.arange(len(order)) - ended >= beams)
+    if not len(clash):
+        return None
+    second = order[clash[0]]
+    before = order[: clash[0]]
+    active = before[end_s[before] > start_s[second] + OVERLAP_TOLERANCE_S]
+    first = active[np.argmin(end_s[active])]
+    return (int(first), int(second)) if number is None else (int(number[first]), int(number[second]))
 
 
 def count_pulses(train: Train) -> int:

@@ -1,5 +1,7 @@
 """Several optical stages in a configuration."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -47,7 +49,7 @@ def test_without_stages_the_sections_are_the_only_one():
 def test_a_single_stage_is_the_configuration(tmp_path):
     config = load(tmp_path, '[[stages]]\nname = "only"\nlaser = { max_power_w = 1.5 }\n')
     assert config.laser.max_power_w == 1.5
-    config.require_one_stage()
+    assert config.select_stage(None) is config
 
 
 @pytest.mark.parametrize(
@@ -102,15 +104,33 @@ def test_a_file_for_one_scanner_is_refused(tmp_path, option, capsys):
     assert f"{option}: got 'given.toml', expected one stage" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["serve", "simulate", "first-light", "home", "doctor"])
-def test_commands_that_drive_a_board_refuse_several_stages(tmp_path, command, capsys):
+@pytest.mark.parametrize("command", ["first-light", "home", "calibrate board"])
+@pytest.mark.parametrize(("stage", "got"), [((), "None"), (("--stage", "top"), "'top'")])
+def test_commands_that_drive_one_board_want_the_name_of_its_stage(tmp_path, command, stage, got, capsys):
     load(tmp_path, TWO_STAGES)
-    (tmp_path / "frames.json").write_text("{}")
-    own = {"simulate": [tmp_path / "frames.json", "--out", tmp_path / "out.h5"], "first-light": ["--yes"]}
-    arguments = (command, *own.get(command, ()), "--config", tmp_path / "display.toml")
-    assert run([str(each) for each in arguments]) != 0
-    printed = capsys.readouterr()
-    assert "stages: got 2, expected one" in printed.out + printed.err
+    own = () if command == "home" else ("--yes",)
+    out = ("--out", tmp_path / "field.toml") if command == "calibrate board" else ()
+    arguments = (*command.split(), *own, *out, *stage, "--config", tmp_path / "display.toml")
+    assert run([str(each) for each in arguments]) == 2
+    assert f"--stage: got {got}, expected one of left, right" in capsys.readouterr().err
+
+
+def test_a_stage_is_selected_by_its_name(tmp_path):
+    right = load(tmp_path, TWO_STAGES).select_stage("right")
+    assert (right.board.port, right.laser.max_power_w, len(right.stages)) == ("/dev/ttyACM1", 1.5, 1)
+    with pytest.raises(InputError, match="--stage: got 'left', expected none: the display has one stage"):
+        load_config("display-16").select_stage("left")
+
+
+def test_several_stages_are_simulated(tmp_path, capsys):
+    load(tmp_path, TWO_STAGES.replace("laser =", "#"))
+    frame = {"show_at_s": 0, "duration_s": 1, "target_um": {str(k): 60 for k in range(16)}}
+    (tmp_path / "frames.json").write_text(json.dumps({"frames": [frame]}))
+    arguments = ("simulate", tmp_path / "frames.json", "--config", tmp_path / "display.toml", "--json")
+    assert run([str(each) for each in arguments]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["executed"] == report["planned"] == 16
+    assert report["pixels"][0]["measured_max_um"] == pytest.approx(60.0, rel=0.02)
 
 
 def test_rows_restrict_the_reach(tmp_path):

@@ -98,6 +98,6 @@ def test_a_later_planner_is_as_dim():
 def test_a_dry_run_is_as_dim():
     start = DryRunStart(*DISPLAY.build_cold_state(), 0.0, power_share=0.1)
     fields = {"name": "dry", "policy": "trim", "fit": "as_is"}
-    report = plan_dry_run(DISPLAY, REQUIREMENTS.scale, BuiltRequest(build_frame(90.0)), start, fields)
+    report = plan_dry_run(DISPLAY, [REQUIREMENTS.scale], BuiltRequest(build_frame(90.0)), start, fields)
     assert set(report.pulses.reason) == {"dim"}
     assert max(report.pulses.power_w) <= 0.1 * DISPLAY.config.laser.max_power_w

@@ -14,9 +14,8 @@ def executed(pixel, start_s, width_s=0.01, power_w=2.0):
     pixel, start_s = np.atleast_1d(pixel), np.atleast_1d(np.asarray(start_s, dtype=float))
     count = len(pixel)
     zeros = np.zeros(count)
-    return ExecutedBatch(
-        None, np.arange(count), pixel, start_s, np.full(count, width_s), np.full(count, power_w), zeros, zeros
-    )
+    columns = pixel, start_s, np.full(count, width_s), np.full(count, power_w), zeros, zeros
+    return ExecutedBatch(None, np.arange(count), *columns, stage=np.zeros(count, dtype=np.int64))
 
 
 def shares(live, at_s):

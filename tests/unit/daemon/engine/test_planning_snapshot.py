@@ -9,10 +9,10 @@ from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.board_setup import build_scales
 
 DISPLAY = DISPLAYS["display-1511"]
-SCALE = build_board_requirements(DISPLAY.config).scale
+SCALES = build_scales(DISPLAY.config)
 START_S = 7.0
 
 
@@ -24,12 +24,12 @@ def running():
     thermal = ThermalEstimate(*DISPLAY.build_cold_state())
     snapshot = PlanningSnapshot(thermal, START_S, thermal.heat, thermal.budget)
     request = PlanningRequest(lambda: built, "f", streamed=True)
-    return make_plan(DISPLAY, SCALE, request, built, snapshot, "p1", lambda fraction: None)
+    return make_plan(DISPLAY, SCALES, request, built, snapshot, "p1", lambda fraction: None)
 
 
 def cut(running, at_s):
     thermal = ThermalEstimate(running.heat_before, running.budget_before)
-    return build_cut_snapshot(running, thermal, START_S + at_s, DISPLAY.budget)
+    return build_cut_snapshot(running, thermal, START_S + at_s, DISPLAY.budget, SCALES[0].tick_s)
 
 
 def test_within_a_pause_of_the_mirrors_the_pulse_after_it_is_kept(running):
@@ -40,7 +40,7 @@ def test_within_a_pause_of_the_mirrors_the_pulse_after_it_is_kept(running):
     assert len(pauses) > 3
     for row in pauses[:4].tolist():
         snapshot = cut(running, 0.5 * (end_s[row] + plan.start_s[row + 1]))
-        assert snapshot.cut_row == row + 2
+        assert snapshot.cut.row == row + 2
         assert snapshot.start_s == pytest.approx(START_S + end_s[row + 1])
 
 
@@ -48,6 +48,6 @@ def test_the_cut_is_at_the_first_end_after_the_stated_time(running):
     plan = running.planned.plan
     end_s = plan.start_s + plan.width_s
     for row in (3, 100, 1000):
-        assert cut(running, end_s[row] - 1e-5).cut_row == row + 1
-        assert cut(running, end_s[row] + 1e-5).cut_row == row + 2
+        assert cut(running, end_s[row] - 1e-5).cut.row == row + 1
+        assert cut(running, end_s[row] + 1e-5).cut.row == row + 2
     assert cut(running, end_s[-1]) is None

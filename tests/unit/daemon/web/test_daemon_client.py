@@ -29,6 +29,7 @@ def build_status(epoch, state="ARMED"):
             "link_error": None,
             "stats": dict(NO_STATS),
             "board": BoardView(state=state).to_dict(),
+            "stages": [],
             "control": None,
             "pause": NO_PAUSE,
         },

@@ -10,6 +10,7 @@ STATUS = {
     "link_error": None,
     "stats": {**NO_STATS, "naks": 3},
     "board": BoardView(state="RUNNING", uid="b1").to_dict(),
+    "stages": [],
     "pause": {"number": 1, "began_s": 2.0, "ends_in_s": None},
     "control": {"caller": "ann", "armed_for_s": 3.0, "hold": True, "arming": 7},
 }

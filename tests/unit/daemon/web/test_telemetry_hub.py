@@ -25,6 +25,7 @@ def build_state(board="DISARMED", fault=None, error=None):
             "pixels": 16,
             "link": LINK | {"port": "p", "state": "down" if error else "up", "error": error},
             "board": BOARD | {"state": board, "fault": fault, "hint": ""},
+            "stages": [],
             "control": None,
             "limits": {"power_share": 1.0},
             "queue": {"waiting": 0, "running": None, "active": [], "plans": []}

@@ -23,6 +23,7 @@ def plan(*pulses):
             "y_rad": y,
             "power_w": power,
             "pixel": np.arange(n),
+            "stage": np.zeros(n, dtype=np.int64),
         },
         energy_j=width * power,
         trimmed_j=np.zeros(n),

@@ -27,7 +27,7 @@ def test_a_plan_is_executed_and_reported_to_the_planner(rig):
     rig.until(lambda: any(m.fields["finished"] for m in rig.of_kind(PLANNER, "progress")))
     assert len(rig.list_emitted()) == 100
     last = rig.of_kind(PLANNER, "progress")[-1].fields
-    assert (last["job"], last["sent_points"], last["finished"]) == (number, 100, True)
+    assert (last["job"], last["sent_points"], last["finished"]) == (number, [100], True)
     positions = []
     for message in rig.of_kind(PLANNER, "executed"):
         records = np.frombuffer(message.payload, EXECUTED_RECORD)
@@ -94,7 +94,7 @@ def test_a_splice_continues_the_plan_without_a_pause(rig):
     rig.run(0.15)
     number, result = rig.splice(build_points(10, 2 * DUTY), 150, ahead_s=0.04)
     assert result["error"] is None
-    assert result["first_index"] == 150
+    assert result["first_index"] == [150]
     rig.until(lambda: any(m.fields["finished"] and m.fields["job"] == number for m in rig.of_kind(PLANNER, "progress")))
     emitted = rig.list_emitted()
     assert [duty for _, duty in emitted] == [DUTY] * 150 + [2 * DUTY] * 10
@@ -105,8 +105,8 @@ def test_truncation_ends_the_plan_early(rig):
     rig.arm()
     rig.begin(build_points(200, DUTY), ahead_s=0.04)
     rig.run(0.15)
-    assert rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=100))["done"]
-    assert not rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=1))["done"]
+    assert rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=[100]))["done"]
+    assert not rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=[1]))["done"]
     rig.run(1.0)
     assert len(rig.list_emitted()) == 100
 

@@ -77,7 +77,7 @@ def test_a_splice_is_refused_in_a_pause(rig):
     _, result = rig.splice(build_points(10, 2 * DUTY), 150, ahead_s=0.04)
     assert result["start_tick"] is None
     assert "paused" in result["error"]["message"]
-    assert not rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=150))["done"]
+    assert not rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=[150]))["done"]
 
 
 class ReportLosingSession(BoardSession):

@@ -105,6 +105,7 @@ def plan(n=100, width_s=0.002, period_s=0.004, power_w=0.5):
         "y_rad": 0.002 * (pixel - 1.5),
         "power_w": power_w * (1 + pixel) / 4,
         "pixel": pixel,
+        "stage": np.zeros(n, dtype=np.int64),
     }
     rest = {"energy_j": ones, "trimmed_j": 0 * ones, "reason": np.full(n, ""), "headroom_k": ones}
     return LimitedPlan(**{**vars(EMPTY_PLAN), **columns, **rest})

@@ -9,6 +9,7 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain
 from optodrive.device.config_file import load_config
+from optodrive.device.config_sections import StageSection
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 from optodrive.planning.stimuli.train_json import check_trains, count_pulses, validate_train
 
@@ -189,3 +190,20 @@ def test_another_laser_has_other_periods():
     with pytest.raises(InputError, match=r"whole PWM periods of 0.001 s, nearest is 0.015"):
         validate_train(train, "t", config)
     assert np.isclose(validate_train(train, "t", CONFIG).pulse_width_s, 0.0152)
+
+
+def test_as_many_trains_at_once_as_there_are_beams():
+    sections = {"laser": CONFIG.laser, "scanner": CONFIG.scanner, "board": CONFIG.board}
+    config = CONFIG.model_copy(update={"stages": tuple(StageSection(name=name, **sections) for name in "ab")})
+
+    def refuse(*trains):
+        with pytest.raises(InputError) as refused:
+            parse_sequence({"trains": [{**TRAIN, **each} for each in trains]}, config, "f")
+        return str(refused.value)
+
+    assert parse_sequence({"trains": [TRAIN, {**TRAIN, "pixel": 18}]}, config, "f").trains
+    text = refuse({}, {"pixel": 18, "start_s": 0.005}, {"pixel": 19, "start_s": 0.01})
+    assert "trains[2]: got 0.01, expected a pulse after 0.02 s: until then all 2 beams are in use" in text
+    assert "trains[1]: got 0.01, expected a pulse after 0.02 s: until then the beam is in use by trains[0]" in refuse(
+        {}, {"start_s": 0.01}
+    )

@@ -1,0 +1,79 @@
+"""Points of a plan for the board of each stage."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Self
+
+import numpy as np
+
+from optodrive.core.types.arrays import IntArray
+from optodrive.core.types.plans import LimitedPlan
+from optodrive.link.protocol.quantisation import DecodedPulses, WirePoints, WireScale, decode, quantise
+
+POINT_BYTES = 10
+
+
+@dataclass(frozen=True, eq=False)
+class StagePoints:
+    """Points of a plan for the board of each stage.
+
+    Those of several boards end at the same time, with the gate off, so that all of them execute the plan to its end.
+    """
+
+    stages: tuple[WirePoints, ...]
+
+    @classmethod
+    def from_plan(cls, plan: LimitedPlan, scales: Sequence[WireScale]) -> Self:
+        """Quantise a plan. scales: of each stage. Raise LocalProtocolError as `quantise` does."""
+        stages = tuple(quantise(plan, scale, stage) for stage, scale in enumerate(scales))
+        if len(stages) > 1:
+            end_tick = max(int(points.compute_end_ticks()[-1]) if len(points) else 0 for points in stages)
+            stages = tuple(points.extend(end_tick) for points in stages)
+        return cls(stages)
+
+    @classmethod
+    def from_payload(cls, payload: bytes, counts: Sequence[int]) -> Self:
+        """Read what encode_payload() wrote. counts: number of points of each stage. Raise ValueError if they differ."""
+        if len(payload) != POINT_BYTES * sum(counts) or min(counts) < 0:
+            raise ValueError(f"{len(payload)} bytes for {sum(counts)} points")
+        table = np.frombuffer(payload, dtype="<u2").reshape(-1, 5)
+        parts = np.split(table, list(accumulate(counts))[:-1])
+        return cls(tuple(WirePoints(part, np.zeros(len(part), dtype=np.int64)) for part in parts))
+
+    @property
+    def counts(self) -> list[int]:
+        """Number of points of each stage."""
+        return [len(points) for points in self.stages]
+
+    def encode_payload(self) -> bytes:
+        """Return the points of all stages as the bytes in DATA, stage after stage."""
+        return b"".join(points.encode_payload() for points in self.stages)
+
+    def count_before(self, row: int) -> list[int]:
+        """Return the number of points of each stage up to its last pulse before the plan's row `row`."""
+        return [points.count_before(row) for points in self.stages]
+
+    def add_pauses(self, ticks: Sequence[int]) -> Self:
+        """Return the points of each stage behind a further pause of `ticks`, with the gate off."""
+        return type(self)(tuple(points.add_pause(each) for points, each in zip(self.stages, ticks, strict=True)))
+
+    def shift_rows(self, first: int) -> Self:
+        """Return the points of a plan of which `first` rows precede these."""
+        return type(self)(
+            tuple(WirePoints(one.table, np.where(one.row >= 0, one.row + first, -1)) for one in self.stages)
+        )
+
+
+def decode_stages(payload: bytes, points: StagePoints, scales: Sequence[WireScale]) -> tuple[IntArray, DecodedPulses]:
+    """Decode the payload of points. Return the pulses of all stages, and the plan's rows to which they belong, [n]."""
+    decoded: list[DecodedPulses] = []
+    first = 0
+    for one, scale in zip(points.stages, scales, strict=True):
+        decoded.append(decode(payload[POINT_BYTES * first : POINT_BYTES * (first + len(one))], scale))
+        first += len(one)
+    row = np.concatenate([one.row[each.index] for one, each in zip(points.stages, decoded, strict=True)])
+    if len(decoded) == 1:
+        return row, decoded[0]
+    columns = {name: np.concatenate([getattr(each, name) for each in decoded]) for name in vars(decoded[0])}
+    return row, DecodedPulses(**columns)

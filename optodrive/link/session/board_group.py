@@ -1,0 +1,402 @@
+"""The boards of all stages as one: they are armed, stopped and lost together, and keep the host's time.
+
+One board keeps its own time: `board_s` is its clock, and its points follow it. Several keep the host's: `board_s` is
+the host's clock, and the points of each board are shifted by what its clock drifts. Light that would come late is not
+emitted: all boards drop their points, and stay armed.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
+from functools import partial
+from itertools import count
+from math import inf
+from typing import Any
+
+from optodrive.core.clock import Clock
+from optodrive.core.errors import LinkError, NotReadyError
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.stage_points import StagePoints
+from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, BoardState
+from optodrive.link.session.board_view import BoardView
+from optodrive.link.session.lease_renewal import LeaseRenewal
+from optodrive.link.session.link_watch import LinkCause
+from optodrive.link.session.plan_job import PointTiming
+from optodrive.link.session.session import BoardSession
+from optodrive.link.session.staged_job import StagedJob
+
+SEND_AHEAD_MAX_S = 0.3
+"""Longest time for which points are sent ahead to several boards; meanwhile their clocks drift."""
+SUMS = ("done_index", "queued", "underruns", "crc_errors", "format_errors", "seq_errors", "laser_on_s")
+STATE_ORDER = (
+    BoardState.RUNNING,
+    BoardState.HOLD,
+    BoardState.ARMED,
+    BoardState.ARMING,
+    "UNKNOWN",
+    BoardState.BOOT,
+    BoardState.FAULT,
+    BoardState.DISARMED,
+)
+"""States in the order in which one board's is that of all: while one may emit, they do not count as off."""
+
+
+class BoardGroup:
+    """Sessions with the boards of all stages, under the names of `BoardSession`.
+
+    sessions: of each stage; names: of the stages, '' if there is one
+    skew_max_s: largest error of a board's clock with which a plan may start
+    """
+
+    def __init__(
+        self, sessions: Sequence[BoardSession], clock: Clock, names: Sequence[str] = ("",), skew_max_s: float = inf
+    ) -> None:
+        self.sessions = tuple(sessions)
+        self.names = tuple(names)
+        self._clock = clock
+        self._skew_max_s = skew_max_s
+        self._numbers = count(1)
+        self._refusal: str | None = None
+        self._failed: BoardSession | None = None
+        self.has_several = len(self.sessions) > 1
+        self.on_executed: Callable[[int, m.Executed], None] = lambda stage, message: None
+        for stage, session in enumerate(self.sessions):
+            session.on_executed = partial(self._forward_executed, stage)
+
+    def _forward_executed(self, stage: int, message: m.Executed) -> None:
+        if self.has_several:
+            fit, tick_s = self.sessions[stage].clock_sync.fit(self._clock.now_s()), self.tick_s
+            if fit is None:
+                return
+            records = tuple(
+                (round(fit.to_host_s(tick * tick_s) / tick_s), ticks, duty) for tick, ticks, duty in message.records
+            )
+            message = m.Executed(message.first_index, records)
+        self.on_executed(stage, message)
+
+    # --- state --------------------------------------------------------------------------------------------------
+
+    @property
+    def tick_s(self) -> float:
+        """Duration of a tick of all boards, s."""
+        return self.sessions[0].scale.tick_s
+
+    @property
+    def connected(self) -> bool:
+        """Whether the links to all boards are up."""
+        return all(session.connected for session in self.sessions)
+
+    @property
+    def port(self) -> str:
+        """Names of all ports."""
+        return ", ".join(session.port for session in self.sessions)
+
+    @property
+    def board(self) -> BoardView:
+        """Latest reported state of all boards: sums of what they count, and the state of the one nearest to light."""
+        boards = [session.board for session in self.sessions]
+        if not self.has_several:
+            return boards[0]
+        faulty = next((board for board in boards if board.fault), boards[0])
+        values = {item.name: getattr(faulty, item.name) for item in fields(BoardView)}
+        values |= {name: sum(getattr(board, name) for board in boards) for name in SUMS}
+        values["free_points"] = min(board.free_points for board in boards)
+        values["temperature_c"] = max((b.temperature_c for b in boards if b.temperature_c is not None), default=None)
+        values["state"] = min((board.state for board in boards), key=STATE_ORDER.index)
+        return BoardView(**values)
+
+    @property
+    def clock_sample(self) -> tuple[float, float] | None:
+        """Host time and board_s() of one moment, s, None before the first exchange with each board."""
+        if not self.has_several:
+            return self.sessions[0].clock_sample
+        now_s = self._clock.now_s()
+        return (now_s, now_s) if all(session.clock_sync.is_synchronised for session in self.sessions) else None
+
+    def board_s(self) -> float:
+        """Return the present time on the clock of the board, or of the host if there are several boards, s."""
+        return self._clock.now_s() if self.has_several else self.sessions[0].board_s()
+
+    @property
+    def faults(self) -> Counter[str]:
+        """Number of times that the boards reported each fault."""
+        total: Counter[str] = Counter()
+        for session in self.sessions:
+            total += session.faults
+        return total
+
+    @property
+    def lease(self) -> LeaseRenewal:
+        """Statistics of the lease renewals of the board that came nearest to its end."""
+        renewals = [session.lease for session in self.sessions]
+        return min(renewals, key=lambda lease: inf if lease.slack_s is None else lease.slack_s)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether a job may start now."""
+        return all(session.is_ready for session in self.sessions)
+
+    @property
+    def is_acknowledged(self) -> bool:
+        """Whether all boards have acknowledged everything sent."""
+        return all(session.is_acknowledged for session in self.sessions)
+
+    @property
+    def abort_confirmed(self) -> bool:
+        """Whether all boards have confirmed the last ABORT."""
+        return all(session.abort_confirmed for session in self.sessions)
+
+    @property
+    def is_draining(self) -> bool:
+        """Whether reports of points that were sent before drain() may still arrive."""
+        return any(session.is_draining for session in self.sessions)
+
+    @property
+    def has_points(self) -> bool:
+        """Whether points were handed over whose execution is not yet reported."""
+        return any(session.has_points for session in self.sessions)
+
+    @property
+    def _worst(self) -> BoardSession:
+        """The session to blame: the one that failed last, has a fault, or has left the armed states."""
+        suspects = [self._failed] if self._failed is not None else []
+        suspects += [session for session in self.sessions if session.board.fault]
+        suspects += [session for session in self.sessions if session.board.state not in ARMED_STATES]
+        return suspects[0] if suspects else self.sessions[0]
+
+    @property
+    def last_event_reason(self) -> str:
+        """Reason of the last event of the board that is to blame."""
+        return self._worst.last_event_reason
+
+    @property
+    def likely_cause(self) -> LinkCause | None:
+        """Likely cause of the last lost link or expired lease, None before the first."""
+        causes = [session.likely_cause for session in self.sessions if session.likely_cause is not None]
+        return max(causes, key=lambda cause: cause.noticed_s, default=None)
+
+    def describe_split(self) -> str:
+        """Return which board has left the armed states while another is in them, '' if none has."""
+        if not self.has_several or self.board.state not in ARMED_STATES:
+            return ""
+        for name, session in zip(self.names, self.sessions, strict=True):
+            board = session.board
+            if board.state not in LEASED_STATES:
+                return f"the board of stage {name!r} went to {board.state} ({board.fault or session.last_event_reason})"
+        return ""
+
+    def _name(self, session: BoardSession) -> str:
+        return f"stage {self.names[self.sessions.index(session)]!r}: " if self.has_several else ""
+
+    # --- connecting ---------------------------------------------------------------------------------------------
+
+    def connect_step_by_step(self) -> Iterator[float]:
+        """Perform the handshakes over the open ports, and yield the longest wait before the next step.
+
+        Raise LinkError without an answer, InputError if a board does not meet the requirements.
+        """
+        self._failed = None
+        pending = {session: session.connect_step_by_step() for session in self.sessions}
+        while pending:
+            wait_s = inf
+            for session in self.sessions:
+                self._failed = session
+                if session in pending:
+                    try:
+                        wait_s = min(wait_s, next(pending[session]))
+                    except StopIteration:
+                        del pending[session]
+                else:
+                    session.step(0.0, renew_lease=False)
+            self._failed = None
+            if pending:
+                yield wait_s
+
+    def on_connect_failed(self) -> None:
+        """Close all ports after one could not be opened, or its board did not answer."""
+        for session in self.sessions:
+            if session.connected:
+                session.leave()
+            else:
+                session.on_connect_failed()
+
+    def on_lost(self, error: Exception) -> str:
+        """Close all links after an error of one, with ABORT to the other boards; return its message, with the cause."""
+        failed = self._failed or self.sessions[0]
+        for session in self.sessions:
+            if session is not failed:
+                session.leave()
+        return f"{self._name(failed)}{failed.on_lost(error)}"
+
+    def close(self) -> None:
+        """Send ABORT if possible and close all links permanently."""
+        for session in self.sessions:
+            session.close()
+
+    # --- loop ---------------------------------------------------------------------------------------------------
+
+    def step(self, wait_s: float, renew_lease: bool, stalled: str = "planner") -> None:
+        """Run one iteration of each session, as `BoardSession.step`; only the first waits for bytes."""
+        self._drop_late_points()
+        for session in self.sessions:
+            self._failed = session
+            session.step(wait_s if session is self.sessions[0] else 0.0, renew_lease, stalled)
+        self._failed = None
+
+    def _drop_late_points(self) -> None:
+        """Drop the points of all boards if one would execute its next point late."""
+        if not self.has_several or self.is_draining:
+            return
+        lateness_s, session = max(((one.find_lateness_s(), one) for one in self.sessions), key=lambda item: item[0])
+        if lateness_s > 0.0 and session.board.state in ARMED_STATES:
+            self.flush()
+            self._refusal = f"{self._name(session)}light would have been {1e3 * lateness_s:.3g} ms late"
+
+    def compute_wait_s(self) -> float:
+        """Return the longest time for which the next step may wait if no bytes arrive, s."""
+        return min(session.compute_wait_s() for session in self.sessions)
+
+    def pop_refusal(self) -> str | None:
+        """Return and clear the reason for which a board, or this group, refused the last command."""
+        refusal, self._refusal = self._refusal, None
+        for session in self.sessions:
+            refused = session.pop_refusal()
+            if refused is not None:
+                refusal = refusal or f"{self._name(session)}{refused}"
+                if self.has_several and session.board.state in ARMED_STATES:
+                    self.flush()
+        return refusal
+
+    # --- commands -----------------------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Request arming of all boards. Raise NotReadyError, without an effect, if one cannot be armed."""
+        for session in self.sessions:
+            session.require_disarmed(self._name(session))
+        for session in self.sessions:
+            session.arm()
+
+    def disarm(self) -> None:
+        """Disarm all boards, or acknowledge their faults."""
+        for session in self.sessions:
+            session.disarm()
+
+    def abort(self) -> None:
+        """Turn all gates off, drop the queues and disarm, before all other queued messages."""
+        for session in self.sessions:
+            session.abort()
+
+    def hold_points(self) -> None:
+        """Send nothing of the points handed over so far, and do not confirm an arming."""
+        for session in self.sessions:
+            session.hold_points()
+
+    def flush(self) -> None:
+        """Turn all gates off and drop the queues. The boards stay armed."""
+        for session in self.sessions:
+            session.flush()
+
+    def drain(self) -> None:
+        """Turn all gates off, drop the queues and collect the last reports. The boards stay armed."""
+        for session in self.sessions:
+            session.drain()
+
+    # --- streaming ----------------------------------------------------------------------------------------------
+
+    def begin(self, points: StagePoints, start_s: float, send_ahead_s: float = inf) -> StagedJob:
+        """Start to stream a plan whose zero is at start_s of board_s().
+
+        send_ahead_s: maximum time from sending a point to its start
+        Raise NotReadyError if the time of a board is not known as exactly as several need it.
+        """
+        zero_tick = round(start_s / self.tick_s)
+        if not self.has_several:
+            part = self.sessions[0].begin(points.stages[0], start_s, send_ahead_s)
+            return StagedJob(next(self._numbers), [part], part.start_tick)
+        self._require_clocks()
+        ahead_s = min(send_ahead_s, SEND_AHEAD_MAX_S)
+        parts = []
+        for session, one in zip(self.sessions, points.stages, strict=True):
+            timing = PointTiming(zero_tick, partial(self._to_board_tick, session))
+            parts.append(session.begin(one, timing.to_board_tick(zero_tick) * self.tick_s, ahead_s, timing))
+        return StagedJob(next(self._numbers), parts, zero_tick)
+
+    def _require_clocks(self) -> None:
+        now_s = self._clock.now_s()
+        for session in self.sessions:
+            fit = session.clock_sync.fit(now_s)
+            error_s = inf if fit is None else fit.uncertainty_s
+            if error_s > self._skew_max_s:
+                raise NotReadyError(
+                    f"{self._name(session)}its clock is known to {1e6 * error_s:.0f} µs, "
+                    f"limits.stage_skew_max_s permits {1e6 * self._skew_max_s:.0f} µs"
+                )
+
+    def _to_board_tick(self, session: BoardSession, host_tick: int) -> float:
+        fit = session.clock_sync.fit(self._clock.now_s())
+        if fit is None:
+            raise LinkError(f"{self._name(session)}its clock is not known")
+        return fit.to_board_s(host_tick * self.tick_s) / self.tick_s
+
+    def splice(self, points: StagePoints, kept_points: Sequence[int], send_ahead_s: float) -> StagedJob | None:
+        """Truncate the last job to `kept_points` points of each stage and continue with `points` without a pause.
+
+        Return None, with nothing changed, if it is too late for that on one board.
+        """
+        triples = list(zip(self.sessions, points.stages, kept_points, strict=True))
+        if not all(session.can_splice(kept) for session, _, kept in triples):
+            return None
+        parts = []
+        for session, one, kept in triples:
+            timing, last = None, session.last_job
+            if self.has_several and last is not None:
+                timing = PointTiming(last.find_host_end_tick(kept), partial(self._to_board_tick, session))
+            part = session.splice(one, kept, min(send_ahead_s, SEND_AHEAD_MAX_S) if timing else send_ahead_s, timing)
+            if part is None:
+                raise LinkError("a board could not be spliced although the others were")
+            parts.append(part)
+        return StagedJob(next(self._numbers), parts, parts[0].start_tick)
+
+    def truncate(self, kept_points: Sequence[int]) -> bool:
+        """Truncate the last job to `kept_points` points of each stage. Return False, unchanged, if more were sent."""
+        pairs = list(zip(self.sessions, kept_points, strict=True))
+        can_truncate = all(session.can_truncate(kept) for session, kept in pairs)
+        return can_truncate and all(session.truncate(kept) for session, kept in pairs)
+
+    def find_first_sent_tick(self, job: StagedJob) -> float | None:
+        """Return the tick of board_s() at which the first point of a job was sent, None before."""
+        if not self.has_several:
+            return job.first_sent_tick
+        now_s = self._clock.now_s()
+        fits = [session.clock_sync.fit(now_s) for session in self.sessions]
+        pairs = ((fit, part.first_sent_tick) for fit, part in zip(fits, job.parts, strict=True))
+        sent_s = [fit.to_host_s(tick * self.tick_s) for fit, tick in pairs if fit is not None and tick is not None]
+        return min(sent_s) / self.tick_s if sent_s else None
+
+    # --- statistics ---------------------------------------------------------------------------------------------
+
+    def collect_link_stats(self) -> dict[str, Any]:
+        """Return the statistics of all links: sums of what they count, the largest of times."""
+        stats = [session.collect_link_stats() for session in self.sessions]
+        if not self.has_several:
+            return stats[0]
+        merged = dict(min(stats, key=lambda each: each["likely_cause_age_s"] or inf))
+        for name in ("host_bad_frames", "retransmitted", "naks", "board_bad_frames", "underruns"):
+            merged[name] = sum(each[name] for each in stats)
+        for name in ("round_trip_ms", "longest_stall_ms"):
+            merged[name] = max((each[name] for each in stats if each[name] is not None), default=None)
+        return merged
+
+    def list_stages(self) -> list[dict[str, Any]]:
+        """Return name, port, board and clock of each of several stages, for the status; nothing of one."""
+        if not self.has_several:
+            return []
+        now_s = self._clock.now_s()
+        stages = []
+        for name, session in zip(self.names, self.sessions, strict=True):
+            fit = session.clock_sync.fit(now_s)
+            stage: dict[str, Any] = {"name": name, "port": session.port, "board": session.board.to_dict()}
+            stage["clock_error_us"] = None if fit is None else 1e6 * fit.uncertainty_s
+            stage["clock_drift_ppm"] = None if fit is None else 1e6 * (fit.rate - 1.0)
+            stages.append(stage)
+        return stages

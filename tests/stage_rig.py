@@ -1,0 +1,88 @@
+"""Planner and link service in virtual time with the simulated boards of several stages, whose clocks drift."""
+
+import numpy as np
+
+from displays import DISPLAYS
+from optodrive.device.config_sections import StageSection
+from optodrive.link.service.link_settings_builder import build_board_settings
+from optodrive.link.session.board_group import BoardGroup
+from optodrive.link.session.session import BoardSession
+from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.planning.display_model import DisplayModel
+from planner_rig import PlannerRig
+
+CLOCKS = (
+    BoardClock(50e-6, offset_s=100.0),
+    BoardClock(-50e-6, 5e-6, 3.0),
+    BoardClock(20e-6, 20e-6, 7000.0),
+    BoardClock(-30e-6, 15e-6, 0.0),
+)
+
+
+class DriftingLink(MemoryLink):
+    """Link to a board with a clock of its own. is_cut: whether nothing passes."""
+
+    def __init__(self, core, clock, board_clock, name):
+        super().__init__(core, clock)
+        self.name = name
+        self.board_clock = board_clock
+        self.is_cut = False
+
+    def _now_us(self):
+        return round(self.board_clock.read_s(self._clock.now_s()) * 1e6)
+
+    def write(self, data):
+        if not self.is_cut:
+            super().write(data)
+
+    def read(self, timeout_s):
+        data = super().read(timeout_s)
+        return b"" if self.is_cut else data
+
+
+def build_stages(name, count, **changes):
+    """Build a display with equal stages. changes: of its [limits]."""
+    config = DISPLAYS[name].config
+    sections = {"laser": config.laser, "scanner": config.scanner, "board": config.board}
+    stages = tuple(StageSection(name=f"s{k}", **sections) for k in range(count))
+    limits = config.limits.model_copy(update=changes)
+    return DisplayModel.from_config(config.model_copy(update={"stages": stages, "limits": limits}))
+
+
+class StageRig(PlannerRig):
+    """Boards of several stages. logs: events of each board; links: its link; cores: the board."""
+
+    def __init__(self, monkeypatch, display, clocks=CLOCKS, link_type=DriftingLink, **options):
+        self.display, self.clocks, self.link_type = display, clocks, link_type
+        super().__init__(monkeypatch, display=display, **options)
+
+    def build_boards(self, _, settings, requirements):
+        boards = build_board_settings(self.display.config)
+        self.logs = [[] for _ in boards]
+        self.cores = [BoardCore(settings, sink=log.append, seed=3 + k) for k, log in enumerate(self.logs)]
+        pairs = zip(self.cores, self.clocks, boards, strict=False)
+        self.links = [self.link_type(core, self.clock, clock, board.stage) for core, clock, board in pairs]
+        sessions = [
+            BoardSession(link, self.clock, board.requirements, is_one_of_several=True)
+            for link, board in zip(self.links, boards, strict=True)
+        ]
+        self.session = sessions[0]
+        skew_max_s = self.display.config.limits.stage_skew_max_s
+        return BoardGroup(sessions, self.clock, [board.stage for board in boards], skew_max_s)
+
+    def open_port(self):
+        for link in self.links:
+            link.open()
+        return True
+
+    def list_pulses(self):
+        """Return the pulses of all boards by their own logs, in host time: begin, end, x and y code, stage, [n, 5]."""
+        rows = []
+        for stage, (log, clock) in enumerate(zip(self.logs, self.clocks, strict=False)):
+            for event in log:
+                if event["event"] == "pulse":
+                    on_s, off_s = (clock.find_true_s(event[key] * 1e-6) for key in ("on_us", "off_us"))
+                    rows.append((on_s, off_s, event["x"], event["y"], stage))
+        return np.array(sorted(rows)).reshape(-1, 5)

@@ -1,0 +1,232 @@
+"""Boards of several stages, driven as one: one time, one state, one end."""
+
+import numpy as np
+import pytest
+
+from displays import DISPLAYS
+from link_service_rig import OPERATOR, WEB
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain
+from optodrive.link.protocol.states import ARMED_STATES, BoardState
+from optodrive.link.session import plan_job
+from planner_rig import build_frame, build_train
+from stage_rig import StageRig, build_stages
+
+LEASE_S = DISPLAYS["display-16"].config.board.lease_s
+
+
+def build_armed(monkeypatch, count, name="display-16", **changes):
+    rig = StageRig(monkeypatch, build_stages(name, count, **changes)).ready()
+    rig.run(2.0)
+    rig.arm()
+    rig.run(0.01)
+    return rig
+
+
+@pytest.fixture(params=[2, 4])
+def rig(request, monkeypatch):
+    return build_armed(monkeypatch, request.param)
+
+
+@pytest.fixture(params=[2, 4])
+def wide_rig(request, monkeypatch):
+    return build_armed(monkeypatch, request.param, "display-437")
+
+
+def fill(height_um, pixels=range(437)):
+    """Build a frame for a stream over 437 pixels."""
+    return build_frame(height_um, pixels, 9.0, 437)
+
+
+def submit(rig, sequence, streamed=False):
+    return rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed).result().plan)
+
+
+def finish(rig, record):
+    rig.until(lambda: record.has_ended, 300.0)
+    return record
+
+
+def run(rig, duration_s):
+    """Let planner and link run."""
+    until_s = rig.clock.now_s() + duration_s
+    rig.until(lambda: rig.clock.now_s() >= until_s)
+
+
+def build_trains(stages, seconds):
+    """Build trains at the same time, one for each stage."""
+    return FrameSequence((), tuple(PulseTrain(3 * k, 0.0, seconds, 0.02, 0.01, 1.0) for k in range(stages)))
+
+
+def list_states(rig):
+    return {core.state for core in rig.cores}
+
+
+def check_beams(rig):
+    """Assert by the boards' own logs that no two beams were on one pixel, that is, at the same codes, at a time."""
+    pulses = rig.list_pulses()
+    for codes in np.unique(pulses[:, 2:4], axis=0):
+        on_s, off_s = pulses[(pulses[:, 2:4] == codes).all(axis=1)][:, :2].T
+        assert (on_s[1:] > off_s[:-1]).all()
+
+
+def test_a_frame_is_drawn_by_all_boards_at_once(rig):
+    record = finish(rig, submit(rig, build_frame(60.0)))
+    assert (record.status, record.error, record.executed_count) == ("done", None, 16)
+    pulses = rig.list_pulses()
+    assert len(pulses) == 16
+    assert set(pulses[:, 4]) == set(range(len(rig.logs)))
+    assert record.execution.simulated_m == pytest.approx(np.full(16, 60e-6), rel=0.01)
+    assert abs(record.timing_error.max_abs_s) < 1e-4
+    check_beams(rig)
+
+
+def test_gates_keep_the_planned_times(rig):
+    record = submit(rig, build_trains(len(rig.cores), 40.0))
+    plan = rig.queue.waiting[0].planned.plan
+    finish(rig, record)
+    begin_s = record.start_s + plan.start_s
+    pulses = rig.list_pulses()
+    errors_s = [pulses[pulses[:, 4] == stage][:, 0] - begin_s[plan.stage == stage] for stage in range(len(rig.cores))]
+    assert max(np.abs(error_s).max() for error_s in errors_s) < 1e-4
+    # All boards lag by the same half of an exchange.
+    assert np.percentile(np.ptp(errors_s, axis=0), 99) < 2e-5
+    assert record.delay_s == 0.0
+
+
+def test_without_following_the_host_s_clock_they_drift_apart(monkeypatch):
+    monkeypatch.setattr(plan_job.PlanJob, "_follow_host", lambda *_: None)
+    rig = build_armed(monkeypatch, 2)
+    finish(rig, submit(rig, build_trains(2, 40.0)))
+    ends_s = [rig.list_pulses()[rig.list_pulses()[:, 4] == stage][-1, 0] for stage in range(2)]
+    assert abs(ends_s[0] - ends_s[1]) > 3e-3
+
+
+def test_a_streamed_frame_replaces_the_rest_on_all_boards_without_a_pause(wide_rig):
+    rig = wide_rig
+    first = submit(rig, fill(60.0), streamed=True)
+    rig.until(lambda: first.executed_count > 20)
+    second = submit(rig, fill(80.0), streamed=True)
+    finish(rig, second)
+    assert (first.status, second.status) == ("superseded", "done")
+    assert first.executed_count + first.dropped == 437
+    assert np.abs(second.execution.simulated_m - 80e-6).max() < 1e-6
+    assert rig.boards.board.underruns == 0
+    assert abs(second.timing_error.max_abs_s) < 1e-4
+    pulses = rig.list_pulses()
+    for stage in range(len(rig.cores)):
+        on_s, off_s = pulses[pulses[:, 4] == stage][:, :2].T
+        assert (on_s[1:] - off_s[:-1]).max() < 0.03
+    check_beams(rig)
+
+
+def test_many_frames_are_streamed(wide_rig):
+    rig, rng, records = wide_rig, np.random.default_rng(4), []
+    for _ in range(12):
+        pixels = rng.choice(437, rng.integers(1, 200), replace=False)
+        records.append(submit(rig, fill(rng.uniform(30.0, 90.0), pixels), streamed=True))
+        run(rig, rng.uniform(0.002, 0.2))
+    finish(rig, records[-1])
+    assert [record.error for record in records if record.status not in ("superseded", "done")] == []
+    assert all(record.executed_count + record.dropped == record.pulse_count for record in records)
+    assert rig.boards.board.underruns == 0
+    assert list_states(rig) <= set(ARMED_STATES)
+    check_beams(rig)
+
+
+def test_stop_ends_the_light_of_all_boards(rig):
+    record = submit(rig, build_trains(len(rig.cores), 3.0))
+    rig.until(lambda: record.executed_count > 20)
+    stopped_s = rig.clock.now_s()
+    result = rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))
+    assert result["error"] is None
+    assert list_states(rig) == {BoardState.DISARMED}
+    assert rig.list_pulses()[:, 1].max() < stopped_s + 0.002
+    rig.run(0.1)
+    assert (record.status, record.error) == ("failed", "ended by stop")
+
+
+def test_the_result_of_stop_waits_for_the_last_board(rig):
+    record = submit(rig, build_trains(len(rig.cores), 3.0))
+    rig.until(lambda: record.executed_count > 20)
+    rig.links[-1].is_cut = True
+    request = rig.request(OPERATOR, "stop")
+    rig.run(0.05)
+    assert rig.find_result(OPERATOR, request) is None
+    assert rig.boards.board.state in ARMED_STATES
+    rig.links[-1].is_cut = False
+    assert rig.await_result(OPERATOR, request)["error"] is None
+
+
+def test_a_fault_of_one_board_ends_the_light_of_all_and_is_named(rig):
+    record = submit(rig, build_trains(len(rig.cores), 3.0))
+    rig.until(lambda: record.executed_count > 20)
+    opened_s = rig.clock.now_s()
+    rig.cores[-1].set_input("interlock", False, rig.links[-1]._now_us())
+    rig.run(0.1)
+    last = len(rig.cores) - 1
+    assert [core.state for core in rig.cores] == [BoardState.DISARMED] * last + [BoardState.FAULT]
+    assert rig.list_pulses()[:, 1].max() < opened_s + 0.01
+    assert f"stage 's{last}' went to FAULT (INTERLOCK" in rig.remote.epoch_reason
+    assert record.status == "failed"
+
+
+def test_a_board_that_falls_silent_ends_the_light_of_all(rig):
+    record = submit(rig, build_trains(len(rig.cores), 9.0))
+    rig.until(lambda: record.executed_count > 20)
+    cut_s = rig.clock.now_s()
+    rig.links[0].is_cut = True
+    rig.run(3.0)
+    assert rig.list_pulses()[rig.list_pulses()[:, 4] == 0][:, 1].max() < cut_s + LEASE_S + 0.01
+    assert rig.list_pulses()[:, 1].max() < cut_s + LEASE_S + 0.03
+    assert "s0" in rig.remote.link_error
+    assert [core.state for core in rig.cores] == [BoardState.FAULT] + [BoardState.DISARMED] * (len(rig.cores) - 1)
+    rig.links[0].is_cut = False
+    rig.until(lambda: rig.remote.connected)
+    assert rig.await_result(WEB, rig.request(WEB, "disarm"))["error"] is None
+    rig.run(2.0)
+    rig.arm()
+    rig.run(0.01)
+    assert finish(rig, submit(rig, build_frame())).status == "done"
+
+
+def test_arming_is_of_all_boards_or_of_none(monkeypatch):
+    rig = StageRig(monkeypatch, build_stages("display-16", 3)).ready()
+    rig.cores[1].set_input("interlock", False, rig.links[1]._now_us())
+    rig.run(0.5)
+    result = rig.await_result(WEB, rig.request(WEB, "arm"))
+    assert "stage 's1': the board is FAULT INTERLOCK" in str(result["error"])
+    rig.run(3.0)
+    assert not list_states(rig) & set(ARMED_STATES)
+
+
+def test_a_board_that_faults_while_it_is_armed_leaves_none_armed(monkeypatch):
+    rig = StageRig(monkeypatch, build_stages("display-16", 3)).ready()
+    rig.request(WEB, "arm")
+    rig.run(1.0)
+    rig.cores[2].set_input("interlock", False, rig.links[2]._now_us())
+    rig.run(3.0)
+    assert not list_states(rig) & set(ARMED_STATES)
+
+
+def test_light_that_would_be_late_is_not_emitted_and_the_boards_stay_armed(wide_rig):
+    """Boards that execute what is late would no longer agree about the order of their pulses."""
+    rig = wide_rig
+    record = submit(rig, fill(60.0), streamed=True)
+    rig.until(lambda: record.executed_count > 20)
+    rig.clock.sleep(0.8 * LEASE_S)  # longer than points are sent ahead
+    run(rig, 0.1)
+    assert record.status == "failed"
+    assert "late" in record.error
+    assert list_states(rig) == {BoardState.ARMED}
+    assert record.executed_count <= len(rig.list_pulses()) < 437
+    assert abs(record.timing_error.max_abs_s) < 1e-4
+    assert finish(rig, submit(rig, fill(40.0))).status == "done"
+
+
+def test_a_board_whose_clock_is_not_known_well_enough_refuses_the_start(monkeypatch):
+    rig = build_armed(monkeypatch, 2, stage_skew_max_s=1e-6)
+    record = finish(rig, submit(rig, build_train(1.0)))
+    assert record.status == "failed"
+    assert "its clock is known to" in record.error
+    assert "stage_skew_max_s permits 1 µs" in record.error
+    assert not len(rig.list_pulses())
