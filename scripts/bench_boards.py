@@ -1,0 +1,148 @@
+"""Benchmark of several simulated boards whose clocks drift and wander: skew of their gate edges, and time to STOP.
+
+Full frames are drawn over and over by four board processes. Each board's own log and the known error of its clock give
+the true time of every pulse; its skew is the deviation from the plan beside the median of the plan.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_scales
+from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.planning.display_model import DisplayModel
+
+TESTS = Path(__file__).resolve().parent.parent / "tests"
+sys.path[:0] = [str(TESTS), str(TESTS / "system")]
+from rig import Board, Daemon, long_train, wait_for
+
+CLOCKS = (BoardClock(50e-6), BoardClock(-50e-6, 10e-6), BoardClock(20e-6, 20e-6), BoardClock(-30e-6, 15e-6))
+"""Drift and wander of the boards, of which the first ones are used."""
+DISPLAY = "display-437"
+STOPS = 100
+FIRST_TRAIN_PIXEL = 50
+STAGE = """
+[[stages]]
+name = "stage-{number}"
+board = {{ transport = "serial", port = "{port}", lease_s = 0.3, stream_lead_s = 0.06 }}
+"""
+
+
+class Bench:
+    """A daemon on the boards of several stages."""
+
+    def __init__(self, folder, count):
+        self.clocks, self.boards = CLOCKS[:count], []
+        for number, clock in enumerate(self.clocks):
+            own = folder / f"board-{number}"
+            own.mkdir()
+            options = ("--clock-ppm", str(1e6 * clock.drift), "--clock-wander-ppm", str(1e6 * clock.wander))
+            program = (sys.executable, "-m", "optodrive.link.simulator.board_process", *options)
+            self.boards.append(Board(own, program=program))
+        several = count > 1
+        stages = [STAGE.format(number=number, port=board.port) for number, board in enumerate(self.boards)]
+        self.daemon = Daemon(folder, self.boards[0].port, DISPLAY, lease_s=0.3, stages="".join(stages) * several)
+        layout_scale = build_scales(load_config(DISPLAY))[0]
+        moves = DisplayModel.from_config(load_config(DISPLAY)).scan_head.moves
+        codes = zip(layout_scale.to_codes(moves.x_rad), layout_scale.to_codes(moves.y_rad), strict=True)
+        self.pixel_by_codes = {(int(x), int(y)): pixel for pixel, (x, y) in enumerate(codes)}
+
+    def stop(self):
+        self.daemon.stop()
+        for board in self.boards:
+            board.stop()
+
+    def arm(self):
+        wait_for(lambda: self.daemon.board_state() == "DISARMED", "the boards")
+        self.daemon.arm()
+
+    def draw_frame(self):
+        """Draw a full frame; return the deviation of each pulse from its plan, s."""
+        for board in self.boards:
+            board.forget()
+        body = {"frames": [{"show_at_s": 0, "duration_s": 0.1, "target_um": {str(k): 60.0 for k in range(437)}}]}
+        answer = self.daemon.finished(self.daemon.call("POST", "/v1/plans", json=body)["plan"])
+        assert (answer["status"], answer["executed"]) == ("done", answer["planned"]), answer["error"]
+        planned_s = dict(zip(answer["pulses"]["pixel"], answer["pulses"]["start_s"], strict=True))
+        count = answer["executed"]
+        wait_for(lambda: sum(len(board.of("pulse")) for board in self.boards) == count, "the logs")
+        errors_s = []
+        for board, clock, began_s in zip(self.boards, self.clocks, self.began_s, strict=True):
+            for pulse in board.of("pulse"):
+                true_s = began_s + clock.find_true_s(1e-6 * pulse["on_us"])
+                errors_s.append(true_s - planned_s[self.pixel_by_codes[pulse["x"], pulse["y"]]])
+        errors_s = np.array(errors_s)
+        return errors_s - np.median(errors_s)
+
+    def read_starts(self):
+        """Read when each board's clock began."""
+        self.began_s = [board.of("clock")[0]["monotonic_s"] for board in self.boards]
+
+    def measure_stop_s(self):
+        """Return the time from a STOP until the gates of all boards are off, by the log, s."""
+        trains = [long_train(FIRST_TRAIN_PIXEL + 60 * k)["trains"][0] for k in range(len(self.boards))]
+        for board in self.boards:
+            board.forget()
+        self.daemon.call("POST", "/v1/plans", json={"trains": trains})
+        wait_for(lambda: all(len(board.of("pulse")) > 2 for board in self.boards), "light on all boards")
+        time.sleep(np.random.default_rng().uniform(0.0, 0.02))
+        stopped_s = time.monotonic()
+        self.daemon.call("POST", "/v1/stop")
+        wait_for(lambda: all(board.of("state")[-1:] for board in self.boards), "the logs")
+        last_s = []
+        for board, clock, began_s in zip(self.boards, self.clocks, self.began_s, strict=True):
+            off_us = max(event["t_us"] for event in board.of("gate") if not event["on"])
+            last_s.append(began_s + clock.find_true_s(1e-6 * off_us))
+        return max(0.0, max(last_s) - stopped_s)
+
+
+def run(count, minutes, stops):
+    """Print the figures of one number of boards."""
+    with tempfile.TemporaryDirectory() as name:
+        bench = Bench(Path(name), count)
+        try:
+            bench.read_starts()
+            bench.arm()
+            time.sleep(5.0)  # until the rates of the clocks are known
+            skews_s, frames, end_s = [], 0, time.monotonic() + 60.0 * minutes
+            while time.monotonic() < end_s:
+                skews_s.append(bench.draw_frame())
+                frames += 1
+            if frames:
+                skews_us = 1e6 * np.abs(np.concatenate(skews_s))
+                p50, p99 = np.percentile(skews_us, [50, 99])
+                print(f"{count} boards: {len(skews_us)} pulses in {frames} frames", flush=True)
+                print(f"skew of gate edges: {p50:.1f} µs median, {p99:.1f} µs p99, {skews_us.max():.1f} µs at most")
+                print(f"underruns {bench.daemon.state()['board']['underruns']}", flush=True)
+            times_s = []
+            for _ in range(stops):
+                bench.arm()
+                times_s.append(bench.measure_stop_s())
+            if stops:
+                p50, p99 = 1e3 * np.percentile(times_s, [50, 99])
+                print(
+                    f"{count} boards: STOP to all gates off {p50:.1f} ms median, {p99:.1f} ms p99 of {stops}",
+                    flush=True,
+                )
+        finally:
+            bench.stop()
+
+
+def main():
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--boards", type=int, nargs="+", default=[4], choices=range(1, 5), help="numbers of boards")
+    parser.add_argument("--minutes", type=float, default=10.0, help="time of drawing frames")
+    parser.add_argument("--stops", type=int, default=STOPS, help="number of STOPs; each arms for two seconds first")
+    options = parser.parse_args()
+    for count in options.boards:
+        run(count, options.minutes, options.stops)
+
+
+if __name__ == "__main__":
+    main()
