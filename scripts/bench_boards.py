@@ -17,8 +17,8 @@ from optodrive.link.board_setup import build_scales
 from optodrive.link.simulator.board_clock import BoardClock
 from optodrive.planning.display_model import DisplayModel
 
-TESTS = Path(__file__).resolve().parent.parent / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "system")]
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "system"))
 from rig import Board, Daemon, long_train, wait_for
 
 CLOCKS = (BoardClock(50e-6), BoardClock(-50e-6, 10e-6), BoardClock(20e-6, 20e-6), BoardClock(-30e-6, 15e-6))

@@ -102,7 +102,8 @@ def build_temporal_pattern(
 def build_two_fingers(config: Config, where: str, digits: str, centre: int | None) -> FrameSequence:
     """Build experiment 6: squares of four pixels under two fingers, the fingers alternating.
 
-    40 pulses of 15 ms in five rounds. The paper's 600 ms leave the mirrors no time: here they have time to settle.
+    40 pulses of 15 ms in five rounds. The paper's 600 ms leave the mirrors of one stage no time: here they have time to
+    settle. With several stages, one beam moves while another draws.
     """
     pitch_m = config.display.pitch_m
     pair = [compute_finger_places(int(digit), pitch_m) for digit in digits.split("-")]
@@ -110,7 +111,8 @@ def build_two_fingers(config: Config, where: str, digits: str, centre: int | Non
     requirement = "space for fingertips that spread over 58 × 22 mm around it"
     lattice = Lattice.from_config(config)
     pixels = lattice.pixels_around(centre, turns, where, requirement)
-    step_s = 0.015 + _longest_settling_s(config, lattice.layout, [*pixels, pixels[0]])
+    move_s = _longest_settling_s(config, lattice.layout, [*pixels, pixels[0]]) if len(config.stages) < 2 else 0.0
+    step_s = 0.015 + move_s
     width_s, period_s, rounds = 0.015, step_s * len(pixels), 5
     return _build_sequence(
         PulseTrain(

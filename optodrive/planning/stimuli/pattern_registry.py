@@ -105,7 +105,7 @@ _PATTERN_LIST = (
         "multi-point: squares of four pixels under two fingers at once",
         (_choice_parameter("digits", "2-3", "the two fingers; 2 is the index finger", _DIGIT_PAIRS), _CENTRE_PARAMETER),
         experiments.build_two_fingers,
-        "40 pulses of 15 ms, the two fingers alternating; 600 ms and the settling times. "
+        "40 pulses of 15 ms, the two fingers alternating; 600 ms, and with one stage the settling times. "
         "The paper does not state the positions of the fingers or the order within a square.",
         policy="refuse",
     ),

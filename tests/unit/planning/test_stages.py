@@ -14,6 +14,7 @@ from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
 from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.stimuli.experiments import build_two_fingers
 
 
 def build_display(name, count, **spans):
@@ -87,6 +88,17 @@ def test_two_fingers_feel_trains_at_once():
     check_beams(two, planned)
     assert planned.train_lateness_max_s == 0.0
     assert set(planned.plan.stage.tolist()) == {0, 1}
+
+
+@pytest.mark.parametrize("digits", ["2-3", "2-5"])
+def test_experiment_6_takes_the_paper_s_600_ms(digits):
+    """One stage needs time for the moves between the fingers; of two, one moves while the other draws."""
+    display = build_display("display-437", 2)
+    planned = plan_sequence(display, build_two_fingers(display.config, "f", digits, None), *display.build_cold_state())
+    check_beams(display, planned)
+    assert planned.train_lateness_max_s == 0.0
+    assert planned.plan.end_s - planned.plan.start_s[0] == pytest.approx(0.6, abs=1e-6)
+    assert planned.plan.width_s.sum() == pytest.approx(0.6)
 
 
 def test_a_train_keeps_its_times_while_other_stages_draw_a_frame(display):
