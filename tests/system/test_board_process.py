@@ -47,6 +47,8 @@ class Host:
 
     def hear(self):
         for frame in self.decoder.feed(self.port.read(4096)):
+            if self.session and frame.session != self.session:
+                continue  # of a session before, from the buffer of the port
             self.heard.append(m.parse_message(frame.type, frame.body))
 
     def wait(self, condition, what, lease=True, patience_s=20.0):
@@ -72,6 +74,7 @@ class Host:
                 self.hear()
                 if self.of(m.HelloReply) and self.of(m.HelloReply)[-1].host_nonce == nonce:
                     self.session = self.of(m.HelloReply)[-1].session
+                    self.heard = [message for message in self.heard if not isinstance(message, m.Executed)]
                     return self
         raise AssertionError("no answer to HELLO")
 
