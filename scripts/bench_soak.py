@@ -144,7 +144,7 @@ class ReportChecker:
         done = job.build_executed(SimpleNamespace(pixel=np.arange(count)), self._scale.full_power_w, self._scale.tick_s)
         on_us, width_us = done.on_tick, done.width_ticks
         ends_us = np.concatenate([[self._last_us], (on_us + width_us)[:-1]])
-        wrong = (on_us < ends_us) | (width_us != WIDTH_US + done.index % WIDTHS)
+        wrong = (on_us < ends_us) | (width_us != WIDTH_US + (job.first_index + done.pixel) % WIDTHS)
         self.out_of_order += int(wrong.sum()) + (not done.complete)
         self.pulses += len(done)
         self._last_us = int(on_us[-1] + width_us[-1])

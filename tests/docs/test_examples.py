@@ -31,6 +31,8 @@ ELSEWHERE = {
     "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",
     "optodrive helios": "tests/helios plays on a DAC's USB protocol; no device is here",
     "optodrive home": "a synopsis; tests/system/test_home.py",
+    "optodrive doctor --config display.toml": "tests/system/test_stages.py",
+    "optodrive first-light --stage": "tests/unit/device/test_stage_config.py",
     "optodrive calibrate board": "a synopsis; tests/system/test_calibrate_loop.py",
     "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
     "optodrive calibrate pixels": "tests/accuracy/test_calibrate_pixels.py records its sweep, which takes minutes",

@@ -114,8 +114,8 @@ def test_splice_and_truncation_through_the_planners_view(link, board):
     second = link.planner.splice(build_stage_points(300, 2 * DUTY, dark_us=8000), [250], 0.0, link.planner.epoch, 0.05)
     assert second.zero_tick == first.parts[0].end_tick_after(250)
     link.until(lambda: first.is_finished)
-    assert link.planner.truncate(200)
-    assert not link.planner.truncate(1)
+    assert link.planner.truncate([200])
+    assert not link.planner.truncate([1])
     link.until(lambda: second.is_finished)
     assert (first.executed_count, second.executed_count) == (250, 200)
     assert link.planner.pop_refusal() is None
