@@ -58,8 +58,9 @@ class Bench:
             board.stop()
 
     def arm(self):
-        wait_for(lambda: self.daemon.board_state() == "DISARMED", "the boards")
-        self.daemon.arm()
+        wait_for(lambda: self.daemon.board_state() in ("DISARMED", "ARMED"), "the boards")
+        if self.daemon.board_state() == "DISARMED":
+            self.daemon.arm()
 
     def draw_frame(self):
         """Draw a full frame; return the deviation of each pulse from its plan, s."""
