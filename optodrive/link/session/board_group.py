@@ -19,6 +19,7 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, BoardState
 from optodrive.link.session.board_view import BoardView
+from optodrive.link.session.clock_sync import DRIFT_MAX, ClockFit
 from optodrive.link.session.lease_renewal import LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.plan_job import PointTiming
@@ -65,9 +66,7 @@ class BoardGroup:
 
     def _forward_executed(self, stage: int, message: m.Executed) -> None:
         if self.has_several:
-            fit, tick_s = self.sessions[stage].clock_sync.fit(self._clock.now_s()), self.tick_s
-            if fit is None:
-                return
+            fit, tick_s = self._fit_clock(self.sessions[stage]), self.tick_s
             records = tuple(
                 (round(fit.to_host_s(tick * tick_s) / tick_s), ticks, duty) for tick, ticks, duty in message.records
             )
@@ -322,21 +321,27 @@ class BoardGroup:
         return StagedJob(next(self._numbers), parts, zero_tick)
 
     def _require_clocks(self) -> None:
-        now_s = self._clock.now_s()
         for session in self.sessions:
-            fit = session.clock_sync.fit(now_s)
-            error_s = inf if fit is None else fit.uncertainty_s
-            if error_s > self._skew_max_s:
+            fit = self._fit_clock(session)
+            if fit.uncertainty_s > self._skew_max_s:
                 raise NotReadyError(
-                    f"{self._name(session)}its clock is known to {1e6 * error_s:.0f} µs, "
+                    f"{self._name(session)}its clock is known to {1e6 * fit.uncertainty_s:.0f} µs, "
                     f"limits.stage_skew_max_s permits {1e6 * self._skew_max_s:.0f} µs"
                 )
+            if abs(fit.rate - 1.0) > DRIFT_MAX:
+                raise NotReadyError(
+                    f"{self._name(session)}its clock drifts by {1e6 * (fit.rate - 1.0):+.0f} ppm, "
+                    f"at most {1e6 * DRIFT_MAX:.0f} ppm can be followed"
+                )
 
-    def _to_board_tick(self, session: BoardSession, host_tick: int) -> float:
+    def _fit_clock(self, session: BoardSession) -> ClockFit:
         fit = session.clock_sync.fit(self._clock.now_s())
         if fit is None:
             raise LinkError(f"{self._name(session)}its clock is not known")
-        return fit.to_board_s(host_tick * self.tick_s) / self.tick_s
+        return fit
+
+    def _to_board_tick(self, session: BoardSession, host_tick: int) -> float:
+        return self._fit_clock(session).to_board_s(host_tick * self.tick_s) / self.tick_s
 
     def splice(self, points: StagePoints, kept_points: Sequence[int], send_ahead_s: float) -> StagedJob | None:
         """Truncate the last job to `kept_points` points of each stage and continue with `points` without a pause.

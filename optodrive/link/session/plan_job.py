@@ -203,9 +203,9 @@ class PlanJob:
 
     def read_reported(self, begin: int, end: int) -> ReportedPulses:
         """Return the reports so far of pulses begin to end, in order of the points. Any thread may call it."""
-        pulse_points = self._pulse_points[begin:end]
-        done = pulse_points[self._on_tick[pulse_points] >= 0]
-        return ReportedPulses(self._row[done], self._on_tick[done], self._on_ticks[done], self._duty[done])
+        reports = self.read_reports(np.arange(len(self._pulse_points))[begin:end])
+        done = reports.on_tick >= 0
+        return ReportedPulses(*(column[done] for column in reports))
 
     @property
     def is_finished(self) -> bool:

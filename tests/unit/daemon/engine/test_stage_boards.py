@@ -1,5 +1,7 @@
 """Boards of several stages, driven as one: one time, one state, one end."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,9 @@ from link_service_rig import OPERATOR, WEB
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.link.protocol.states import ARMED_STATES, BoardState
 from optodrive.link.session import plan_job
+from optodrive.link.simulator.board_clock import BoardClock
 from planner_rig import build_frame, build_train
-from stage_rig import StageRig, build_stages
+from stage_rig import CLOCKS, StageRig, build_stages
 
 LEASE_S = DISPLAYS["display-16"].config.board.lease_s
 
@@ -229,4 +232,16 @@ def test_a_board_whose_clock_is_not_known_well_enough_refuses_the_start(monkeypa
     assert record.status == "failed"
     assert "its clock is known to" in record.error
     assert "stage_skew_max_s permits 1 µs" in record.error
+    assert not len(rig.list_pulses())
+
+
+def test_a_board_whose_clock_drifts_beyond_what_can_be_followed_refuses_the_start(monkeypatch):
+    clocks = CLOCKS[0], BoardClock(1e-3)
+    rig = StageRig(monkeypatch, build_stages("display-16", 2, stage_skew_max_s=0.01), clocks).ready()
+    rig.run(4.0)
+    rig.arm()
+    rig.run(0.01)
+    record = finish(rig, submit(rig, build_train(1.0)))
+    assert record.status == "failed"
+    assert re.search(r"stage 's1': its clock drifts by \+(99\d|1000) ppm, at most 200 ppm can be", record.error)
     assert not len(rig.list_pulses())
