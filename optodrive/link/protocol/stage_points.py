@@ -12,6 +12,7 @@ from optodrive.core.types.plans import LimitedPlan
 from optodrive.link.protocol.quantisation import DecodedPulses, WirePoints, WireScale, decode, quantise
 
 POINT_BYTES = 10
+DAMAGED_POINTS = "the points differ from those that were verified (CRC-32)"
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.core.ipc import Message
 from optodrive.link.protocol import messages as m
-from optodrive.link.protocol.stage_points import StagePoints
+from optodrive.link.protocol.stage_points import DAMAGED_POINTS, StagePoints
 from optodrive.link.protocol.states import ARMED_STATES
 from optodrive.link.service.epoch import Epoch
 from optodrive.link.service.pauses import Pauses
@@ -131,7 +131,7 @@ class PointHandover:
         if not self._boards.connected or self._boards.board.state not in ARMED_STATES:
             raise NotReadyError(f"the board is {self._boards.board.state}; arm it first")
         if crc != zlib.crc32(message.payload):
-            raise NotReadyError("the points differ from those that were verified (CRC-32)")
+            raise NotReadyError(DAMAGED_POINTS)
 
     def _permits(self, message: Message) -> bool:
         return self._pauses.permits(int(message.fields["pause"]))

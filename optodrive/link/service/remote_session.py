@@ -21,7 +21,7 @@ from optodrive.core.histogram import Histogram
 from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
 from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.quantisation import WireScale
-from optodrive.link.protocol.stage_points import StagePoints
+from optodrive.link.protocol.stage_points import DAMAGED_POINTS, StagePoints
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.lease_renewal import AGE_BUCKETS_S
@@ -39,7 +39,7 @@ EXECUTED_RECORD = np.dtype([("on_tick", "<u8"), ("on_ticks", "<u4"), ("duty", "<
 class RemoteJob(StagedJob):
     """Points of one plan in the link process, updated from its messages. Indices are the boards' once it has begun.
 
-    start_ticks: at which the points of each stage begin
+    number: by which planner and link process call it; start_ticks: at which the points of each stage begin
     """
 
     def __init__(
@@ -52,7 +52,8 @@ class RemoteJob(StagedJob):
     ) -> None:
         starts = [zero_tick] * len(points.stages) if start_ticks is None else start_ticks
         pairs = zip(points.stages, starts, strict=True)
-        super().__init__(number, [PlanJob(number, one, 0, start_tick) for one, start_tick in pairs], zero_tick)
+        super().__init__([PlanJob(number, one, 0, start_tick) for one, start_tick in pairs], zero_tick)
+        self.number = number
         self._session = session
         self._first_sent_tick: float | None = None
 
@@ -388,6 +389,9 @@ class RemoteSession:
         start_ticks = [part.end_tick_after(kept) for part, kept in zip(last.parts, kept_points, strict=True)]
         zero_tick = round(zero_s / self.tick_s)
         if len(self.scales) > 1:
+            if crc is not None and crc != zlib.crc32(points.encode_payload()):
+                self._keep_refusal(DAMAGED_POINTS)
+                return None
             points, crc = points.add_pauses([zero_tick - tick for tick in start_ticks]), None
         payload = points.encode_payload()
         self._job_number += 1

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from functools import partial
-from itertools import count
 from math import inf
 from typing import Any
 
@@ -56,7 +55,6 @@ class BoardGroup:
         self.names = tuple(names)
         self._clock = clock
         self._skew_max_s = skew_max_s
-        self._numbers = count(1)
         self._refusal: str | None = None
         self._failed: BoardSession | None = None
         self.has_several = len(self.sessions) > 1
@@ -311,14 +309,14 @@ class BoardGroup:
         zero_tick = round(start_s / self.tick_s)
         if not self.has_several:
             part = self.sessions[0].begin(points.stages[0], start_s, send_ahead_s)
-            return StagedJob(next(self._numbers), [part], part.start_tick)
+            return StagedJob([part], part.start_tick)
         self._require_clocks()
         ahead_s = min(send_ahead_s, SEND_AHEAD_MAX_S)
         parts = []
         for session, one in zip(self.sessions, points.stages, strict=True):
             timing = PointTiming(zero_tick, partial(self._to_board_tick, session))
             parts.append(session.begin(one, timing.to_board_tick(zero_tick) * self.tick_s, ahead_s, timing))
-        return StagedJob(next(self._numbers), parts, zero_tick)
+        return StagedJob(parts, zero_tick)
 
     def _require_clocks(self) -> None:
         for session in self.sessions:
@@ -360,7 +358,7 @@ class BoardGroup:
             if part is None:
                 raise LinkError("a board could not be spliced although the others were")
             parts.append(part)
-        return StagedJob(next(self._numbers), parts, parts[0].start_tick)
+        return StagedJob(parts, parts[0].start_tick)
 
     def truncate(self, kept_points: Sequence[int]) -> bool:
         """Truncate the last job to `kept_points` points of each stage. Return False, unchanged, if more were sent."""

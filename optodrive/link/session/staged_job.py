@@ -24,12 +24,11 @@ class StageReports(NamedTuple):
 class StagedJob:
     """Points of one plan on their way through the boards of all stages.
 
-    number: by which planner and link process call it; parts: the job of each stage
+    parts: the job of each stage
     zero_tick: tick of the plan's zero, as those of the reports: of the board, or of the host if there are several
     """
 
-    def __init__(self, number: int, parts: Sequence[PlanJob], zero_tick: int) -> None:
-        self.number = number
+    def __init__(self, parts: Sequence[PlanJob], zero_tick: int) -> None:
         self.parts = tuple(parts)
         self.zero_tick = zero_tick
         rows = [part.pulse_rows for part in self.parts]

@@ -245,3 +245,13 @@ def test_a_board_whose_clock_drifts_beyond_what_can_be_followed_refuses_the_star
     assert record.status == "failed"
     assert re.search(r"stage 's1': its clock drifts by \+(99\d|1000) ppm, at most 200 ppm can be", record.error)
     assert not len(rig.list_pulses())
+
+
+def test_a_splice_of_points_that_are_not_those_verified_is_refused(wide_rig):
+    rig = wide_rig
+    first = submit(rig, fill(60.0), streamed=True)
+    rig.until(lambda: first.executed_count > 20)
+    plan = rig.queue.running[0].plan
+    kept = [count // 2 for count in plan.points.counts]
+    assert rig.remote.splice(plan.points, kept, first.start_s + 1.0, rig.remote.epoch, 0.05, plan.crc ^ 1) is None
+    assert "CRC-32" in rig.remote.pop_refusal()
