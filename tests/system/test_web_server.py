@@ -4,6 +4,7 @@ import asyncio
 import socket
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
 
 import pytest
@@ -16,25 +17,34 @@ from optodrive.daemon.web.acceptor import Acceptor
 from optodrive.daemon.web.acceptor_client import AcceptorClient
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.listeners import open_tcp_listener
+from optodrive.daemon.web.request_head import peek_head
 from optodrive.daemon.web.server_state import ARRIVED_S, CALLER
 from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config_sections import DaemonSection
+from rig import wait_for
 
 GET = b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
 SECRET = "a-valid-secret-of-a-viewer"
 BEARER = f"Authorization: Bearer {SECRET}\r\n".encode()
 STOP = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\n" + BEARER + b"Content-Length: 0\r\n\r\n"
 ANN = Token("ann", "armer", "a-secret-of-ann")
+LONG_S = 1e6
+"""A time that passes only on the clock of a test."""
 
 
 class Application:
-    """Answers 200; waits on /wait, blocks the loop on /block, reads bodies on /body, echoes WebSocket messages."""
+    """Answers 200; waits on /wait, blocks the loop on /block, reads bodies on /body, echoes WebSocket messages.
+
+    arrivals: paths of the requests with the times at which they arrived; message_arrivals: those times of messages
+    blocked, go_on: begin, and end, of a request for /block; release: of those for /wait, and of the message "wait"
+    """
 
     def __init__(self):
         self.calls = []
-        self.ages_s = []
-        self.message_ages_s = []
+        self.arrivals = []
+        self.message_arrivals = []
+        self.blocked, self.go_on = threading.Semaphore(0), threading.Semaphore(0)
         self.release = asyncio.Event()
 
     async def __call__(self, scope, receive, send):
@@ -45,7 +55,7 @@ class Application:
         elif scope["type"] == "websocket":
             await self.echo(receive, send)
         else:
-            self.ages_s.append(time.monotonic() - scope["state"][ARRIVED_S])
+            self.arrivals.append((scope["path"], scope["state"][ARRIVED_S]))
             scope[CALLER] = ANN if scope["path"] == "/trusted" else ANONYMOUS
             await self.answer(scope["path"], receive, send)
 
@@ -53,15 +63,16 @@ class Application:
         await receive()
         await send({"type": "websocket.accept"})
         while (message := await receive())["type"] == "websocket.receive":
-            self.message_ages_s.append(time.monotonic() - message[ARRIVED_S])
-            if message.get("text") == "block":
-                await asyncio.sleep(0.5)
+            self.message_arrivals.append(message[ARRIVED_S])
+            if message.get("text") == "wait":
+                await self.release.wait()
             await send({"type": "websocket.send", "text": str(len(message.get("text") or message["bytes"]))})
 
     async def answer(self, path, receive, send):
         self.calls.append(path)
         if path == "/block":
-            time.sleep(0.5)
+            self.blocked.release()
+            self.go_on.acquire()
         if path == "/wait":
             await self.release.wait()
         if path == "/body":
@@ -71,11 +82,39 @@ class Application:
         await send({"type": "http.response.body", "body": b"ok"})
 
 
+class Clock:
+    """The clock by which acceptor and server close what takes too long: the computer's, and what a test adds."""
+
+    def __init__(self):
+        self._added_s = 0.0
+        self._checks = Counter()
+
+    def now_s(self):
+        return time.monotonic() + self._added_s
+
+    def drive(self, connections):
+        """Let connections be judged by this clock, and count how often they are."""
+        close_expired = connections.close_expired
+
+        def close_expired_and_count():
+            close_expired()
+            self._checks[connections] += 1
+
+        connections._now_s, connections.close_expired = self.now_s, close_expired_and_count
+        self._checks[connections] = 0
+
+    def sleep(self, duration_s):
+        """Let a time pass, and all connections be judged after it."""
+        self._added_s += duration_s
+        begin = self._checks.copy()
+        wait_for(lambda: all(self._checks[each] >= begin[each] + 2 for each in begin), "the connections to be judged")
+
+
 class Client:
     """One connection to the server."""
 
     def __init__(self, port):
-        self.link = socket.create_connection(("127.0.0.1", port), timeout=20)
+        self.link = socket.create_connection(("127.0.0.1", port))
 
     def send(self, data):
         self.link.sendall(data)
@@ -108,7 +147,7 @@ class Client:
         except BlockingIOError:
             return False
         finally:
-            self.link.settimeout(20)
+            self.link.setblocking(True)
 
 
 @pytest.fixture
@@ -122,35 +161,64 @@ def policy():
 
 
 @pytest.fixture
-def acceptor_port(tmp_path, policy):
-    """Keep an acceptor in a thread and return the port that it listens on."""
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def acceptor(tmp_path, policy, clock):
+    """Keep an acceptor in a thread."""
     supervisor, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     beat = BeatWriter(channel.detach())
     with supervisor, open_tcp_listener("127.0.0.1", 0) as listener:
         acceptor = Acceptor([listener], policy, DaemonSection(), tmp_path / "acceptor", tmp_path / "link", beat)
+        acceptor.port = listener.getsockname()[1]
+        clock.drive(acceptor._room)
         thread = threading.Thread(target=acceptor.run)
         thread.start()
-        yield listener.getsockname()[1]
+        yield acceptor
         acceptor.end()
-        thread.join(20)
+        thread.join()
         acceptor.close()
         beat.close()
-    assert not thread.is_alive()
 
 
 @pytest.fixture
-def port(application, acceptor_port, tmp_path, policy):
+def server(application, acceptor, tmp_path, policy, clock):
+    """Keep a server in a thread."""
     server = Server(application, AcceptorClient(tmp_path / "acceptor"), policy)
+    server.config.timeout_keep_alive = LONG_S
+    clock.drive(server._connections)
     ready = threading.Event()
     server.on_ready = ready.set
     thread = threading.Thread(target=server.run)
     thread.start()
-    assert ready.wait(20)
-    yield acceptor_port
+    ready.wait()
+    yield server
     server.loop.call_soon_threadsafe(application.release.set)
     server.should_exit = True
-    thread.join(20)
-    assert not thread.is_alive()
+    thread.join()
+
+
+@pytest.fixture
+def port(acceptor, server):
+    return acceptor.port
+
+
+def await_phases(server, phase, count=1):
+    """Wait until the server has noticed that a number of connections are in a phase."""
+    entries = server._connections._entries
+    wait_for(lambda: [entry.phase.phase for entry in list(entries.values())].count(phase) == count, f"phase {phase}")
+
+
+def await_held(server):
+    """Wait until the server has received a connection for which there is no room."""
+    wait_for(lambda: server._opener._held, "a connection that waits for room")
+
+
+def await_unread(server, count):
+    """Wait until requests wait in the sockets of a number of clients."""
+    wait_for(lambda: sum(map(bool, map(peek_head, server._selector._clients.values()))) == count, "unread requests")
 
 
 @pytest.fixture
@@ -175,35 +243,41 @@ HALVES = {
 
 
 @pytest.mark.parametrize("phase", HALVES)
-def test_a_connection_that_stays_in_a_phase_is_closed(open_client, monkeypatch, phase):
-    monkeypatch.setitem(connections.PHASE_MAX_S, phase, 0.3)
+def test_a_connection_that_stays_in_a_phase_is_closed(open_client, acceptor, server, clock, monkeypatch, phase):
+    monkeypatch.setitem(connections.PHASE_MAX_S, phase, LONG_S)
     for text in HALVES[phase]:
         client = open_client()
         client.send(text)
-        begin_s = time.monotonic()
         if phase in ("idle", "drain"):
             assert client.receive_answer()
+        if phase == "headers":  # it waits in front of the server
+            wait_for(lambda: len(acceptor._room) == 1, "the connection")
+        else:
+            await_phases(server, phase)
+        clock.sleep(0.9 * LONG_S)
+        assert not client.is_closed()
+        clock.sleep(0.2 * LONG_S)
         assert client.receive() == b""
-        assert time.monotonic() - begin_s > 0.2
 
 
-def test_bytes_that_trickle_in_do_not_prolong_a_phase(open_client, monkeypatch):
-    monkeypatch.setitem(connections.PHASE_MAX_S, "headers", 0.5)
+def test_bytes_that_trickle_in_do_not_prolong_a_phase(open_client, clock, monkeypatch):
+    monkeypatch.setitem(connections.PHASE_MAX_S, "headers", LONG_S)
     client = open_client()
-    begin_s = time.monotonic()
-    with suppress(OSError):
-        while not client.is_closed():
-            client.send(b"X")
-            time.sleep(0.05)
-    assert 0.4 < time.monotonic() - begin_s < 5.0
+    for _ in range(3):
+        assert not client.is_closed()
+        client.send(b"X")
+        assert open_client().ask(GET)  # which arrived after the byte
+        clock.sleep(0.4 * LONG_S)
+    assert client.receive() == b""
 
 
-def test_a_client_that_does_not_read_its_answers_is_closed(open_client, monkeypatch):
-    monkeypatch.setitem(connections.PHASE_MAX_S, "stalled", 0.3)
+def test_a_client_that_does_not_read_its_answers_is_closed(open_client, server, clock, monkeypatch):
+    monkeypatch.setitem(connections.PHASE_MAX_S, "stalled", LONG_S)
     monkeypatch.setattr(Application, "answer", send_without_end)
     client = open_client()
     client.send(GET)
-    time.sleep(2.0)
+    await_phases(server, "stalled")
+    clock.sleep(1.1 * LONG_S)
     size = 0
     while data := client.receive():
         size += len(data)
@@ -228,7 +302,7 @@ def test_a_connection_with_a_valid_token_gives_way_last(open_client, monkeypatch
     assert trusted.ask(GET)
 
 
-def test_who_has_no_token_takes_no_place_from_who_has_one(open_client, monkeypatch):
+def test_who_has_no_token_takes_no_place_from_who_has_one(open_client, server, monkeypatch):
     monkeypatch.setattr(connections, "CONNECTIONS_MAX", 4)
     get_trusted = GET.replace(b"/v1/state", b"/trusted")
     trusted = [open_client() for _ in range(4)]
@@ -236,7 +310,7 @@ def test_who_has_no_token_takes_no_place_from_who_has_one(open_client, monkeypat
     newcomers = [open_client() for _ in range(3)]
     for newcomer in newcomers:
         newcomer.send(GET)
-    time.sleep(0.3)
+    await_held(server)
     assert not any(client.is_closed() for client in trusted)
     with_token = open_client()
     assert with_token.ask(STOP.replace(b"POST /v1/stop", b"GET /trusted"))
@@ -266,33 +340,44 @@ def test_only_stop_enters_while_every_connection_is_busy(open_client, applicatio
     assert refused.receive() == b""
 
 
-def test_a_slow_body_gives_way_to_a_new_connection(open_client, monkeypatch):
+def test_a_slow_body_gives_way_to_a_new_connection(open_client, server, clock, monkeypatch):
     monkeypatch.setattr(connections, "CONNECTIONS_MAX", 5)
-    monkeypatch.setattr(connections, "SLOW_BODY_S", 0.3)
+    monkeypatch.setattr(connections, "SLOW_BODY_S", LONG_S)
+    monkeypatch.setitem(connections.PHASE_MAX_S, "body", 2 * LONG_S)
     slow = [open_client() for _ in range(5)]
     for client in slow:
         client.send(HALVES["body"][0])
-    time.sleep(0.5)
-    assert open_client().ask(GET)
+    await_phases(server, "body", 5)
+    newcomer = open_client()
+    newcomer.send(GET)
+    await_held(server)
+    clock.sleep(0.9 * LONG_S)
+    assert not any(client.is_closed() for client in slow)
+    clock.sleep(0.2 * LONG_S)
+    assert newcomer.receive_answer()
     assert sum(client.is_closed() for client in slow) == 1
 
 
-def test_stop_precedes_requests_that_arrived_before_it(open_client, application):
+def test_stop_precedes_requests_that_arrived_before_it(open_client, acceptor, server, application):
     blocking, stop = open_client(), open_client()
     others = [open_client() for _ in range(60)]
     assert all(client.ask(GET) for client in (stop, *others))
-    application.calls.clear()
     blocking.send(GET.replace(b"/v1/state", b"/block"))
-    time.sleep(0.1)
+    application.blocked.acquire()
+    application.calls.clear()
+    handed_over = acceptor._handed_over
     for client in others:
         client.send(GET)
     stop.send(STOP)
     new = open_client()
     new.send(STOP)
+    await_unread(server, 61)
+    wait_for(lambda: acceptor._handed_over > handed_over, "the new connection")
+    application.go_on.release()
     assert all(client.receive_answer() for client in (stop, new, *others))
     # Of the clients that are ready, STOP is served first; the other one waited as a new connection.
-    assert application.calls[:2] == ["/block", "/v1/stop"]
-    assert "/v1/stop" in application.calls[2:30]
+    assert application.calls[0] == "/v1/stop"
+    assert "/v1/stop" in application.calls[1:29]
 
 
 def open_websocket(port, **options):
@@ -303,7 +388,7 @@ def send_and_get_close_code(stream, message):
     """Return the code, None if the close frame was lost because the client was still sending; else the answer."""
     try:
         stream.send(message)
-        return stream.recv(20)
+        return stream.recv()
     except ConnectionClosed as closed:
         return closed.rcvd and closed.rcvd.code
 
@@ -312,7 +397,7 @@ def test_a_message_has_a_maximum_size_and_no_compression(port):
     with open_websocket(port) as stream:
         assert "sec-websocket-extensions" not in stream.response.headers
         stream.send("x" * bounded_websocket.MESSAGE_MAX_BYTES)
-        assert stream.recv(20) == str(bounded_websocket.MESSAGE_MAX_BYTES)
+        assert stream.recv() == str(bounded_websocket.MESSAGE_MAX_BYTES)
         assert send_and_get_close_code(stream, "x" * (bounded_websocket.MESSAGE_MAX_BYTES + 1)) in (1009, None)
 
 
@@ -320,7 +405,7 @@ def test_a_message_has_a_maximum_size_and_no_compression(port):
 def test_fragments_are_bounded(port, fragment):
     with open_websocket(port) as stream:
         stream.send(["a", "b"])
-        assert stream.recv(20) == "2"
+        assert stream.recv() == "2"
         assert send_and_get_close_code(stream, [fragment] * 200) in (1009, None)
 
 
@@ -332,23 +417,23 @@ PING, PONG = b"\x89\x80\x00\x00\x00\x00", b"\x8a\x00"
 MESSAGE, ECHO = b"\x81\x81\x00\x00\x00\x00x", b"\x81\x011"
 
 
-def test_pings_are_paced_and_delay_no_other_client(open_client):
+def test_pings_are_paced_and_delay_no_other_client(open_client, monkeypatch):
+    monkeypatch.setattr(bounded_websocket, "FRAMES_PER_S", 1.0 / LONG_S)
     stream = open_client()
     stream.send(HANDSHAKE)
     assert stream.receive().startswith(b"HTTP/1.1 101 ")
-    begin_s = time.monotonic()
     stream.send(PING * 2500)  # what the sockets hold beyond this would block this thread
+    received = b""
+    while len(received) < len(PONG) * bounded_websocket.FRAMES_BURST:
+        received += stream.receive()
     for _ in range(20):
         assert open_client().ask(STOP)
-    received = b""
-    while time.monotonic() < begin_s + 1.0:
-        stream.link.settimeout(0.1)
-        with suppress(TimeoutError):
+    stream.link.setblocking(False)
+    with suppress(BlockingIOError):
+        while True:
             received += stream.receive()
-    elapsed_s = time.monotonic() - begin_s
     slice_frames = bounded_websocket.SLICE_BYTES // len(PING) + 1
-    allowed = bounded_websocket.FRAMES_BURST + bounded_websocket.FRAMES_PER_S * elapsed_s + slice_frames
-    assert len(PONG) * 100 <= len(received) <= len(PONG) * allowed
+    assert len(received) <= len(PONG) * (bounded_websocket.FRAMES_BURST + slice_frames)
 
 
 def test_messages_wait_for_the_pings_before_them(open_client, monkeypatch):
@@ -363,32 +448,45 @@ def test_messages_wait_for_the_pings_before_them(open_client, monkeypatch):
     assert received.count(PONG) >= 900
 
 
-def test_a_request_that_waited_for_its_turn_states_when_it_arrived(open_client, application):
-    blocking, others = [open_client() for _ in range(4)], [open_client() for _ in range(30)]
+def test_a_request_that_waited_for_its_turn_states_when_it_arrived(open_client, server, application):
+    blocking, others = [open_client() for _ in range(2)], [open_client() for _ in range(30)]
     assert all(client.ask(GET) for client in (*blocking, *others))
-    application.ages_s.clear()
-    for client in others:
-        client.send(GET)
-    for client in blocking:  # each holds the loop for half a second, while some of the others wait
-        client.send(GET.replace(b"/v1/state", b"/block"))
+    blocking[0].send(GET.replace(b"/v1/state", b"/block"))
+    application.blocked.acquire()
+    for client in (blocking[1], *others):
+        client.send(GET.replace(b"/v1/state", b"/block" if client is blocking[1] else b"/v1/state"))
+    await_unread(server, 31)
+    application.go_on.release()
+    application.blocked.acquire()  # among the first of them, while the others wait for their turn
+    application.arrivals.clear()
+    blocked_s = time.monotonic()
+    application.go_on.release()
     assert all(client.receive_answer() for client in (*others, *blocking))
-    assert max(application.ages_s) > 0.4
-    application.ages_s.clear()
+    arrived_s = [at_s for _, at_s in application.arrivals]
+    assert len(arrived_s) > 20
+    assert max(arrived_s) < blocked_s
+    begin_s = time.monotonic()
     assert others[0].ask(GET)
-    assert application.ages_s[0] < 0.4
+    assert application.arrivals[-1][1] >= begin_s
 
 
-def test_a_message_that_waited_in_the_socket_is_not_taken_for_new(port, application):
+def test_a_message_that_waited_is_not_taken_for_new(port, server, application):
     with open_websocket(port) as stream:
+        (protocol,) = server.server_state.connections
+        begin_s = time.monotonic()
         stream.send("first")
-        stream.recv(20)
-        stream.send("block")
-        time.sleep(0.1)
-        stream.send("waits")  # read half a second later
-        assert [stream.recv(20), stream.recv(20)] == ["5", "5"]
-        time.sleep(0.3)
+        stream.recv()
+        stream.send("wait")
+        wait_for(lambda: len(application.message_arrivals) == 2, "the message for which the next one waits")
+        stream.send("next")
+        wait_for(protocol.queue.qsize, "the next message")
+        waiting_s = time.monotonic()
+        server.loop.call_soon_threadsafe(application.release.set)
+        assert [stream.recv(), stream.recv()] == ["4", "4"]
+        wait_for(lambda: protocol._unread_since_s is None, "the end of all input")
+        new_s = time.monotonic()
         stream.send("new")
-        stream.recv(20)
-    assert application.message_ages_s[0] < 0.3
-    assert application.message_ages_s[2] > 0.35
-    assert application.message_ages_s[3] < 0.25
+        stream.recv()
+    assert application.message_arrivals[0] >= begin_s
+    assert application.message_arrivals[2] < waiting_s
+    assert application.message_arrivals[3] >= new_s
