@@ -1,7 +1,7 @@
 """A supervisor over children of a few lines, each of which serves, hangs, dies, fails or is deaf, start by start.
 
 arguments: FOLDER NAME=BEHAVIOUR[,BEHAVIOUR…]…, one behaviour per start of the child, of which the last one repeats
-$MUTANT: one of MUTANTS, a check that the supervisor then lacks
+$MUTANT: one of MUTANTS, a check that the supervisor then lacks; $END_GRACE_S: in place of the supervisor's own
 """
 
 import json
@@ -12,7 +12,6 @@ import sys
 import time
 from contextlib import suppress
 from functools import partial
-from math import inf
 from pathlib import Path
 
 from optodrive.core.beat import BeatWriter
@@ -21,14 +20,12 @@ from optodrive.core.errors import InputError
 from optodrive.core.ipc import IpcError, Message, MessageSocket
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
-from optodrive.daemon.supervisor import forking
+from optodrive.daemon.supervisor import forking, supervisor
 from optodrive.daemon.supervisor.child import Child
 from optodrive.daemon.supervisor.forking import fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.supervisor import Supervisor
 
-LIFE_S = 0.1
-"""A child that dies or hangs does so after this time, and not before the daemon serves: that would end the daemon."""
 STATUS = {"connected": True, "port": "tty", "board": {"state": "DISARMED"}}
 
 MUTANTS = {
@@ -39,7 +36,7 @@ MUTANTS = {
 
 
 def behave(behaviour, name, folder, beat):
-    """Live the life of a child."""
+    """Live the life of a child. One that dies or hangs does so once the daemon serves: before, that would end it."""
     listener = None
     if behaviour == "fail":
         raise InputError("capture", "x.jsonl", "a new file")
@@ -55,21 +52,20 @@ def behave(behaviour, name, folder, beat):
     note(folder, f"{name} starts", descriptors=len(list(Path("/proc/self/fd").iterdir())) - 1)
     beat.report_ready()
     clients = []
-    served_s = inf
     while True:
-        is_last = bool(ends)
-        if served_s == inf and (folder / "serving").exists():
-            served_s = time.monotonic()
-        if time.monotonic() - served_s > LIFE_S and behaviour == "die":
+        is_last, is_served = bool(ends), (folder / "serving").exists()
+        if is_served and behaviour == "die":
             os._exit(3)
-        if time.monotonic() - served_s > LIFE_S and behaviour == "hang":
+        if is_served and behaviour == "hang":
             note(folder, f"{name} hangs")
-            time.sleep(60)
+            while True:
+                time.sleep(1000)
         beat.beat()
         for fields in beat.receive():
             note(folder, f"{name} receives", **fields)
         clients = serve_link(listener, clients, folder)
         if is_last:
+            note(folder, f"{name} ends")
             return
         time.sleep(0.02)
 
@@ -100,6 +96,7 @@ def note(folder, event, **fields):
 
 def main():
     MUTANTS.get(os.environ.get("MUTANT"), lambda: None)()
+    supervisor.END_GRACE_S = float(os.environ["END_GRACE_S"])
     folder = Path(sys.argv[1])
     clock = MonotonicClock()
     children = {}
@@ -107,17 +104,17 @@ def main():
         name, _, listed = argument.partition("=")
         children[name] = Child(name, partial(start, name, listed.split(","), folder), clock)
     notifier = Notifier(clock)
-    supervisor = Supervisor(children.pop("link"), LinkView(folder / "link.sock", clock), notifier, DaemonLog(), clock)
-    supervisor.install_signal_handlers()
+    daemon = Supervisor(children.pop("link"), LinkView(folder / "link.sock", clock), notifier, DaemonLog(), clock)
+    daemon.install_signal_handlers()
     try:
-        supervisor.start_link()
+        daemon.start_link()
         web = children.pop("web")
-        if supervisor.start_others(list(children.values()), web):
+        if daemon.start_others(list(children.values()), web):
             note(folder, "serves")
             (folder / "serving").touch()
-            supervisor.serve()
+            daemon.serve()
     finally:
-        supervisor.close()
+        daemon.close()
         note(folder, "ended")
 
 

@@ -9,7 +9,11 @@ import pytest
 
 from optodrive.core.beat import BEAT, READY
 from optodrive.core.clock import ManualClock
+from optodrive.daemon.log import DaemonLog
+from optodrive.daemon.notify import Notifier
 from optodrive.daemon.supervisor.child import HANG_S, RESTART_DELAYS_S, START_TIMEOUT_S, STEADY_S, Child
+from optodrive.daemon.supervisor.link_view import LinkView
+from optodrive.daemon.supervisor.supervisor import STALL_S, Supervisor
 
 MOMENT_S = 0.01
 
@@ -112,3 +116,46 @@ def test_a_child_that_lived_for_a_minute_starts_again_at_once(sleeper):
     assert [sleeper.live(0.3) for _ in range(3)] == pytest.approx(list(RESTART_DELAYS_S[:3]), abs=1.5 * MOMENT_S)
     assert sleeper.live(STEADY_S - MOMENT_S) == pytest.approx(RESTART_DELAYS_S[3], abs=1.5 * MOMENT_S)
     assert sleeper.live(STEADY_S + MOMENT_S) == 0.0
+
+
+@pytest.fixture
+def supervisor(sleeper, tmp_path):
+    """A supervisor that serves with one child, and whose steps the test takes."""
+    clock, log = sleeper.clock, DaemonLog()
+    notifier = Notifier(clock, {})
+    supervisor = Supervisor(sleeper.child, LinkView(tmp_path / "nowhere", clock), notifier, log, clock)
+    supervisor._is_serving = True
+    supervisor._step()
+    sleeper.send(READY)
+    yield supervisor
+    supervisor.close()
+    notifier.close()
+    log.close()
+
+
+def test_children_that_were_stopped_with_the_supervisor_have_all_their_time_again(sleeper, supervisor):
+    """Ctrl-Z and fg: the supervisor may run first again, and finds no beats of the meantime."""
+    pid = sleeper.child.pid
+    sleeper.clock.sleep(HANG_S + STALL_S)
+    supervisor._step()
+    sleeper.clock.sleep(HANG_S / 4)
+    supervisor._step()
+    assert (sleeper.child.pid, sleeper.child.killed_because) == (pid, "")
+    for _ in range(2):
+        sleeper.clock.sleep(0.9 * STALL_S)
+        supervisor._step()
+    assert sleeper.child.killed_because == "killed: no beat for 2 s"
+
+
+def test_a_child_that_died_again_starts_after_its_delay(sleeper, supervisor):
+    for number, delay_s in enumerate(RESTART_DELAYS_S[:3], 1):
+        os.kill(sleeper.child.pid, signal.SIGKILL)
+        first, waited_s = sleeper.child.pid, 0.0
+        while sleeper.child.pid == first:
+            supervisor._step()
+        while not sleeper.child.is_running:
+            sleeper.clock.sleep(MOMENT_S)
+            waited_s += MOMENT_S
+            supervisor._step()
+        assert sleeper.child.starts == number + 1
+        assert waited_s == pytest.approx(delay_s, abs=1.5 * MOMENT_S)
