@@ -15,7 +15,7 @@ from optodrive.daemon.supervisor.child import HANG_S, RESTART_DELAYS_S, START_TI
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.supervisor import STALL_S, Supervisor
 
-MOMENT_S = 0.01
+MOMENT_S, STEP_S = 0.01, 0.05
 
 
 class Sleeper:
@@ -154,8 +154,8 @@ def test_a_child_that_died_again_starts_after_its_delay(sleeper, supervisor):
         while sleeper.child.pid == first:
             supervisor._step()
         while not sleeper.child.is_running:
-            sleeper.clock.sleep(MOMENT_S)
-            waited_s += MOMENT_S
+            sleeper.clock.sleep(STEP_S)
+            waited_s += STEP_S
             supervisor._step()
         assert sleeper.child.starts == number + 1
-        assert waited_s == pytest.approx(delay_s, abs=1.5 * MOMENT_S)
+        assert waited_s == pytest.approx(delay_s, abs=1.5 * STEP_S)
