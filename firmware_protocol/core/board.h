@@ -170,7 +170,7 @@ struct board {
     uint64_t laser_on_duty_us; /* µs × duty */
 
     uint64_t last_tick_us, readback_differs_since_us;
-    bool readback_differs, loop_ran;
+    bool readback_differs, loop_ran, has_ticked;
 };
 
 /* Power-up or reset: initialises all state, gate off, DISARMED. now_us: a monotonic 64-bit time in µs. */

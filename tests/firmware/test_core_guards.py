@@ -165,6 +165,14 @@ def test_indicator_relay_and_mirrors(make):
     assert b.core.mirrors == (CENTRE, CENTRE), "where the core takes them to be"
 
 
+def test_ticks_are_late_only_after_the_first(library):
+    core = CBoard(library)
+    core.tick(20_000)  # board_init took a chip that long
+    assert core.state == "DISARMED"
+    core.tick(20_601)
+    assert core.fault == "TICK"
+
+
 @pytest.mark.parametrize(("name", "unsafe"), [("interlock", False), ("key", False), ("estop", True)])
 def test_an_input_unsafe_at_power_up_does_not_let_arm(make, name, unsafe):
     b = make()

@@ -96,13 +96,6 @@ static const struct board_hal HAL = {NULL,      set_gate,     read_gate,        
 
 /* --- time --- */
 
-static void power_up(const struct board_config *config) {
-    oracle_power_up(o, config, o->now_us);
-    driver.ticked_us = o->now_us;
-    board_init(board, &HAL, config, RESET_POWER_UP, o->now_us);
-    oracle_check(o, board);
-}
-
 static void tick(void) {
     uint64_t since_us = o->now_us - driver.ticked_us;
     driver.ticked_us = o->now_us;
@@ -110,6 +103,14 @@ static void tick(void) {
     board_tick(board, o->now_us);
     oracle_check(o, board);
     oracle_after_tick(o, since_us);
+}
+
+static void power_up(const struct board_config *config) {
+    oracle_power_up(o, config, o->now_us);
+    board_init(board, &HAL, config, RESET_POWER_UP, o->now_us);
+    oracle_check(o, board);
+    driver.ticked_us = o->now_us; /* from the first tick on, a tick can be late */
+    tick();
 }
 
 static void run_loop(const uint8_t *bytes, size_t n) {
