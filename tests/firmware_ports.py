@@ -3,9 +3,14 @@
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 PORTS = Path(__file__).parents[1] / "firmware_protocol" / "ports"
+sys.path.append(str(PORTS / "mps2-an385"))
+
+from emulated_chip import EmulatedChip  # noqa: E402
+
 PACKAGES = {
     "gcc": "gcc libc6-dev",
     "make": "make",
@@ -21,13 +26,23 @@ def require(*tools):
     assert not missing, f"the firmware's tests need: apt-get install {' '.join(missing)}"
 
 
-def build_board(folder, mutant=0, port="host"):
-    """Build a port and return its command without options. mutant: number of the disabled guard."""
+def _build(folder, mutant, port):
+    """Build a port; return its file without suffix. mutant: number of the disabled guard."""
     require(*NEEDS[port])
     build = ["make", "-s", "-C", PORTS / port, f"BUILD={folder}", f"MUTANT={mutant}"]
     built = subprocess.run(build, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
-    program = folder / (f"board-{mutant}" if mutant else "board")
+    return folder / (f"board-{mutant}" if mutant else "board")
+
+
+def build_board(folder, mutant=0, port="host"):
+    """Build a port and return its command without options."""
+    program = _build(folder, mutant, port)
     if port == "host":
         return (str(program),)
     return (sys.executable, str(PORTS / port / "board.py"), "--image", f"{program}.elf")
+
+
+def build_emulated_chip(folder, mutant=0):
+    """Build the image of the emulated Cortex-M3; return a function of settings, sink and seed for a chip."""
+    return partial(EmulatedChip, _build(folder, mutant, "mps2-an385").with_suffix(".elf"))

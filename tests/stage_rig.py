@@ -61,7 +61,7 @@ class StageRig(PlannerRig):
     def build_boards(self, _, settings, requirements):
         boards = build_board_settings(self.display.config)
         self.logs = [[] for _ in boards]
-        self.cores = [BoardCore(settings, sink=log.append, seed=3 + k) for k, log in enumerate(self.logs)]
+        self.cores = [self.build_core(k, settings, log.append) for k, log in enumerate(self.logs)]
         pairs = zip(self.cores, self.clocks, boards, strict=False)
         self.links = [self.link_type(core, self.clock, clock, board.stage) for core, clock, board in pairs]
         sessions = [
@@ -71,6 +71,9 @@ class StageRig(PlannerRig):
         self.session = sessions[0]
         skew_max_s = self.display.config.limits.stage_skew_max_s
         return BoardGroup(sessions, self.clock, [board.stage for board in boards], skew_max_s)
+
+    def build_core(self, stage, settings, sink):
+        return BoardCore(settings, sink=sink, seed=3 + stage)
 
     def open_port(self):
         for link in self.links:

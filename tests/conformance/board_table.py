@@ -38,7 +38,7 @@ def scenarios_of(guard):
 
 def row(guard):
     """Return a row of the table."""
-    boards = [kind.name for kind in PROCESS_KINDS if not kind.spares(guard)]
+    boards = [*(kind.name for kind in PROCESS_KINDS if not kind.spares(guard)), "qemu"]
     broken = Counter(mutant.board for mutant in MUTANTS if mutant.guard == guard)
     killed = ", ".join(f"{board.replace('c', 'C')} {count}" for board, count in broken.items())
     return f"| {guard} | {ENFORCED[guard]} | {scenarios_of(guard)} | {', '.join(boards)} | {killed} |"

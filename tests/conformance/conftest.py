@@ -7,21 +7,24 @@ import pytest
 pytest.register_assert_rewrite(*(f"{name}_scenarios" for name in ("guard", "job", "link", "order", "self", "trust")))
 
 from process_board import ABOUT_ITSELF, PROCESS_KINDS  # noqa: E402
-from virtual_board import VirtualKind  # noqa: E402
+from virtual_board import EmulatedBoard, VirtualKind  # noqa: E402
 
 from c_core import SeededCBoard, build_library  # noqa: E402
+from firmware_ports import build_emulated_chip  # noqa: E402
 from optodrive.link.simulator.board_core import BoardCore  # noqa: E402
 
 
 @pytest.fixture(scope="session")
 def virtual(tmp_path_factory):
-    """Return a function for a virtual kind by name, or a mutant of the C core; each is built once."""
+    """Return a function for a virtual kind by name, or a mutant of the core in C; each is built once."""
     folder = tmp_path_factory.mktemp("core")
 
     @cache
     def build(name, mutant=0):
         if name == "python":
             return VirtualKind(name, BoardCore, dict.fromkeys(("B14", "B15"), ABOUT_ITSELF))
+        if name == "qemu":
+            return VirtualKind(name, build_emulated_chip(folder, mutant), make_board=EmulatedBoard)
         return VirtualKind(name, partial(SeededCBoard, build_library(folder, mutant)))
 
     return build

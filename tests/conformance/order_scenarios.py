@@ -44,7 +44,7 @@ def each_point_executes_once_and_in_order(bench):
 def frame_repeated_256_later_is_detected_by_its_index(bench):
     host = bench.ready(**BRIGHT)
     old = host.data(here(100, duty=999))
-    assert host.order(old, *[host.data(here(0)) for _ in range(255)]) == []
+    assert host.order(old, *[host.data(here(0, dark_us=200)) for _ in range(255)]) == []
     assert host.order(old) == ["INDEX"]
     host.seq = (host.seq + 1) % 256  # the frame had the expected number
     assert host.status().queued == 256

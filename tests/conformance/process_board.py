@@ -14,8 +14,6 @@ from optodrive.core.clock import MonotonicClock
 
 READ_WAIT_S = 0.005
 ABOUT_ITSELF = "the simulated board does B1 to B13: it has no tick, readback or watchdog of its own"
-LINK_FAULTS = "link faults"
-TOO_FAST = "its witness leaves the emulator byte by byte, some 2 ms a pulse: too slow for a point every 1.2 ms"
 
 
 class ProcessKind(NamedTuple):
@@ -52,7 +50,6 @@ class ProcessKind(NamedTuple):
 PROCESS_KINDS = [
     ProcessKind("python", SIMULATED, spared=dict.fromkeys(("B14", "B15"), ABOUT_ITSELF)),
     ProcessKind("host", port="host"),
-    ProcessKind("qemu", port="mps2-an385", spared={LINK_FAULTS: TOO_FAST}),
 ]
 """All board implementations that run as a process."""
 

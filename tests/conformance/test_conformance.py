@@ -1,13 +1,26 @@
-"""Black-box conformance with PROTOCOL.md in virtual time: each scenario against each board core."""
+"""Black-box conformance with PROTOCOL.md in virtual time: each scenario against each board core.
+
+The emulated chip plays in every run what the processes on ptys play; scripts/test --slow plays all.
+"""
 
 import pytest
 from all_scenarios import MODULES, SCENARIOS
 from bench import Bench
 from scenario import GUARDS, judge
+from test_conformance_pty import CASES
+
+
+def name_case(case):
+    return f"{case.subject}-{case.name}"
+
+
+@pytest.mark.parametrize("case", CASES, ids=name_case)
+def test_emulated_chip_conforms(case, virtual):
+    judge(virtual("qemu"), case)
 
 
 @pytest.mark.parametrize("name", ["python", "c"])
-@pytest.mark.parametrize("case", SCENARIOS, ids=lambda case: f"{case.subject}-{case.name}")
+@pytest.mark.parametrize("case", SCENARIOS, ids=name_case)
 def test_conforms(case, name, virtual):
     kind = virtual(name)
     if why := kind.spares(case.subject):

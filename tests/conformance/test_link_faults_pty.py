@@ -11,7 +11,6 @@ from pathlib import Path
 from threading import Timer
 
 import pytest
-from process_board import LINK_FAULTS
 from pty_rig import PtyRig
 from wire_format import HOST
 
@@ -23,15 +22,13 @@ KINDS = 11
 """Number of fault kinds; the close of a port is another one."""
 
 
-@pytest.fixture(scope="module", params=["python", "host", "qemu"])
+@pytest.fixture(scope="module", params=["python", "host"])
 def board_kind(request, ready):
     return ready(request.param, 0)
 
 
 @pytest.fixture
 def make_rig(board_kind, tmp_path):
-    if why := board_kind.spares(LINK_FAULTS):
-        pytest.skip(f"{board_kind.name}: {why}")
     rigs = []
 
     def make(*faults, **more):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from board_log import BoardLog
 
-from c_core import SeededCBoard
+from firmware_ports import EmulatedChip
 from optodrive.core.clock import ManualClock
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
@@ -18,29 +18,6 @@ WATCHDOG_CAUSE = 3
 LATE_TICK_US = 1000
 BYTE_S = 10 / 1_000_000
 """Time of a byte on the line."""
-
-
-class VirtualKind(NamedTuple):
-    """A board core. make_core: (settings, sink, seed) → core; spared: as of a process."""
-
-    name: str
-    make_core: Callable[..., Any]
-    spared: dict[str, str] = {}  # noqa: RUF012 - nobody writes to it
-
-    def spares(self, subject):
-        """Return the reason for exempting it from a subject, '' if it is tested."""
-        return self.spared.get(subject, "")
-
-    def make_clock(self):
-        """Return the clock of a bench."""
-        return VirtualClock()
-
-    def start(self, folder, clock, number, steps, limits):
-        """Return a new board; number: its seed."""
-        guarded = {name: value for name, value in limits.items() if hasattr(DEFAULT_LIMITS, name)}
-        others = {name: value for name, value in limits.items() if name not in guarded}
-        settings = BoardSettings(replace(DEFAULT_LIMITS, **guarded), **others)
-        return VirtualBoard(self.make_core, settings, clock, number, steps)
 
 
 class VirtualClock(ManualClock):
@@ -76,7 +53,6 @@ class VirtualBoard(BoardLog):
         self.clock = clock
         self._log = []
         self._core = make_core(settings, self._log.append, seed=seed)
-        self._has_loop = isinstance(self._core, SeededCBoard)
         self._steps = list(steps)
         self._is_open = self._loop_stopped = False
         self._resumes_us = 0
@@ -164,6 +140,27 @@ class VirtualBoard(BoardLog):
         self.close()
 
 
+class EmulatedBoard(VirtualBoard):
+    """An emulated chip with its port: loop, tick, gate and watchdog are its own."""
+
+    def advance(self, now_us):
+        """Advance to a time."""
+        self._core.advance(now_us)
+        self._receive(now_us)
+
+    def next_step(self):
+        """Carry out the next step of the script."""
+        if self._steps[0].get("do") in EmulatedChip.FAULTS:
+            self._core.inject_fault(self._steps.pop(0)["do"])
+        else:
+            super().next_step()
+
+    def end(self):
+        """Close the port and end the emulator."""
+        super().end()
+        self._core.close()
+
+
 class VirtualLine:
     """The host's end of a board's port."""
 
@@ -186,3 +183,27 @@ class VirtualLine:
     def close(self):
         """Close the port."""
         self._board.close()
+
+
+class VirtualKind(NamedTuple):
+    """A board core. make_core: (settings, sink, seed) → core; spared: as of a process; make_board: of its port."""
+
+    name: str
+    make_core: Callable[..., Any]
+    spared: dict[str, str] = {}  # noqa: RUF012 - nobody writes to it
+    make_board: Callable[..., VirtualBoard] = VirtualBoard
+
+    def spares(self, subject):
+        """Return the reason for exempting it from a subject, '' if it is tested."""
+        return self.spared.get(subject, "")
+
+    def make_clock(self):
+        """Return the clock of a bench."""
+        return VirtualClock()
+
+    def start(self, folder, clock, number, steps, limits):
+        """Return a new board; number: its seed."""
+        guarded = {name: value for name, value in limits.items() if hasattr(DEFAULT_LIMITS, name)}
+        others = {name: value for name, value in limits.items() if name not in guarded}
+        settings = BoardSettings(replace(DEFAULT_LIMITS, **guarded), **others)
+        return self.make_board(self.make_core, settings, clock, number, steps)

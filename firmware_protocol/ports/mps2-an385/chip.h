@@ -4,22 +4,16 @@
 #define CHIP_H
 
 #include <stdbool.h>
-#include <stddef.h>
 #include <stdint.h>
 
-enum uart { UART_HOST, UART_WITNESS, UART_BENCH, UARTS };
-
-/* Initialises clocks, UARTs, timer and watchdog; returns whether the watchdog reset the chip. */
+/* Initialises clock and watchdog; returns whether the watchdog reset the chip. */
 bool chip_start(void);
-/* Returns µs since power-up; must be called at least once per hour to detect wraps. */
+/* Returns µs since power-up, also after a reset; must be called at least once per hour to detect wraps. */
 uint64_t chip_now_us(void);
-/* Sleeps until a byte arrives or until a time, a few milliseconds at most. host: whether bytes of the host wait, too. */
-void chip_sleep(uint64_t until_us, bool host);
+/* Returns the time of the last reset, 0 since power-up. */
+uint64_t chip_reset_us(void);
+/* Waits until a time, at most a minute. */
+void chip_wait_until(uint64_t at_us);
 void chip_feed_watchdog(void);
-/* Reads up to size received bytes. */
-size_t chip_read(enum uart uart, uint8_t *bytes, size_t size);
-void chip_write(enum uart uart, const uint8_t *bytes, size_t n);
-/* Waits until the last written byte has left. */
-void chip_flush(enum uart uart);
 
 #endif

@@ -1,57 +1,48 @@
-/* The board's core on a Cortex-M3: UART 0 is the host, UART 1 the log, UART 2 the bench.
+/* The board's core on a Cortex-M3 whose time is the emulator's.
 
-   The bench simulates the environment. It sends the configuration whenever the log requests it with C, then commands:
-   input levels (I, one byte), link lost (L), reset (R), and faults: the main loop stops (H), the tick is late (T), the
-   gate's readback freezes (S). */
+   The bench simulates the environment. It sends the configuration when the chip requests it with the record C, then
+   commands: run until a time (U), bytes from the host (B), input levels (I), link lost (L), reset (R), and faults: the
+   main loop stops (H), the tick is late (T), the gate's readback freezes (S). Each ends with the record D: the chip's
+   time and that of its next due event. */
 
 #include <string.h>
 
+#include "bench.h"
 #include "board.h"
 #include "chip.h"
+
+#define LOOP_BYTES_MAX 64u /* so that the ticks between are not late */
 
 static struct board board;
 static uint8_t inputs = INPUT_INTERLOCK | INPUT_KEY;
 static bool gate_on, readback_stuck, readback_value, loop_stopped;
 static uint32_t entropy_state;
 
-/* --- log: one line of numbers per event, decoded by the bench --- */
-
-static void write_numbers(char kind, const uint64_t *numbers, size_t n) {
-    uint8_t line[256], digits[20];
-    size_t length = 0;
-    line[length++] = (uint8_t)kind;
-    for (size_t k = 0; k < n; k++) {
-        size_t count = 0;
-        uint64_t left = numbers[k];
-        do {
-            digits[count++] = (uint8_t)('0' + left % 10u);
-            left /= 10u;
-        } while (left);
-        line[length++] = ' ';
-        while (count) {
-            line[length++] = digits[--count];
-        }
-    }
-    line[length++] = '.'; /* marks a line that no reset has truncated */
-    line[length++] = '\n';
-    chip_write(UART_WITNESS, line, length);
-}
+/* --- log --- */
 
 static void on_trace(void *context, const struct board_trace *event) {
     (void)context;
-    uint64_t numbers[] = {event->at_us, (uint64_t)event->kind, event->on,    event->is_point, event->state,
-                          event->before, event->reason,        event->fault, event->x,        event->y,
-                          event->duty,   event->index,         event->on_us, event->off_us};
-    write_numbers('T', numbers, sizeof numbers / sizeof numbers[0]);
+    const struct __attribute__((packed)) {
+        uint64_t at_us, on_us, off_us;
+        uint32_t index;
+        uint16_t x, y, duty;
+        uint8_t kind, on, is_point, state, before, reason, fault;
+    } record = {event->at_us,          event->on_us, event->off_us,   event->index, event->x,      event->y,      event->duty,
+                (uint8_t)event->kind, event->on,    event->is_point, event->state, event->before, event->reason, event->fault};
+    bench_write('T', &record, sizeof record);
+}
+
+static void write_times(char kind, uint64_t first, uint64_t second) {
+    uint64_t times[] = {first, second};
+    bench_write(kind, times, sizeof times);
 }
 
 /* --- the HAL --- */
 
 static void on_gate(void *context, bool on, uint16_t duty) {
-    (void)context;
+    (void)context, (void)duty;
     if (on != gate_on) {
-        uint64_t numbers[] = {chip_now_us(), on, duty}; /* actual time of the pin's change */
-        write_numbers('G', numbers, 3);
+        write_times('G', chip_now_us(), on); /* actual time of the pin's change */
     }
     gate_on = on;
 }
@@ -87,8 +78,8 @@ static int16_t on_temperature(void *context) {
 
 static void on_send(void *context, const uint8_t *frame, size_t length) {
     (void)context;
-    chip_flush(UART_WITNESS); /* the log precedes the answer, also if a full socket delayed its last byte */
-    chip_write(UART_HOST, frame, length);
+    write_times('A', chip_now_us(), 0); /* time of the frames that follow */
+    bench_write('O', frame, length);
 }
 
 static void on_forget(void *context) { (void)context; /* frames are sent immediately */ }
@@ -113,31 +104,49 @@ static const struct board_hal hal = {
     .trace = on_trace,
 };
 
+/* --- the loop --- */
+
+static void run_loop_once(const uint8_t *bytes, size_t n) {
+    board_tick(&board, chip_now_us());
+    if (loop_stopped) {
+        return;
+    }
+    uint64_t until_us = board.lease_until_us, now_us = chip_now_us();
+    board_receive(&board, bytes, n, now_us);
+    if (board.lease_until_us != until_us) {
+        write_times('P', now_us, board.lease_until_us); /* end of the lease */
+    }
+}
+
+static void run_until(uint64_t end_us) {
+    for (uint64_t now_us; (now_us = chip_now_us()) < end_us;) {
+        uint64_t tick_us = now_us + BOARD_TICK_US, due_us = board_next_due_us(&board);
+        uint64_t at_us = due_us < tick_us ? due_us : tick_us;
+        chip_wait_until(at_us < end_us ? at_us : end_us);
+        run_loop_once(NULL, 0);
+    }
+}
+
+static void receive(const uint8_t *bytes, size_t n) {
+    for (size_t at = 0; at < n; at += LOOP_BYTES_MAX) {
+        run_loop_once(bytes + at, n - at < LOOP_BYTES_MAX ? n - at : LOOP_BYTES_MAX);
+    }
+}
+
 /* --- the bench --- */
 
 static struct board_config config;
 
-static void read_exactly(uint8_t *bytes, size_t n) {
-    for (size_t have = 0; have < n;) {
-        have += chip_read(UART_BENCH, bytes + have, n - have);
-        if (have < n) {
-            chip_sleep(UINT64_MAX, false);
-        }
-    }
-}
-
 /* The configuration as the bench packs it: u32 seed, u32 firmware, u8[12] uid, u16 cell_codes, u16 queue_points,
    u8 key_edge, u8 inputs, then the limits as in LIMITS. */
-#define CONFIG_SIZE (4u + 4u + 12u + 2u + 2u + 1u + 1u + LIMITS_SIZE)
-
 static uint16_t get_u16(const uint8_t *at) { return (uint16_t)(at[0] | at[1] << 8); }
 static uint32_t get_u32(const uint8_t *at) { return get_u16(at) | (uint32_t)get_u16(at + 2) << 16; }
 
 static void configure(void) {
-    uint8_t bytes[CONFIG_SIZE];
-    chip_write(UART_WITNESS, (const uint8_t *)"\n", 1); /* ends a line that a reset truncated */
-    write_numbers('C', NULL, 0);
-    read_exactly(bytes, sizeof bytes);
+    struct command command;
+    write_times('C', chip_reset_us(), 0);
+    bench_read(&command);
+    const uint8_t *bytes = command.bytes;
     entropy_state = get_u32(bytes);
     config.firmware = get_u32(bytes + 4);
     memcpy(config.uid, bytes + 8, 12);
@@ -160,70 +169,55 @@ static void reset(void) {
     board_init(&board, &hal, &config, RESET_RESET, now_us);
 }
 
-/* Runs a tick at the same time, since the emulator's next one may come later than a millisecond. */
-static void set_inputs(uint8_t value, uint64_t now_us) {
-    uint64_t numbers[] = {now_us, value};
-    write_numbers('I', numbers, 2);
+static void set_inputs(uint8_t value) {
+    write_times('I', chip_now_us(), value);
     inputs = value;
-    board_tick(&board, now_us);
+    board_tick(&board, chip_now_us());
 }
 
 static void miss_ticks(void) {
-    uint64_t until_us = chip_now_us() + BOARD_TICK_LATE_US + 2u * BOARD_TICK_US;
-    while (chip_now_us() < until_us) {
-        chip_sleep(until_us, false);
-    }
+    chip_wait_until(chip_now_us() + BOARD_TICK_LATE_US + 2u * BOARD_TICK_US);
 }
 
-static void run_bench_commands(void) {
-    uint8_t command, value;
-    while (chip_read(UART_BENCH, &command, 1)) {
-        switch (command) {
-        case 'I':
-            read_exactly(&value, 1);
-            set_inputs(value, chip_now_us());
-            break;
-        case 'L':
-            board_on_link_lost(&board, chip_now_us());
-            break;
-        case 'R':
-            reset();
-            break;
-        case 'H':
-            loop_stopped = true;
-            break;
-        case 'T':
-            miss_ticks();
-            break;
-        case 'S':
-            readback_value = gate_on;
-            readback_stuck = true;
-            break;
-        }
-    }
-}
-
-static void run_loop_once(void) {
-    uint8_t bytes[256];
-    size_t n = chip_read(UART_HOST, bytes, sizeof bytes);
-    uint64_t until_us = board.lease_until_us, now_us = chip_now_us();
-    board_receive(&board, bytes, n, now_us);
-    if (board.lease_until_us != until_us) {
-        uint64_t numbers[] = {now_us, board.lease_until_us};
-        write_numbers('P', numbers, 2); /* end of the lease */
+static void run(const struct command *command) {
+    switch (command->kind) {
+    case 'U':
+        run_until(command->at_us);
+        break;
+    case 'B':
+        receive(command->bytes, command->length);
+        break;
+    case 'I':
+        set_inputs(command->bytes[0]);
+        break;
+    case 'L':
+        board_on_link_lost(&board, chip_now_us());
+        break;
+    case 'R':
+        reset();
+        break;
+    case 'H':
+        loop_stopped = true;
+        break;
+    case 'T':
+        miss_ticks();
+        break;
+    case 'S':
+        readback_value = gate_on;
+        readback_stuck = true;
+        break;
     }
 }
 
 int main(void) {
+    struct command command;
     bool watchdog_reset = chip_start();
+    bench_open();
     configure();
     board_init(&board, &hal, &config, watchdog_reset ? RESET_WATCHDOG : RESET_POWER_UP, chip_now_us());
     for (;;) {
-        chip_sleep(board_next_due_us(&board), !loop_stopped);
-        board_tick(&board, chip_now_us());
-        run_bench_commands();
-        if (!loop_stopped) {
-            run_loop_once();
-        }
+        write_times('D', chip_now_us(), board_next_due_us(&board));
+        bench_read(&command);
+        run(&command);
     }
 }

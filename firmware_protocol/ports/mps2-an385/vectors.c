@@ -1,13 +1,12 @@
 #include "start.h"
 
 extern char stack_top[];
-void uart0_isr(void), uart1_isr(void), uart2_isr(void), timer0_isr(void);
+void watchdog_isr(void);
 
 __attribute__((section(".vectors"), used)) static const struct {
     void *stack;
-    handler handlers[15 + 9];
+    handler handlers[15];
 } vectors = {
     stack_top,
-    {reset, halt, halt, halt, halt, halt, 0, 0, 0, 0, halt, halt, 0, halt, halt,
-     uart0_isr, halt, uart1_isr, halt, uart2_isr, halt, halt, halt, timer0_isr},
+    {reset, watchdog_isr, halt, halt, halt, halt, 0, 0, 0, 0, halt, halt, 0, halt, halt},
 };

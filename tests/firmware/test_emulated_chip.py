@@ -1,0 +1,273 @@
+"""The core on an emulated Cortex-M3, judged in the chip's own time: loss of its host, edges, watchdog, stalls.
+
+The host is a real session whose time is virtual: it grants the chip's time.
+"""
+
+import os
+import random
+import signal
+import threading
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from displays import DISPLAYS
+from firmware_ports import build_emulated_chip
+from optodrive.core.clock import ManualClock
+from optodrive.device.config import Config
+from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.protocol.quantisation import WirePoints
+from optodrive.link.session import session as session_module
+from optodrive.link.session.session import BoardSession
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.memory_link import MemoryLink
+
+TICK_US = 100
+WATCHDOG_US = 50_000
+LEASE_S = DEFAULT_LIMITS.lease_ms * 1e-3
+DARK_US, ON_US, DUTY = 600, 8000, 2000
+PLACES = np.array([(30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500)])
+ROUNDS, MANY_ROUNDS = 3, 30
+LATE_MAX_US = 2 * TICK_US
+"""From an edge's time to the pin: what the main loop and the guards compute before."""
+
+
+def build_config():
+    table = DISPLAYS["display-16"].config.model_dump()
+    table["board"] |= {"lease_s": LEASE_S}
+    return Config.model_validate(table)
+
+
+def build_points(count):
+    rows = np.arange(count)
+    columns = [np.full(count, value) for value in (DARK_US, ON_US, DUTY)]
+    return WirePoints(np.column_stack([PLACES[rows % len(PLACES)], *columns]).astype(np.uint16), rows)
+
+
+class CuttableLink(MemoryLink):
+    """Link of which no bytes pass if it is cut."""
+
+    is_cut = False
+
+    def write(self, data):
+        if not self.is_cut:
+            super().write(data)
+
+    def read(self, timeout_s):
+        data = super().read(timeout_s)
+        return b"" if self.is_cut else data
+
+
+class Rig:
+    """A session and a chip in one virtual time."""
+
+    def __init__(self, make_chip):
+        self.clock, self.log = ManualClock(), []
+        self.chip = make_chip(BoardSettings(), self.log.append, seed=1)
+        self.link = CuttableLink(self.chip, self.clock)
+        self.session = BoardSession(self.link, self.clock, build_board_requirements(build_config()))
+
+    def of(self, kind):
+        return [event for event in self.log if event["event"] == kind]
+
+    def step(self):
+        self.session.step(0.002, renew_lease=True)
+
+    def until(self, condition, steps=5000):
+        for _ in range(steps):
+            if condition():
+                return
+            self.step()
+        raise AssertionError(f"{self.session.board}; log {self.log[-8:]}")
+
+    def emit(self):
+        """Connect, arm, and emit points for many leases."""
+        self.session.connect()
+        if self.session.board.state == "FAULT":
+            self.session.disarm()
+            self.until(lambda: self.session.board.state == "DISARMED")
+        self.session.arm()
+        self.until(lambda: self.session.is_ready)
+        self.log.clear()
+        self.session.begin(build_points(4000), self.session.board_s() + 0.05, 1.5 * LEASE_S)
+        self.until(lambda: len(self.of("pulse")) > 2)
+
+    def run(self, duration_s):
+        """Let time pass for the host and the chip."""
+        until_s = self.clock.now_s() + duration_s
+        while self.clock.now_s() < until_s:
+            self.step()
+
+    def pass_time(self, duration_s):
+        """Let time pass for the chip alone."""
+        self.clock.sleep(duration_s)
+        self.chip.advance(round(self.clock.now_s() * 1e6))
+
+
+def kill_host(rig):
+    """The kernel closes the port of a host that was killed."""
+    rig.link.close()
+    rig.pass_time(2 * LEASE_S)
+
+
+def stop_host(rig):
+    """A stopped host sends nothing and leaves the port open."""
+    rig.pass_time(2 * LEASE_S)
+
+
+def close_port(rig):
+    rig.session.disconnect()
+    rig.pass_time(2 * LEASE_S)
+
+
+def cut_cable(rig):
+    """Nothing passes any more; the host runs on and renews the lease."""
+    rig.link.is_cut = True
+    rig.run(2 * LEASE_S)
+    rig.link.is_cut = False
+
+
+WAYS = {
+    "kill -9": (kill_host, ("DISARMED", "link lost")),
+    "SIGSTOP": (stop_host, ("FAULT", "fault")),
+    "close": (close_port, ("DISARMED", "link lost")),
+    "cut cable": (cut_cable, ("FAULT", "fault")),
+}
+
+
+def check_host_loss(rig, way, delay_s):
+    """Lose the host of an emitting chip; return the time of the last edge after the end of the lease, µs."""
+    lose, ended = WAYS[way]
+    rig.emit()
+    rig.run(delay_s)
+    lost_us = rig.clock.now_s() * 1e6
+    assert rig.chip.state == "RUNNING"
+    lose(rig)
+    state, last_pin, last_gate, lease = (rig.of(kind)[-1] for kind in ("state", "pin", "gate", "lease"))
+    assert (state["state"], state["reason"]) == ended
+    assert not last_gate["on"]
+    assert not last_pin["on"]
+    assert not rig.chip.gate
+    late_us = last_pin["t_us"] - lease["until_us"]
+    assert late_us <= TICK_US
+    assert lease["until_us"] - lease["t_us"] == LEASE_S * 1e6
+    if ended[0] == "FAULT":  # by nothing but the end of the lease
+        assert rig.of("fault")[-1]["fault"] == "LINK"
+        assert late_us >= -DARK_US - TICK_US
+        assert state["t_us"] == lease["until_us"]
+    else:
+        assert last_pin["t_us"] <= lost_us + TICK_US
+    rig.session.disconnect()
+    return late_us
+
+
+@pytest.fixture(scope="module")
+def chips(tmp_path_factory):
+    """Return a function for the chip of a mutant; each is built once."""
+    return cache(partial(build_emulated_chip, tmp_path_factory.mktemp("cortex-m3")))
+
+
+@pytest.fixture
+def rig(chips):
+    rig = Rig(chips(0))
+    yield rig
+    rig.chip.close()
+
+
+@pytest.mark.parametrize("rounds", [ROUNDS, pytest.param(MANY_ROUNDS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", WAYS)
+def test_the_gate_is_off_a_tick_after_the_lease_of_a_lost_host(rig, way, rounds):
+    source = random.Random(0)
+    late_us = [check_host_loss(rig, way, source.uniform(0.0, 0.15)) for _ in range(rounds)]
+    print(f"{way}: last edge {min(late_us)} to {max(late_us)} µs after the end of the lease")
+
+
+@pytest.mark.parametrize("way", ["SIGSTOP", "cut cable"])
+def test_a_chip_without_a_lease_is_detected(chips, way):
+    rig = Rig(chips(3))
+    with pytest.raises(AssertionError):
+        check_host_loss(rig, way, ON_US * 0.5e-6)
+    rig.chip.close()
+
+
+def test_a_chip_that_leaves_the_gate_on_is_detected(chips):
+    rig = Rig(chips(1))
+    with pytest.raises(AssertionError):
+        check_host_loss(rig, "kill -9", ON_US * 0.5e-6)
+    rig.chip.close()
+
+
+def test_the_pin_follows_the_log_and_is_never_early(rig):
+    rig.emit()
+    rig.until(lambda: len(rig.of("pulse")) > 200)
+    pulses = rig.of("pulse")
+    pins = rig.of("pin")[: 2 * len(pulses)]
+    assert [pin["on"] for pin in pins] == [True, False] * len(pulses)
+    due_us = [at_us for pulse in pulses for at_us in (pulse["on_us"], pulse["off_us"])]
+    late_us = np.array([pin["t_us"] for pin in pins]) - due_us
+    print(f"pin after the log's edge: median {np.median(late_us):.0f} µs, at most {late_us.max()} µs")
+    assert late_us.min() >= 0
+    assert late_us.max() <= LATE_MAX_US
+
+
+def check_watchdog(rig):
+    rig.emit()
+    rig.chip.inject_fault("stop_loop")
+    stopped_us = rig.clock.now_s() * 1e6
+    rig.pass_time(2 * WATCHDOG_US * 1e-6)
+    assert rig.of("state")[-1]["reason"] == "boot"
+    last = rig.of("pin")[-1]
+    assert not last["on"]
+    assert rig.of("gate")[-1] == last | {"event": "gate", "reason": "reset"}, "not the end of a pulse"
+    # The next tick feeds it once more, for the loop's last iteration.
+    assert WATCHDOG_US <= last["t_us"] - stopped_us <= WATCHDOG_US + 2 * TICK_US
+
+
+def test_the_watchdog_turns_the_gate_off_after_50_ms(rig):
+    check_watchdog(rig)
+
+
+def test_a_chip_without_a_watchdog_is_detected(chips):
+    rig = Rig(chips(15))
+    with pytest.raises(AssertionError):
+        check_watchdog(rig)
+    rig.chip.close()
+
+
+class Staller(threading.Thread):
+    """Suspends a process again and again."""
+
+    def __init__(self, pid):
+        super().__init__()
+        self._pid, self._ended = pid, threading.Event()
+        self.count = 0
+
+    def run(self):
+        while not self._ended.wait(0.002):
+            os.kill(self._pid, signal.SIGSTOP)
+            self._ended.wait(0.003)
+            os.kill(self._pid, signal.SIGCONT)
+            self.count += 1
+
+    def end(self):
+        self._ended.set()
+        self.join()
+
+
+def test_a_computer_that_stalls_changes_nothing(chips, monkeypatch):
+    logs = []
+    for stalls in (False, True):
+        monkeypatch.setattr(session_module.secrets, "randbits", random.Random(4).getrandbits)
+        rig = Rig(chips(0))
+        staller = Staller(rig.chip._emulator.pid)
+        if stalls:
+            staller.start()
+        rig.emit()
+        stop_host(rig)
+        if stalls:
+            staller.end()
+            assert staller.count > 0
+        rig.chip.close()
+        logs.append(rig.log)
+    assert logs[0] == logs[1]

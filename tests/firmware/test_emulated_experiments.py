@@ -1,0 +1,67 @@
+"""The paper's experiments through the real planner, queue and link service to the core on an emulated Cortex-M3."""
+
+import numpy as np
+import pytest
+
+from displays import DISPLAYS
+from firmware_ports import build_emulated_chip
+from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.session.board_group import BoardGroup
+from optodrive.link.session.session import BoardSession
+from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.planning.stimuli.pattern_registry import build_pattern
+from planner_rig import PlannerRig
+
+DISPLAY = DISPLAYS["display-437"]
+PWM_S = 2e-4
+EXPERIMENTS = [
+    *(pytest.param(name, given, count, marks=pytest.mark.slow) for name, given, count in (
+        ("experiment-1", {"direction": "right"}, 24),
+        ("experiment-2", {"direction": "cw", "speed": 16}, 16),
+        ("experiment-3", {"target": 3}, 20),
+        ("experiment-4", {"level": 9}, 20),
+        ("experiment-5", {"oddball": 2, "kind": "fast", "pause_s": 0.5}, 32),
+    )),
+    ("experiment-6", {"digits": "2-3"}, 40),
+]  # fmt: skip
+
+
+class ChipRig(PlannerRig):
+    """The chip as the board of a display."""
+
+    def __init__(self, monkeypatch, make_chip):
+        self._make_chip = make_chip
+        super().__init__(monkeypatch, display=DISPLAY, requirements=build_board_requirements(DISPLAY.config))
+
+    def build_boards(self, _, settings, requirements):
+        self.chip = self._make_chip(settings, self.log.append, seed=3)
+        self.link = MemoryLink(self.chip, self.clock)
+        self.session = BoardSession(self.link, self.clock, requirements)
+        return BoardGroup([self.session], self.clock)
+
+
+@pytest.fixture(scope="module")
+def make_chip(tmp_path_factory):
+    return build_emulated_chip(tmp_path_factory.mktemp("cortex-m3"))
+
+
+@pytest.mark.parametrize(("name", "given", "count"), EXPERIMENTS)
+def test_an_experiment_is_executed_as_planned(monkeypatch, make_chip, name, given, count):
+    rig = ChipRig(monkeypatch, make_chip).ready().arm()
+    rig.run(0.01)
+    planned = rig.submit(build_pattern(name, given, DISPLAY.config), rig.remote.epoch).result()
+    record = rig.store.find(planned.plan)
+    plan = rig.queue.waiting[0].planned.plan
+    rig.until(lambda: record.has_ended)
+    assert (record.status, record.error, record.executed_count) == ("done", None, count)
+    pulses = [event for event in rig.log if event["event"] == "pulse"]
+    on_us, off_us, codes = (
+        np.array([[pulse[key] for key in keys] for pulse in pulses]) for keys in (("on_us",), ("off_us",), ("x", "y"))
+    )
+    assert len(pulses) == count
+    assert np.diff(on_us[:, 0]) * 1e-6 == pytest.approx(np.diff(plan.start_s), abs=PWM_S)
+    assert (off_us - on_us)[:, 0] * 1e-6 == pytest.approx(plan.width_s, abs=PWM_S)
+    scale = rig.session.scale
+    assert codes.tolist() == np.column_stack([scale.to_codes(plan.x_rad), scale.to_codes(plan.y_rad)]).tolist()
+    assert not [event for event in rig.log if event["event"] == "fault"]
+    rig.chip.close()
