@@ -25,7 +25,8 @@ FREEZE_S = (0.05, 0.3)
 GAP_S = (0.1, 0.55)
 """From the end of a freeze to the next one: with the mean freeze, two per second."""
 LIVE = ("tests/system", "tests/browser", "tests/conformance", "tests/docs")
-RUNNERS = ("pytest", "exec(eval(sys.stdin.readline()))")  # the second: a worker of xdist
+WORKER = "import sys;exec(eval(sys.stdin.readline()))"
+"""Program of a worker of xdist."""
 PTRACE_SEIZE, PTRACE_INTERRUPT, PTRACE_DETACH, WALL = 0x4206, 0x4207, 17, 0x40000000
 EVENT_STOP = 128
 libc = ctypes.CDLL(None, use_errno=True)
@@ -51,9 +52,10 @@ def list_descendants(pid):
 
 def can_freeze(pid):
     """Return whether a process is not the test runner and is neither suspended nor ended."""
-    command = read_proc(pid, "cmdline")
+    arguments = read_proc(pid, "cmdline").split("\0")
+    is_runner = WORKER in arguments or "pytest" in (Path(argument).name for argument in arguments[:4])
     state = read_proc(pid, "stat").rpartition(")")[2].split()[:1]
-    return state in (["R"], ["S"]) and not any(name in command for name in RUNNERS)
+    return state in (["R"], ["S"]) and not is_runner
 
 
 def freeze(pid, duration_s):
