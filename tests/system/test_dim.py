@@ -30,9 +30,11 @@ def find_max_share(board):
 
 def kill_planner(daemon):
     """Kill the planner process and wait until another one serves."""
-    os.kill(daemon.find_process("planner"), signal.SIGKILL)
-    wait_for(lambda: daemon.state()["limits"]["power_share"] is None, "the planner's end")
-    return wait_for(lambda: daemon.state()["limits"]["power_share"], "the next planner")
+    first = daemon.find_process("planner")
+    os.kill(first, signal.SIGKILL)
+    wait_for(lambda: daemon.find_process("planner") not in (None, first), "the next planner")
+    wait_for(lambda: daemon.client.get("/metrics").is_success, "its answer, which follows its state")
+    return daemon.state()["limits"]["power_share"]
 
 
 def test_an_operator_lowers_the_power_an_armer_raises_it_and_a_restart_keeps_it(bright, board):

@@ -1,12 +1,10 @@
 """Access control of every route, with every reason for refusal."""
 
 import asyncio
-import fcntl
 import json
 import os
 import resource
 import socket
-import time
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -78,7 +76,7 @@ def request_route(daemon, key, headers):
     path = template.replace("{plan_id}", "p1").replace("{name}", "pixel").replace("{path:path}", "x")
     path = path.replace("{name:path}", "index.html")
     if method != "WEBSOCKET":
-        with httpx.stream(method, daemon.url + path, headers=headers) as response:  # telemetry has no end
+        with httpx.stream(method, daemon.url + path, headers=headers, timeout=None) as response:  # telemetry has no end
             if "json" not in response.headers["content-type"]:
                 return response.status_code, None
             response.read()
@@ -98,7 +96,7 @@ def request_route(daemon, key, headers):
 
 def test_the_files_of_the_login_are_public_and_hold_no_secret(running):
     for path in LOGIN_PATHS:
-        response = httpx.get(running.url + path)
+        response = httpx.get(running.url + path, timeout=None)
         assert response.status_code == 200
         assert TOKEN not in response.text
 
@@ -169,8 +167,8 @@ def test_every_route_accepts_its_role(running, key):
     ("method", "path", "status"), [("GET", "/v1/nothing", 404), ("PUT", "/v1/arm", 405), ("OPTIONS", "/v1/state", 405)]
 )
 def test_an_unknown_route_requires_a_token_first(running, method, path, status):
-    assert httpx.request(method, running.url + path).status_code == 401
-    response = httpx.request(method, running.url + path, headers=build_bearer_header(TOKEN))
+    assert httpx.request(method, running.url + path, timeout=None).status_code == 401
+    response = httpx.request(method, running.url + path, headers=build_bearer_header(TOKEN), timeout=None)
     assert response.status_code == status
     assert (status == 405) == ("allow" in response.headers)
     assert "access-control-allow-origin" not in response.headers
@@ -178,7 +176,9 @@ def test_an_unknown_route_requires_a_token_first(running, method, path, status):
 
 def test_the_unix_socket_requires_the_token(running, folder):
     assert (folder / "s").stat().st_mode & 0o777 == 0o660
-    with httpx.Client(transport=httpx.HTTPTransport(uds=str(folder / "s")), base_url="http://localhost") as client:
+    with httpx.Client(
+        transport=httpx.HTTPTransport(uds=str(folder / "s")), base_url="http://localhost", timeout=None
+    ) as client:
         assert client.get("/v1/health").status_code == 200
         assert client.get("/v1/state").status_code == 401
         assert client.get("/v1/state", headers=build_bearer_header(TOKEN)).status_code == 200
@@ -210,7 +210,7 @@ def test_command_line_and_client_use_the_unix_socket(running, folder):
 
 def send_raw(daemon, request):
     host, port = daemon.url.removeprefix("http://").split(":")
-    with socket.create_connection((host, int(port)), timeout=10) as link:
+    with socket.create_connection((host, int(port))) as link:
         link.sendall(request.encode())
         return link.recv(300).decode()
 
@@ -234,38 +234,21 @@ def test_stop_gets_in_while_idle_connections_flood_the_daemon(running):
     host, port = running.url.removeprefix("http://").split(":")
     with ExitStack() as stack:
         for _ in range(700):
-            stack.enter_context(socket.create_connection((host, int(port)), timeout=10))
+            stack.enter_context(socket.create_connection((host, int(port))))
         headers = build_bearer_header(read_role_tokens(running)["viewer"])
         for _ in range(20):
-            assert httpx.post(f"{running.url}/v1/stop", headers=headers, timeout=5).status_code == 200
+            assert httpx.post(f"{running.url}/v1/stop", headers=headers, timeout=None).status_code == 200
     assert len(running.errors.read_bytes()) < 100_000
 
 
 def test_a_client_that_hangs_up_during_its_body_leaves_no_traceback(running):
     host, port = running.url.removeprefix("http://").split(":")
     for path in ("/v1/plans", "/v1/patterns/pixel"):
-        with socket.create_connection((host, int(port)), timeout=10) as link:
+        with socket.create_connection((host, int(port))) as link:
             link.sendall(f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {TOKEN}\r\n".encode())
             link.sendall(b"Content-Length: 1000\r\n\r\n{")
     running.call("GET", "/v1/state")
     assert "Traceback" not in running.errors.read_text()
-
-
-def test_a_stuck_audit_pipe_does_not_keep_the_daemon_from_ending(make_daemon, board, tmp_path):
-    pipe = tmp_path / "audit.pipe"
-    os.mkfifo(pipe)
-    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096)
-    try:
-        daemon = make_daemon(board, replace=build_daemon_replacement(f'audit = "{pipe}"'))
-        for _ in range(50):  # more than the pipe holds
-            daemon.call("POST", "/v1/disarm")
-        begin_s = time.monotonic()
-        daemon.process.terminate()
-        assert daemon.process.wait(timeout=20) == 0
-        assert time.monotonic() - begin_s < 10
-    finally:
-        os.close(reader)
 
 
 def read_audit(folder):
@@ -303,27 +286,40 @@ def test_the_audit_file_names_user_and_action(running, folder):
 
 def test_no_token_is_written(running, folder):
     running.call("GET", "/v1/state", status=401, headers=build_bearer_header("s3cret-that-is-wrong"))
-    httpx.get(f"{running.url}/v1/state?token={TOKEN}")
+    httpx.get(f"{running.url}/v1/state?token={TOKEN}", timeout=None)
     secrets = [*read_role_tokens(running).values(), "s3cret-that-is-wrong"]
     for path in (running.errors, folder / "audit.jsonl"):
         text = path.read_text()
         assert not [secret for secret in secrets if secret in text], path
 
 
+def collect_until_refused(call):
+    """Call until the rate limit refuses; return the statuses before that, and the refusal."""
+    statuses = []
+    while (response := call()).status_code != 429:
+        statuses.append(response.status_code)
+    return statuses, response
+
+
 def test_the_rate_limit_applies_per_client_and_not_to_stop(make_daemon, board, tmp_path):
     daemon = make_daemon(board, replace=build_daemon_replacement("requests_per_s = 1\nrequests_burst = 20"))
     secrets = read_role_tokens(daemon)
-    with httpx.Client(base_url=daemon.url, headers=build_bearer_header(secrets["viewer"])) as viewer:
-        given = [viewer.get("/v1/state") for _ in range(60)]
-        late = [response for response in given if response.status_code == 429]
-        assert 30 <= len(late) < 60
-        assert int(late[-1].headers["retry-after"]) >= 1
-        assert late[-1].json()["code"] == "too_many_requests"
+    with (
+        httpx.Client(base_url=daemon.url, headers=build_bearer_header(secrets["viewer"]), timeout=None) as viewer,
+        httpx.Client(base_url=daemon.url, timeout=None) as anonymous,
+    ):
+        statuses, refusal = collect_until_refused(lambda: viewer.get("/v1/state"))
+        assert len(statuses) >= 20
+        assert set(statuses) == {200}
+        assert int(refusal.headers["retry-after"]) >= 1
+        assert refusal.json()["code"] == "too_many_requests"
         assert [viewer.post("/v1/stop").status_code for _ in range(50)] == [200] * 50
-        assert 429 in {viewer.get("/v1/config").status_code for _ in range(20)}
-    assert httpx.get(f"{daemon.url}/v1/state", headers=build_bearer_header(secrets["operator"])).status_code == 200
-    assert {httpx.get(f"{daemon.url}/v1/state").status_code for _ in range(40)} == {401, 429}
-    assert httpx.post(f"{daemon.url}/v1/stop").status_code == 401
+        collect_until_refused(lambda: viewer.get("/v1/config"))
+        headers = build_bearer_header(secrets["operator"])
+        assert anonymous.get("/v1/state", headers=headers).status_code == 200
+        statuses, _ = collect_until_refused(lambda: anonymous.get("/v1/state"))
+        assert set(statuses) == {401}
+        assert anonymous.post("/v1/stop").status_code == 401
 
 
 def test_without_an_audit_file_arming_fails_and_stop_works(make_board, tmp_path):
