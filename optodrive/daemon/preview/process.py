@@ -20,13 +20,20 @@ from optodrive.planning.display_model import DisplayModel
 
 RUNNING_MAX, DRY_RUNS_MAX = 2, 1
 """Jobs at once, and how many of them may be dry runs, so that a build never waits for one."""
-LOOP_WAIT_S = 0.1
+LOOP_WAIT_S, ENDING_WAIT_S = 0.1, 0.01
+"""Longest wait for messages, usually and while a worker ends."""
 
 
 @dataclass
 class _Slot:
+    """A worker with its job, which counts as running until a killed process has ended, because it holds its memory.
+
+    is_lost: the process has ended by itself, so the job has no answer yet
+    """
+
     worker: Worker
     job: Job | None = None
+    is_lost: bool = False
 
 
 class PreviewServer:
@@ -37,26 +44,32 @@ class PreviewServer:
         self._run = run
         self._queue = JobQueue()
         self._slots: list[_Slot] = []
+        self._ending: list[_Slot] = []
         self._server = MessageServer(loop, folder.preview_socket, self._on_request, self._on_client_lost)
         self._add_spare()
 
     def step(self) -> None:
         """Wait for messages for a short time, and end the jobs that have exceeded their time."""
         next_check_s = min((slot.worker.next_check_s for slot in self._slots), default=float("inf"))
-        self._loop.poll(min(LOOP_WAIT_S, next_check_s - time.monotonic()))
+        wait_s = ENDING_WAIT_S if self._ending else LOOP_WAIT_S
+        self._loop.poll(min(wait_s, next_check_s - time.monotonic()))
         now_s = time.monotonic()
         for slot in list(self._slots):
             if slot.worker.check(now_s) and slot.job is not None:
                 self._reply(slot.job, build_refusal(build_timeout_error(slot.job.message.kind)))
                 self._end_worker(slot)
+        self._collect_ended()
         self._start_jobs()
 
     def close(self) -> None:
         """End all workers and connections."""
         for slot in self._slots:
             self._loop.remove(slot.worker.connection)
-            slot.worker.end()
+            slot.worker.kill()
+        for slot in (*self._slots, *self._ending):
+            slot.worker.collect(waits=True)
         self._slots.clear()
+        self._ending.clear()
         self._server.close()
 
     def _on_request(self, client: MessageSocket, message: Message) -> None:
@@ -83,7 +96,7 @@ class PreviewServer:
     def _start_jobs(self) -> None:
         """Start waiting jobs while the limits permit it. A spare worker is always ready."""
         while True:
-            running = [slot.job for slot in self._slots if slot.job is not None]
+            running = [slot.job for slot in (*self._slots, *self._ending) if slot.job is not None]
             dry_runs = sum(job.message.kind == "dry_run" for job in running)
             kinds = {"build"} if dry_runs >= DRY_RUNS_MAX else {"build", "dry_run"}
             if len(running) >= RUNNING_MAX:
@@ -111,24 +124,36 @@ class PreviewServer:
     def _on_result(self, slot: _Slot, result: Message) -> None:
         if slot.job is not None:
             self._reply(slot.job, result)
-        slot.job = None
         slot.worker.finish()
-        if not slot.worker.is_reusable:
+        if slot.worker.is_reusable:
+            slot.job = None
+        else:
             self._end_worker(slot)
         self._start_jobs()
 
     def _on_worker_lost(self, slot: _Slot) -> None:
+        slot.is_lost = True
         self._slots.remove(slot)
-        error = slot.worker.end()
-        if slot.job is not None:
-            self._reply(slot.job, build_refusal(error))
+        slot.worker.kill()
+        self._ending.append(slot)
 
     def _end_worker(self, slot: _Slot) -> None:
         self._slots.remove(slot)
         self._loop.remove(slot.worker.connection)
-        slot.worker.end()
+        slot.worker.kill()
+        self._ending.append(slot)
         if not any(slot.job is None for slot in self._slots):
             self._add_spare()
+
+    def _collect_ended(self) -> None:
+        """Forget the workers whose process has ended, and answer the jobs of those that ended by themselves."""
+        for slot in list(self._ending):
+            error = slot.worker.collect()
+            if error is None:
+                continue
+            self._ending.remove(slot)
+            if slot.is_lost and slot.job is not None:
+                self._reply(slot.job, build_refusal(error))
 
     def _reply(self, job: Job, result: Message) -> None:
         fields = {**result.fields, "id": job.job_id}

@@ -94,10 +94,19 @@ class Worker:
         self._demote_at_s = float("inf")
         os.setpriority(os.PRIO_PROCESS, self.pid, LOW_PRIORITY)
 
-    def end(self) -> OptodriveError:
-        """Kill the process if it still runs, and return the error of a job that ended with it."""
+    def kill(self) -> None:
+        """Kill the process if it still runs."""
         os.kill(self.pid, signal.SIGKILL)  # the process is not reaped yet, so the id is its own
-        _, status = os.waitpid(self.pid, 0)
+
+    def collect(self, waits: bool = False) -> OptodriveError | None:
+        """Return the error of a job that ended with the process; None while the process exists.
+
+        Call it until the process has ended, and not again. On a busy computer a killed process of low priority may take
+        seconds to end. waits: for the end.
+        """
+        pid, status = os.waitpid(self.pid, 0 if waits else os.WNOHANG)
+        if pid == 0:
+            return None
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
             return build_timeout_error(self._kind)
         how = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"status {os.WEXITSTATUS(status)}"
