@@ -6,54 +6,130 @@ Show, floods and STOPs share this computer, so each time is an upper bound: part
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import httpx
+from measuring import Sleeper, compute_percentile, realtime_priority, time_limit
 from rich.console import Console
 from rich.table import Table
 
 sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / part) for part in ("system", "")]
 from floods import FLOODS  # noqa: E402 - of the tests
-from stop_rig import StopRig  # noqa: E402
+from rig import read_role_tokens  # noqa: E402
+from stop_rig import FloodProcess, StopRig, is_gate_on, is_unarmed  # noqa: E402
 
-SLEEPER = """
-import os, sys, time
-try:
-    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-except OSError:
-    pass
-late_s = [0.0]
-os.set_blocking(0, False)
-while sys.stdin.buffer.raw.read(1) is None:
-    wake_s = time.monotonic() + 0.002
-    time.sleep(0.002)
-    late_s.append(time.monotonic() - wake_s)
-print(max(late_s))
-"""
-"""A real-time process that only sleeps: its lateness is that of the computer, which no process of a daemon can beat."""
+ANSWER_MAX_S = 60.0
+"""A STOP without an answer for this time counts as one."""
+BEGIN_MAX_S = 30.0
+"""Longest wait for the light of a show. A flood that keeps one from beginning is a result, too."""
+END_MAX_S = 30.0
+GIVEN_UP = (OSError, AssertionError, httpx.HTTPError)
 
 
-class Sleeper:
-    """A process that measures how late the computer lets a real-time process run."""
+@dataclass
+class FloodResult:
+    """What shows and their STOPs met under a flood.
 
-    def __init__(self):
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", SLEEPER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+    gate_off_s: from sending STOP to the board's abort; answered_s: from sending STOP to the first byte of its answer
+    reference_s: times of the reference, measured before each STOP
+    darkened: faults and underruns that were not STOP's doing; relit: pulses after a STOP and before the next arming
+    log: what the daemon wrote to its log meanwhile
+    """
 
-    def finish(self):
-        """Return the largest lateness, s."""
-        return float(self._process.communicate(timeout=30)[0])
+    name: str
+    gate_off_s: list[float] = field(default_factory=list)
+    answered_s: list[float] = field(default_factory=list)
+    reference_s: list[float] = field(default_factory=list)
+    darkened: list[str] = field(default_factory=list)
+    relit: int = 0
+    not_begun: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    log: list[str] = field(default_factory=list)
+
+
+def start_show(rig):
+    """Begin a show and return the index of its first event, None if that fails twice."""
+    for _ in range(2):
+        with suppress(*GIVEN_UP), time_limit(BEGIN_MAX_S):
+            return rig.start_show()
+    return None
+
+
+def watch_show(rig, result, begin, duration_s):
+    """Let the show that began at an event run for a time, note what darkens it, and return whether it is lit."""
+    until_s = time.monotonic() + duration_s
+    while time.monotonic() < until_s and not rig.find_darkness(begin):
+        time.sleep(0.05)
+    darkened = rig.find_darkness(begin)
+    if darkened:
+        result.darkened += darkened
+        with suppress(*GIVEN_UP), time_limit(ANSWER_MAX_S):
+            rig.client.post("/v1/stop")
+    return not darkened
+
+
+def stop_show(rig, result, begin, send):
+    """Send STOP to the show that began at an event, and note when the board was dark for good."""
+    sent_s = time.monotonic()
+    try:
+        with time_limit(ANSWER_MAX_S):
+            result.answered_s.append(send() - sent_s)
+    except GIVEN_UP:
+        result.answered_s.append(ANSWER_MAX_S)
+    try:
+        with time_limit(ANSWER_MAX_S):
+            end = rig.tail.find(is_unarmed, begin, "the board to be unarmed")
+    except TimeoutError:
+        result.gate_off_s.append(ANSWER_MAX_S)
+        return
+    if end["state"] == "FAULT":
+        result.darkened += rig.find_darkness(begin)
+    result.gate_off_s.append(max(0.0, rig.to_host_s(end) - sent_s))
+    result.relit += sum(map(is_gate_on, rig.tail.events[rig.tail.events.index(end) :]))
+
+
+def run_flood(rig, name, stops=20, seconds=60.0, watch_s=0.0, path="http", measure_reference=None):
+    """Run a flood over a show that is on already, then STOP it and further shows.
+
+    name: of the flood; "rest" for none. watch_s: time of the first show before its STOP. stops: how many, or as many as
+    `seconds` allow; no more once two shows in a row did not begin. measure_reference: returns a time, s, called before
+    each STOP. Returns the FloodResult.
+    """
+    result, send = FloodResult(name), rig.senders[path]
+    begin = start_show(rig)
+    if begin is None:
+        raise SystemExit("the first show did not begin, before the flood")
+    with time_limit(BEGIN_MAX_S):
+        flood = None if name == "rest" else FloodProcess(name, rig.daemon.url, read_role_tokens(rig.daemon))
+    try:
+        until_s, failed, round_s = time.monotonic() + seconds, 0, watch_s
+        for k in range(stops):
+            if begin is not None and watch_show(rig, result, begin, round_s):
+                if measure_reference is not None:
+                    result.reference_s.append(measure_reference())
+                with nullcontext() if flood is None else flood.triggered():
+                    stop_show(rig, result, begin, send)
+            if k + 1 == stops or time.monotonic() > until_s or failed == 2:
+                break
+            begin, round_s = start_show(rig), 0.02 + 0.013 * (k % 17)
+            failed = failed + 1 if begin is None else 0
+            result.not_begun += begin is None
+    finally:
+        if flood is not None:
+            with time_limit(END_MAX_S):
+                result.counts = flood.finish()
+    result.log = rig.daemon.errors.read_text().splitlines()
+    return result
 
 
 def format_ms(values, share):
     """Format the value below which a share of the values lies, ms."""
-    ordered = sorted(values)
-    return f"{1e3 * ordered[min(len(ordered) - 1, int(share * len(ordered)))]:.1f}" if ordered else "-"
+    return f"{1e3 * compute_percentile(values, share):.1f}" if values else "-"
 
 
 def count_items(items):
@@ -66,13 +142,10 @@ def measure_flood(name, options):
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         rig = StopRig(Path(folder), lease_s=options.lease_s)
         try:
-            if options.path not in rig.senders:
-                raise SystemExit(f"scripts/bench stop: --path {options.path}: this daemon has {', '.join(rig.senders)}")
-            result = rig.run_flood(name, options.stops, options.seconds, options.watch_s, options.path)
+            with realtime_priority():  # the time of STOP must not include the wait of this process for a core
+                return run_flood(rig, name, options.stops, options.seconds, options.watch_s, options.path)
         finally:
-            with suppress(subprocess.TimeoutExpired):  # it did not end in time and was killed
-                rig.close()
-        return result
+            rig.close()
 
 
 def build_row(result):
@@ -100,7 +173,7 @@ def main():
     parser.add_argument("--seconds", type=float, default=40.0, help="longest time of each flood")
     parser.add_argument("--watch-s", type=float, default=6.0, help="time of a show without STOP, first")
     parser.add_argument("--lease-s", type=float, default=0.1, help="lease; the shipped one by default")
-    parser.add_argument("--path", default="http", help="way of STOP: http, or socket for the link process's own")
+    parser.add_argument("--path", default="http", choices=("http", "socket"), help="way of STOP")
     parser.add_argument("--json", type=Path, help="file to which each flood's measurements are appended")
     options = parser.parse_args()
     unknown = [name for name in options.floods if name not in FLOODS and name != "rest"]
@@ -110,11 +183,11 @@ def main():
     console = Console(width=190, file=sys.stdout)
     for name in options.floods or ("rest", *FLOODS):
         begin_s = time.monotonic()
-        sleeper = Sleeper()
+        sleeper = Sleeper(is_realtime=True)
         try:
             result = measure_flood(name, options)
         finally:
-            late_s = sleeper.finish()
+            late_s = max(sleeper.finish())
         row = (*build_row(result), f"{1e3 * late_s:.0f}")
         table.add_row(*row)
         print(f"{time.monotonic() - begin_s:5.0f} s  {' | '.join(row)}", file=sys.stderr, flush=True)

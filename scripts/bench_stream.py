@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
@@ -123,13 +124,13 @@ def measure_superseding():
     return [*format_percentiles(f"{name}: plan", make_s), *format_percentiles(f"{name}: state at the cut", cut_s)]
 
 
-def push_frames(url):
-    """Push frames; return round trips, s, the answers, the final state, and the plans of the last frames."""
+def push_frames(url, seconds):
+    """Push frames for a time; return round trips, s, the answers, the final state, and the plans of the last frames."""
     rng = np.random.default_rng(7)
     trips, answers = [], []
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30) as client:
         next_s = time.monotonic()
-        for _ in range(int(RATE_HZ * SECONDS)):
+        for _ in range(int(RATE_HZ * seconds)):
             body = json.dumps({"frames": [{"show_at_s": 0, "duration_s": 60, "target_um": build_random_frame(rng)}]})
             begin_s = time.monotonic()
             response = client.post("/v1/plans", params={"newest": True}, content=body)
@@ -162,12 +163,14 @@ def start_bare_server(folder, port):
             time.sleep(0.05)
 
 
-def push_frames_under_load(url, tokens, load_hz):
+def push_frames_under_load(url, tokens, load_hz, seconds):
     """Push frames while other clients request the state; return what push_frames does, and the answers per second."""
+    if load_hz is None:
+        return push_frames(url, seconds), 0.0
     interval_s = CLIENTS / load_hz if load_hz else 0.0
     load, begin_s = FloodProcess(LOAD, url, tokens, PIXELS, CLIENTS, interval_s), time.monotonic()
     try:
-        results = push_frames(url)
+        results = push_frames(url, seconds)
     finally:
         duration_s = time.monotonic() - begin_s
         counts = load.finish()
@@ -182,12 +185,32 @@ def format_percentiles(name, values, unit="ms"):
     ]
 
 
-def measure_latency(load_hz=LOAD_HZ, lead_s=LEAD_S):
-    """Measure frames over REST under load, at the daemon and at a bare FastAPI; return the rows of the table."""
+@dataclass
+class Streaming:
+    """What pushing frames under load met at the daemon and at a bare FastAPI.
+
+    rate_hz, bare_rate_hz: answers to the other clients; trips_s, bare_trips_s: round trips of the frames
+    plans: the last ones; latencies: of those that were shown; state: the final one
+    """
+
+    rate_hz: float
+    bare_rate_hz: float
+    trips_s: list[float]
+    bare_trips_s: list[float]
+    plans: list[dict]
+    state: dict
+
+    @property
+    def latencies(self):
+        return [plan["latency"] for plan in self.plans if plan["latency"]["first_light_s"] is not None]
+
+
+def stream_under_load(load_hz=LOAD_HZ, lead_s=LEAD_S, seconds=SECONDS):
+    """Push frames over REST under load, to a bare FastAPI and to the daemon. load_hz: None for no load."""
     with tempfile.TemporaryDirectory() as folder:
         bare_server, url = start_bare_server(folder, 8459)
         try:
-            (bare_trips, *_), bare_rate = push_frames_under_load(url, {"viewer": TOKEN}, load_hz)
+            (bare_trips, *_), bare_rate = push_frames_under_load(url, {"viewer": TOKEN}, load_hz, seconds)
         finally:
             bare_server.terminate()
             bare_server.wait()
@@ -198,18 +221,26 @@ def measure_latency(load_hz=LOAD_HZ, lead_s=LEAD_S):
             daemon = Daemon(Path(folder), board.port, "display-1511", keys, lease_s=LEASE_S)
             try:
                 daemon.arm()
-                (trips, _, state, plans), rate = push_frames_under_load(daemon.url, read_role_tokens(daemon), load_hz)
+                (trips, _, state, plans), rate = push_frames_under_load(
+                    daemon.url, read_role_tokens(daemon), load_hz, seconds
+                )
             finally:
                 daemon.stop()
         finally:
             board.stop()
-    finished = [plan["latency"] for plan in plans if plan["latency"]["first_light_s"] is not None]
+    return Streaming(rate, bare_rate, trips, bare_trips, plans, state)
+
+
+def measure_latency(load_hz=LOAD_HZ, lead_s=LEAD_S):
+    """Measure frames over REST under load, at the daemon and at a bare FastAPI; return the rows of the table."""
+    measured = stream_under_load(load_hz, lead_s)
+    finished, plans = measured.latencies, measured.plans
     first_byte_s = [latency["first_byte_s"] for latency in finished]
     rows = [
-        ("other clients, requests answered per second", rate, "1/s"),
-        ("other clients of a bare FastAPI, requests answered per second", bare_rate, "1/s"),
-        *format_percentiles("round trip of a frame over REST", trips),
-        *format_percentiles("round trip of a frame to a bare FastAPI", bare_trips),
+        ("other clients, requests answered per second", measured.rate_hz, "1/s"),
+        ("other clients of a bare FastAPI, requests answered per second", measured.bare_rate_hz, "1/s"),
+        *format_percentiles("round trip of a frame over REST", measured.trips_s),
+        *format_percentiles("round trip of a frame to a bare FastAPI", measured.bare_trips_s),
     ]
     for key, name in (
         ("planned_s", "arrival to plan accepted"),
@@ -218,14 +249,14 @@ def measure_latency(load_hz=LOAD_HZ, lead_s=LEAD_S):
     ):
         rows += format_percentiles(name, [latency[key] for latency in finished])
     lead_s = [latency["first_light_s"] - latency["first_byte_s"] for latency in finished]
-    ratio = float(np.percentile(first_byte_s, 99) / np.percentile(bare_trips, 99))
+    ratio = float(np.percentile(first_byte_s, 99) / np.percentile(measured.bare_trips_s, 99))
     superseded = sum(plan["status"] == "superseded" for plan in plans)
     return [
         *rows,
         ("lead of first byte over light, median", 1e3 * statistics.median(lead_s), "ms"),
         ("p99 to the first byte over p99 round trip to a bare FastAPI", ratio, "1"),
         ("fraction of frames superseded by a newer one", superseded / len(plans), "1"),
-        ("underruns", state["board"]["underruns"], "1"),
+        ("underruns", measured.state["board"]["underruns"], "1"),
         ("load average, including this benchmark", os.getloadavg()[0], "1"),
     ]
 

@@ -20,6 +20,7 @@ from collections import Counter
 from pathlib import Path
 
 import httpx
+from measuring import Sleeper, compute_percentile
 
 TOKEN = "a-token-for-a-load"
 HEADERS = {"Authorization": f"Bearer {TOKEN}"}
@@ -27,22 +28,6 @@ STOP_EVERY_S = 3.0
 GROWTH_MAX_MB = 30.0
 """Growth of memory from the first third to the last that counts as a leak; records of plans are bounded."""
 STOP_P99_MAX_S = 0.05
-
-
-SLEEPER = """
-import json, signal, time
-late_s, on = [], True
-def leave(*_):
-    global on
-    on = False
-signal.signal(signal.SIGTERM, leave)
-while on:
-    wake_s = time.monotonic() + 0.002
-    time.sleep(0.002)
-    late_s.append(time.monotonic() - wake_s)
-print(json.dumps(late_s[:: max(1, len(late_s) // 100_000)] + [max(late_s)]))
-"""
-"""A process that only sleeps: its lateness is that of the computer, not of the daemon."""
 
 
 class LoadRig:
@@ -190,7 +175,7 @@ class StopTest:
             f"--{name.replace('_', '-')}={value}" for name, value in vars(options).items() if name != "client_url"
         ]
         self._client.post("/v1/arm").raise_for_status()
-        self._sleeper = subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True)
+        self._sleeper = Sleeper()
         self._client_process = subprocess.Popen(
             [sys.executable, __file__, *arguments, f"--client-url={rig.url}"], stdout=subprocess.PIPE, text=True
         )
@@ -210,8 +195,7 @@ class StopTest:
                 self.faults += 1
                 self._client.post("/v1/disarm")
             self._client.post("/v1/arm")
-        self._sleeper.terminate()
-        self.wake_delays_s = json.loads(self._sleeper.communicate(timeout=60)[0])
+        self.wake_delays_s = self._sleeper.finish()
         output, _ = self._client_process.communicate(timeout=60)
         results = json.loads(output)
         self.answers, self.trips = Counter(results["answers"]), results["trips"]
@@ -240,22 +224,16 @@ class StopTest:
 
     def close(self):
         self._client.close()
-        for process in (self._client_process, self._sleeper):
-            if process.poll() is None:
-                process.terminate()
-            process.wait(timeout=15)
-            process.stdout.close()
-
-
-def compute_percentile_ms(values, share):
-    """Return the value below which a share of the values lies, ms; NaN without values."""
-    ordered = sorted(values)
-    return 1e3 * ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else float("nan")
+        process = self._client_process
+        if process.poll() is None:
+            process.terminate()
+        process.wait(timeout=15)
+        process.stdout.close()
 
 
 def format_percentiles(values):
     """Format the count, median and 99th percentile."""
-    p50_ms, p99_ms = (compute_percentile_ms(values, share) for share in (0.5, 0.99))
+    p50_ms, p99_ms = (1e3 * compute_percentile(values, share) for share in (0.5, 0.99))
     return f"{len(values)} times, p50 {p50_ms:.1f} ms, p99 {p99_ms:.1f} ms"
 
 
@@ -313,7 +291,7 @@ def main():
             failures = print_report(stop_test, 60 * options.minutes)
         finally:
             rig.close()
-    p99_s = compute_percentile_ms(stop_test.stop_s, 0.99) * 1e-3
+    p99_s = compute_percentile(stop_test.stop_s, 0.99)
     if p99_s >= STOP_P99_MAX_S:
         print(f"slow       STOP answered p99 {1e3 * p99_s:.0f} ms, expected below {1e3 * STOP_P99_MAX_S:.0f} ms")
     if failures:

@@ -1,9 +1,10 @@
 """Floods of a daemon's web interface, each in a process of its own: python floods.py NAME [WORKERS].
 
 The process reads one line of JSON from stdin: address, port, tokens by role and number of pixels. It prints `ready`
-once every worker has completed an exchange or READY_MAX_S have passed, repeats its flood until stdin ends, and prints
-the outcomes that it counted. Each further line on stdin triggers the floods that wait for it. No flood but `callers`
-presents the token of an armer, and none pushes a valid plan: such a caller must not darken a show, nor delay STOP.
+once every worker has counted an outcome or broken off, repeats its flood until stdin ends, and prints the outcomes
+that it counted. A flood that waits runs once per further line on stdin, and `over` is printed after it. No flood but
+`callers` presents the token of an armer, and none pushes a valid plan: such a caller must not darken a show, nor delay
+STOP.
 """
 
 import asyncio
@@ -17,16 +18,18 @@ import zlib
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-READY_MAX_S = 3.0
 PAUSE_S = 0.02
 """Pause after an exchange that the daemon refused to begin or broke off."""
 BODY_MAX_BYTES = 8_000_000
 """The default of [daemon] body_max_bytes; the large bodies are slightly smaller."""
 BROKEN = (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError, ValueError)
+BEGUN: ContextVar[asyncio.Event] = ContextVar("BEGUN", default=asyncio.Event())  # noqa: B039 - nobody waits for this one
+"""Set when this worker's part of the flood has reached the daemon."""
 TEXT, BINARY, CONTINUED, CLOSE, PING = 0x1, 0x2, 0x0, 0x8, 0x9
 
 
@@ -36,7 +39,11 @@ class Target:
     def __init__(self, host: str, port: int, tokens: dict[str, str], pixels: int, interval_s: float = 0.0) -> None:
         self.host, self.port, self.tokens, self.pixels, self.interval_s = host, port, tokens, pixels, interval_s
         self.counts: Counter[str] = Counter()
-        self.triggered = asyncio.Event()
+
+    def count(self, outcome: str, number: int = 1) -> None:
+        """Count an outcome."""
+        self.counts[outcome] += number
+        BEGUN.get().set()
 
     def build_head(
         self, method: str, path: str, role: str | None = "operator", length: int = 0, **headers: str
@@ -59,7 +66,7 @@ class Target:
         length = re.search(rb"(?i)content-length: (\d+)", head)
         if length:
             await reader.readexactly(int(length[1]))
-        self.counts[str(status)] += 1
+        self.count(str(status))
         return status
 
     async def exchange(self, head: bytes, body: bytes = b"") -> int:
@@ -86,7 +93,7 @@ class Target:
         }
         writer.write(self.build_head("GET", "/v1/stream", **upgrade, **headers))
         status = int((await reader.readuntil(b"\r\n\r\n")).split(None, 2)[1])
-        self.counts[str(status)] += 1
+        self.count(str(status))
         if status != 101:
             writer.close()
             raise ConnectionError(f"answered {status}")
@@ -98,7 +105,7 @@ Work = Callable[[Target, int], Awaitable[object]]
 
 @dataclass(frozen=True)
 class Flood:
-    """A flood: `work` is repeated by `workers` tasks at once. waits: for a line on stdin before each repetition."""
+    """A flood: `work` is repeated by `workers` tasks at once. waits: all do it once per line on stdin."""
 
     work: Work
     workers: int
@@ -240,11 +247,12 @@ async def slow_headers(target: Target, number: int) -> None:
 
 async def trickle(target: Target, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, data: bytes) -> None:
     """Send a byte per second until the daemon closes or answers."""
+    target.count("opened")
     for k in range(len(data)):
         writer.write(data[k : k + 1])
         with suppress(TimeoutError):
             answer = await asyncio.wait_for(reader.read(4096), 1.0)
-            target.counts[answer.split(None, 2)[1].decode() if answer else "closed"] += 1
+            target.count(answer.split(None, 2)[1].decode() if answer else "closed")
             return
 
 
@@ -256,10 +264,10 @@ async def idle_connections(target: Target, number: int) -> None:
     """2,000 connections without a request, opened again when the daemon closes them."""
     await asyncio.sleep(number * 0.5e-3)
     reader, writer = await target.connect()
-    target.counts["opened"] += 1
+    target.count("opened")
     try:
         await reader.read(1)
-        target.counts["closed"] += 1
+        target.count("closed")
     finally:
         writer.close()
     await asyncio.sleep(0.5)
@@ -275,7 +283,7 @@ async def connection_churn(target: Target, number: int) -> None:
             await asyncio.wait_for(loop.sock_connect(link, (target.host, target.port)), 5.0)
             if k % 2:
                 link.send(target.build_head("GET", "/v1/health", role=None))
-            target.counts["opened"] += 1
+            target.count("opened")
 
 
 @flood(workers=4)
@@ -347,9 +355,9 @@ def build_frame_head(opcode: int, length: int, is_final: bool = True, bits: int 
 async def read_some(target: Target, reader: asyncio.StreamReader, timeout_s: float = 60.0) -> None:
     """Read what the daemon sent; ConnectionError at its end."""
     if not await asyncio.wait_for(reader.read(1 << 16), timeout_s):
-        target.counts["closed"] += 1
+        target.count("closed")
         raise ConnectionError("closed")
-    target.counts["read"] += 1
+    target.count("read")
 
 
 async def drain_answers(target: Target, reader: asyncio.StreamReader) -> None:
@@ -368,7 +376,7 @@ async def pings(target: Target, number: int) -> None:
     try:
         while not reading.done():
             writer.write(ping * 500)
-            target.counts["pings"] += 500
+            target.count("pings", 500)
             await writer.drain()
             await asyncio.sleep(0)
     finally:
@@ -394,7 +402,7 @@ async def compressed_frames(target: Target, number: int) -> None:
     try:
         for _ in range(150):
             write_frame(writer, TEXT, data, bits=0x40)
-            target.counts["frames"] += 1
+            target.count("frames")
             await writer.drain()
         await asyncio.wait([reading], timeout=20.0)
     finally:
@@ -412,7 +420,7 @@ async def fragmented_frames(target: Target, number: int) -> None:
         write_frame(writer, TEXT, b"{", is_final=False)
         for _ in range(2_000):
             writer.write(fragment * 1000)
-            target.counts["fragments"] += 1000
+            target.count("fragments", 1000)
             await writer.drain()
             await asyncio.sleep(0)
     finally:
@@ -446,7 +454,7 @@ async def abandon_dry_run(target: Target, frames: int) -> None:
     try:
         writer.write(target.build_head("POST", "/v1/plans?dry_run=true", length=len(body)) + body)
         await writer.drain()
-        target.counts["sent"] += 1
+        target.count("sent")
         await asyncio.sleep(0.3)
     finally:
         writer.close()
@@ -468,7 +476,7 @@ async def abandoned_dry_runs_of_8_MB(target: Target, number: int) -> None:
 async def valid_previews(target: Target, number: int) -> None:
     """A dry run of 750 full frames, and its answer is awaited."""
     body = build_full_frames(750, target.pixels)
-    target.counts["sent"] += 1
+    target.count("sent")
     await target.exchange(target.build_head("POST", "/v1/plans?dry_run=true", length=len(body)), body)
 
 
@@ -484,7 +492,7 @@ async def telemetry_that_is_not_read(target: Target, number: int) -> None:
         link.setblocking(False)
         await asyncio.wait_for(loop.sock_connect(link, (target.host, target.port)), 5.0)
         await loop.sock_sendall(link, target.build_head("GET", "/v1/telemetry?rate_hz=60", "viewer"))
-        target.counts["opened"] += 1
+        target.count("opened")
         await asyncio.sleep(3600.0)
 
 
@@ -494,7 +502,7 @@ async def watch_telemetry(target: Target, rate_hz: int) -> None:
     try:
         writer.write(target.build_head("GET", f"/v1/telemetry?rate_hz={rate_hz}", "viewer"))
         while data := await reader.read(1 << 16):
-            target.counts["bytes"] += len(data)
+            target.count("bytes", len(data))
     finally:
         writer.close()
 
@@ -528,20 +536,30 @@ PAGE_FILES = ("main.js", "api.js", "display.js", "draw.js", "gauges.js", "plans.
 # --- process ---------------------------------------------------------------------------------------------------------
 
 
-async def repeat_work(target: Target, item: Flood, number: int, is_begun: asyncio.Event) -> None:
+async def attempt(target: Target, item: Flood, number: int) -> bool:
+    """Do one worker's part once; return whether it was not broken off."""
+    try:
+        await item.work(target, number)
+    except BROKEN as error:
+        target.count(type(error).__name__)
+        return False
+    return True
+
+
+async def repeat_work(target: Target, item: Flood, number: int, begun: asyncio.Event) -> None:
     """Repeat one worker's part until it is cancelled."""
+    BEGUN.set(begun)
     while True:
-        if item.waits:
-            is_begun.set()
-            await target.triggered.wait()
-        try:
-            await item.work(target, number)
-        except BROKEN as error:
-            target.counts[type(error).__name__] += 1
+        if not await attempt(target, item, number):
             await asyncio.sleep(PAUSE_S if item.workers < 100 else 1.0)
-        is_begun.set()
-        if item.waits:
-            target.triggered.clear()
+        begun.set()
+
+
+async def announce(begun: list[asyncio.Event]) -> None:
+    """Print `ready` once every worker has begun."""
+    for event in begun:
+        await event.wait()
+    print("ready", flush=True)
 
 
 def report_unless_broken(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -557,19 +575,20 @@ async def run_flood(name: str, workers: int | None = None) -> None:
     lines = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     target, item = Target(**json.loads(await lines.readline())), FLOODS[name]
-    begun = [asyncio.Event() for _ in range(workers or item.workers)]
+    numbers = range(workers or item.workers)
+    begun = [] if item.waits else [asyncio.Event() for _ in numbers]
     tasks = [asyncio.create_task(repeat_work(target, item, k, event)) for k, event in enumerate(begun)]
-    waits = [asyncio.create_task(event.wait()) for event in begun]
-    await asyncio.wait(waits, timeout=READY_MAX_S)
-    print("ready", flush=True)
+    tasks.append(asyncio.create_task(announce(begun)))
     while await lines.readline():
-        target.triggered.set()
-    pending = {*tasks, *waits}
+        if item.waits:
+            await asyncio.gather(*(attempt(target, item, k) for k in numbers))
+            print("over", flush=True)
+    pending = {*tasks}
     while pending:  # a task may miss one cancellation, if what it waits for ends at that moment
         for task in pending:
             task.cancel()
         _, pending = await asyncio.wait(pending, timeout=0.2)
-    results = await asyncio.gather(*tasks, *waits, return_exceptions=True)
+    results = await asyncio.gather(*tasks, return_exceptions=True)
     print(json.dumps(target.counts), flush=True)
     for error in results:
         if isinstance(error, Exception):

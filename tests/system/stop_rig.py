@@ -1,4 +1,4 @@
-"""Board, daemon and a show of full frames, with the time from sending STOP to dark according to the board's log."""
+"""Board, daemon and a show of full frames, which a flood must not darken and a STOP must end."""
 
 import json
 import os
@@ -10,27 +10,18 @@ import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 
 import httpx
 
-from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, read_role_tokens, wait_for
+from floods import FLOODS
+from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, wait_for
 
 HERE = Path(__file__).parent
 SHORT_INDICATOR_BOARD = (sys.executable, HERE / "short_indicator_board.py")
 PIXELS = 437
 DESCRIPTORS = 1024
 """Soft limit of open files that systemd gives a service by default."""
-FLOOD_LEASE_S = 0.3
-"""Lease under a flood. Bytes to a board on a pseudo-terminal pass a thread of the kernel without real-time priority,
-which a full computer delays by up to 0.15 s; those to a board on USB do not.
-"""
-ANSWER_MAX_S = 60.0
-"""A STOP without an answer for this time counts as one."""
-CALL_MAX_S = 15.0
-"""Longest wait for the other answers of the show's own caller."""
 FRAME_S = 1.6
 """Time of a frame of the show: 437 pixels of 3.5 ms each keep the beam busy for most of it."""
 SHOW_PERIOD_S = 8.0
@@ -75,14 +66,14 @@ class LogTail:
         self.events += fresh
         return fresh
 
-    def find(self, condition, begin, what, patience_s=20.0):
+    def find(self, condition, begin, what):
         """Wait for the first event from index `begin` on that meets the condition."""
 
         def look():
             self.read()
             return next((event for event in self.events[begin:] if condition(event)), None)
 
-        return wait_for(look, what, patience_s)
+        return wait_for(look, what)
 
 
 class FloodProcess:
@@ -92,6 +83,7 @@ class FloodProcess:
     """
 
     def __init__(self, name, url, tokens, pixels=PIXELS, workers=None, interval_s=0.0):
+        self._waits = FLOODS[name].waits
         command = [sys.executable, HERE / "floods.py", name, *(() if workers is None else (str(workers),))]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         base = httpx.URL(url)
@@ -102,51 +94,33 @@ class FloodProcess:
         self.process.stdin.write(json.dumps(value) + "\n")
         self.process.stdin.flush()
 
-    def trigger(self):
-        """Let a flood that waits begin."""
+    @contextmanager
+    def triggered(self):
+        """Let a flood that waits run once, and be over at the end of the block."""
         self._send("go")
+        yield
+        if self._waits:
+            assert self.process.stdout.readline() == "over\n"
 
     def finish(self):
         """End the flood and return the outcomes that it counted."""
-        try:
-            output, _ = self.process.communicate(timeout=30)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.communicate()
-            raise
+        output, _ = self.process.communicate()
         assert self.process.returncode == 0
         return json.loads(output)
 
 
-@dataclass
-class FloodResult:
-    """What a show and its STOPs met under a flood.
+def build_http_sender(url, method, path):
+    """Return a function that sends a request on a fresh connection and returns when its answer began.
 
-    gate_off_s: from sending STOP to the board's abort; answered_s: from sending STOP to the first byte of its answer
-    darkened: faults and underruns that were not STOP's doing; relit: pulses after a STOP and before the next arming
-    log: what the daemon wrote to its log meanwhile
+    url: an httpx.URL; the answer must be 200
     """
-
-    name: str
-    gate_off_s: list[float] = field(default_factory=list)
-    answered_s: list[float] = field(default_factory=list)
-    darkened: list[str] = field(default_factory=list)
-    relit: int = 0
-    not_begun: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
-    log: list[str] = field(default_factory=list)
-
-
-def send_stop_over_http(daemon, token):
-    """Return a function that sends STOP on a fresh connection and returns when the first byte of the answer came."""
-    base = daemon.client.base_url
     request = (
-        f"POST /v1/stop HTTP/1.1\r\nHost: {base.host}:{base.port}\r\nAuthorization: Bearer {token}\r\n"
+        f"{method} {path} HTTP/1.1\r\nHost: {url.host}:{url.port}\r\nAuthorization: Bearer {TOKEN}\r\n"
         "Content-Length: 0\r\nConnection: close\r\n\r\n"
     ).encode()
 
     def send():
-        with socket.create_connection((base.host, base.port), timeout=ANSWER_MAX_S) as link:
+        with socket.create_connection((url.host, url.port)) as link:
             link.sendall(request)
             answer = link.recv(4096)
             answered_s = time.monotonic()
@@ -156,15 +130,12 @@ def send_stop_over_http(daemon, token):
     return send
 
 
-def send_stop_over_socket(daemon):
-    """Return the path of the link process's own socket, and a function that sends STOP there as the one over HTTP."""
-    port = daemon.client.base_url.port
-    path = os.path.realpath(daemon.config.parent / "optodrive" / f"daemon-{port}") + "/link.sock"
+def build_socket_sender(path):
+    """Return a function that sends STOP over the link process's own socket and returns when its answer came."""
     messages = encode_message("hello", role="operator") + encode_message("stop", id=1)
 
     def send():
         with socket.socket(socket.AF_UNIX) as link:
-            link.settimeout(ANSWER_MAX_S)
             link.connect(path)
             link.sendall(messages)
             received = b""
@@ -174,7 +145,7 @@ def send_stop_over_socket(daemon):
                 received += data
             return time.monotonic()
 
-    return path, send
+    return send
 
 
 class StopRig:
@@ -195,21 +166,15 @@ class StopRig:
         except BaseException:
             self.board.stop()
             raise
-        self.client = httpx.Client(
-            base_url=self.daemon.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=CALL_MAX_S
-        )
+        self.client = httpx.Client(base_url=self.daemon.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=None)
         heights = ",".join(["60"] * PIXELS)
         frames = [
             f'{{"show_at_s":{FRAME_S * k},"duration_s":{FRAME_S},"target_um":[{heights}]}}' for k in range(show_frames)
         ]
         self._show = f'{{"frames":[{",".join(frames)}]}}'
-        self._scheduling = os.sched_getscheduler(0), os.sched_getparam(0)
-        with suppress(OSError):  # the time of STOP must not include the wait of this process for a core
-            os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-        self.senders = {"http": send_stop_over_http(self.daemon, TOKEN)}
-        path, send = send_stop_over_socket(self.daemon)
-        if Path(path).exists():
-            self.senders["socket"] = send
+        url = self.daemon.client.base_url
+        path = os.path.realpath(folder / "optodrive" / f"daemon-{url.port}") + "/link.sock"
+        self.senders = {"http": build_http_sender(url, "POST", "/v1/stop"), "socket": build_socket_sender(path)}
 
     def _read_clock(self):
         path = Path(f"{self.board.port}.clock")
@@ -226,34 +191,28 @@ class StopRig:
             self.client.post("/v1/arm").raise_for_status()
 
     def start_show(self):
-        """Arm, push a show, wait for light, and return the index of the show's first event; None if it did not begin.
+        """Arm, push a show, wait for light or a fault, and return the index of the show's first event."""
+        self.arm()
+        self.tail.read()
+        begin = len(self.tail.events)
+        response = self.client.post("/v1/plans", content=self._show)
+        assert response.status_code == 201, response.text
+        self.tail.find(lambda event: is_gate_on(event) or is_unarmed(event), begin, "light")
+        return begin
 
-        A flood may keep the daemon from answering; the caller counts that.
-        """
-        for _ in range(2):
-            with suppress(httpx.HTTPError, AssertionError):
-                self.arm()
-                self.tail.read()
-                begin = len(self.tail.events)
-                if self.client.post("/v1/plans", content=self._show).status_code == 201:
-                    self.tail.find(is_gate_on, begin, "light", CALL_MAX_S)
-                    return begin
-        return None
-
-    def find_darkness(self, begin, end_s=float("inf")):
-        """Return the faults and underruns logged from index `begin` on and before a time of the host."""
+    def find_darkness(self, begin):
+        """Return the faults and underruns logged from index `begin` on."""
         self.tail.read()
         return [
             event.get("fault") or "UNDERRUN"
             for event in self.tail.events[begin:]
-            if (event["event"] == "fault" or event.get("state") == "HOLD") and self.to_host_s(event) < end_s
+            if event["event"] == "fault" or event.get("state") == "HOLD"
         ]
 
     @contextmanager
     def running_show(self):
         """Keep a show running, push by push, and yield the index of its first event; STOP at the end."""
         begin, is_over = self.start_show(), threading.Event()
-        assert begin is not None, "the show did not begin"
 
         def push():
             while not is_over.wait(SHOW_PERIOD_S):
@@ -267,78 +226,22 @@ class StopRig:
         finally:
             is_over.set()
             thread.join()
-            self._end_show()
+            with suppress(httpx.HTTPError):
+                self.client.post("/v1/stop")
 
-    def find_gap_s(self, begin):
-        """Return the longest time without light in the events from index `begin` on, s."""
-        self.tail.read()
-        on_s = [self.to_host_s(event) for event in self.tail.events[begin:] if is_gate_on(event)]
-        return max(after - before for before, after in pairwise(on_s))
+    def watch_show(self, begin, pulses):
+        """Let the show that began at an event emit a number of pulses; return the faults and underruns that end it."""
 
-    def _end_show(self):
-        with suppress(httpx.HTTPError):
-            self.client.post("/v1/stop")
+        def look():
+            self.tail.read()
+            events = self.tail.events[begin:]
+            return self.find_darkness(begin) or sum(map(is_gate_on, events)) >= pulses
 
-    def watch_show(self, result, begin, duration_s):
-        """Let the show that began at an event run for a time, note what darkens it, and return whether it is lit."""
-        until_s = time.monotonic() + duration_s
-        while time.monotonic() < until_s and not self.find_darkness(begin):
-            time.sleep(0.05)
-        darkened = self.find_darkness(begin)
-        if darkened:
-            result.darkened += darkened
-            self._end_show()
-        return not darkened
-
-    def stop_show(self, result, begin, send, trigger):
-        """Send STOP to the show that began at an event, and note when the board was dark for good."""
-        trigger()
-        sent_s = time.monotonic()
-        try:
-            result.answered_s.append(send() - sent_s)
-        except (OSError, AssertionError):
-            result.answered_s.append(ANSWER_MAX_S)
-        try:
-            end = self.tail.find(is_unarmed, begin, "the board to be unarmed", ANSWER_MAX_S)
-        except AssertionError:
-            result.gate_off_s.append(ANSWER_MAX_S)
-            return
-        if end["state"] == "FAULT":
-            result.darkened += self.find_darkness(begin)
-        result.gate_off_s.append(max(0.0, self.to_host_s(end) - sent_s))
-        rest = self.tail.events[self.tail.events.index(end) :]
-        result.relit += sum(map(is_gate_on, rest))
-
-    def run_flood(self, name, stops=20, seconds=60.0, watch_s=0.0, path="http"):
-        """Run a flood over a show that is on already, then STOP it and further shows.
-
-        name: of the flood; "rest" for none. watch_s: time of the first show before its STOP. stops: how many, or as
-        many as `seconds` allow; no more once two shows in a row did not begin. Returns the FloodResult.
-        """
-        result, send = FloodResult(name), self.senders[path]
-        begin = self.start_show()
-        assert begin is not None, "the first show did not begin, before the flood"
-        flood = None if name == "rest" else FloodProcess(name, self.daemon.url, read_role_tokens(self.daemon))
-        trigger = flood.trigger if flood else lambda: None
-        try:
-            until_s, failed, round_s = time.monotonic() + seconds, 0, watch_s
-            for k in range(stops):
-                if begin is not None and self.watch_show(result, begin, round_s):
-                    self.stop_show(result, begin, send, trigger)
-                if k + 1 == stops or time.monotonic() > until_s or failed == 2:
-                    break
-                begin, round_s = self.start_show(), 0.02 + 0.013 * (k % 17)
-                failed = failed + 1 if begin is None else 0
-                result.not_begun += begin is None
-        finally:
-            if flood is not None:
-                result.counts = flood.finish()
-        result.log = self.daemon.errors.read_text().splitlines()
-        return result
+        wait_for(look, f"{pulses} pulses")
+        return self.find_darkness(begin)
 
     def close(self):
         """End daemon and board."""
-        os.sched_setscheduler(0, self._scheduling[0], self._scheduling[1])
         self.client.close()
         try:
             self.daemon.stop()

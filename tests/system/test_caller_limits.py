@@ -93,10 +93,10 @@ def test_abandoned_dry_runs_do_not_hold_up_another_callers_push(rig, count, fram
     wait_for(lambda: len(read_audit(rig, "POST /v1/plans")) == audited + 1 + count, "the lines of the dry runs")
     # The web process has dropped all of them, so the next request follows the drops to the preview process.
     assert post(rig, SMALL, role="armer").status_code == 201
-    assert not any(map(is_alive, suspended))
+    wait_for(lambda: not any(map(is_alive, suspended)), "the end of the dry runs")
     running = find_dry_runs(rig.daemon)  # or the slow build of this push, which ends before the next one
     assert post(rig, SMALL, role="armer").status_code == 201
-    assert not set(running) & set(find_dry_runs(rig.daemon))
+    wait_for(lambda: not set(running) & set(find_dry_runs(rig.daemon)), "the end of what ran")
     rig.client.post("/v1/stop")
     pushed, *abandoned = read_audit(rig, "POST /v1/plans")[audited : audited + 1 + count]
     assert (pushed["name"], pushed["status"]) == ("armer", 201)
