@@ -80,6 +80,7 @@ struct log {
 void log_trace(struct log *log, const struct board_trace *event);
 void log_input(struct log *log, uint64_t at_us, const char *name, bool value);
 void log_port(struct log *log, uint64_t at_us, bool open);
+void log_lease(struct log *log, uint64_t at_us, uint64_t until_us);
 
 /* --- line --- */
 

@@ -78,3 +78,7 @@ void log_input(struct log *log, uint64_t at_us, const char *name, bool value) {
 void log_port(struct log *log, uint64_t at_us, bool open) {
     write_line(log, at_us, "port", "\"open\": %s", json_boolean(open));
 }
+
+void log_lease(struct log *log, uint64_t at_us, uint64_t until_us) {
+    write_line(log, at_us, "lease", "\"until_us\": %" PRIu64, until_us);
+}

@@ -66,6 +66,11 @@ class BoardCore:
         """Whether the gate is on."""
         return self.machine.gate
 
+    @property
+    def lease_until_us(self) -> int:
+        """End of the lease, 0 before the first one."""
+        return self.machine.lease_until_us
+
     # --- time and inputs ----------------------------------------------------------------------------------------
 
     def next_event_us(self) -> int | None:

@@ -52,6 +52,10 @@ class BoardBackend(Protocol):
     def next_event_us(self) -> int | None:
         """Return the time of the next due event, None if there is none."""
 
+    @property
+    def lease_until_us(self) -> int:
+        """End of the lease, 0 for a backend that logs it itself."""
+
 
 BackendFactory = Callable[[BoardSettings, Callable[[dict[str, Any]], None]], BoardBackend]
 ScriptActions = Mapping[str, Callable[[Any], None]]
@@ -147,12 +151,11 @@ class PtyBoard:
         if self._is_open and self._now_us() - self._due_us > LATE_LOOP_US:
             # The process ran late, a real board would not: the waiting bytes arrived gradually in the meantime.
             self._read(self._due_us)
-        self._run_due_steps()
-        self._core.advance(self._now_us())
+        self._advance()
         self._update_port_state()
         if self._is_open:
             self._read(self._now_us())
-            self._core.advance(self._now_us())
+            self._advance()
             self._write()
         else:
             self._core.bytes_to_send()
@@ -160,6 +163,11 @@ class PtyBoard:
         if self._optics is not None:
             self._optics.answer_requests(self._now_us())
         self._wait()
+
+    def _advance(self) -> None:
+        now_us = self._now_us()
+        self._run_due_steps(now_us)
+        self._core.advance(now_us)
 
     def _wait(self) -> None:
         now_us, due_us = self._now_us(), self._core.next_event_us()
@@ -219,13 +227,24 @@ class PtyBoard:
         part_count = max(1, late_us // LATE_LOOP_US)
         for k in range(part_count):
             part = data[len(data) * k // part_count : len(data) * (k + 1) // part_count]
-            self._core.receive(part, since_us + late_us * (k + 1) // part_count)
+            at_us = since_us + late_us * (k + 1) // part_count
+            self._run_due_steps(at_us)
+            if not self._is_open:
+                return  # a step has closed the port
+            self._receive(part, at_us)
+
+    def _receive(self, data: bytes, at_us: int) -> None:
+        """Process bytes, and log the lease that they grant."""
+        until_us = self._core.lease_until_us
+        self._core.receive(data, at_us)
+        if self._core.lease_until_us > until_us:
+            self._log({"t_us": at_us, "event": "lease", "until_us": self._core.lease_until_us})
 
     def _drain_input(self) -> None:
         """Process the bytes that the host wrote before it closed, so that no later host receives their effect."""
         with suppress(OSError):  # empty, or EIO from the closed end
             while data := os.read(self._master, READ_MAX):
-                self._core.receive(self._faults.transmit(data), self._now_us())
+                self._receive(self._faults.transmit(data), self._now_us())
 
     def _write(self) -> None:
         self._output += self._faults.transmit(self._core.bytes_to_send())
@@ -246,16 +265,14 @@ class PtyBoard:
         self._script.sort(key=lambda step: step.at_s)
         self._steps_from_first_pulse = []
 
-    def _run_due_steps(self) -> None:
-        while self._script and self._script[0].at_s <= self._now_s():
-            step = self._script.pop(0)
-            self._run_step(
-                step, int(self._clock.read_s(step.at_s) * 1e6)
-            )  # the scripted time, not the time of this poll
+    def _run_due_steps(self, now_us: int) -> None:
+        """Carry out the script's steps up to a time, each at its own time, however late this process runs."""
+        while self._script and (at_us := int(self._clock.read_s(self._script[0].at_s) * 1e6)) <= now_us:
+            self._run_step(self._script.pop(0), at_us)
         while self._signal_count:
             self._signal_count -= 1
             if self._steps_on_signal:
-                self._run_step(self._steps_on_signal.pop(0), self._now_us())
+                self._run_step(self._steps_on_signal.pop(0), now_us)
 
     def _run_step(self, step: ScriptStep, now_us: int) -> None:
         if step.kind == "set":
