@@ -40,6 +40,8 @@ class EmulatedChip:
     LEASE with its end.
     """
 
+    lease_until_us = 0
+    """The chip reports its leases itself."""
     FAULTS = {"stop_loop": b"H", "late_tick": b"T", "stick_gate": b"S"}  # noqa: RUF012 - nobody writes to it
 
     def __init__(

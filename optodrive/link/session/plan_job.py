@@ -137,9 +137,11 @@ class PlanJob:
             self._end_tick[position:] += shift
 
     def find_start_tick(self) -> int | None:
-        """Return the board tick at which the next point's gate is due to turn on, None if all were sent."""
-        position = self.next_to_send - self.first_index
-        return int(self._end_tick[position]) - int(self._table[position, 3]) if position < self._count else None
+        """Return the board tick at which the next point begins, None if all were sent.
+
+        A board that does not have it by then waits, and the gate turns on that much later.
+        """
+        return None if self.is_fully_sent else self.end_tick_after(self.next_to_send - self.first_index)
 
     def can_truncate(self, kept_points: int) -> bool:
         """Return whether no more than `kept_points` points were sent."""

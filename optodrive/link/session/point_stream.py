@@ -133,7 +133,7 @@ class PointStream:
             self._end_sent = True
 
     def find_start_tick(self) -> int | None:
-        """Return the board tick at which the gate of the next unsent point is due, None if all were sent."""
+        """Return the board tick at which the next unsent point begins, None if all were sent."""
         return next((job.find_start_tick() for job in self._jobs if not job.is_fully_sent), None)
 
     def find_due_tick(self) -> float | None:

@@ -226,6 +226,23 @@ def test_light_that_would_be_late_is_not_emitted_and_the_boards_stay_armed(wide_
     assert finish(rig, submit(rig, fill(40.0))).status == "done"
 
 
+@pytest.mark.parametrize("resumed_s", [0.001, 0.008])
+def test_light_after_a_board_ran_out_of_points_is_late(rig, resumed_s):
+    """The host goes on before the gate of the next point is due, which the board has not begun in time."""
+    record = submit(rig, build_trains(len(rig.cores), 9.0), streamed=True)
+    rig.until(lambda: record.executed_count > 20)
+    while BoardState.HOLD not in list_states(rig):
+        rig.clock.sleep(0.001)
+        for core, link in zip(rig.cores, rig.links, strict=True):
+            core.advance(link._now_us())
+    rig.clock.sleep(resumed_s)
+    run(rig, 0.1)
+    assert record.status == "failed"
+    assert "late" in record.error
+    assert list_states(rig) == {BoardState.ARMED}
+    assert abs(record.timing_error.max_abs_s) < 1e-4
+
+
 def test_a_board_whose_clock_is_not_known_well_enough_refuses_the_start(monkeypatch):
     rig = build_armed(monkeypatch, 2, stage_skew_max_s=1e-6)
     record = finish(rig, submit(rig, build_train(1.0)))
