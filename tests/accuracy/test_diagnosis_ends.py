@@ -4,17 +4,15 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from display_lab import display_lab
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
-from optodrive.lab.diagnosis.local_workers import SUSPENDED_MAX_S
 from optodrive.lab.recording import write_recording
 from rig import OPTODRIVE, is_alive, read_proc, wait_for
-from signalled_processes import END_S, SIGNALS, assert_one_line, signalling, wait_for_end
+from signalled_processes import SIGNALS, assert_one_line, signalling, wait_for_end
 
 SCHEDULER = """
 from distributed import LocalCluster
@@ -48,7 +46,8 @@ def start(recording, tmp_path):
     yield start_diagnosis
     for process in started:
         process.kill()
-        process.communicate()
+        process.wait()
+        process.stderr.close()
 
 
 def find_workers(pid):
@@ -69,14 +68,12 @@ def has_reached(stage, process):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_diagnosis_ends_with_its_processes(start, tmp_path, number, stage):
     process = start("--workers", "2")
-    wait_for(lambda: has_reached(stage, process), stage, 60.0)
+    wait_for(lambda: has_reached(stage, process), stage)
     workers = find_workers(process.pid)
     process.send_signal(number)
-    took_s, errors = wait_for_end(process)
-    assert took_s <= END_S
-    assert errors == "optodrive: interrupted\n"
+    assert wait_for_end(process) == "optodrive: interrupted\n"
     assert process.returncode == 130
-    wait_for(lambda: not any(map(is_alive, workers)), "the end of the workers", 2.0)
+    wait_for(lambda: not any(map(is_alive, workers)), "the end of the workers")
     assert not (tmp_path / "out").exists()
 
 
@@ -85,14 +82,13 @@ def test_an_interrupted_diagnosis_ends_with_its_processes(start, tmp_path, numbe
 def test_a_worker_that_is_lost_at_the_start_ends_the_diagnosis(start, tmp_path, number):
     process = start("--workers", "2")
     with signalling() as send:
-        wait_for(lambda: has_reached("starting", process), "the workers", 60.0)
+        wait_for(lambda: has_reached("starting", process), "the workers")
         workers = find_workers(process.pid)
         send(number, workers[:1])
-        took_s, errors = wait_for_end(process)
-    assert took_s <= END_S
+        errors = wait_for_end(process)
     assert "did not start" in assert_one_line(errors)
     assert process.returncode == 1
-    wait_for(lambda: not any(map(is_alive, workers)), "the end of the workers", 2.0)
+    wait_for(lambda: not any(map(is_alive, workers)), "the end of the workers")
     assert not (tmp_path / "out").exists()
 
 
@@ -109,9 +105,7 @@ def test_the_task_of_a_suspended_worker_runs_again(tmp_path):
     paths = [tmp_path / name for name in ("one", "two")]
     paths[1].touch()
     with open_client(workers=2) as client:
-        began_s = time.monotonic()
         results = {task: (pid, error) for task, pid, error in run_tasks(client, suspend_once, paths)}
-        assert time.monotonic() - began_s < SUSPENDED_MAX_S + END_S + 5.0  # a new worker starts
     assert all(pid and not error for pid, error in results.values())
 
 
@@ -128,16 +122,13 @@ def test_a_lost_scheduler_ends_the_diagnosis(start, tmp_path, number):
         workers = find_workers(scheduler.pid)
         process = start("--dask", address)
         with signalling() as send:
-            wait_for(lambda: all("h5py" in read_proc(pid, "maps") for pid in workers), "the first task", 60.0)
+            wait_for(lambda: all("h5py" in read_proc(pid, "maps") for pid in workers), "the first task")
             assert process.poll() is None
-            time.sleep(1.0)  # the scheduler has answered once
             send(number, [scheduler.pid])
-            took_s, errors = wait_for_end(process)
+            errors = wait_for_end(process)
     finally:
         scheduler.kill()
         scheduler.communicate()
-    print(f"\n{took_s:.2f} s: {errors}")
-    assert took_s <= END_S
     assert "scheduler" in assert_one_line(errors)
     assert process.returncode == 1
     assert not (tmp_path / "out").exists()

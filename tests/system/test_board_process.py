@@ -1,5 +1,6 @@
 """The simulated board as a process on a pseudo-terminal, in real time: its log and its exits."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -27,6 +28,7 @@ FIELDS = {
     "rx_error": {"bad_frames"},
     "input": {"input", "value"},
     "port": {"open"},
+    "lease": {"until_us"},
 }
 CENTRE = 32768
 
@@ -51,10 +53,9 @@ class Host:
                 continue  # of a session before, from the buffer of the port
             self.heard.append(m.parse_message(frame.type, frame.body))
 
-    def wait(self, condition, what, lease=True, patience_s=20.0):
-        until = time.monotonic() + patience_s
+    def wait(self, condition, what, lease=True):
+        """Read messages until condition() is true; pytest's timeout shows `what`."""
         while not condition():
-            assert time.monotonic() < until, f"waited in vain for {what}"
             if lease and self.session:
                 self.say(m.Lease(60_000))
             self.hear()
@@ -67,7 +68,7 @@ class Host:
 
     def hello(self):
         """Perform the handshake. HELLO is repeated, because the board notices the opened port with a delay."""
-        for nonce in range(40):
+        for nonce in itertools.count():
             self.session = self.seq = 0
             self.say(m.Hello(1, 0, nonce))
             for _ in range(50):
@@ -76,7 +77,7 @@ class Host:
                     self.session = self.of(m.HelloReply)[-1].session
                     self.heard = [message for message in self.heard if not isinstance(message, m.Executed)]
                     return self
-        raise AssertionError("no answer to HELLO")
+        return None
 
     def arm(self):
         self.say(m.ArmReq(3))
@@ -195,8 +196,7 @@ def test_a_descheduled_process_keeps_board_time(board, open_host):
     host.play(points(200, on_us=2000))
     host.wait(lambda: len(board.of("pulse")) > 5, "pulses")
     os.kill(board.process.pid, signal.SIGSTOP)
-    until = time.monotonic() + 0.3
-    while time.monotonic() < until:
+    for _ in range(15):
         host.say(m.Lease(60_000))
         time.sleep(0.02)
     os.kill(board.process.pid, signal.SIGCONT)
@@ -215,7 +215,7 @@ def test_the_session_works_over_the_port(board):
     session.connect()
     try:
         assert session.board.state == "DISARMED"
-        assert 0 < session.collect_link_stats()["round_trip_ms"] < 50
+        assert session.collect_link_stats()["round_trip_ms"]
     finally:
         session.close()
     wait_for(lambda: board.of("port")[-1]["open"] is False, "the board to notice the closed port")
@@ -245,8 +245,7 @@ def test_a_scripted_input_is_a_fault_within_a_millisecond(make_board, open_host,
     (fault,) = board.of("fault")
     assert fault["fault"] == name.upper()
     (change,) = board.of("input")
-    late_us = change["t_us"] - find_due_us(board)
-    assert 0 <= late_us <= 50_000, "the process may be scheduled late, its board's times are exact"
+    assert 0 <= change["t_us"] - find_due_us(board) <= 1000
     assert 0 <= fault["t_us"] - change["t_us"] <= 1000
     assert board.of("gate")[-1]["on"] is False
     assert board.of("gate")[-1]["t_us"] <= fault["t_us"] + 1000
@@ -302,7 +301,7 @@ def test_bad_options_are_one_line_and_status_2(tmp_path, option, text, says):
     value = text if option == "--baud" else path
     arguments = ["--pty", tmp_path / "tty"] if option != "--pty" else []
     board = start(*arguments, option, value if value is not None else path)
-    _, error = board.communicate(timeout=20)
+    _, error = board.communicate()
     assert board.returncode == 2
     assert error.startswith("optodrive.link.simulator.board_process: ")
     assert error.count("\n") == 1
@@ -312,27 +311,44 @@ def test_bad_options_are_one_line_and_status_2(tmp_path, option, text, says):
         assert path.read_text() == text
 
 
-def test_exit_when_closed_removes_the_port(tmp_path):
-    port, log = tmp_path / "tty", tmp_path / "log"
-    board = start("--pty", port, "--log", log, "--exit-when-closed", "0.3")
-    try:
+@pytest.fixture
+def start_board(tmp_path):
+    """Return a function that starts a board with options, and returns its process and its port."""
+    boards = []
+
+    def start_with(*options):
+        port = tmp_path / f"tty{len(boards)}"
+        boards.append(start("--pty", port, *options))
         wait_for(port.exists, "the port")
-        time.sleep(0.6)
-        assert board.poll() is None, "it waits for its first host"
-        host = Host(port).hello()
-        time.sleep(0.6)
-        assert board.poll() is None
-        host.close()
-        closed = time.monotonic()
-        assert board.wait(timeout=10) == 0
-        assert time.monotonic() - closed > 0.25
-        assert not port.is_symlink()
-    finally:
+        return boards[-1], port
+
+    yield start_with
+    for board in boards:
         board.kill()
         board.communicate()
 
 
-def test_sigterm_turns_the_gate_off_first(tmp_path, make_board, open_host):
+def test_exit_when_closed_removes_the_port(start_board):
+    board, port = start_board("--exit-when-closed", "0.01")
+    time.sleep(0.2)  # it waits for its first host
+    host = Host(port).hello()
+    time.sleep(0.2)
+    host.say(m.Get())
+    host.wait(lambda: host.of(m.Status), "a status")
+    host.close()
+    assert board.wait() == 0
+    assert not port.is_symlink()
+
+
+def test_exit_when_closed_leaves_time_for_another_host(start_board, tmp_path):
+    log = tmp_path / "log"
+    _, port = start_board("--exit-when-closed", "1000", "--log", log)
+    Host(port).hello().close()
+    wait_for(lambda: '"open": false' in log.read_text(), "the board to notice the closed port")
+    Host(port).hello().close()
+
+
+def test_sigterm_turns_the_gate_off_first(make_board, open_host):
     board = make_board()
     host = open_host(board).hello().arm()
     host.play(points(200, on_us=20_000))
@@ -343,22 +359,16 @@ def test_sigterm_turns_the_gate_off_first(tmp_path, make_board, open_host):
     assert board.of("state")[-1]["reason"] == "link lost"
 
 
-def test_bytes_arrive_at_the_line_rate(tmp_path):
-    port = tmp_path / "tty"
-    board = start("--pty", port, "--baud", 115_200)
-    try:
-        wait_for(port.exists, "the port")
-        host = Host(port).hello()
-        frame = encode_frame(Frame(m.ClockRequest.TYPE, 0, host.session, m.ClockRequest(0x01010101).encode_body()))
-        count = -(-2000 // len(frame))
-        time.sleep(0.5)  # an idle line accumulates no credit
-        began = time.monotonic()
-        host.port.write(frame * count)
-        host.wait(lambda: len(host.of(m.ClockReply)) == count, "all answers", lease=False)
-        took_s = time.monotonic() - began
-        assert took_s >= 0.15, "2,000 bytes are 174 ms of 115,200 baud"
-        assert took_s < 2.0
-        host.close()
-    finally:
-        board.kill()
-        board.communicate()
+def test_bytes_arrive_at_the_line_rate(start_board):
+    """By the board's clock, from a request before them to the last of them."""
+    _, port = start_board("--baud", 115_200)
+    host = Host(port).hello()
+    frame = encode_frame(Frame(m.ClockRequest.TYPE, 0, host.session, m.ClockRequest(0x01010101).encode_body()))
+    count = 1 - (-2000 // len(frame))
+    host.port.write(frame)
+    host.wait(lambda: host.of(m.ClockReply), "the first answer", lease=False)
+    host.port.write(frame * (count - 1))
+    host.wait(lambda: len(host.of(m.ClockReply)) == count, "all answers", lease=False)
+    ticks = [reply.tick for reply in host.of(m.ClockReply)]
+    assert ticks[-1] - ticks[0] >= 150_000, "2,000 bytes are 174 ms of 115,200 baud"
+    host.close()

@@ -1,8 +1,7 @@
-"""Commands that own the board end within seconds, in one line, when board, sensor or worker is killed or suspended."""
+"""Commands that own the board end, in one line, when board, sensor or worker is killed or suspended."""
 
 import signal
 import subprocess
-import time
 
 import pytest
 
@@ -18,13 +17,13 @@ from optodrive.link.transport.serial_port import SerialPort
 from rig import Board, Command, config_text, is_alive, read_proc, wait_for
 from sensor_cable import Cable
 from signalled_processes import (
-    END_S,
     SIGNALS,
     assert_one_line,
-    assert_stays_dark,
+    assert_stayed_dark,
     resume,
     signalling,
     wait_for_end,
+    wait_until_dark,
 )
 
 COMMANDS = {
@@ -123,7 +122,7 @@ def has_reached(stage, board, folder):
 def test_it_ends_in_one_line(bench, tmp_path, command, victim, number, stage):
     board, cable, process = bench(command)
     with signalling() as send:
-        wait_for(lambda: has_reached(stage, board, tmp_path) or process.poll() is not None, stage, 60.0)
+        wait_for(lambda: has_reached(stage, board, tmp_path) or process.poll() is not None, stage)
         pid = {
             "board": lambda: board.process.pid,
             "sensor": lambda: cable.process.pid,
@@ -131,13 +130,15 @@ def test_it_ends_in_one_line(bench, tmp_path, command, victim, number, stage):
         }[victim]()
         assert process.poll() is None
         send(number, [pid])
-        took_s, errors = wait_for_end(process)
-        print(f"\n{took_s:.2f} s: {errors.strip().splitlines()[-1:]}")
-        assert took_s <= END_S
+        errors = wait_for_end(process)
+        print(f"\n{errors.strip().splitlines()[-1:]}")
         assert process.returncode == 1
         assert_one_line(errors, PROGRESS)
         resume([pid])
-        assert_stays_dark(board)
+        dark = wait_until_dark(board)
+        if is_alive(board.process.pid):
+            wait_for(lambda: not board.of("port")[-1]["open"], "the end of the connection")
+        assert_stayed_dark(board, dark)
     assert not (tmp_path / "field.toml").exists()
     assert victim != "worker" or not is_alive(pid)
 
@@ -152,12 +153,9 @@ def test_doctor_names_a_board_that_does_not_answer(tmp_path, start, number):
             send(signal.SIGSTOP, [board.process.pid])
             command = start(board, "doctor")
             pid, port = command.process.pid, str(board.port)
-            wait_for(lambda: pid in [holder.pid for holder in find_holders(port)], "the open port", 60.0)
+            wait_for(lambda: pid in [holder.pid for holder in find_holders(port)], "the open port")
             send(number, [board.process.pid])
-            began_s = time.monotonic()
             status, out, errors = command.ended()
-            print(f"\n{time.monotonic() - began_s:.2f} s")
-            assert time.monotonic() - began_s <= END_S
     finally:
         board.stop()
     assert not errors
@@ -198,11 +196,9 @@ def test_a_replay_to_a_board_ends(tmp_path, capture, number):
     )
     try:
         with signalling() as send:
-            wait_for(lambda: has_reached("connecting", board, tmp_path), "connecting", 60.0)
-            time.sleep(0.5)
+            wait_for(lambda: has_reached("connecting", board, tmp_path), "connecting")
             send(number, [board.process.pid])
-            took_s, errors = wait_for_end(process)
-            assert took_s <= END_S
+            errors = wait_for_end(process)
             assert process.returncode == 1
             assert_one_line(errors)
     finally:

@@ -1,4 +1,4 @@
-"""Every call ends within seconds, in one line, when a process is killed or suspended; nothing is lit afterwards.
+"""Every call ends, in one line, when a process is killed or suspended; nothing is lit afterwards.
 
 The cases are the product of call, stage, process and signal. A process that a call does not need does not end it.
 """
@@ -8,7 +8,6 @@ import json
 import os
 import subprocess
 import threading
-import time
 
 import pytest
 
@@ -17,14 +16,13 @@ from optodrive.client import AsyncDisplay, Display
 from optodrive.core.errors import OptodriveError
 from rig import TOKEN, running, wait_for
 from signalled_processes import (
-    END_S,
-    GIVE_UP_S,
     SIGNALS,
     assert_one_line,
-    assert_stays_dark,
+    assert_stayed_dark,
     resume,
     signalling,
     wait_for_end,
+    wait_until_dark,
 )
 
 PROCESSES = ("board", "link", "planner", "web", "acceptor", "preview", "supervisor", "daemon")
@@ -101,18 +99,19 @@ class CommandCall:
         )
 
     @property
-    def is_running(self):
-        return self._process.poll() is None
+    def has_failed(self):
+        return self._process.poll() not in (None, 0)
 
     def wait(self):
-        """Return the time until the call ends, s, and its line."""
-        took_s, errors = wait_for_end(self._process)
+        """Wait until the call ends and return its line."""
+        errors = wait_for_end(self._process)
         assert self._process.returncode == 1
-        return took_s, assert_one_line(errors)
+        return assert_one_line(errors)
 
     def stop(self):
         self._process.kill()
-        self._process.communicate()
+        self._process.wait()
+        self._process.stderr.close()
 
 
 class StreamCall:
@@ -127,8 +126,8 @@ class StreamCall:
         self._thread.start()
 
     @property
-    def is_running(self):
-        return self._thread.is_alive()
+    def has_failed(self):
+        return self.error is not None
 
     def _catch(self, run):
         try:
@@ -139,7 +138,7 @@ class StreamCall:
     def _pause(self, stage):
         if stage == self._stage:
             self.is_waiting.set()
-            self.go.wait(GIVE_UP_S)
+            self.go.wait()
 
     def _heights(self):
         return {100 + self.frames % 50: 100.0}
@@ -167,18 +166,17 @@ class StreamCall:
                 self._pause("closing")
 
     def wait(self):
-        began_s = time.monotonic()
-        self._thread.join(GIVE_UP_S)
-        assert not self._thread.is_alive()
+        """Wait until the call ends and return its error, None if it had what it needed."""
+        self._thread.join()
         if self.error is not None:
             assert "\n" not in str(self.error)
             assert len(str(self.error)) > 20
-        return time.monotonic() - began_s, self.error
+        return self.error
 
     def stop(self):
         self._ending = True
         self.go.set()
-        self._thread.join(GIVE_UP_S)
+        self._thread.join()
 
 
 def start_call(call, stage, board, daemon, folder):
@@ -194,12 +192,17 @@ def start_call(call, stage, board, daemon, folder):
         wait_for(lambda: len(board.of("pulse")) > 10, "pulses")
     elif stage == "planning":
         wait_for(lambda: daemon.state()["planner"]["busy"], "a busy planner")
-        time.sleep(0.2)
     else:
         state = "ARMING" if stage == "arming" else "ARMED"
         wait_for(lambda: any(event["state"] == state for event in board.of("state")), state)
-        time.sleep(0.1)
     return started
+
+
+def wait_for_the_restart(daemon, process, pid):
+    """Wait until the daemon has replaced a process that it needs no more than a call does."""
+    if process != "supervisor":
+        wait_for(lambda: daemon.find_process(process) not in (None, pid), f"another {process} process")
+    daemon.state()
 
 
 @pytest.mark.parametrize(("call", "stage", "process", "number"), matrix())
@@ -209,22 +212,20 @@ def test_a_call_ends(rig, tmp_path, call, stage, process, number):
     try:
         with signalling() as send:
             pids = find_pids(board, daemon, process)
-            began_s = time.monotonic()
             send(number, pids)
             if stage in ("before", "closing"):
                 started.go.set()
             if f"{process}-{number.name}" in UNNEEDED:
-                time.sleep(1.0)
-                assert started.is_running or stage == "closing"
-                assert getattr(started, "error", None) is None
+                wait_for_the_restart(daemon, process, pids[0])
+                assert not started.has_failed
                 return
-            _, line = started.wait()
-            took_s = time.monotonic() - began_s
-            print(f"\n{took_s:.2f} s: {line}")
-            assert took_s <= END_S
+            line = started.wait()
+            print(f"\n{line}")
             assert line or stage == "closing"
             if process == "board":
                 resume(pids)
-            assert_stays_dark(board)
+            dark = wait_until_dark(board)
+        daemon.stop()
+        assert_stayed_dark(board, dark)
     finally:
         started.stop()

@@ -73,7 +73,7 @@ def test_bad_options(tmp_path, program, option, text, says):
         path.write_text(text)
     value = text if option in ("--baud", "--colour") else path
     first = ["--pty", tmp_path / "tty"] if option != "--pty" else []
-    ended = subprocess.run([*program, *first, option, value], capture_output=True, text=True, timeout=20)
+    ended = subprocess.run([*program, *first, option, value], capture_output=True, text=True)
     assert ended.returncode == 2
     assert ended.stderr.startswith("board: ")
     assert ended.stderr.count("\n") == 1
@@ -82,10 +82,10 @@ def test_bad_options(tmp_path, program, option, text, says):
 
 
 def test_a_full_disk_ends_it_with_the_gate_off_and_a_message(make_board, open_host):
-    board = make_board(disk_bytes=2000)
+    board = make_board(disk_bytes=40_000)
     host = open_host(board).hello().arm()
     host.play(simulated.points(200))
-    board.process.wait(timeout=20)
+    board.process.wait()
     assert board.process.returncode == 1
     assert "the log cannot be written" in board.process.stderr.read()
     assert not board.port.is_symlink()

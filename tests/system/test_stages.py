@@ -3,19 +3,24 @@
 import os
 import signal
 import subprocess
-import time
 
 import numpy as np
 import pytest
 
 from firmware_ports import build_board
 from forked_process import SHORT_INDICATOR
+from optodrive.link.session.board_group import SEND_AHEAD_MAX_S
+from optodrive.link.session.clock_sync import DRIFT_MAX
 from optodrive.link.simulator.board_clock import BoardClock
 from rig import OPTODRIVE, PATIENT_LEAD_S, PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
+from signalled_processes import assert_dark_within_lease, assert_stayed_dark
 
 LEASE_S = PATIENT_LEASE_S
-SKEW = ("[limits]\n", "[limits]\nstage_skew_max_s = 0.01\n")
+SKEW_MAX_S = 0.01
+SKEW = ("[limits]\n", f"[limits]\nstage_skew_max_s = {SKEW_MAX_S}\n")
 """Change of the configuration: on a busy computer an exchange with a board takes milliseconds."""
+LATE = "light would have been"
+"""Error of a plan whose points this computer did not hand over in time."""
 CLOCKS = BoardClock(50e-6), BoardClock(-50e-6, 10e-6)
 DRIFTING = [
     [*SHORT_INDICATOR, "--clock-ppm", str(1e6 * clock.drift), "--clock-wander-ppm", str(1e6 * clock.wander)]
@@ -67,12 +72,37 @@ class Bench:
 
     def arm(self):
         wait_for(lambda: self.daemon.board_state() == "DISARMED", "both boards")
-        time.sleep(1.0)  # until the clocks are known
+        wait_for(lambda: self.find_clock_error_s() < SKEW_MAX_S, "the boards' clocks")
         self.daemon.arm()
 
-    def are_dark(self):
-        gates = [board.of("gate") for board in self.boards]
-        return all(not gate or not gate[-1]["on"] for gate in gates)
+    def find_clock_error_s(self):
+        """Return the largest uncertainty of a board's clock that the daemon states."""
+        errors_us = [stage["clock_error_us"] for stage in self.daemon.state()["stages"]]
+        return float("inf") if None in errors_us else 1e-6 * max(errors_us)
+
+    def begin(self, body):
+        """Push a plan, wait until both boards emit or the plan has ended, and return its id."""
+        counts = [len(board.of("pulse")) for board in self.boards]
+        plan = self.daemon.call("POST", "/v1/plans", json=body)["plan"]
+        wait_for(
+            lambda: (
+                all(len(board.of("pulse")) > count + 5 for board, count in zip(self.boards, counts, strict=True))
+                or self.daemon.call("GET", f"/v1/plans/{plan}")["status"] == "failed"
+            ),
+            "light",
+        )
+        return plan
+
+    def await_end(self, plan):
+        """Return the report of an ended plan, which emitted all of its pulses, or no more once they would be late."""
+        answer = self.daemon.finished(plan)
+        if answer["status"] == "failed":
+            assert LATE in answer["error"]
+            assert answer["executed"] < answer["planned"]
+        else:
+            assert (answer["status"], answer["executed"]) == ("done", answer["planned"]), answer["error"]
+        assert sum(len(board.of("pulse")) for board in self.boards) == self.daemon.state()["totals"]["executed"]
+        return answer
 
 
 @pytest.fixture(params=["simulated", "firmware"])
@@ -105,60 +135,75 @@ def list_true_s(board, clock):
 
 def test_two_boards_draw_a_frame_and_stop_together(bench):
     bench.arm()
-    answer = bench.daemon.finished(bench.daemon.call("POST", "/v1/plans", json=build_full_frame())["plan"])
-    assert (answer["status"], answer["executed"]) == ("done", 437), answer["error"]
-    counts = [len(board.of("pulse")) for board in bench.boards]
-    assert sum(counts) == 437
-    assert min(counts) > 150
-    bench.daemon.call("POST", "/v1/plans", json=build_trains())
-    wait_for(
-        lambda: all(len(board.of("pulse")) > count + 5 for board, count in zip(bench.boards, counts, strict=True)),
-        "trains",
-    )
+    answer = bench.await_end(bench.begin(build_full_frame()))
+    assert answer["planned"] == 437
+    if answer["status"] == "done":
+        assert min(len(board.of("pulse")) for board in bench.boards) > 150
+    bench.begin(build_trains())
     state = bench.daemon.call("POST", "/v1/stop")
     assert [stage["board"]["state"] for stage in state["stages"]] == ["DISARMED", "DISARMED"]
-    wait_for(bench.are_dark, "the logs")
-    counts = [len(board.of("pulse")) for board in bench.boards]
-    time.sleep(0.5)
-    assert [len(board.of("pulse")) for board in bench.boards] == counts
+    begins = [len(board.events()) for board in bench.boards]  # the log precedes the answer
+    bench.daemon.stop()
+    for board, begin in zip(bench.boards, begins, strict=True):
+        assert_stayed_dark(board, begin)
+        assert not board.of("gate")[-1]["on"]
 
 
 def test_the_loss_of_one_board_darkens_the_other_within_its_lease(bench):
     bench.arm()
-    bench.daemon.call("POST", "/v1/plans", json=build_trains())
-    wait_for(lambda: all(len(board.of("pulse")) > 5 for board in bench.boards), "trains")
+    bench.begin(build_trains())
     lost, left = bench.boards
     lost.process.kill()
-    killed_s = time.monotonic()
-    wait_for(lambda: left.of("state")[-1]["state"] == "DISARMED", "the other board")
-    assert time.monotonic() - killed_s < LEASE_S + 1.0
-    assert not left.of("gate")[-1]["on"]
-    state = bench.daemon.state()
-    assert state["link"]["state"] == "down"
+    wait_for(lambda: left.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the other board")
+    assert_dark_within_lease(left)
+    state = wait_for(lambda: (s := bench.daemon.state())["link"]["state"] == "down" and s, "the loss")
     assert "stage 'left'" in state["link"]["error"]
 
 
-def test_clocks_that_drift_keep_the_host_s_time(drifting):
+def test_light_that_would_be_late_is_not_emitted(bench):
+    """The link process stands still until both boards have executed all points that they were sent ahead."""
+    bench.arm()
+    plan = bench.begin(build_trains(30.0))
+    link = bench.daemon.find_process("link")
+    os.kill(link, signal.SIGSTOP)
+    try:
+        wait_for(lambda: all(board.of("state")[-1]["state"] != "RUNNING" for board in bench.boards), "the last points")
+        begins = [len(board.events()) for board in bench.boards]
+    finally:
+        os.kill(link, signal.SIGCONT)
+    assert bench.daemon.finished(plan)["status"] == "failed"
+    for board, begin in zip(bench.boards, begins, strict=True):
+        assert_stayed_dark(board, begin)
+
+
+def test_boards_keep_the_host_s_time_as_exactly_as_the_daemon_states(drifting):
     drifting.arm()
-    time.sleep(4.0)
-    answer = drifting.daemon.finished(drifting.daemon.call("POST", "/v1/plans", json=build_trains(8.0))["plan"])
-    assert answer["status"] == "done"
+    errors_s = [drifting.find_clock_error_s()]
+    plan = drifting.begin(build_trains(8.0))
+
+    def look():
+        errors_s.append(drifting.find_clock_error_s())
+        return drifting.daemon.call("GET", f"/v1/plans/{plan}")["status"] in ("done", "failed")
+
+    wait_for(look, "the plan's end")
+    answer = drifting.await_end(plan)
     planned_s, pixel = np.array(answer["pulses"]["start_s"]), np.array(answer["pulses"]["pixel"])
     true_s = [np.array(list_true_s(board, clock)) for board, clock in zip(drifting.boards, CLOCKS, strict=True)]
     spreads_s = []
     for first in (100, 300):  # whichever of the boards drew it
-        errors_s = [true_s[0] - planned_s[pixel == first], true_s[1] - planned_s[pixel == 400 - first]]
-        spreads_s.append(np.ptp(np.concatenate(errors_s)))
-    assert min(spreads_s) < 1e-3
-    drifts = [stage["clock_drift_ppm"] for stage in drifting.daemon.state()["stages"]]
-    assert drifts == pytest.approx([50.0, -50.0], abs=30.0)
+        late_s = [
+            one_s - planned_s[pixel == number][: len(one_s)]
+            for one_s, number in zip(true_s, (first, 400 - first), strict=True)
+        ]
+        spreads_s.append(np.ptp(np.concatenate(late_s)))
+    assert min(spreads_s) <= 2.0 * (max(errors_s) + DRIFT_MAX * SEND_AHEAD_MAX_S)
 
 
 def test_status_shows_the_stages_and_the_commands_select_one(drifting, tmp_path):
     environment = {**os.environ, "OPTODRIVE_URL": drifting.daemon.url, "OPTODRIVE_TOKEN": TOKEN}
 
     def run(*arguments):
-        done = subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment, timeout=60)
+        done = subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
         return done.returncode, done.stdout + done.stderr
 
     wait_for(lambda: drifting.daemon.board_state() == "DISARMED", "both boards")
