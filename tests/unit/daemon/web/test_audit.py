@@ -106,6 +106,6 @@ log.close()
 
 def test_a_write_that_hangs_does_not_keep_the_process_from_ending(tmp_path):
     command = [sys.executable, "-c", HUNG_WRITER, tmp_path / "audit.jsonl"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    ended = subprocess.run(command, capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert "its last entries may be missing" in ended.stdout

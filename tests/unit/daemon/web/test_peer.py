@@ -3,7 +3,6 @@
 import asyncio
 import socket
 import threading
-import time
 from contextlib import contextmanager
 
 import pytest
@@ -38,7 +37,7 @@ class Process:
 
     def close(self):
         self._closing.set()
-        self._thread.join(10)
+        self._thread.join()
         self._server.close()
         self._loop.close()
 
@@ -53,9 +52,8 @@ def running(path):
 
 
 async def wait_for(condition):
-    async with asyncio.timeout(10):
-        while not condition():
-            await asyncio.sleep(0.005)
+    while not condition():
+        await asyncio.sleep(0.005)
 
 
 def run(path, scenario):
@@ -121,7 +119,7 @@ def test_the_process_after_one_that_died_without_reading_is_found(tmp_path):
             listener.listen()
             connection, _ = await asyncio.to_thread(listener.accept)
             waiting = asyncio.ensure_future(peer.call(Message("wait", {}, bytes(5_000_000))))
-            await asyncio.sleep(0.05)
+            await wait_for(lambda: peer._socket.wants_write)
             connection.close()
         with pytest.raises(LinkError, match="does not run"):
             await waiting
@@ -168,15 +166,13 @@ def test_pushed_messages_are_received(tmp_path):
 
 def test_a_large_request_does_not_hold_the_loop(tmp_path):
     async def scenario(peer):
-        gaps, last_s = [], time.monotonic()
+        turns = 0
         call = asyncio.ensure_future(peer.call(Message("echo", {}, bytes(30_000_000))))
         while not call.done():
             await asyncio.sleep(0)
-            now_s = time.monotonic()
-            gaps.append(now_s - last_s)
-            last_s = now_s
+            turns += 1
         assert len(call.result().payload) == 30_000_000
-        assert len(gaps) > 50  # it was sent and received in pieces
+        assert turns > 50  # it was sent and received in pieces
 
     with running(tmp_path / "s"):
         run(tmp_path / "s", scenario)

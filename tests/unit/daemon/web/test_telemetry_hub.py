@@ -62,9 +62,8 @@ class Reader:
                 self.events.append((kind.removeprefix("event: "), data.removeprefix("data: ")))
 
     async def until(self, count):
-        async with asyncio.timeout(10):
-            while len(self.events) < count:
-                await asyncio.sleep(0.002)
+        while len(self.events) < count:
+            await asyncio.sleep(0.002)
         return self.events
 
     async def leave(self):

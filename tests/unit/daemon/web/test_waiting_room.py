@@ -44,7 +44,7 @@ def room(clock, stack):
 @pytest.fixture
 def connect(room, stack):
     def connect(data=b""):
-        link = stack.enter_context(socket.create_connection(("127.0.0.1", room.port), timeout=5))
+        link = stack.enter_context(socket.create_connection(("127.0.0.1", room.port)))
         link.sendall(data)
         return link
 
