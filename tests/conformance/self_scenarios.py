@@ -10,7 +10,7 @@ WATCHDOG = 3
 
 
 def failing(bench, action):
-    """Run a job and break a part of the board; an emulated watchdog may take six seconds."""
+    """Run a job of nine seconds and break a part of the board."""
     host = bench.ready(act(action), **BRIGHT)
     assert host.play(*[here(10_000, dark_us=10_000, duty=2000)] * 450, end=False) == []
     host.wait(host.board.is_gate_on, "light")

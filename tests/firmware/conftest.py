@@ -10,6 +10,7 @@ for folder in ("simulator", "protocol"):  # bench, checks and vectors of the Pyt
 from c_board import CBench  # noqa: E402 - it stands on the bench
 
 from c_core import build_library  # noqa: E402
+from firmware_ports import build_emulated_chip  # noqa: E402
 
 
 @pytest.fixture(scope="session")
@@ -21,6 +22,12 @@ def libraries(tmp_path_factory):
 @pytest.fixture(scope="session")
 def library(libraries):
     return libraries(0)
+
+
+@pytest.fixture(scope="session")
+def chips(tmp_path_factory):
+    """Return a function for the emulated chip of a mutant, 0 for the unmodified core; each is built once."""
+    return cache(partial(build_emulated_chip, tmp_path_factory.mktemp("cortex-m3")))
 
 
 @pytest.fixture

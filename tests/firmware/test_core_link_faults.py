@@ -22,11 +22,23 @@ del test_goodput_of_a_job_at_one_percent_loss  # noqa: F821
 
 
 SEEDS = range(5, 13)
+CHIP_FAULTS = 5_000
 
 
 @pytest.fixture(autouse=True)
 def _c_core_in_every_rig(monkeypatch, library):
     monkeypatch.setattr(python_board, "VirtualRig", partial(VirtualRig, make_core=partial(SeededCBoard, library)))
+
+
+@pytest.mark.slow
+def test_the_emulated_chip_under_link_faults_emits_each_pulse_as_sent_once_and_in_order(chips):
+    rig = VirtualRig(6, 0.05, extra=0.6, pauses=0.001, make_core=chips(0))
+    pulses = 0
+    while rig.faults < CHIP_FAULTS:
+        rig.live(3000, patience_s=4.0)
+        pulses += rig.check()
+    assert pulses > 0
+    rig.core.close()
 
 
 @pytest.mark.parametrize("guard", [1, 12, 13])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
-from firmware_ports import build_emulated_chip
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
@@ -40,14 +39,9 @@ class ChipRig(PlannerRig):
         return BoardGroup([self.session], self.clock)
 
 
-@pytest.fixture(scope="module")
-def make_chip(tmp_path_factory):
-    return build_emulated_chip(tmp_path_factory.mktemp("cortex-m3"))
-
-
 @pytest.mark.parametrize(("name", "given", "count"), EXPERIMENTS)
-def test_an_experiment_is_executed_as_planned(monkeypatch, make_chip, name, given, count):
-    rig = ChipRig(monkeypatch, make_chip).ready().arm()
+def test_an_experiment_is_executed_as_planned(monkeypatch, chips, name, given, count):
+    rig = ChipRig(monkeypatch, chips(0)).ready().arm()
     rig.run(0.01)
     planned = rig.submit(build_pattern(name, given, DISPLAY.config), rig.remote.epoch).result()
     record = rig.store.find(planned.plan)

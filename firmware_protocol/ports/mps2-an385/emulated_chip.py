@@ -70,6 +70,7 @@ class EmulatedChip:
             start_new_session=True,
         )
         self._commands, self._records = self._emulator.stdin, self._emulator.stdout
+        self.pid = self._emulator.pid
         self.close = weakref.finalize(self, _end, self._emulator)
         self._read_until_done()
 
