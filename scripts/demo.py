@@ -18,17 +18,16 @@ from optodrive.core.errors import LinkError, OptodriveError, RefusedError
 from optodrive.daemon.web.tokens import build_tokens_path
 
 PATTERNS = ("showcase", "experiment-1", "experiment-2", "experiment-3", "experiment-4", "experiment-5", "experiment-6")
-START_TIMEOUT_S = 30.0
 COLUMNS = ("pattern", "planned", "sent", "executed", "target µm", "reached µm")
 
 
-def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], DaemonClient]:
+def start_daemon(port: int, config: str | None) -> tuple[subprocess.Popen[bytes], DaemonClient]:
     """Start a daemon and wait until it answers."""
     build_tokens_path(port).unlink(missing_ok=True)
     optodrive = Path(sys.executable).with_name("optodrive")
-    daemon = subprocess.Popen([optodrive, "serve", "--port", str(port)])
-    deadline_s = time.monotonic() + START_TIMEOUT_S
-    while time.monotonic() < deadline_s and daemon.poll() is None:
+    chosen = ["--config", config] if config else []
+    daemon = subprocess.Popen([optodrive, "serve", "--port", str(port), *chosen])
+    while daemon.poll() is None:
         if build_tokens_path(port).exists():
             client = DaemonClient(f"http://127.0.0.1:{port}")
             try:
@@ -38,7 +37,6 @@ def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], DaemonClient]:
             else:
                 return daemon, client
         time.sleep(0.05)
-    daemon.terminate()
     raise RefusedError("the daemon did not start; its message above gives the reason")
 
 
@@ -93,11 +91,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="scripts/demo", description=__doc__)
     parser.add_argument("--seconds", type=float, help="duration of the demo; default: until Ctrl-C")
     parser.add_argument("--port", type=int, default=8450, help="TCP port of the daemon")
+    parser.add_argument("--config", help="file or name of the display's configuration; default: display-437")
     options = parser.parse_args()
     shown: list[tuple[str, Plan]] = []
     daemon = None
     try:
-        daemon, client = start_daemon(options.port)
+        daemon, client = start_daemon(options.port, options.config)
         print("arming: the board's indicator is on for two seconds first", flush=True)
         client.call(ARM)
         started_s = time.monotonic()
@@ -114,7 +113,7 @@ def main() -> int:
     finally:
         if daemon is not None:
             daemon.terminate()
-            daemon.wait(timeout=10)
+            daemon.wait()
     return 0 if shown and print_report(shown) else 1
 
 

@@ -61,8 +61,8 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
     if not calibrated_field:
         loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()
-    board, clock = loaded.board, MonotonicClock()
-    transport, sensor_port = build_bench_transport(build_port_settings(board), config or DEFAULT_CONFIG, stage)
+    clock = MonotonicClock()
+    transport, sensor_port = build_bench_transport(build_port_settings(loaded), config or DEFAULT_CONFIG, stage)
     for signal_number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(signal_number, signal.default_int_handler)
     with ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:

@@ -21,7 +21,7 @@ UNSAFE_REASONS = {
 
 def check_board(config: Config, clock: Clock) -> list[Finding]:
     """Connect to the board, compare its limits with the configuration, measure the round trip, and stay DISARMED."""
-    transport = find_transport_factory(build_port_settings(config.board))()
+    transport = find_transport_factory(build_port_settings(config))()
     session = BoardSession(transport, clock, build_board_requirements(config))
     try:
         session.connect()

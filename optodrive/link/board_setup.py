@@ -1,25 +1,35 @@
 """Port settings and board requirements of a configuration, as the plain numbers that the link works with."""
 
+from dataclasses import asdict, replace
 from math import ceil
 
 import numpy as np
 
 from optodrive.device.config import Config
-from optodrive.device.config_sections import BoardSection
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.pixel_map import build_aim_layout
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
 from optodrive.link.session.board_requirements import TICK_HZ, BoardRequirements, ConfiguredValues
+from optodrive.link.session.plan_job import RETIMING_MAX_TICKS
 from optodrive.link.transport.port_settings import PortSettings
 
 CAP_MARGIN = 1.05
 """Ratio of the board's caps to the limiter's. The board is the second line of defence behind the limiter."""
 FIELD_MARGIN_CODES = 64
+MIRROR_RANGE = ("x_min", "x_max", "y_min", "y_max")
 
 
-def build_port_settings(board: BoardSection) -> PortSettings:
-    """Return the address of the configured board."""
+def build_port_settings(config: Config) -> PortSettings:
+    """Return the address of the board of a configuration with one stage.
+
+    A simulated board is built for the display: its own limits are those that the display requires. Its range of the
+    mirrors is that of the scanner.
+    """
+    board, own_limits = config.board, {}
+    if board.transport == "simulated":
+        limits = permit_retiming(build_board_requirements(config).limits)
+        own_limits = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
     return PortSettings(
         transport=board.transport,
         port=board.port,
@@ -27,7 +37,14 @@ def build_port_settings(board: BoardSection) -> PortSettings:
         vendor_id=board.vendor_id,
         product_id=board.product_id,
         serial_number=board.serial_number,
+        own_limits=own_limits,
     )
+
+
+def permit_retiming(limits: m.Limits) -> m.Limits:
+    """Return limits with the shorter pauses of points that follow the host's clock."""
+    settle_us, rest_us = (max(0, each - RETIMING_MAX_TICKS) for each in (limits.settle_us, limits.rest_us))
+    return replace(limits, settle_us=settle_us, rest_us=rest_us)
 
 
 def build_scales(config: Config) -> tuple[WireScale, ...]:

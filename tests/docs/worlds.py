@@ -16,10 +16,11 @@ from hidden_field import CONFIG, grid_codes, measure_spots
 from hidden_servo import HiddenServo
 from hidden_servo import recording as record_servos
 from labs import lab
-from optodrive.device.config_file import locate_shipped
+from optodrive.device.config_file import list_shipped_configs, locate_shipped
 from optodrive.lab.calibration.spots import write_spots
 from optodrive.lab.recording.writer import write_recording
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
+from rig import config_text
 
 PROGRAMS = Path(sys.executable).parent
 FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "18": 120.5}}]}
@@ -32,8 +33,6 @@ end() {
 }"""
 READ_STATUS = "echo $?"
 SANDBOX = ("--dev-bind", "/", "/", "--unshare-net", "--unshare-pid", "--proc", "/proc", "--die-with-parent")
-TIMEOUT_S = 100.0
-"""Less than the limit of pytest for a test, whose end would tell nothing of the examples."""
 
 
 def find_obstacle():
@@ -100,12 +99,21 @@ def serve(command):
     return ["end", f"{command} > serve.log 2>&1 &", "daemon=$!", WAIT]
 
 
+def write_patient_configs(folder):
+    """Write the shipped configurations with a lease that a stalled computer outlasts; return the folder."""
+    shutil.copytree(locate_shipped(), folder)
+    for name in list_shipped_configs():
+        (folder / f"{name}.toml").write_text(config_text(name=name))
+    return folder
+
+
 def run_script(script, folder):
     """Run a script in a folder with a network, a home and a runtime folder of its own; return what it printed."""
     (folder / "script.sh").write_text(script)
+    configs = write_patient_configs(folder / "configs")
     (folder / "runtime").mkdir(mode=0o700)
     ended = subprocess.run(
-        ["bwrap", *SANDBOX, "--chdir", str(folder), "bash", "script.sh"],
+        ["bwrap", *SANDBOX, "--bind", configs, locate_shipped(), "--chdir", folder, "bash", "script.sh"],
         env={
             "PATH": f"{PROGRAMS}:/usr/bin:/bin",
             "HOME": str(folder),
@@ -115,7 +123,6 @@ def run_script(script, folder):
         },
         capture_output=True,
         text=True,
-        timeout=TIMEOUT_S,
     )
     daemon = folder / "serve.log"
     shown = ended.stderr + (daemon.read_text() if daemon.exists() else "")

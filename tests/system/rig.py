@@ -106,13 +106,14 @@ class Board:
             self.process.stderr.close()
 
 
-def config_text(port, name="display-437", sensor=None, lease_s=PATIENT_LEASE_S):
-    """Return the text of a shipped configuration with the ports of a board and a sensor."""
+def config_text(port=None, name="display-437", sensor=None, lease_s=PATIENT_LEASE_S):
+    """Return the text of a shipped configuration with the ports of a board, by default simulated, and a sensor."""
     text = locate_shipped(f"{name}.toml").read_text()
     lead = f"stream_lead_s = {PATIENT_LEAD_S}\n" if lease_s == PATIENT_LEASE_S else ""
     text, count = re.subn(r"(?m)^lease_s = \S+", f"{lead}lease_s = {lease_s}", text)
     assert count == 1
-    text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)
+    if port is not None:
+        text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)
     return text if sensor is None else f'{text}\n[sensor]\nport = "{sensor}"\n'
 
 

@@ -4,10 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from optodrive.device.config import Config
-from optodrive.link.board_setup import build_board_requirements, build_port_settings
+from optodrive.link.board_setup import build_board_requirements, build_port_settings, permit_retiming
 from optodrive.link.service.settings import BoardSettings, LinkSettings
-from optodrive.link.session.board_requirements import BoardRequirements
-from optodrive.link.session.plan_job import RETIMING_MAX_TICKS
 
 
 def build_link_settings(config: Config, socket_path: Path, socket_mode: int, capture_path: Path | None) -> LinkSettings:
@@ -25,15 +23,10 @@ def build_link_settings(config: Config, socket_path: Path, socket_mode: int, cap
 def build_board_settings(config: Config) -> tuple[BoardSettings, ...]:
     """Build the settings of the boards of all stages."""
     if len(config.stages) < 2:
-        return (BoardSettings(build_port_settings(config.board), build_board_requirements(config)),)
-    return tuple(
-        BoardSettings(build_port_settings(one.board), _permit_retiming(build_board_requirements(one)), stage.name)
-        for stage, one in zip(config.stages, config.list_stage_configs(), strict=True)
-    )
-
-
-def _permit_retiming(requirements: BoardRequirements) -> BoardRequirements:
-    """Let the board accept the shorter pauses of points that follow the host's clock."""
-    limits = requirements.limits
-    settle_us, rest_us = (max(0, each - RETIMING_MAX_TICKS) for each in (limits.settle_us, limits.rest_us))
-    return replace(requirements, limits=replace(limits, settle_us=settle_us, rest_us=rest_us))
+        return (BoardSettings(build_port_settings(config), build_board_requirements(config)),)
+    settings = []
+    for stage, one in zip(config.stages, config.list_stage_configs(), strict=True):
+        requirements = build_board_requirements(one)
+        requirements = replace(requirements, limits=permit_retiming(requirements.limits))
+        settings.append(BoardSettings(build_port_settings(one), requirements, stage.name))
+    return tuple(settings)

@@ -43,6 +43,6 @@ def build_bench_transport(port: PortSettings, display: str, stage: str | None = 
     display: file or shipped name of the configuration; stage: whose board it is, None for the only one
     """
     if port.transport == "simulated":
-        simulated = SimulatedBoard(port.port, port.baud, display, stage)
+        simulated = SimulatedBoard(port, display, stage)
         return simulated, simulated.sensor_port
     return find_transport_factory(port)(), ""

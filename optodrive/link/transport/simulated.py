@@ -8,6 +8,7 @@ from pathlib import Path
 
 from optodrive.core.errors import LinkError
 from optodrive.link.transport.base import TransportKind
+from optodrive.link.transport.port_settings import PortSettings
 from optodrive.link.transport.serial_port import SerialPort
 
 START_TIMEOUT_S = 15.0
@@ -18,15 +19,18 @@ LINGER_S = 5.0
 class SimulatedBoard(SerialPort):
     """Serial port of a board process that open() starts if none is running.
 
+    settings: its address and its own limits
     display: file or shipped name of the configuration; with it the process also simulates a spot sensor
     stage: whose scanner moves the spot, None for the only one
     log: path of the board's log
     sensor_port: port of the spot sensor
     """
 
-    def __init__(self, port: str, baud: int, display: str | None = None, stage: str | None = None) -> None:
+    def __init__(self, settings: PortSettings, display: str | None = None, stage: str | None = None) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="optodrive-board-")
-        super().__init__(port or str(Path(self._folder.name) / "tty"), baud)
+        super().__init__(settings.port or str(Path(self._folder.name) / "tty"), settings.baud)
+        self._limits = Path(self._folder.name) / "limits.toml"
+        self._limits.write_text("".join(f"{name} = {value}\n" for name, value in settings.own_limits.items()))
         self.log = Path(self._folder.name) / "board.jsonl"
         self.sensor_port = str(Path(self._folder.name) / "sensor")
         self._display, self._stage = display, stage
@@ -49,6 +53,7 @@ class SimulatedBoard(SerialPort):
 
     def _start(self) -> None:
         arguments = ["--pty", self.name, "--log", str(self.log), "--baud", str(self._baud)]
+        arguments += ["--limits", str(self._limits)]
         if self._display is not None:
             arguments += ["--sensor", self.sensor_port, "--config", self._display]
         if self._stage is not None:
@@ -75,4 +80,4 @@ class SimulatedBoard(SerialPort):
             time.sleep(0.01)
 
 
-TRANSPORT = TransportKind("simulated", lambda port: SimulatedBoard(port.port, port.baud))
+TRANSPORT = TransportKind("simulated", SimulatedBoard)

@@ -153,12 +153,16 @@ def test_a_missing_libusb_is_reported(monkeypatch):
         UsbBulk(1, 2).open()
 
 
+def find_factory(**board):
+    config = DISPLAYS["display-16"].config
+    return find_transport_factory(build_port_settings(config.model_copy(update={"board": BoardSection(**board)})))
+
+
 def test_the_registry_builds_the_configured_transport():
-    board = BoardSection(transport="usb", vendor_id=0x1209, product_id=1, serial_number="A1")
-    assert find_transport_factory(build_port_settings(board))().name == "usb 1209:0001 A1"
-    serial = build_port_settings(BoardSection(transport="serial", port="/dev/ttyX"))
-    assert find_transport_factory(serial)().name == "/dev/ttyX"
+    usb_board = find_factory(transport="usb", vendor_id=0x1209, product_id=1, serial_number="A1")
+    assert usb_board().name == "usb 1209:0001 A1"
+    assert find_factory(transport="serial", port="/dev/ttyX")().name == "/dev/ttyX"
     stated = get_args(BoardSection.model_fields["transport"].annotation)
     assert {*(kind.name for kind in iterate_transports()), "helios"} == set(stated)
     with pytest.raises(InputError, match="the daemon cannot use a Helios"):
-        find_transport_factory(build_port_settings(BoardSection(transport="helios")))
+        find_factory(transport="helios")
