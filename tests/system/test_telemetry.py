@@ -8,7 +8,6 @@ import re
 import socket
 import subprocess
 import threading
-import time
 
 import httpx
 import numpy as np
@@ -22,10 +21,11 @@ from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
 
 
 class Reader:
-    """Reader of the telemetry in a thread, with events as (time, kind, data)."""
+    """Reader of the telemetry in a thread, with events as (kind, data). was_cut: whether the stream broke off."""
 
     def __init__(self, daemon, query=""):
         self.events = []
+        self.was_cut = False
         self.ended = threading.Event()
         self._closing = False
         self._url = f"{daemon.url}/v1/telemetry{query}"
@@ -36,31 +36,31 @@ class Reader:
         headers = {"Authorization": f"Bearer {TOKEN}"}
         kind = None
         try:
-            with httpx.stream("GET", self._url, headers=headers, timeout=30) as answer:
+            with httpx.stream("GET", self._url, headers=headers, timeout=None) as answer:
                 assert answer.headers["content-type"].startswith("text/event-stream")
                 for line in answer.iter_lines():
                     if line.startswith("event: "):
                         kind = line[7:]
                     elif line.startswith("data: "):
                         EVENTS[kind].model_validate_json(line[6:])
-                        self.events.append((time.monotonic(), kind, json.loads(line[6:])))
+                        self.events.append((kind, json.loads(line[6:])))
                     if self._closing:
                         return
         except httpx.TransportError:
-            pass
+            self.was_cut = True
         finally:
             self.ended.set()
 
     def of(self, kind):
-        return [(at_s, data) for at_s, name, data in list(self.events) if name == kind]
+        return [data for name, data in list(self.events) if name == kind]
 
     def last(self, kind):
         found = self.of(kind)
-        return found[-1][1] if found else None
+        return found[-1] if found else None
 
     def close(self):
         self._closing = True
-        self._thread.join(10)
+        self._thread.join()
 
 
 @pytest.fixture
@@ -78,8 +78,13 @@ def reader(daemon):
 
 def executed(follower, plan):
     """Return the executed batches of a plan. Batches of earlier plans may be repeated."""
-    batches = [batch for _, event in follower.of("pulses") for batch in event["executed"]]
+    batches = [batch for event in follower.of("pulses") for batch in event["executed"]]
     return [batch for batch in batches if batch["plan"] == plan]
+
+
+def list_rows(follower, plan):
+    """Return the rows of a plan that are reported as executed."""
+    return [row for batch in executed(follower, plan) for row in batch["row"]]
 
 
 def heights_um(event):
@@ -92,29 +97,28 @@ def celsius(event):
 
 def test_a_new_reader_gets_all_events_at_once(daemon, reader):
     follower = reader()
-    wait_for(lambda: {"state", "display", "budget", "fault"} <= {kind for _, kind, _ in follower.events}, "one of each")
+    wait_for(lambda: {"state", "display", "budget", "fault"} <= {kind for kind, _ in follower.events}, "one of each")
     assert follower.last("state")["board"]["state"] == "DISARMED"
     assert follower.last("fault")["fault"] is None
     assert len(heights_um(follower.last("display"))) == 437
     wait_for(lambda: not follower.last("display")["warm"], "the last test's heat to be gone")
     assert set(celsius(follower.last("display")).tolist()) == {20.0}
-    wait_for(lambda: len(follower.of("state")) >= 6, "states")
-    times = [at_s for at_s, _ in follower.of("state")]
-    assert (times[-1] - times[0]) / (len(times) - 1) < 0.8
+    states = len(follower.of("state"))
+    wait_for(lambda: len(follower.of("state")) >= states + 3, "states though nothing changes")
 
 
 def test_the_display_event_agrees_with_the_executed_pulses(daemon, reader):
     follower = reader("?rate_hz=60")
     daemon.arm()
     answer = daemon.call(
-        "POST", "/v1/plans", json={"frames": [{"show_at_s": 0.5, "duration_s": 1, "target_um": {"17": 150}}]}
-    )  # a pulse half a second ahead is announced also on a busy computer
+        "POST", "/v1/plans", json={"frames": [{"show_at_s": 1.5, "duration_s": 1, "target_um": {"17": 150}}]}
+    )
     done = daemon.finished(answer["plan"])
     wait_for(
         lambda: (
             follower.of("display")
             and not follower.last("display")["warm"]
-            and any(e["warm"] for _, e in follower.of("display"))
+            and any(event["warm"] for event in follower.of("display"))
         ),
         "warm, then cold",
     )
@@ -123,14 +127,14 @@ def test_the_display_event_agrees_with_the_executed_pulses(daemon, reader):
     (batch,) = batches
     heat = DisplayModel.from_config(load_config()).build_cold_heat()
     heat.apply_pulses(*(np.array(batch[key]) for key in ("pixel", "start_s", "width_s", "power_w")))
-    events = [event for _, event in follower.of("display") if heights_um(event).any()]
-    assert len(events) > 3
+    events = [event for event in follower.of("display") if heights_um(event).any()]
+    assert events
     for event in events:
         expected = heat.state_at(event["board_s"])
         assert heights_um(event) == pytest.approx(expected.displacement_m * 1e6, abs=0.2)
         assert celsius(event) == pytest.approx(20.0 + expected.absorber_k, abs=0.2)
     assert max(heights_um(event)[17] for event in events) < done["simulated_max_um"] + 0.2
-    announced = [batch for _, event in follower.of("pulses") for batch in event["planned"]]
+    announced = [batch for event in follower.of("pulses") for batch in event["planned"]]
     planned = [batch for batch in announced if batch["plan"] == answer["plan"]]
     assert planned[0]["start_s"] == pytest.approx(batches[0]["start_s"], abs=2e-3)
     assert planned[0]["width_s"] == pytest.approx(batches[0]["width_s"], abs=1e-6)
@@ -143,12 +147,8 @@ def test_every_executed_pulse_is_reported_once_even_without_a_reader_at_first(da
     wait_for(lambda: daemon.state()["totals"]["executed"] > before + 20, "emission before the first reader")
     follower = reader()
     daemon.finished(answer["plan"])
-
-    def rows():
-        return [row for batch in executed(follower, answer["plan"]) for row in batch["row"]]
-
-    wait_for(lambda: len(rows()) >= answer["planned"], "all pulses")
-    assert sorted(rows()) == list(range(answer["planned"]))
+    wait_for(lambda: len(list_rows(follower, answer["plan"])) >= answer["planned"], "all pulses")
+    assert sorted(list_rows(follower, answer["plan"])) == list(range(answer["planned"]))
 
 
 def test_a_stop_is_reported_and_unexecuted_pulses_do_not_count(daemon, reader):
@@ -159,11 +159,7 @@ def test_a_stop_is_reported_and_unexecuted_pulses_do_not_count(daemon, reader):
     daemon.call("POST", "/v1/stop")
     wait_for(lambda: follower.last("state")["board"]["state"] == "DISARMED", "the state event")
     plan = daemon.finished(answer["plan"])
-
-    def rows():
-        return sum(len(batch["row"]) for batch in executed(follower, answer["plan"]))
-
-    wait_for(lambda: rows() == plan["executed"], "what was executed")
+    wait_for(lambda: len(list_rows(follower, answer["plan"])) == plan["executed"], "what was executed")
     wait_for(lambda: not follower.last("display")["warm"], "cold")
 
 
@@ -175,13 +171,14 @@ def test_trimmed_pulses_have_their_reason_and_the_budget_rises(daemon, reader):
     answer = daemon.call("POST", "/v1/plans", json=train)
     assert answer["summary"]["trimmed"]["pulses"]
     daemon.finished(answer["plan"])
+    wait_for(lambda: len(list_rows(follower, answer["plan"])) == answer["planned"], "all pulses")
     batches = executed(follower, answer["plan"])
     reasons = {
         reason for batch in batches for reason, taken in zip(batch["reason"], batch["trimmed_j"], strict=True) if taken
     }
     assert reasons == set(answer["summary"]["trimmed"]["by_reason"])
     shares = {cap["cap"]: [] for cap in follower.last("budget")["caps"]}
-    for _, event in follower.of("budget"):
+    for event in follower.of("budget"):
         for cap in event["caps"]:
             shares[cap["cap"]].append(cap["fraction"])
             assert cap["fraction"] <= 1.01
@@ -198,7 +195,8 @@ def test_a_stalled_reader_does_not_block(daemon, reader):
     answer = daemon.call("POST", "/v1/plans", json=long_train(seconds=3.0))
     assert daemon.finished(answer["plan"])["status"] == "done"
     assert daemon.state()["board"]["underruns"] == 0
-    assert len(follower.of("display")) > 10
+    wait_for(lambda: len(list_rows(follower, answer["plan"])) == answer["planned"], "all pulses")
+    assert any(event["warm"] for event in follower.of("display"))
     stuck.close()
     assert daemon.call("POST", "/v1/stop")["board"]["state"] == "DISARMED"
 
@@ -208,8 +206,9 @@ def test_sigterm_does_not_wait_for_telemetry_readers(make_board, make_daemon):
     follower = Reader(daemon)
     wait_for(lambda: follower.events, "events")
     daemon.process.terminate()
-    assert daemon.process.wait(timeout=10) == 0
-    assert follower.ended.wait(5)
+    assert daemon.process.wait() == 0
+    follower.ended.wait()
+    assert not follower.was_cut, "the daemon waited for the reader until it cut its stream"
     assert "Traceback" not in daemon.errors.read_text()
 
 
@@ -255,8 +254,8 @@ def test_a_terminal_alone_is_shown_the_address_with_the_token(make_board, tmp_pa
         address = re.search(r"(http://127\.0\.0\.1:\d+/)#token=(\S+)", text)
         assert address
         assert address.group(2) == TOKEN
-        assert httpx.get(address.group(1)).status_code == 401
+        assert httpx.get(address.group(1), timeout=None).status_code == 401
     finally:
         process.terminate()
-        process.wait(timeout=10)
+        process.wait()
         os.close(leader)
