@@ -236,6 +236,20 @@ def test_a_snapshot_starts_a_dry_run(web):
     wait_for(look, "the end of the tests' earlier plans")
 
 
+def test_a_report_that_cannot_be_encoded_is_answered_as_an_error(web, monkeypatch):
+    """Or its caller would wait and never hear of it."""
+
+    def encode(report):
+        raise MemoryError
+
+    plan = web.report(web.submit(build_train(0.1))).plan
+    monkeypatch.setattr(planner_server, "iterate_json", encode)
+    for request in (web.request("get_plan", plan=plan, pulses=True), web.submit(build_train(0.1))):
+        answer = web.result(request)
+        assert answer.fields["status"] == 500
+        assert "MemoryError" in json.loads(answer.payload)["detail"]
+
+
 def test_the_metrics_are_text(web):
     text = web.result(web.request("metrics")).payload.decode()
     assert "optodrive_link_up 1" in text

@@ -246,19 +246,18 @@ def _fail(error: BaseException) -> None:
 
 
 def _encode(get_report: Callable[[], PlanReport], status: int) -> tuple[int, bytes, dict[str, object]]:
-    """Return status, JSON and audit fields of a report, or of the problem that its future holds."""
+    """Return status, JSON and audit fields of a report, or of the problem that kept it from being made or encoded."""
     try:
         report = get_report()
+        audit: dict[str, object] = {
+            "plan": report.plan,
+            "pattern": report.name,
+            "pulses": report.planned,
+            "plan_status": report.status,
+        }
+        return status, b"".join(iterate_json(report)), audit
     except OptodriveError as error:
         problem = build_error_problem(error)
-        return problem.status, problem.to_json(), {}
     except Exception as error:
         problem = build_error_problem(OptodriveError(f"{type(error).__name__}: {error}"))
-        return problem.status, problem.to_json(), {}
-    audit: dict[str, object] = {
-        "plan": report.plan,
-        "pattern": report.name,
-        "pulses": report.planned,
-        "plan_status": report.status,
-    }
-    return status, b"".join(iterate_json(report)), audit
+    return problem.status, problem.to_json(), {}
