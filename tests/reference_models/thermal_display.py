@@ -6,9 +6,9 @@ It shares no code with the limiter and the physics package.
 from dataclasses import dataclass
 from math import inf
 
-import numba
 import numpy as np
 
+from optodrive.core.kernels import array_kernel
 from optodrive.core.types.plans import EMPTY_PLAN, PulsePlan
 from optodrive.device.config_sections import DisplaySection
 from optodrive.device.neighbours import Neighbours
@@ -33,7 +33,7 @@ SETTLED_AFTER_S = 3.0
 """Time after a pulse, s, after which absorbers and gas have settled to their walls: over twenty time constants."""
 
 
-@numba.njit(cache=False)
+@array_kernel
 def _fill_leaving_w(y, leaving_w, numbers, neighbours, frame_edges):
     """Fill in the heat flow from each wall [p], W, to the panel and to its neighbours; return that to the panel."""
     rw, rx, rf, into_panel_w = numbers[6], numbers[8], numbers[9], 0.0
@@ -46,7 +46,7 @@ def _fill_leaving_w(y, leaving_w, numbers, neighbours, frame_edges):
     return into_panel_w
 
 
-@numba.njit(cache=False)
+@array_kernel
 def _rates(y, out, power_w, numbers, neighbours, frame_edges):
     """Compute dy/dt of y [5, p], light power_w [p]: absorber, gas, wall and touch surface, and the panel in y[4, 0]."""
     eps, r, c, ambient_k, n, tau_g, _, cw, _, _, fg, fw, lag, rp, cp = numbers
@@ -64,7 +64,7 @@ def _rates(y, out, power_w, numbers, neighbours, frame_edges):
         out[4, 0] = (into_panel - y[4, 0] / rp) / cp
 
 
-@numba.njit(cache=False)
+@array_kernel
 def _slow_rates(y, out, numbers, neighbours, frame_edges):
     """Compute dy/dt of walls, touch surfaces and panel when absorbers and gas have settled to their walls."""
     _, _, c, _, _, _, _, cw, _, _, fg, fw, lag, rp, cp = numbers
@@ -77,10 +77,19 @@ def _slow_rates(y, out, numbers, neighbours, frame_edges):
         out[4, 0] = (into_panel - y[4, 0] / rp) / cp
 
 
-@numba.njit(cache=False)
+@array_kernel
+def _advance(y, h, rate, out):
+    """Compute y + h · rate and return it: in loops, which take a tenth of the time to compile that array sums do."""
+    for kind in range(y.shape[0]):
+        for i in range(y.shape[1]):
+            out[kind, i] = y[kind, i] + h * rate[kind, i]
+    return out
+
+
+@array_kernel
 def _rest(y, peak, time_s, numbers, neighbours, frame_edges):
     """Integrate a rest with settled absorbers and gas by Heun's method."""
-    k1, k2 = np.empty_like(y), np.empty_like(y)
+    k1, k2, ahead = np.empty_like(y), np.empty_like(y), np.empty_like(y)
     _, _, _, _, _, _, rw, cw, rx, rf, _, _, lag, _, _ = numbers
     longest = 1.0
     if cw > 0.0:
@@ -91,20 +100,22 @@ def _rest(y, peak, time_s, numbers, neighbours, frame_edges):
     h = time_s / steps
     for _ in range(steps):
         _slow_rates(y, k1, numbers, neighbours, frame_edges)
-        _slow_rates(y + h * k1, k2, numbers, neighbours, frame_edges)
-        y += 0.5 * h * (k1 + k2)
+        _slow_rates(_advance(y, h, k1, ahead), k2, numbers, neighbours, frame_edges)
         for kind in range(2, 5):
-            peak[kind] = max(peak[kind], y[kind].max())
+            for i in range(y.shape[1]):
+                y[kind, i] += 0.5 * h * (k1[kind, i] + k2[kind, i])
+                peak[kind] = max(peak[kind], y[kind, i])
     y[0] = y[1] = y[2]
 
 
-@numba.njit(cache=False)
+@array_kernel
 def _integrate(y, peak, at, pixel, watts, until, numbers, neighbours, frame_edges, on_step, off_step):
     """Integrate by the fourth-order Runge–Kutta method between edges; peak [5] receives the maximum of each kind.
 
     at, pixel, watts: [e] light on a pixel from an edge on
     """
     k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
+    ahead = np.empty_like(y)
     power, now = np.zeros(y.shape[1]), 0.0
     for edge in range(len(at) + 1):
         end = at[edge] if edge < len(at) else until
@@ -117,9 +128,9 @@ def _integrate(y, peak, at, pixel, watts, until, numbers, neighbours, frame_edge
             h = (end - now) / steps
             for _ in range(steps):
                 _rates(y, k1, power, numbers, neighbours, frame_edges)
-                _rates(y + 0.5 * h * k1, k2, power, numbers, neighbours, frame_edges)
-                _rates(y + 0.5 * h * k2, k3, power, numbers, neighbours, frame_edges)
-                _rates(y + h * k3, k4, power, numbers, neighbours, frame_edges)
+                _rates(_advance(y, 0.5 * h, k1, ahead), k2, power, numbers, neighbours, frame_edges)
+                _rates(_advance(y, 0.5 * h, k2, ahead), k3, power, numbers, neighbours, frame_edges)
+                _rates(_advance(y, h, k3, ahead), k4, power, numbers, neighbours, frame_edges)
                 for kind in range(5):
                     for i in range(y.shape[1] if kind < 4 else 1):
                         y[kind, i] += h / 6 * (k1[kind, i] + 2 * k2[kind, i] + 2 * k3[kind, i] + k4[kind, i])
@@ -187,7 +198,7 @@ def build_true_display(model, factor=None):
     return TrueDisplay(numbers, np.array(model.neighbours), np.array(model.frame_edges))
 
 
-@numba.njit(cache=False)
+@array_kernel
 def _coil(at_s, command_rad, until_s, omega, damping, delay_s, slew, mean_s):
     """Return the peak exponential mean of one servo's squared acceleration, rad²/s⁴, by fourth-order Runge–Kutta."""
     angle, speed, target, mean, maximum, now = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
