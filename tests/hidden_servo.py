@@ -49,19 +49,20 @@ class HiddenServo:
     def follow(self, at_s, command_rad, t_s):
         """Return the angles at t_s, integrated between breakpoints."""
         times, places = self.knots(at_s, command_rad)
-        omega = 2.0 * np.pi * self.hz
+        stiffness, friction = (2.0 * np.pi * self.hz) ** 2, 4.0 * np.pi * self.damping * self.hz
 
-        def rate(now_s, state):
-            target = np.interp(now_s, times, places)
-            return [state[1], omega**2 * (target - state[0]) - 2.0 * self.damping * omega * state[1]]
+        def rate(now_s, state, begin_s, place, slope):
+            angle, speed = state.tolist()
+            return [speed, stiffness * (place + slope * (now_s - begin_s) - angle) - friction * speed]
 
         out, state = np.full(len(t_s), float(command_rad[0])), [command_rad[0], 0.0]
-        edges = [*times, max(t_s[-1], times[-1]) + 1e-9]
-        for begin_s, end_s in pairwise(edges):
+        edges = zip([*times, max(t_s[-1], times[-1]) + 1e-9], [*places, places[-1]], strict=True)
+        for (begin_s, place), (end_s, next_place) in pairwise(edges):
             inside = (t_s >= begin_s) & (t_s < end_s)
             if end_s > begin_s:
+                line = (float(begin_s), float(place), float((next_place - place) / (end_s - begin_s)))
                 solved = solve_ivp(
-                    rate, (begin_s, end_s), state, method="DOP853", rtol=1e-9, atol=1e-13, dense_output=True
+                    rate, (begin_s, end_s), state, "DOP853", args=line, rtol=1e-9, atol=1e-13, dense_output=True
                 )
                 out[inside] = solved.sol(t_s[inside])[0] if inside.any() else 0.0
                 state = solved.y[:, -1]

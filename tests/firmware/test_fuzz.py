@@ -40,7 +40,11 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("fuzz")
 
 
-@pytest.mark.parametrize("counts", [INPUTS, pytest.param(LONG_INPUTS, marks=pytest.mark.slow)], ids=["few", "many"])
+@pytest.mark.parametrize(
+    "counts",
+    [INPUTS, pytest.param(LONG_INPUTS, marks=[pytest.mark.slow, pytest.mark.timeout(600)])],
+    ids=["few", "many"],
+)
 def test_nothing_is_found(folder, counts):
     fuzzers = [start(build(folder, target), count) for target, count in counts.items()]
     for fuzzer in fuzzers:
@@ -59,6 +63,7 @@ def test_what_was_found_is_mended(folder, what):
     assert fuzzer.returncode == 0, reported[-5000:]
 
 
+@pytest.mark.timeout(600)  # of the inputs that a core whose fault is not noticed would take
 @pytest.mark.parametrize(
     ("target", "mutant", "says"),
     [

@@ -110,7 +110,7 @@ def assert_in_order(run):
         assert not np.any(np.isinf(signal.value))
 
 
-@settings(max_examples=30)
+@settings(max_examples=3 * settings.default.max_examples // 10)
 @given(st.data())
 def test_bytes_changed_or_cut_off(valid, path, data):
     with pytest.MonkeyPatch.context() as patch:

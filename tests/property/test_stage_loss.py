@@ -106,10 +106,14 @@ def patch(monkeypatch):
     return monkeypatch
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.parametrize("kind", KINDS)
+@settings(
+    max_examples=settings.default.max_examples // 20,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(
     count=st.integers(2, 4),
-    kind=st.sampled_from(KINDS),
     stage=st.integers(0, 3),
     trains=st.booleans(),
     streamed=st.booleans(),
