@@ -7,7 +7,6 @@ emitted: all boards drop their points, and stay armed.
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
 from functools import partial
 from math import inf
 from typing import Any
@@ -95,8 +94,7 @@ class BoardGroup:
         if not self.has_several:
             return boards[0]
         faulty = next((board for board in boards if board.fault), boards[0])
-        values = {item.name: getattr(faulty, item.name) for item in fields(BoardView)}
-        values |= {name: sum(getattr(board, name) for board in boards) for name in SUMS}
+        values = vars(faulty) | {name: sum(getattr(board, name) for board in boards) for name in SUMS}
         values["free_points"] = min(board.free_points for board in boards)
         values["temperature_c"] = max((b.temperature_c for b in boards if b.temperature_c is not None), default=None)
         values["state"] = min((board.state for board in boards), key=STATE_ORDER.index)

@@ -37,6 +37,19 @@ class ClockFit(NamedTuple):
         return self.host_s + (board_s - self.board_s) / self.rate
 
 
+class _FittedLine(NamedTuple):
+    """A fit as of its last exchange.
+
+    samples: those it was fitted to; drift: bound on the error of its rate
+    narrowest: exchange that bounds the error of the fit, round trip and middle, s
+    """
+
+    samples: tuple[tuple[float, float, float], ...]
+    fit: ClockFit
+    drift: float
+    narrowest: tuple[float, float]
+
+
 class ClockSync:
     """Map from host time to board time (ticks / tick_hz). One thread adds samples, any thread may read.
 
@@ -48,6 +61,8 @@ class ClockSync:
         self._request_s: dict[int, float] = {}
         # An immutable tuple, because another thread may be reading it.
         self._samples: tuple[tuple[float, float, float], ...] = ()
+        self._best: tuple[float, float] | None = None
+        self._line: _FittedLine | None = None
 
     def start_exchange(self, request_s: float) -> int:
         """Record a request sent at request_s and return its random stamp."""
@@ -64,6 +79,8 @@ class ClockSync:
             return
         sample = (reply_s - request_s, (request_s + reply_s) / 2, board_s)
         self._samples = (*self._samples[1 - self._samples_max :], sample)
+        # All brackets widen alike, so that the narrowest is the same at all times.
+        self._best = min(self._samples, key=lambda each: each[0] - DRIFT_MAX * each[1])[1:]
 
     @property
     def is_synchronised(self) -> bool:
@@ -75,44 +92,49 @@ class ClockSync:
         """Shortest round trip of the recent samples, s, None without any."""
         return min((sample[0] for sample in self._samples), default=None)
 
-    def find_best_sample(self, host_s: float) -> tuple[float, float] | None:
-        """Return host time and board time, s, of the narrowest exchange as of host_s; None before the first."""
-        samples = self._samples
-        if not samples:
-            return None
-        best = min(samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
-        return best[1:]
+    @property
+    def best_sample(self) -> tuple[float, float] | None:
+        """Host time and board time, s, of the exchange whose bracket is the narrowest now; None before the first."""
+        return self._best
 
     def fit(self, host_s: float) -> ClockFit | None:
         """Fit the line to the recent exchanges, None before the first.
 
         An exchange counts by the inverse square of its width. With few of them, the rate stays near 1.
         """
-        samples = self._samples
+        samples, line = self._samples, self._line
         if not samples:
             return None
-        weights = [1.0 / max(width_s, WIDTH_MIN_S) ** 2 for width_s, _, _ in samples]
-        total = sum(weights)
-        mean_s = sum(w * midpoint_s for w, (_, midpoint_s, _) in zip(weights, samples, strict=True)) / total
-        ahead_s = [board_s - midpoint_s for _, midpoint_s, board_s in samples]
-        mean_ahead_s = sum(w * each for w, each in zip(weights, ahead_s, strict=True)) / total
-        spread = covariance = 0.0
-        for w, (_, midpoint_s, _), each in zip(weights, samples, ahead_s, strict=True):
-            spread += w * (midpoint_s - mean_s) ** 2
-            covariance += w * (midpoint_s - mean_s) * (each - mean_ahead_s)
-        rate = 1.0 + covariance / (spread + 1.0 / DRIFT_MAX**2)
-        at_s = samples[-1][1]
-        drift = _bound_drift(samples)
-        uncertainty_s = min(width_s / 2 + drift * (host_s - midpoint_s) for width_s, midpoint_s, _ in samples)
-        return ClockFit(at_s, mean_s + mean_ahead_s + rate * (at_s - mean_s), rate, uncertainty_s)
+        if line is None or line.samples is not samples:
+            line = self._line = _fit_line(samples)
+        width_s, midpoint_s = line.narrowest
+        return line.fit._replace(uncertainty_s=width_s / 2 + line.drift * (host_s - midpoint_s))
 
     def board_s(self, host_s: float) -> float:
         """Return the board time at host time host_s, s, or 0 before the first exchange."""
-        sample = self.find_best_sample(host_s)
-        if sample is None:
+        if self._best is None:
             return 0.0
-        midpoint_s, board_s = sample
+        midpoint_s, board_s = self._best
         return board_s + (host_s - midpoint_s)
+
+
+def _fit_line(samples: tuple[tuple[float, float, float], ...]) -> _FittedLine:
+    """Fit the line, an exchange by the inverse square of its width."""
+    weights = [1.0 / max(width_s, WIDTH_MIN_S) ** 2 for width_s, _, _ in samples]
+    total = sum(weights)
+    mean_s = sum(w * midpoint_s for w, (_, midpoint_s, _) in zip(weights, samples, strict=True)) / total
+    ahead_s = [board_s - midpoint_s for _, midpoint_s, board_s in samples]
+    mean_ahead_s = sum(w * each for w, each in zip(weights, ahead_s, strict=True)) / total
+    spread = covariance = 0.0
+    for w, (_, midpoint_s, _), each in zip(weights, samples, ahead_s, strict=True):
+        spread += w * (midpoint_s - mean_s) ** 2
+        covariance += w * (midpoint_s - mean_s) * (each - mean_ahead_s)
+    rate = 1.0 + covariance / (spread + 1.0 / DRIFT_MAX**2)
+    at_s = samples[-1][1]
+    drift = _bound_drift(samples)
+    width_s, midpoint_s, _ = min(samples, key=lambda sample: sample[0] / 2 - drift * sample[1])
+    fit = ClockFit(at_s, mean_s + mean_ahead_s + rate * (at_s - mean_s), rate, width_s / 2)
+    return _FittedLine(samples, fit, drift, (width_s, midpoint_s))
 
 
 def _bound_drift(samples: Sequence[tuple[float, float, float]]) -> float:

@@ -115,7 +115,7 @@ class BoardSession:
     @property
     def clock_sample(self) -> tuple[float, float] | None:
         """Host time and board time of the exchange that board_s() uses, s, None before the first."""
-        return self._clock_sync.find_best_sample(self._clock.now_s())
+        return self._clock_sync.best_sample
 
     @property
     def is_ready(self) -> bool:
