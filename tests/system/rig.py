@@ -96,6 +96,11 @@ class Board:
         """Ignore the events logged so far."""
         self._forgotten += len(self.events())
 
+    def all_of(self, kind):
+        """Return all events of a kind, the forgotten ones too."""
+        self.events()
+        return [event for event in self._events if event["event"] == kind]
+
     def of(self, kind):
         return [event for event in self.events() if event["event"] == kind]
 

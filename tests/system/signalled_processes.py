@@ -63,7 +63,7 @@ def assert_stayed_dark(board, begin):
 
 def assert_dark_within_lease(board, lease_s=PATIENT_LEASE_S):
     """Assert, in the board's own time, that its gate is off from the end of the last lease that it received."""
-    leases, gates = board.of("lease"), board.of("gate")
+    leases, gates = board.all_of("lease"), board.of("gate")
     if gates:
         assert gates[-1]["on"] is False
         assert leases[-1]["until_us"] - leases[-1]["t_us"] <= lease_s * 1e6

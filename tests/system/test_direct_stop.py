@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 
 import pytest
 
@@ -10,9 +9,6 @@ from forked_process import run_process
 from optodrive.daemon.runtime_folder import find_link_socket
 from optodrive.link.service.operator_client import stop_board
 from rig import OPTODRIVE, long_train, running, wait_for
-
-STATE_TIMEOUT_S = 2.0
-PATIENCE_S = 10.0
 
 
 def find_others(daemon):
@@ -45,15 +41,12 @@ def test_stop_needs_only_the_link_process(board, daemon, tmp_path, suspended):
     assert len(others) == 5
     suspended(others)
     environment = {name: value for name, value in os.environ.items() if name != "OPTODRIVE_TOKEN"}  # none is needed
-    begin_s = time.monotonic()
     ended = run_process(
         [OPTODRIVE, "stop", "--url", daemon.url],
         env=environment | {"XDG_RUNTIME_DIR": str(tmp_path), "OPTODRIVE_TOKENS": str(tmp_path / "none")},
         capture_output=True,
         text=True,
-        timeout=PATIENCE_S,
     )
-    print(f"\noptodrive stop took {time.monotonic() - begin_s:.2f} s")
     assert ended.returncode == 0, ended.stderr
     assert "the board was stopped" in ended.stderr
     assert "Traceback" not in ended.stderr
@@ -71,7 +64,6 @@ def test_a_second_daemon_on_the_same_socket_leaves_the_direct_stop_of_the_first(
             env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
             capture_output=True,
             text=True,
-            timeout=PATIENCE_S,
         )
         assert second.returncode == 2
         assert "daemon.socket: got" in second.stderr

@@ -1,14 +1,12 @@
 """Engine on a simulated board process, in real time."""
 
 import threading
-import time
 
 import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError, NotReadyError, RefusedError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.engine.planner import STALL_TIMEOUT_S
 from optodrive.daemon.engine.request_body import BuiltRequest
 from rig import ended, wait_for
 
@@ -26,22 +24,21 @@ def train(seconds):
 def test_a_stalled_planner_lets_the_lease_expire(armed, board):
     hang = threading.Event()
     future = armed.submit(lambda: BuiltRequest(hang.wait() and frame()), "hangs")
-    begun_s = time.monotonic()
     wait_for(lambda: armed.board_state == "FAULT", "the lease to expire")
-    assert time.monotonic() - begun_s > 0.9 * STALL_TIMEOUT_S
     assert board.of("fault")[-1]["fault"] == "LINK"
+    assert "planner made no progress" in armed.web.status["epoch_reason"]
     hang.set()
     with pytest.raises(StoppedError, match="went to FAULT"):
-        future.result(10)
+        future.result()
 
 
-def test_a_busy_planner_keeps_the_lease(armed):
+def test_a_busy_planner_keeps_the_lease(armed, board):
     long_one = train(200.0)
     answers = [armed.submit(lambda: BuiltRequest(long_one), "long") for _ in range(3)]
     for answer in answers:
-        assert answer.result(60).planned == 10_000
+        assert answer.result().planned == 10_000
     assert armed.board_state == "RUNNING"
-    assert armed.snapshot().board.underruns == 0
+    assert not board.of("fault")
 
 
 def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
@@ -49,9 +46,9 @@ def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
     heated[17] = 300e-6
     lead = frame(100.0, pixel=100, duration_s=1.0).frames[0]  # time to hand over the second, which must not be late
     sequence = FrameSequence((lead, TactileFrame("f", 1.0, 0.05, heated)))
-    first = armed.submit(lambda: BuiltRequest(sequence), "first").result(10)
-    second = armed.submit(lambda: BuiltRequest(frame(350.0)), "second").result(10)
-    rest = armed.submit(lambda: BuiltRequest(frame(350.0, pixel=300)), "rest").result(10)
+    first = armed.submit(lambda: BuiltRequest(sequence), "first").result()
+    second = armed.submit(lambda: BuiltRequest(frame(350.0)), "second").result()
+    rest = armed.submit(lambda: BuiltRequest(frame(350.0, pixel=300)), "rest").result()
     assert second.pulses.energy_j[0] < 0.99 * rest.pulses.energy_j[0]
     for answer, height_um in ((first, 300.0), (second, 350.0)):
         record = ended(armed, answer)
@@ -60,11 +57,11 @@ def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
 
 
 def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
-    running = armed.submit(lambda: BuiltRequest(train(1.0)), "a").result(10)
-    waiting = armed.submit(lambda: BuiltRequest(train(1.0)), "b").result(10)
-    last = armed.submit(lambda: BuiltRequest(train(0.1)), "c").result(10)
-    assert armed.cancel(waiting.plan).result(10).status == "cancelled"
-    assert ended(armed, running).status == "done"
+    running = armed.submit(lambda: BuiltRequest(train(60.0)), "a").result()
+    waiting = armed.submit(lambda: BuiltRequest(train(1.0)), "b").result()
+    last = armed.submit(lambda: BuiltRequest(train(0.1)), "c").result()
+    assert armed.cancel(waiting.plan).result().status == "cancelled"
+    assert armed.cancel(running.plan).result().status == "cancelled"
     assert ended(armed, last).status == "done"
     assert armed.get_plan(waiting.plan).executed == 0
 
@@ -72,25 +69,26 @@ def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
 def test_the_queue_is_bounded_and_ended_plans_are_dropped(armed, monkeypatch):
     monkeypatch.setattr("optodrive.daemon.engine.engine.QUEUE_MAX", 2)
     monkeypatch.setattr("optodrive.daemon.engine.plan_store.RECORDS_MAX", 3)
-    first = armed.submit(lambda: BuiltRequest(train(1.0)), "first").result(10)
+    first = armed.submit(lambda: BuiltRequest(train(60.0)), "first").result()
     wait_for(lambda: armed.get_plan(first.plan).status == "running", "the first to run")
-    waiting = [armed.submit(lambda: BuiltRequest(train(0.02)), "waiting").result(10) for _ in range(2)]
+    waiting = [armed.submit(lambda: BuiltRequest(train(0.02)), "waiting").result() for _ in range(2)]
     with pytest.raises(NotReadyError, match="2 plans are already waiting"):
-        armed.submit(lambda: BuiltRequest(train(0.02)), "too many").result(10)
-    for answer in (first, *waiting):
+        armed.submit(lambda: BuiltRequest(train(0.02)), "too many").result()
+    armed.cancel(first.plan).result()
+    for answer in waiting:
         assert ended(armed, answer).status == "done"
-    armed.submit(lambda: BuiltRequest(train(0.02)), "one more").result(10)
+    armed.submit(lambda: BuiltRequest(train(0.02)), "one more").result()
     with pytest.raises(InputError, match="plan"):
         armed.get_plan(first.plan)
 
 
 def test_a_blank_plan_is_done_at_once(armed):
-    answer = armed.submit(lambda: BuiltRequest(frame(0.0)), "blank").result(10)
+    answer = armed.submit(lambda: BuiltRequest(frame(0.0)), "blank").result()
     assert ended(armed, answer).status == "done"
 
 
 def test_a_crash_of_the_loop_aborts_the_board(armed, board, monkeypatch):
-    armed.submit(lambda: BuiltRequest(train(5.0)), "long").result(10)
+    armed.submit(lambda: BuiltRequest(train(5.0)), "long").result()
     wait_for(lambda: len(board.of("pulse")) > 10, "pulses")
 
     def crash(*_, **__):
@@ -106,30 +104,30 @@ def test_a_crash_of_the_loop_aborts_the_board(armed, board, monkeypatch):
 
 def test_an_unarmed_board_accepts_no_plans(engine):
     with pytest.raises(NotReadyError, match="arm it first"):
-        engine.submit(lambda: BuiltRequest(frame()), "x").result(10)
+        engine.submit(lambda: BuiltRequest(frame()), "x").result()
 
 
 def test_arming_twice_is_refused(armed):
     with pytest.raises(NotReadyError, match="only a DISARMED board"):
-        armed.arm().result(10)
+        armed.arm().result()
 
 
 def test_after_a_failed_plan_the_board_can_be_armed_again(armed):
-    answer = armed.submit(lambda: BuiltRequest(train(5.0)), "long").result(10)
+    answer = armed.submit(lambda: BuiltRequest(train(5.0)), "long").result()
     wait_for(lambda: armed.get_plan(answer.plan).executed > 10, "pulses")
-    armed.stop().result(10)
+    armed.stop().result()
     record = armed.get_plan(answer.plan)
     assert record.status == "failed"
     assert len(record.executed_pulses.start_s) < record.planned
-    armed.arm().result(10)
-    again = armed.submit(lambda: BuiltRequest(frame(100.0, pixel=200)), "again").result(10)
+    armed.arm().result()
+    again = armed.submit(lambda: BuiltRequest(frame(100.0, pixel=200)), "again").result()
     assert ended(armed, again).status == "done"
 
 
 def test_an_infeasible_plan_is_rejected_by_name(armed):
     with pytest.raises(InputError, match="target_um of pixel 17"):
-        armed.submit(lambda: BuiltRequest(frame(5000.0)), "x").result(10)
+        armed.submit(lambda: BuiltRequest(frame(5000.0)), "x").result()
     with pytest.raises(RefusedError, match="needs"):
-        armed.submit(lambda: BuiltRequest(frame(500.0, duration_s=0.01)), "x", policy="refuse").result(10)
+        armed.submit(lambda: BuiltRequest(frame(500.0, duration_s=0.01)), "x", policy="refuse").result()
     with pytest.raises(InputError, match="plan"):
         armed.get_plan("p99")

@@ -2,15 +2,11 @@
 
 import os
 import signal
-import time
 
 import pytest
 
-from rig import PATIENT_LEASE_S, long_train, wait_for
-
-LEASE_US = round(PATIENT_LEASE_S * 1e6)
-LATENESS_US = 30_000
-"""Maximum scheduling delay of the board process and of this test. The gate times in the log are exact."""
+from rig import long_train, wait_for
+from signalled_processes import assert_dark_within_lease, assert_stayed_dark
 
 
 def start_pulses(board, daemon, seconds=5.0):
@@ -35,11 +31,10 @@ def test_kill_9_while_pulses_run(board, make_daemon):
     daemon = make_daemon(board)
     start_pulses(board, daemon)
     daemon.process.kill()
-    killed_us = board.now_us()
     daemon.process.wait()
     wait_for(lambda: board.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the board to leave RUNNING")
     assert_off_and_unarmed(board, ("DISARMED", "FAULT"))
-    assert board.of("gate")[-1]["t_us"] <= killed_us + LEASE_US + LATENESS_US
+    assert_dark_within_lease(board)
 
     again = make_daemon(board)
     assert again.board_state() in ("DISARMED", "FAULT")
@@ -48,20 +43,17 @@ def test_kill_9_while_pulses_run(board, make_daemon):
     assert len(board.of("pulse")) == count
 
 
-@pytest.mark.parametrize("lease_s", [PATIENT_LEASE_S, pytest.param(0.1, marks=pytest.mark.slow)])
-def test_sigstop_while_pulses_run(board, make_daemon, lease_s):
-    daemon, lease_us = make_daemon(board, lease_s=lease_s), round(lease_s * 1e6)
+def test_sigstop_while_pulses_run(board, daemon):
     plan = start_pulses(board, daemon)
     pids = [daemon.process.pid, *daemon.list_children()]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
-    stopped_us = board.now_us()
-    wait_for(lambda: board.of("fault"), "the board's fault")
-    assert board.of("fault") == [{"t_us": board.of("fault")[0]["t_us"], "event": "fault", "fault": "LINK"}]
+    wait_for(lambda: board.of("state")[-1]["state"] == "FAULT", "the board's fault")
+    until_us = board.of("lease")[-1]["until_us"]
+    assert board.of("fault") == [{"t_us": until_us, "event": "fault", "fault": "LINK"}]
     assert_off_and_unarmed(board, ("FAULT",))
-    assert board.of("gate")[-1]["t_us"] <= stopped_us + lease_us + LATENESS_US
-    time.sleep(0.3)
-    assert board.of("pulse")[-1]["t_us"] <= stopped_us + lease_us + LATENESS_US
+    assert_dark_within_lease(board)
+    dark = len(board.events())
 
     for pid in pids:
         os.kill(pid, signal.SIGCONT)
@@ -73,6 +65,7 @@ def test_sigstop_while_pulses_run(board, make_daemon, lease_s):
     assert "LINK" in refused["detail"]
     assert daemon.call("POST", "/v1/disarm")["board"]["state"] == "DISARMED"
     assert daemon.arm()["board"]["state"] == "ARMED"
+    assert_stayed_dark(board, dark)
 
 
 def test_sigterm_while_pulses_run(board, make_daemon):
@@ -142,7 +135,7 @@ def test_a_full_disk_under_the_boards_log(make_board, make_daemon):
     board = make_board(disk_bytes=12_000)
     daemon = make_daemon(board)
     plan = start_pulses(board, daemon)
-    assert board.process.wait(timeout=20) == 1
+    assert board.process.wait() == 1
     assert board.process.stderr.read().count("\n") == 1
     assert not board.port.exists()
     answer = daemon.finished(plan)

@@ -14,22 +14,21 @@ from functools import partial
 import httpx
 import pytest
 
-from optodrive.daemon.supervisor.child import HANG_S
-from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, wait_for
+from rig import TOKEN, Board, Daemon, is_alive, long_train, wait_for
+from signalled_processes import assert_dark_within_lease, wait_until_dark
 from test_processes import (
     EMITTING_STATES,
     PROCESSES,
-    RESTART_S,
     SITUATIONS,
     Rig,
     ask,
-    assert_dark_within,
-    board_now_us,
     rigs,
     shared,
 )
 
 __all__ = ("rigs", "shared")
+RESTART_S = 3.0
+"""Time for which a supervisor without memory is left to itself."""
 FILLED = ("link", "planner", "preview", "web")
 """Processes that callers and other processes can send much; the acceptor reads a few kilobytes at once."""
 STARVED_BYTES = 1 << 20
@@ -127,7 +126,6 @@ def test_a_process_without_memory_leaves_the_board_dark_and_starts_again(shared,
     first, (entries, lines) = rig.daemon.find_process(process), rig.restarts()
     log_bytes = rig.daemon.errors.stat().st_size
     starve(first)
-    since_us = board_now_us(rig.board)
     fill(rig, process)
     line = await_restart(rig, process, first, entries, lines)
     assert f"the {process} process ended with status 1: out of memory" in line
@@ -137,7 +135,8 @@ def test_a_process_without_memory_leaves_the_board_dark_and_starts_again(shared,
         assert ask(rig.daemon)["board"]["state"] == expected
     else:
         assert ask(rig.daemon)["board"]["state"] not in EMITTING_STATES
-        assert_dark_within(rig.board, since_us, FILLING_S + PATIENT_LEASE_S)
+        wait_until_dark(rig.board)
+        assert_dark_within_lease(rig.board)
         assert_refuses_plans(rig)
 
 
@@ -198,12 +197,13 @@ def test_a_full_disk_behind_everything_costs_lines_and_arming_only(tmp_path, pro
         with full_disk(rig):
             pulses = len(board.of("pulse"))
             wait_for(lambda: len(board.of("pulse")) > pulses + 10, "further pulses")
-            first, since_us = rig.daemon.find_process(process), board_now_us(board)
+            first = rig.daemon.find_process(process)
             os.kill(first, signal.SIGKILL)
             wait_for(lambda: rig.daemon.find_process(process) not in (None, first), "another process")
             wait_for(lambda: ask(daemon)["link"]["state"] == "up", "the link")
             if process != "preview":
-                assert_dark_within(board, since_us, PATIENT_LEASE_S)
+                wait_until_dark(board)
+                assert_dark_within_lease(board)
             stopped = daemon.call("POST", "/v1/stop")["board"]
             assert stopped["state"] in ("DISARMED", "FAULT")
             daemon.client.post("/v1/disarm")
@@ -239,10 +239,10 @@ def test_a_log_that_nobody_reads_keeps_no_process_from_its_work(tmp_path):
         daemon.call("POST", "/v1/plans", json=long_train(seconds=20.0))
         wait_for(lambda: len(board.of("pulse")) > 5, "pulses")
         first = find("planner")
-        since_us = board_now_us(board)
         os.kill(first, signal.SIGKILL)
         wait_for(lambda: find("planner") not in (None, first), "another planner process")
-        assert_dark_within(board, since_us, PATIENT_LEASE_S)
+        wait_until_dark(board)
+        assert_dark_within_lease(board)
         begin_s = time.monotonic()
         daemon.process.terminate()
         assert daemon.process.wait(20) == 0
@@ -311,7 +311,6 @@ def test_a_process_that_ends_in_between_leaves_nothing_to_be_lit_later(shared, p
             httpx.post(f"{daemon.url}{path}", json=body, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=20)
 
     caller = threading.Thread(target=call)
-    since_us = board_now_us(board)
     if moment == "stopping":
         os.kill(first, number)
         caller.start()
@@ -327,7 +326,8 @@ def test_a_process_that_ends_in_between_leaves_nothing_to_be_lit_later(shared, p
     if process == "preview":  # nothing depends on it
         daemon.call("POST", "/v1/stop")
     elif moment == "stopping":
-        assert_dark_within(board, since_us, PATIENT_LEASE_S + (HANG_S if number == signal.SIGSTOP else 0.0))
+        wait_until_dark(board)
+        assert_dark_within_lease(board)
     time.sleep(0.2)
     pulses, state = len(board.of("pulse")), ask(daemon)["board"]["state"]
     assert state in ("DISARMED", "FAULT")
