@@ -8,7 +8,7 @@ import pytest
 
 from forked_process import run_process
 from optodrive.link.transport.link_capture import LinkCapture
-from rig import OPTODRIVE, Board, long_train, wait_for
+from rig import OPTODRIVE, PATIENT_LEASE_S, Board, long_train, wait_for
 
 
 def play(daemon, seconds=5.0):
@@ -102,8 +102,8 @@ def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tm
     assert "FAULT" in states
     totals = last["totals"]
     assert totals["ignored_bytes"] == totals["bad_bytes"] == 0
-    assert totals["host_silence_s"] > 0.09
-    assert 0 < totals["round_trip_min_s"] < 1
+    assert totals["host_silence_s"] > 0.5 * PATIENT_LEASE_S  # the lease ended in it
+    assert totals["round_trip_min_s"] > 0
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def seeded(tmp_path):
 
 def replay(*arguments):
     command = [OPTODRIVE, "wire", "replay", *arguments, "--json"]
-    run = run_process(command, capture_output=True, text=True, timeout=60)
+    run = run_process(command, capture_output=True, text=True)
     assert run.returncode in (0, 1), run.stderr
     verdict = json.loads(run.stdout)
     assert run.returncode == (not verdict["identical"])
