@@ -250,6 +250,11 @@ def read_proc(pid, name):
         return ""
 
 
+def is_suspended(pid):
+    """Return whether a process was stopped by a signal, and was neither continued nor killed since."""
+    return read_proc(pid, "stat").rpartition(")")[2].split()[:1] == ["T"]
+
+
 def is_alive(pid):
     """Return whether a process runs, is suspended or waits; a zombie does not."""
     return read_proc(pid, "stat").rpartition(")")[2].split()[:1] not in ([], ["Z"])

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from pushes import RawPush
-from rig import TOKEN, long_train, read_proc, wait_for
+from rig import TOKEN, is_suspended, long_train, wait_for
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_stop_answers_while_the_planner_is_suspended(armed):
         state = daemon.call("POST", "/v1/stop")["board"]["state"]
         assert state in ("DISARMED", "FAULT")  # the latter if the lease, which a suspended planner ends, was faster
         assert board.of("gate")[-1]["on"] is False
-        assert read_proc(planner, "stat").rpartition(")")[2].split()[0] == "T"
+        assert is_suspended(planner)
 
 
 def test_stop_takes_effect_while_the_web_process_is_suspended_and_is_answered_afterwards(make_board, make_daemon):
