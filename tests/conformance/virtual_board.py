@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 from board_log import BoardLog
 
-from firmware_ports import EmulatedChip
 from optodrive.core.clock import ManualClock
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
@@ -150,7 +149,7 @@ class EmulatedBoard(VirtualBoard):
 
     def next_step(self):
         """Carry out the next step of the script."""
-        if self._steps[0].get("do") in EmulatedChip.FAULTS:
+        if self._steps[0].get("do") in self._core.FAULTS:
             self._core.inject_fault(self._steps.pop(0)["do"])
         else:
             super().next_step()

@@ -113,7 +113,7 @@ static void run_loop_once(const uint8_t *bytes, size_t n) {
     }
     uint64_t until_us = board.lease_until_us, now_us = chip_now_us();
     board_receive(&board, bytes, n, now_us);
-    if (board.lease_until_us != until_us) {
+    if (board.lease_until_us > until_us) {
         write_times('P', now_us, board.lease_until_us); /* end of the lease */
     }
 }
