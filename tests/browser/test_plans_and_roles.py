@@ -95,7 +95,7 @@ def test_the_frames_of_a_stream_are_one_entry_of_the_history(page, daemon):
     with connect("ws://127.0.0.1/v1/stream", sock=link, additional_headers=headers, proxy=None) as stream:
         for number in range(4):
             stream.send(json.dumps({"frame": number, "target_um": {"17": 100}}))
-            while json.loads(stream.recv(timeout=20))["status"] != "done":
+            while json.loads(stream.recv())["status"] != "done":
                 pass
             expect(plans.first).to_have_text(re.compile(rf"frame {number} by armer: done, 1 of 1 pulses$"))
     entries = plans.all_inner_texts()
@@ -182,7 +182,7 @@ def test_a_page_that_is_not_there_holds_nothing(page, daemon, loss):
         page.goto("about:blank")
     else:
         page.evaluate("setTimeout(() => { for (const end = Date.now() + 2000; Date.now() < end; ); })")
-    wait_for(lambda: daemon.board_state() == "DISARMED", "the arming to end", patience_s=2.5)
+    wait_for(lambda: daemon.board_state() == "DISARMED", "the arming to end")
     assert daemon.state()["control"] is None
     page.keyboard.up("Enter")
 

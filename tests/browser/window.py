@@ -16,7 +16,8 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
-TIMEOUT_MS = 30_000
+TIMEOUT_MS = 110_000
+"""Limit of last resort, shorter than that of pytest: its error shows the page."""
 WIDE, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 
 
@@ -92,7 +93,7 @@ def arm(page):
 
 def press_escape(page):
     """Press Escape and wait until STOP, which it must send, has been answered."""
-    with page.expect_response("**/v1/stop", timeout=5_000):
+    with page.expect_response("**/v1/stop"):
         page.keyboard.press("Escape")
     page.locator("#stopping").wait_for(state="hidden")
 

@@ -28,7 +28,6 @@ def command(daemon, *arguments):
         env=os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN},
         capture_output=True,
         text=True,
-        timeout=30,
     )
 
 

@@ -24,7 +24,7 @@ def armed(tmp_path_factory):
 
 def run(*arguments):
     environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
-    return run_process([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=60, env=environment)
+    return run_process([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
 
 
 def test_a_feasible_sequence_is_reported(armed):

@@ -24,7 +24,7 @@ FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 1.0, "target_um": {"5": 60
 
 
 def run(*arguments):
-    return run_process([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=120)
+    return run_process([OPTODRIVE, *arguments], capture_output=True, text=True)
 
 
 @pytest.fixture

@@ -34,7 +34,6 @@ def schemathesis(daemon, *arguments, examples):
         ],
         capture_output=True,
         text=True,
-        timeout=110,
         cwd=daemon.config.parent,
     )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
@@ -97,7 +96,6 @@ def test_a_wrong_document_is_detected(open_daemon):
         ],
         capture_output=True,
         text=True,
-        timeout=60,
         cwd=path.parent,
     )
     assert done.returncode == 1, done.stdout

@@ -68,7 +68,7 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
     signal = Signal(17, t_s, 1e-6 * t_s, 1e-7)
     write_recording(lab, Measurement((Run(run, 293.0, np.zeros((0, 4)), {"displacement_m": signal}, {}),)))
     merge = [OPTODRIVE, "recording", "merge", path, lab, "--out", tmp_path / "both.h5"]
-    run_process(merge, check=True, timeout=60)
+    run_process(merge, check=True)
     np.testing.assert_array_equal(read_recording(tmp_path / "both.h5").runs[0].pulses, pulses)
 
 

@@ -95,7 +95,7 @@ def assert_one_line(arguments, naming, environment=None):
     """Run a command in this process, to save its start. The daemon and its clients run in their own processes."""
     if arguments[0] == "serve" or "--url" in arguments:
         command = [OPTODRIVE, *arguments]
-        done = run_process(command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment})
+        done = run_process(command, capture_output=True, text=True, env={**os.environ, **environment})
         status, output, errors = done.returncode, done.stdout, done.stderr
     else:
         out, err = io.StringIO(), io.StringIO()
@@ -276,7 +276,6 @@ def test_a_full_disk_behind_stdout_ends_in_one_line(run_command, arguments, tmp_
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
             env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
         )
     assert done.returncode == 1
