@@ -212,12 +212,14 @@ def test_arm_and_confirm_are_in_view_on_a_phone(page):
 
 def test_a_colour_means_the_same_height_all_the_time(page, daemon):
     top = page.locator("#legend-high")
-    daemon.arm()
     for height_um in (30, 150):
-        plan = daemon.call("POST", "/v1/patterns/checker", json={"height_um": height_um})["plan"]
+        daemon.arm()
+        targets_um = dict.fromkeys(map(str, range(0, 437, 7)), height_um)
+        frames = [{"show_at_s": 0.3 * k, "duration_s": 0.3, "target_um": targets_um} for k in range(200)]
+        daemon.call("POST", "/v1/plans", json={"frames": frames})  # longer than the page needs to show it
         expect(page.locator("#summary")).to_contain_text("pixels above 1 µm")
         expect(top).to_have_text("≥ 200 µm")
-        daemon.finished(plan)
+        daemon.call("POST", "/v1/stop")
     page.get_by_text("Options").click()
     page.get_by_text("100 µm", exact=True).click()
     expect(top).to_have_text("≥ 100 µm")
