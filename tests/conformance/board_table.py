@@ -3,7 +3,7 @@
 from collections import Counter
 
 from all_scenarios import SCENARIOS
-from process_board import PROCESS_KINDS
+from process_board import PROCESS_KINDS, has_subject
 from scenario import GUARDS
 from test_conform_mutants import MUTANTS
 from test_conformance_pty import IN_EVERY_RUN
@@ -38,7 +38,7 @@ def scenarios_of(guard):
 
 def row(guard):
     """Return a row of the table."""
-    boards = [*(kind.name for kind in PROCESS_KINDS if not kind.spares(guard)), "qemu"]
+    boards = [*(kind.name for kind in PROCESS_KINDS if has_subject(kind.name, guard)), "qemu"]
     broken = Counter(mutant.board for mutant in MUTANTS if mutant.guard == guard)
     killed = ", ".join(f"{board.replace('c', 'C')} {count}" for board, count in broken.items())
     return f"| {guard} | {ENFORCED[guard]} | {scenarios_of(guard)} | {', '.join(boards)} | {killed} |"

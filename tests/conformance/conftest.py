@@ -6,7 +6,7 @@ import pytest
 
 pytest.register_assert_rewrite(*(f"{name}_scenarios" for name in ("guard", "job", "link", "order", "self", "trust")))
 
-from process_board import ABOUT_ITSELF, PROCESS_KINDS  # noqa: E402
+from process_board import PROCESS_KINDS  # noqa: E402
 from virtual_board import EmulatedBoard, VirtualKind  # noqa: E402
 
 from c_core import SeededCBoard, build_library  # noqa: E402
@@ -22,7 +22,7 @@ def virtual(tmp_path_factory):
     @cache
     def build(name, mutant=0):
         if name == "python":
-            return VirtualKind(name, BoardCore, dict.fromkeys(("B14", "B15"), ABOUT_ITSELF))
+            return VirtualKind(name, BoardCore)
         if name == "qemu":
             return VirtualKind(name, build_emulated_chip(folder, mutant), make_board=EmulatedBoard)
         return VirtualKind(name, partial(SeededCBoard, build_library(folder, mutant)))

@@ -13,28 +13,28 @@ from forked_process import SIMULATED
 from optodrive.core.clock import MonotonicClock
 
 READ_WAIT_S = 0.005
-ABOUT_ITSELF = "the simulated board does B1 to B13: it has no tick, readback or watchdog of its own"
+NOT_ITS_OWN = {"python": ("B14", "B15")}
+"""Guards that a kind of board lacks: the simulated one has no tick, readback or watchdog of its own."""
+
+
+def has_subject(name, subject):
+    """Return whether a kind of board is tested for a guard or another subject."""
+    return subject not in NOT_ITS_OWN.get(name, ())
 
 
 class ProcessKind(NamedTuple):
     """A board implementation that runs as a process.
 
-    command: of its process; port: firmware port to build instead; spared: reasons for exempting it from subjects, by
-    name
+    command: of its process; port: firmware port to build instead
     """
 
     name: str
     command: tuple[str, ...] = ()
     port: str = ""
-    spared: dict[str, str] = {}  # noqa: RUF012 - nobody writes to it
 
     def ready(self, folder, mutant=0):
         """Return this kind with its port built in a folder. mutant: number of the disabled guard."""
         return self._replace(command=build_board(folder, mutant, self.port)) if self.port else self
-
-    def spares(self, subject):
-        """Return the reason for exempting it from a subject, '' if it is tested."""
-        return self.spared.get(subject, "")
 
     def make_clock(self):
         """Return the clock of a bench."""
@@ -48,7 +48,7 @@ class ProcessKind(NamedTuple):
 
 
 PROCESS_KINDS = [
-    ProcessKind("python", SIMULATED, spared=dict.fromkeys(("B14", "B15"), ABOUT_ITSELF)),
+    ProcessKind("python", SIMULATED),
     ProcessKind("host", port="host"),
 ]
 """All board implementations that run as a process."""

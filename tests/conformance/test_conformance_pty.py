@@ -5,7 +5,7 @@ Every run plays IN_EVERY_RUN: what real time, a real port and a process can chan
 
 import pytest
 from all_scenarios import SCENARIOS
-from process_board import PROCESS_KINDS
+from process_board import PROCESS_KINDS, has_subject
 from scenario import run_all
 
 IN_EVERY_RUN = (
@@ -27,7 +27,7 @@ IN_EVERY_RUN = (
 )
 
 
-@pytest.fixture(scope="module", params=[kind.name for kind in PROCESS_KINDS])
+@pytest.fixture(scope="module")
 def board_kind(request, ready):
     return ready(request.param, 0)
 
@@ -37,7 +37,7 @@ def outcomes(board_kind, request):
     """Return the futures of this module's selected scenarios, by name."""
     here = [item for item in request.session.items if item.module is request.module and hasattr(item, "callspec")]
     requested = {item.callspec.params["case"].name: item.callspec.params["case"] for item in here}
-    futures = run_all(board_kind, [case for case in requested.values() if not board_kind.spares(case.subject)])
+    futures = run_all(board_kind, [case for case in requested.values() if has_subject(board_kind.name, case.subject)])
     yield futures
     for future in futures.values():
         future.cancel()
@@ -47,13 +47,21 @@ def in_every_run(case):
     return case.name in IN_EVERY_RUN
 
 
-CASES = [case if in_every_run(case) else pytest.param(case, marks=pytest.mark.slow) for case in SCENARIOS]
+MARKS = {True: (), False: (pytest.mark.slow,)}
+CASES = [pytest.param(case, marks=MARKS[in_every_run(case)]) for case in SCENARIOS]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.subject}-{case.name}")
+@pytest.mark.parametrize(
+    ("board_kind", "case"),
+    [
+        pytest.param(kind.name, case, id=f"{kind.name}-{case.subject}-{case.name}", marks=MARKS[in_every_run(case)])
+        for kind in PROCESS_KINDS
+        for case in SCENARIOS
+        if has_subject(kind.name, case.subject)
+    ],
+    indirect=["board_kind"],
+)
 def test_conforms(case, board_kind, outcomes):
-    if why := board_kind.spares(case.subject):
-        pytest.skip(f"{board_kind.name}: {why}")
     outcomes[case.name].result()
 
 

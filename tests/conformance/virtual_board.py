@@ -185,16 +185,11 @@ class VirtualLine:
 
 
 class VirtualKind(NamedTuple):
-    """A board core. make_core: (settings, sink, seed) → core; spared: as of a process; make_board: of its port."""
+    """A board core. make_core: (settings, sink, seed) → core; make_board: of its port."""
 
     name: str
     make_core: Callable[..., Any]
-    spared: dict[str, str] = {}  # noqa: RUF012 - nobody writes to it
     make_board: Callable[..., VirtualBoard] = VirtualBoard
-
-    def spares(self, subject):
-        """Return the reason for exempting it from a subject, '' if it is tested."""
-        return self.spared.get(subject, "")
 
     def make_clock(self):
         """Return the clock of a bench."""

@@ -250,20 +250,20 @@ def test_connections_that_a_web_process_has_not_opened_at_its_end_are_opened_by_
 
 
 def test_every_process_has_the_priority_of_the_daemon(shared):
-    if os.geteuid():
-        pytest.skip("only the superuser may raise a priority")
+    """Only the superuser may raise it."""
     niceness = {name: os.getpriority(os.PRIO_PROCESS, shared.daemon.find_process(name)) for name in PROCESSES}
-    assert niceness == dict.fromkeys(PROCESSES, NICE) | {"acceptor": acceptor.NICE}
+    raised = dict.fromkeys(PROCESSES, NICE) | {"acceptor": acceptor.NICE}
+    assert niceness == (raised if os.geteuid() == 0 else dict.fromkeys(PROCESSES, os.getpriority(os.PRIO_PROCESS, 0)))
 
 
 def test_what_makes_dark_runs_before_the_planning_of_streams_and_that_before_all_else(shared):
-    if os.geteuid():
-        pytest.skip("only the superuser may use real-time priorities")
+    """Only the superuser may use real-time priorities."""
     shared.bring_to("streaming")
     pids = {name: shared.daemon.find_process(name) for name in PROCESSES}
     usual = dict.fromkeys(PROCESSES, 0)
     priorities = {name: read_realtime_priority(pid, pid) for name, pid in pids.items()}
-    assert priorities == usual | {"link": LIGHT, "acceptor": LIGHT, "planner": PLANNING}
+    raised = usual | {"link": LIGHT, "acceptor": LIGHT, "planner": PLANNING}
+    assert priorities == (raised if os.geteuid() == 0 else usual)
     threads = [int(path.name) for path in Path(f"/proc/{pids['planner']}/task").iterdir()]
     assert len(threads) > 2
     assert {read_realtime_priority(pids["planner"], thread) for thread in threads[1:]} == {0}

@@ -32,8 +32,6 @@ def is_permitted():
 @pytest.fixture
 def priorities(rig):
     """Return the priorities of the thread that plans, at the hand-over of each plan."""
-    if not is_permitted():
-        pytest.skip("this machine permits no real-time priority")
     seen = []
     rig.before_loop_action = lambda: seen.append(read_priority())
     return seen
@@ -42,7 +40,7 @@ def priorities(rig):
 @pytest.mark.parametrize(("streamed", "expected"), [(True, PLANNING), (False, 0)])
 def test_only_streamed_plans_are_made_in_real_time(rig, priorities, streamed, expected):
     rig.submit(build_frame(), rig.remote.epoch, streamed).result()
-    assert set(priorities) == {expected}
+    assert set(priorities) == {expected if is_permitted() else 0}
     assert read_priority() == 0
 
 
