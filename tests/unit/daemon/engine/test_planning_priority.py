@@ -2,6 +2,7 @@
 
 import os
 import threading
+from math import inf
 
 import pytest
 
@@ -38,7 +39,8 @@ def priorities(rig):
 
 
 @pytest.mark.parametrize(("streamed", "expected"), [(True, PLANNING), (False, 0)])
-def test_only_streamed_plans_are_made_in_real_time(rig, priorities, streamed, expected):
+def test_only_streamed_plans_are_made_in_real_time(rig, priorities, monkeypatch, streamed, expected):
+    monkeypatch.setattr(planner, "REALTIME_MAX_S", inf)
     rig.submit(build_frame(), rig.remote.epoch, streamed).result()
     assert set(priorities) == {expected if is_permitted() else 0}
     assert read_priority() == 0
