@@ -312,11 +312,18 @@ def test_figures_that_stop_arriving_are_marked_as_stale(page, daemon):
     panels = [page.get_by_role("region", name=name) for name in ("Budgets", "Board", "Pulses", "Playing")]
     for panel in panels:
         expect(panel.locator(".stale-mark")).to_be_hidden()
+    page.evaluate("""() => {
+        const [state, link] = ["board-state", "link"].map((name) => document.getElementById(name));
+        new MutationObserver(() => {
+            if (state.textContent === "UNKNOWN") window.linkWhenUnknown ??= link.textContent;
+        }).observe(state, { childList: true, characterData: true, subtree: true });
+    }""")
     processes = [daemon.process.pid, *daemon.list_children()]
     for pid in processes:  # the supervisor first, which would restart the others
         os.kill(pid, signal.SIGSTOP)
     try:
         expect(page.locator("#board-state")).to_have_text("UNKNOWN")
+        assert page.evaluate("window.linkWhenUnknown") == "live"  # before the connection counts as lost
         for panel in panels:
             expect(panel.locator(".stale-mark")).to_have_text(re.compile(r"^stale since \d\d:\d\d:\d\d$"))
         expect(page.locator("#idle")).to_contain_text("Unknown")

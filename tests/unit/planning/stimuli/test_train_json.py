@@ -1,11 +1,11 @@
 """Validation, overlaps and limits of pulse trains and height trains from JSON."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from executed_lines import count_lines
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain
 from optodrive.device.config_file import load_config
@@ -172,12 +172,10 @@ def test_the_pulse_count_matches_the_generated_pulses():
         assert count_pulses(train) == len(train.pulse_starts_s())
 
 
-def test_a_hundred_thousand_pulses_are_checked_quickly():
+def test_a_hundred_thousand_pulses_are_checked_together():
     train = PulseTrain(0, 0.0, 1000.0, 0.0002, 0.0018, 1.0)
     many = [replace(train, pixel=k, start_s=0.0005 * k, duration_s=50.0) for k in range(4)]
-    start_s = time.process_time()
-    check_trains(many, "trains", CONFIG)
-    assert time.process_time() - start_s < 0.5
+    assert count_lines(lambda: check_trains(many, "trains", CONFIG)) < 1000
     assert sum(map(count_pulses, many)) == 100_000
     late = replace(train, pixel=9, start_s=49.9996, duration_s=0.001)
     with pytest.raises(InputError, match="the beam is in use"):
