@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager, suppress
 
 SLEEPER = """
@@ -45,18 +46,21 @@ class Sleeper:
 
 @contextmanager
 def time_limit(limit_s):
-    """Raise TimeoutError in this block after a time, wherever the main thread waits."""
+    """Raise TimeoutError in this block after a time, wherever the main thread waits; such blocks may be nested."""
 
     def end(*_):
         raise TimeoutError(f"it took longer than {limit_s:g} s")
 
+    begin_s = time.monotonic()
     previous = signal.signal(signal.SIGALRM, end)
-    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    outer_s, _ = signal.setitimer(signal.ITIMER_REAL, limit_s)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, previous)
+        if outer_s:
+            signal.setitimer(signal.ITIMER_REAL, max(1e-3, outer_s - (time.monotonic() - begin_s)))
 
 
 @contextmanager

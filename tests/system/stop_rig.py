@@ -206,7 +206,7 @@ class StopRig:
         return [
             event.get("fault") or "UNDERRUN"
             for event in self.tail.events[begin:]
-            if event["event"] == "fault" or event.get("state") == "HOLD"
+            if event["event"] == "fault" or is_underrun(event)
         ]
 
     @contextmanager
@@ -230,15 +230,16 @@ class StopRig:
                 self.client.post("/v1/stop")
 
     def watch_show(self, begin, pulses):
-        """Let the show that began at an event emit a number of pulses; return the faults and underruns that end it."""
+        """Let the show that began at an event emit a number of pulses; return the events that end it."""
 
         def look():
             self.tail.read()
-            events = self.tail.events[begin:]
-            return self.find_darkness(begin) or sum(map(is_gate_on, events)) >= pulses
+            shown = self.tail.events[begin:]
+            ends = [event for event in shown if is_unarmed(event) or event["event"] == "fault" or is_underrun(event)]
+            return ends or (sum(map(is_gate_on, shown)) >= pulses and "lit")
 
-        wait_for(look, f"{pulses} pulses")
-        return self.find_darkness(begin)
+        found = wait_for(look, f"{pulses} pulses")
+        return [] if found == "lit" else found
 
     def close(self):
         """End daemon and board."""
@@ -260,3 +261,8 @@ def is_gate_on(event):
 def is_unarmed(event):
     """Return whether an event is a change to a state without light."""
     return event["event"] == "state" and event["state"] in ("DISARMED", "FAULT")
+
+
+def is_underrun(event):
+    """Return whether an event is a wait for points that have not come."""
+    return event["event"] == "state" and event["state"] == "HOLD"

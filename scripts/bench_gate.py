@@ -1,0 +1,635 @@
+"""What depends on the computer, in a few minutes: one table of times with their aims. Nothing is asserted.
+
+Beside each row stands how late the computer woke a process that only sleeps, at the same time, and, where there is one,
+the ratio to a reference of the same run. Daemon, board, callers and this benchmark share the computer.
+"""
+
+import argparse
+import asyncio
+import fcntl
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from itertools import pairwise
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from bench_boards import Bench as SeveralBoards
+from bench_stop import run_flood
+from bench_stream import start_bare_server, stream_under_load
+from measuring import Sleeper, compute_percentile, realtime_priority, time_limit
+from rich.console import Console
+from rich.table import Table
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / part) for part in ("system", "")]
+from floods import Target, abandon_dry_run, build_full_frames, build_refused_bodies  # noqa: E402 - of the tests
+from optodrive.client import Display  # noqa: E402
+from optodrive.core.clock import MonotonicClock  # noqa: E402
+from optodrive.core.types.stimuli import PulseTrain  # noqa: E402
+from optodrive.daemon.supervisor.supervisor import END_GRACE_S  # noqa: E402
+from optodrive.device.config_file import load_config  # noqa: E402
+from optodrive.link.board_setup import build_board_requirements  # noqa: E402
+from optodrive.link.session.session import BoardSession  # noqa: E402
+from optodrive.link.transport.serial_port import SerialPort  # noqa: E402
+from optodrive.planning.stimuli.sequence_file import parse_sequence  # noqa: E402
+from optodrive.planning.stimuli.train_json import check_trains  # noqa: E402
+from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, read_role_tokens, wait_for  # noqa: E402
+from service_manager import Manager, reload  # noqa: E402
+from stop_rig import PIXELS, StopRig, build_http_sender, is_gate_on, is_unarmed  # noqa: E402
+
+LIMIT_S = 90.0
+"""Longest time of one measurement, after which it counts as failed."""
+LEASE_S = 0.1
+"""The shipped lease."""
+STOP_MAX_MS = 50.0
+FLOODS = ("rest", "refused bodies of 8 MB", "valid previews", "pings", "idle connections", "connection churn")
+FLOOD_S, STREAM_S = 3.0, 4.0
+BARE = "a bare FastAPI's answer"
+
+
+@dataclass
+class Row:
+    """A measured quantity, in ms unless stated otherwise.
+
+    aim: largest value wanted; reference: what the ratio is to, with its values; late_s: lateness of the computer
+    """
+
+    quantity: str
+    aim: float | None
+    values: list[float]
+    unit: str = "ms"
+    reference: str = ""
+    reference_values: list[float] = field(default_factory=list)
+    note: str = ""
+    late_s: list[float] = field(default_factory=list)
+
+    def report(self):
+        """Return the row as JSON values; times without a unit in their name are in the row's unit."""
+        p50, p99, largest = (self._percentile(self.values, share) for share in (0.5, 0.99, 1.0))
+        reference = self._percentile(self.reference_values, 0.5)
+        return {
+            "quantity": self.quantity,
+            "unit": self.unit,
+            "aim": self.aim,
+            "n": len(self.values),
+            "median": p50,
+            "p99": p99,
+            "max": largest,
+            "misses_aim": self.aim is not None and (p99 is None or p99 > self.aim),
+            "late_p99_ms": self._percentile([1e3 * late_s for late_s in self.late_s], 0.99),
+            "late_max_ms": self._percentile([1e3 * late_s for late_s in self.late_s], 1.0),
+            "reference": self.reference or None,
+            "reference_median": reference,
+            "ratio": p50 / reference if p50 is not None and reference else None,
+            "note": self.note,
+        }
+
+    @staticmethod
+    def _percentile(values, share):
+        return compute_percentile(values, share) if values else None
+
+
+def to_ms(values_s):
+    return [1e3 * value_s for value_s in values_s]
+
+
+class Bench:
+    """What measurements share: boards and daemons that start when they are first needed, and end with the benchmark."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+
+    def make_folder(self) -> Path:
+        return Path(self._stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
+
+    @cached_property
+    def stop_rig(self):
+        rig = StopRig(self.make_folder(), LEASE_S)
+        self._stack.callback(rig.close)
+        return rig
+
+    @cached_property
+    def bare_url(self):
+        process, url = start_bare_server(self.make_folder(), 8458)
+        self._stack.callback(process.wait)
+        self._stack.callback(process.terminate)
+        return httpx.URL(url)
+
+    @contextmanager
+    def daemon(self, text="", name="display-437") -> Iterator[tuple[Board, Daemon]]:
+        """Run a daemon on a board of its own. text: of its section [daemon]"""
+        folder = self.make_folder()
+        board = Board(folder, limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
+        try:
+            lease = f"lease_s = {LEASE_S}"
+            section = [(lease, f"{lease}\n[daemon]\n{text}\n#")] if text else []
+            daemon = Daemon(folder, board.port, name, section, lease_s=LEASE_S)
+            try:
+                yield board, daemon
+            finally:
+                daemon.stop()
+        finally:
+            board.stop()
+
+
+Measurement = Callable[[Bench], list[Row]]
+MEASUREMENTS: dict[str, Measurement] = {}
+
+
+def measurement(name: str) -> Callable[[Measurement], Measurement]:
+    def register(measure: Measurement) -> Measurement:
+        MEASUREMENTS[name] = measure
+        return measure
+
+    return register
+
+
+# --- STOP ------------------------------------------------------------------------------------------------------------
+
+
+def measure_stop(name: str, bench: Bench) -> list[Row]:
+    rows = []
+    send_bare = build_http_sender(bench.bare_url, "GET", "/v1/state")
+
+    def measure_bare():
+        begin_s = time.monotonic()
+        return send_bare() - begin_s
+
+    with realtime_priority():  # the times must not include the wait of this process for a core
+        for path, way in (("http", "over HTTP"), ("socket", "at the link's socket")):
+            result = run_flood(bench.stop_rig, name, 100, FLOOD_S, path=path, measure_reference=measure_bare)
+            notes = [f"{len(result.darkened)} dark before"] if result.darkened else []
+            notes += [
+                f"{count} {what}" for count, what in ((result.relit, "relit"), (result.not_begun, "no show")) if count
+            ]
+            for what, values_s in (("gate off", result.gate_off_s), ("its answer", result.answered_s)):
+                quantity = f"STOP {way} to {what}, {name}"
+                rows.append(Row(quantity, STOP_MAX_MS, to_ms(values_s), note=", ".join(notes)))
+                rows[-1].reference, rows[-1].reference_values = BARE, to_ms(result.reference_s)
+    return rows
+
+
+for flood in FLOODS:
+    measurement(f"stop-{flood.replace(' ', '-')}")(partial(measure_stop, flood))
+
+
+@measurement("command")
+def measure_command(bench):
+    rig, gate_off_s, ended_s, empty_s = bench.stop_rig, [], [], []
+    for _ in range(5):
+        begin_s = time.monotonic()
+        subprocess.run([sys.executable, "-c", "pass"], check=True)
+        empty_s.append(time.monotonic() - begin_s)
+        begin = rig.start_show()
+        environment = {**os.environ, "XDG_RUNTIME_DIR": str(rig.daemon.config.parent)}
+        begin_s = time.monotonic()
+        command = [OPTODRIVE, "stop", "--url", rig.daemon.url]
+        subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        ended_s.append(time.monotonic() - begin_s)
+        gate_off_s.append(rig.to_host_s(rig.tail.find(is_unarmed, begin, "dark")) - begin_s)
+    reference = {"reference": "`python -c pass`", "reference_values": to_ms(empty_s)}
+    return [
+        Row("`optodrive stop` to gate off", None, to_ms(gate_off_s), **reference),
+        Row("`optodrive stop` to its end", None, to_ms(ended_s), **reference),
+    ]
+
+
+@measurement("audit")
+def measure_audit(bench):
+    """A FIFO that nobody reads as the audit file."""
+    fifo = bench.make_folder() / "audit"
+    os.mkfifo(fifo)
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096)
+
+    def stop(times):
+        values_s = []
+        for _ in range(times):
+            begin_s = time.monotonic()
+            daemon.call("POST", "/v1/stop")
+            values_s.append(time.monotonic() - begin_s)
+        return to_ms(values_s)
+
+    try:
+        with bench.daemon(f'audit = "{fifo}"') as (_, daemon):
+            free = stop(10)
+            stop(60)  # more lines than the pipe holds
+            stuck = stop(30)
+            begin_s = time.monotonic()
+            daemon.process.terminate()
+            daemon.process.wait()
+            ended_s = time.monotonic() - begin_s
+    finally:
+        os.close(reader)
+    return [
+        Row("STOP over HTTP behind an audit path that hangs", 500.0, stuck, "ms", "with a path that is free", free),
+        Row("end of that daemon after SIGTERM", 10e3, [1e3 * ended_s]),
+    ]
+
+
+# --- frames ----------------------------------------------------------------------------------------------------------
+
+
+def measure_stream(load_hz, bench):
+    streaming = stream_under_load(load_hz, seconds=STREAM_S)
+    beside = f"beside {streaming.rate_hz:.0f} requests/s" if load_hz else "at rest"
+    bare = to_ms(streaming.bare_trips_s)
+    return [
+        Row(f"push to {what}, {beside}", aim, to_ms(latency[key] for latency in streaming.latencies), "ms", BARE, bare)
+        for what, key, aim in (("first byte", "first_byte_s", None), ("first light", "first_light_s", 1000.0))
+    ]
+
+
+measurement("stream-rest")(partial(measure_stream, None))
+measurement("stream-load")(partial(measure_stream, 300.0))
+
+
+@measurement("onset")
+def measure_onset(bench):
+    train = {"pixel": 17, "start_s": 0.3, "duration_s": 0.1, "pulse_width_s": 0.01, "gap_s": 0.03, "power_w": 1.0}
+    errors_s = []
+    with bench.daemon() as (board, daemon):
+        daemon.arm()
+        zero_s = float(Path(f"{board.port}.clock").read_text())
+        for _ in range(8):
+            board.forget()
+            announced = daemon.call("POST", "/v1/plans", json={"trains": [train]})
+            ended = daemon.finished(announced["plan"])
+            gate_on_s = zero_s + 1e-6 * next(event["t_us"] for event in board.of("gate") if event["on"])
+            errors_s.append(abs(announced["onset"]["monotonic_s"] + ended["delay_s"] - gate_on_s))
+    return [Row("error of an announced onset", 1000.0, [1e6 * error_s for error_s in errors_s], "µs")]
+
+
+@measurement("parsing")
+def measure_parsing(bench):
+    def measure(work, runs):
+        values_s = []
+        for _ in range(runs):
+            begin_s = time.process_time()
+            work()
+            values_s.append(time.process_time() - begin_s)
+        return to_ms(values_s)
+
+    frame = {"show_at_s": 0, "duration_s": 1, "target_um": {str(k): 50.0 for k in range(1511)}}
+    text, config = json.dumps({"frames": [frame]}), load_config("display-1511")
+    trains = [PulseTrain(k, 0.0005 * k, 50.0, 0.0002, 0.0018, 1.0) for k in range(4)]
+    return [
+        Row("a frame of 1,511 pixels read, CPU time", 20.0, measure(lambda: parse_sequence(text, config, "f"), 30)),
+        Row("100,000 pulses checked, CPU time", 500.0, measure(lambda: check_trains(trains, "trains", config), 5)),
+    ]
+
+
+# --- other callers ---------------------------------------------------------------------------------------------------
+
+
+def post(rig, body, role="operator", **params):
+    headers = {"Authorization": f"Bearer {read_role_tokens(rig.daemon)[role]}"}
+    return httpx.post(f"{rig.daemon.url}/v1/plans", params=params, content=body, headers=headers, timeout=None)
+
+
+@measurement("gap")
+def measure_gap(bench):
+    """Longest time without light while another caller's request is under way."""
+    rig, rows = bench.stop_rig, []
+
+    def measure(bodies, **params):
+        gaps_s = []
+        with rig.running_show() as begin:
+            for body in bodies:
+                begin_s = time.monotonic()
+                post(rig, body, **params)
+                rig.tail.read()
+                on_s = [rig.to_host_s(event) for event in rig.tail.events[begin:] if is_gate_on(event)]
+                gaps_s.append(max(b - a for a, b in pairwise([on_s[0], *on_s]) if b >= begin_s))
+        return to_ms(gaps_s)
+
+    rows.append(Row("gap of light beside a refused body of 8 MB", 500.0, measure(build_refused_bodies(PIXELS))))
+    previews = [build_full_frames(300, PIXELS)] * 3
+    rows.append(Row("gap of light beside a preview of 300 frames", 500.0, measure(previews, dry_run=True)))
+    return rows
+
+
+@measurement("dry-runs")
+def measure_dry_runs(bench):
+    rig = bench.stop_rig
+    base, small = rig.client.base_url, b'{"frames":[{"show_at_s":0,"duration_s":1,"target_um":{"17":60}}]}'
+    target = Target(base.host, base.port, read_role_tokens(rig.daemon), PIXELS)
+    pushed_s, dropped_s = [], []
+    for _ in range(3):
+        rig.arm()
+        for _ in range(5):
+            asyncio.run(abandon_dry_run(target, 730))
+        begin_s = time.monotonic()
+        post(rig, small, role="armer").raise_for_status()
+        pushed_s.append(time.monotonic() - begin_s)
+        rig.client.post("/v1/stop")
+        begin_s = time.monotonic()
+        post(rig, small, dry_run=True).raise_for_status()
+        dropped_s.append(time.monotonic() - begin_s)
+    body = build_full_frames(100, PIXELS)
+    with ThreadPoolExecutor(24) as pool:
+
+        def run(_):
+            begin_s = time.monotonic()
+            status = post(rig, body, dry_run=True).status_code
+            return status, time.monotonic() - begin_s
+
+        refused_s = [took_s for status, took_s in pool.map(run, range(24)) if status in (429, 503)]
+    return [
+        Row("small push behind five abandoned dry runs", 1000.0, to_ms(pushed_s)),
+        Row("small dry run behind five abandoned ones", 8000.0, to_ms(dropped_s)),
+        Row("refusal of dry runs beyond those that may wait", 5000.0, to_ms(refused_s)),
+    ]
+
+
+@measurement("revocation")
+def measure_revocation(bench):
+    """From the removal of a token from the file, with the request to reload, to the end of its WebSocket."""
+    folder, values_s = bench.make_folder(), []
+    tokens, secrets = folder / "tokens.toml", {"rig": TOKEN, "ben": "another-token-for-ben"}
+
+    def write(*names):
+        entries = (f'[[token]]\nname = "{name}"\nrole = "armer"\nsecret = "{secrets[name]}"\n' for name in names)
+        tokens.write_text('format = "optodrive-tokens"\nversion = 1\n' + "".join(entries))
+        tokens.chmod(0o600)
+
+    write("rig")
+    with pytest.MonkeyPatch.context() as patch:
+        manager = Manager(folder, patch)
+        with bench.daemon(f'tokens = "{tokens}"') as (_, daemon):
+            for _ in range(4):
+                write("rig", "ben")
+                reload(daemon, manager, lambda text: text)
+                header = {"Authorization": f"Bearer {secrets['ben']}"}
+                url = f"ws{daemon.url.removeprefix('http')}/v1/stream"
+                with connect(url, additional_headers=header, proxy=None, compression=None) as stream:
+                    ended = []
+
+                    def read(stream=stream, ended=ended):
+                        with suppress(ConnectionClosed):
+                            stream.recv()
+                        ended.append(time.monotonic())
+
+                    thread = threading.Thread(target=read)
+                    thread.start()
+                    begin_s = time.monotonic()
+                    write("rig")
+                    reload(daemon, manager, lambda text: text)
+                    thread.join()
+                values_s.append(ended[0] - begin_s)
+        manager.close()
+    return [Row("token removed to the end of its connection", 500.0, to_ms(values_s))]
+
+
+@measurement("hold")
+def measure_hold(bench):
+    values_s = []
+    with bench.daemon() as (board, daemon):
+        for _ in range(8):
+            board.forget()
+            display = Display(daemon.url, TOKEN)
+            display.arm(hold=True)
+            display.push(long_train(seconds=20.0), wait=False)
+            wait_for(lambda: len(board.of("pulse")) > 3, "pulses")
+            released_us = board.now_us()
+            display.close()
+            values_s.append(1e-6 * (wait_for_dark_us(board) - released_us))
+    return [Row("release of a hold to dark", 500.0, to_ms(values_s))]
+
+
+def wait_for_dark_us(board):
+    """Return the time of the board's clock at which it left its armed states for good."""
+    return wait_for(lambda: list(filter(is_unarmed, board.of("state"))), "dark")[-1]["t_us"]
+
+
+# --- processes -------------------------------------------------------------------------------------------------------
+
+
+def light(board, daemon):
+    """Let a long train run."""
+    if daemon.board_state() != "ARMED":
+        daemon.client.post("/v1/disarm")
+        daemon.arm()
+    board.forget()
+    daemon.call("POST", "/v1/plans", json=long_train(seconds=30.0))
+    wait_for(lambda: len(board.of("pulse")) > 3, "pulses")
+
+
+@measurement("restart")
+def measure_restart(bench):
+    rows = []
+    with bench.daemon() as (board, daemon):
+        for name in ("planner", "web", "link"):
+            dark_s, served_s = zip(*(kill_and_await(board, daemon, name) for _ in range(2)), strict=True)
+            rows.append(Row(f"SIGKILL of {name} to dark", 100.0, to_ms(dark_s)))
+            rows.append(Row(f"SIGKILL of {name} to the next one's service", 3000.0, to_ms(served_s)))
+    return rows
+
+
+def kill_and_await(board, daemon, name):
+    """Kill a process while a train runs; return the times until dark and until the next one serves, s."""
+    light(board, daemon)
+    pid = daemon.find_process(name)
+    killed_us, killed_s = board.now_us(), time.monotonic()
+    os.kill(pid, signal.SIGKILL)
+
+    def is_served():
+        if daemon.find_process(name) in (None, pid):
+            return False
+        with suppress(httpx.HTTPError):
+            state = daemon.client.get("/v1/state").json()
+            refused = daemon.client.post("/v1/plans", json=long_train())
+            return state["link"]["state"] == "up" and refused.status_code == 409  # the board is not armed
+        return False
+
+    wait_for(is_served, name)
+    return find_dark_s(board, killed_us), time.monotonic() - killed_s
+
+
+def find_dark_s(board, since_us):
+    """Return the time from one of the board's clock until the gate was off for good, s."""
+    off_us = [event["t_us"] for event in board.of("gate") if not event["on"]]
+    return max(0.0, 1e-6 * (off_us[-1] - since_us))
+
+
+@measurement("loss")
+def measure_loss(bench):
+    """All processes of the daemon are killed or suspended while `optodrive push` shows a train."""
+    rows = []
+    with bench.daemon() as (board, daemon):
+        suspended_s = [lose(bench, board, daemon, signal.SIGSTOP) for _ in range(2)]
+    killed_s = []
+    for _ in range(2):
+        with bench.daemon() as (board, daemon):
+            killed_s.append(lose(bench, board, daemon, signal.SIGKILL))
+    for what, times_s in (("killed", killed_s), ("suspended", suspended_s)):
+        dark_s, ended_s = zip(*times_s, strict=True)
+        rows.append(Row(f"every process {what} to dark, with a lease of 100 ms", 101.0, to_ms(dark_s)))
+        rows.append(Row(f"every process {what} to the end of `optodrive push`", 5000.0, to_ms(ended_s)))
+    return rows
+
+
+def lose(bench, board, daemon, number):
+    """Send a signal to every process of a daemon; return the times until dark and until the end of the command, s."""
+    daemon.client.post("/v1/disarm")
+    daemon.arm()
+    board.forget()
+    frames = bench.make_folder() / "frames.json"
+    frames.write_text(json.dumps(long_train(seconds=30.0)))
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
+    command = [OPTODRIVE, "push", frames, "--url", daemon.url]
+    push = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for(lambda: len(board.of("pulse")) > 3, "pulses")
+    lost_us, lost_s = board.now_us(), time.monotonic()
+    pids = [daemon.process.pid, *daemon.list_children()]
+    for pid in pids:
+        os.kill(pid, number)
+    push.wait()
+    ended_s = time.monotonic() - lost_s
+    wait_for_dark_us(board)
+    for pid in reversed(pids):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+    return find_dark_s(board, lost_us), ended_s
+
+
+@measurement("end")
+def measure_end(bench):
+    values_s = []
+    for _ in range(2):
+        with bench.daemon() as (_, daemon):
+            os.kill(daemon.find_process("planner"), signal.SIGSTOP)
+            begin_s = time.monotonic()
+            daemon.process.terminate()
+            daemon.process.wait()
+            values_s.append(time.monotonic() - begin_s)
+    return [Row("SIGTERM to the end of a daemon with a suspended planner", 1e3 * END_GRACE_S, to_ms(values_s))]
+
+
+# --- boards ----------------------------------------------------------------------------------------------------------
+
+
+@measurement("board")
+def measure_board(bench):
+    """The exchanges of a session's clock; that of one of several boards has four per second."""
+    folder = bench.make_folder()
+    board = Board(folder)
+    try:
+        requirements = build_board_requirements(load_config("display-16"))
+        session = BoardSession(SerialPort(str(board.port), 1_000_000), MonotonicClock(), requirements, True)
+        session.connect()
+        until_s = time.monotonic() + 3.0
+        while time.monotonic() < until_s:
+            session.step(0.002, renew_lease=False)
+        trips_s = [width_s for width_s, *_ in session._clock_sync._samples]
+        session.close()
+    finally:
+        board.stop()
+    return [Row("round trip to a board on a pseudo-terminal", 50.0, to_ms(trips_s))]
+
+
+@measurement("boards")
+def measure_boards(bench):
+    boards = SeveralBoards(bench.make_folder(), 2)
+    try:
+        boards.read_starts()
+        boards.arm()
+        time.sleep(5.0)  # until the rates of the clocks are known
+        skews_s = np.concatenate([boards.draw_frame() for _ in range(4)])
+        stops_s = []
+        for _ in range(4):
+            boards.arm()
+            stops_s.append(boards.measure_stop_s())
+        boards.arm()
+        boards.start_trains()
+        lost, left = boards.boards
+        lost.process.kill()
+        lost_s = time.monotonic()
+        lost.process.wait()
+        dark_s = boards.began_s[1] + boards.clocks[1].find_true_s(1e-6 * wait_for_dark_us(left)) - lost_s
+    finally:
+        boards.stop()
+    skew_max_us = 1e6 * load_config("display-437").limits.stage_skew_max_s
+    return [
+        Row("skew of gate edges of two boards", skew_max_us, (1e6 * np.abs(skews_s)).tolist(), "µs"),
+        Row("STOP to dark of two boards", STOP_MAX_MS, to_ms(stops_s)),
+        Row("loss of one board to dark of the other, with a lease of 300 ms", 320.0, [1e3 * dark_s]),
+    ]
+
+
+# --- table -----------------------------------------------------------------------------------------------------------
+
+
+def run(names):
+    """Run measurements; yield their names and rows."""
+    with ExitStack() as stack:
+        bench = Bench(stack)
+        for name in names:
+            sleeper, begin_s = Sleeper(), time.monotonic()
+            try:
+                with time_limit(LIMIT_S):
+                    rows = MEASUREMENTS[name](bench)
+            except Exception as error:
+                traceback.print_exc()
+                rows = [Row(name, None, [], note=f"failed: {type(error).__name__}: {error}")]
+            late_s = sleeper.finish()
+            print(f"{time.monotonic() - begin_s:5.1f} s  {name}", file=sys.stderr, flush=True)
+            for row in rows:
+                row.late_s = late_s
+                yield {"name": name, **row.report()}
+
+
+def format_number(value):
+    return "" if value is None else f"{value:,.0f}" if value >= 100 else f"{value:.1f}"
+
+
+def print_table(rows):
+    table = Table(title="What depends on the computer; ! misses its aim")
+    for column in ("quantity", "unit", "aim ≤", "", "n", "median", "p99", "max", "late p99, max, ms", "ratio", "of"):
+        table.add_column(column, justify="left" if column in ("quantity", "unit", "of") else "right")
+    for row in rows:
+        late = f"{format_number(row['late_p99_ms'])}, {format_number(row['late_max_ms'])}"
+        numbers = [format_number(row[key]) for key in ("median", "p99", "max")]
+        quantity = row["quantity"] + (f" ({row['note']})" if row["note"] else "")
+        mark = "!" if row["misses_aim"] else ""
+        cells = (quantity, row["unit"], format_number(row["aim"]), mark, str(row["n"]), *numbers, late)
+        table.add_row(*cells, format_number(row["ratio"]), row["reference"] or "")
+    Console(width=190).print(table)
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    print(f"{platform.machine()}, {os.cpu_count()} cores, load averages {load}, including these processes")
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="scripts/bench gate", description=__doc__)
+    parser.add_argument("--only", action="append", metavar="NAME", help=f"one of {', '.join(MEASUREMENTS)}")
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
+    options = parser.parse_args()
+    unknown = [name for name in options.only or () if name not in MEASUREMENTS]
+    if unknown:
+        parser.error(f"--only: got {unknown[0]!r}, expected one of {', '.join(MEASUREMENTS)}")
+    rows = list(run(options.only or MEASUREMENTS))
+    if options.json:
+        print(json.dumps(rows, indent=1))
+    else:
+        print_table(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
