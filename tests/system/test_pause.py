@@ -61,8 +61,14 @@ def check_paused(daemon, board, plan):
     assert 0 < state["queue"]["pause_ends_in_s"] <= 300
     assert (active["plan"], active["status"], active["ends_in_s"]) == (plan, "paused", None)
     assert (state["queue"]["running"], state["queue"]["waiting"]) == (plan, 0)
-    report = daemon.call("GET", f"/v1/plans/{plan}")
-    assert (report["status"], report["executed"], report["sent"]) == ("paused", emitted, emitted)
+
+    def find_paused():
+        """Return the plan's report once the planner knows of the pause, which the board has confirmed already."""
+        report = daemon.call("GET", f"/v1/plans/{plan}")
+        return report["status"] == "paused" and report
+
+    report = wait_for(find_paused, "the report of a paused plan")
+    assert (report["executed"], report["sent"]) == (emitted, emitted)
     time.sleep(WATCH_S)
     assert len(board.of("pulse")) == emitted
     assert is_dark(board)
