@@ -18,9 +18,7 @@ from forked_process import OPTODRIVE, SHORT_INDICATOR, start_process
 from optodrive.device.config_file import locate_shipped
 
 TOKEN = "a-token-for-tests"
-PATIENCE_S = 20.0
 NAP_MAX_S = 0.02
-START_S = 60.0
 PATIENT_LEASE_S, PATIENT_LEAD_S = 1.0, 0.06
 """Maximum lease, and a long lead of streams, for tests that are about neither.
 
@@ -28,7 +26,7 @@ A busy machine may stall a host for 0.1 s, and the bytes on a pseudo-terminal fo
 ENDED = ("done", "superseded", "failed", "cancelled")
 
 
-def wait_for(condition, what, _patience_s=None, nap_s=0.005):
+def wait_for(condition, what, nap_s=0.005):
     """Poll until condition() is truthy and return its value; less often the longer it takes.
 
     Only pytest's timeout ends it, which shows `what`: how long something takes is the computer's affair.
@@ -74,7 +72,7 @@ class Board:
             options = {"stderr": subprocess.PIPE, "preexec_fn": limit}
         self.process = start_process([*program, *arguments], text=True, **options)
         self._events, self._read_bytes, self._forgotten = [], 0, 0
-        wait_for(self.port.exists, "the board's port", START_S)
+        wait_for(self.port.exists, "the board's port")
 
     def events(self):
         if self.log.exists():  # only what is new is read: tests poll
