@@ -76,7 +76,15 @@ def build_library(folder, mutant=0, *defines):
     require("gcc")
     library = folder / f"core-{mutant}{''.join(defines)}.so"
     sources = [*sorted((FIRMWARE / "core").glob("*.c")), SHIM]
-    flags = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]
+    flags = [
+        "-std=c11",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-O0" if mutant else "-O1",
+        "-shared",
+        "-fPIC",
+    ]  # a mutant ends soon
     command = [
         "gcc",
         *flags,

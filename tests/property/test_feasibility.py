@@ -217,7 +217,7 @@ def test_both_verdicts_are_common_among_the_seeds():
     assert 25 < sum(fits) < 75
 
 
-@settings(max_examples=60)
+@settings(max_examples=3 * settings.default.max_examples // 5)
 @given(SEEDS)
 def test_the_nearest_feasible_variants_fit(seed):
     sequence = random_sequence(seed)
@@ -245,7 +245,7 @@ def test_the_nearest_feasible_variants_fit(seed):
 
 
 @pytest.mark.parametrize("fit", ["even", "priority"])
-@settings(max_examples=40)
+@settings(max_examples=2 * settings.default.max_examples // 5)
 @given(seed=SEEDS)
 def test_best_effort_fits_or_is_refused(fit, seed):
     sequence = random_sequence(seed)

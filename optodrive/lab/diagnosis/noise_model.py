@@ -226,12 +226,18 @@ def _fit_coloured(contrasts: list[Contrast], resolution: float) -> ColouredNoise
 
     def cost(x: FloatArray) -> float:
         noise, total = decode(x), 0.0
+        grams: dict[int, list[FloatArray]] = {}
         for t_s, columns in stacked:
             whitened, logdet = whiten(t_s, columns, noise)
-            gram = whitened.T @ whitened
-            inner = gram[1:, 1:] + 1e-9 * np.eye(len(gram) - 1) * np.trace(gram)
-            total += logdet + gram[0, 0] - gram[0, 1:] @ np.linalg.solve(inner, gram[0, 1:])
-            total += float(np.linalg.slogdet(inner)[1])
+            grams.setdefault(columns.shape[1], []).append(whitened.T @ whitened)
+            total += logdet
+        for gram in map(np.array, grams.values()):  # of the same size, for one call of each function
+            right, identity = gram[:, 1:, 0], np.eye(gram.shape[1] - 1)
+            inner = gram[:, 1:, 1:] + 1e-9 * identity * np.trace(gram, axis1=1, axis2=2)[:, None, None]
+            total += float(
+                (gram[:, 0, 0] - (right * np.linalg.solve(inner, right[:, :, None])[:, :, 0]).sum(axis=1)).sum()
+            )
+            total += float(np.linalg.slogdet(inner)[1].sum())
         # Weak priors regularise parameters that the data does not determine.
         return total + 0.02 * float((x[:5] ** 2).sum()) + 1e3 * float(np.maximum(0.0, np.abs(x[:5]) - 8.0).sum())
 

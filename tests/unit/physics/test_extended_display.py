@@ -173,21 +173,21 @@ def test_a_pulse_asked_to_be_wide_and_to_count_late_is(key):
 
 
 @pytest.mark.parametrize("key", ["", *SINGLE])
-def test_heights_from_the_heat_there_are_those_of_the_whole_run(key):
+@pytest.mark.parametrize("pixel", [pytest.param(0, marks=pytest.mark.slow), 5])
+def test_heights_from_the_heat_there_are_those_of_the_whole_run(key, pixel):
     keys = key.split("+")
     columns = some_pulses(9)
-    for pixel in (0, 5):
-        own = select_acting(keys, columns, pixel)
-        half = int(np.flatnonzero(columns[0] == pixel)[3]) - 1
-        heat = extended(*keys)
-        heat.apply_pulses(*(column[: half + 1] for column in columns))
-        pulses = np.column_stack([*columns[1:], columns[0]])
-        t_s, _, displacement_m = simulate_alone(keys, pixel, own, pulses[-1, 0] + 0.1)
-        after = t_s > pulses[half, :2].sum() + 1e-6
-        untouched = heat.copy()
-        ours_m = heat.simulate_displacement_m(pulses[half + 1 :], pixel, t_s[after])
-        assert ours_m == pytest.approx(displacement_m[after], rel=1e-3, abs=5e-8)
-        assert heat.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE) == untouched.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE)
+    own = select_acting(keys, columns, pixel)
+    half = int(np.flatnonzero(columns[0] == pixel)[3]) - 1
+    heat = extended(*keys)
+    heat.apply_pulses(*(column[: half + 1] for column in columns))
+    pulses = np.column_stack([*columns[1:], columns[0]])
+    t_s, _, displacement_m = simulate_alone(keys, pixel, own, pulses[-1, 0] + 0.1)
+    after = t_s > pulses[half, :2].sum() + 1e-6
+    untouched = heat.copy()
+    ours_m = heat.simulate_displacement_m(pulses[half + 1 :], pixel, t_s[after])
+    assert ours_m == pytest.approx(displacement_m[after], rel=1e-3, abs=5e-8)
+    assert heat.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE) == untouched.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE)
     with pytest.raises(ValueError, match="lies before it"):
         heat.simulate_displacement_m(pulses[half + 1 :], pixel, np.zeros(1))
 

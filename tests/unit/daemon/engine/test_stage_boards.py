@@ -25,12 +25,16 @@ def build_armed(monkeypatch, count, name="display-16", **changes):
     return rig
 
 
-@pytest.fixture(params=[2, 4])
+STAGES = (2, pytest.param(4, marks=pytest.mark.slow))
+"""Four run the same code as two; tests of what depends on their number state it."""
+
+
+@pytest.fixture(params=STAGES)
 def rig(request, monkeypatch):
     return build_armed(monkeypatch, request.param)
 
 
-@pytest.fixture(params=[2, 4])
+@pytest.fixture(params=STAGES)
 def wide_rig(request, monkeypatch):
     return build_armed(monkeypatch, request.param, "display-437")
 
@@ -72,6 +76,7 @@ def check_beams(rig):
         assert (on_s[1:] > off_s[:-1]).all()
 
 
+@pytest.mark.parametrize("rig", [2, 4], indirect=True)
 def test_a_frame_is_drawn_by_all_boards_at_once(rig):
     record = finish(rig, submit(rig, build_frame(60.0)))
     assert (record.status, record.error, record.executed_count) == ("done", None, 16)
@@ -83,7 +88,11 @@ def test_a_frame_is_drawn_by_all_boards_at_once(rig):
     check_beams(rig)
 
 
-@pytest.mark.parametrize("duration_s", [8.0, pytest.param(40.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("rig", "duration_s"),
+    [(2, 8.0), (4, 8.0), pytest.param(2, 40.0, marks=pytest.mark.slow), pytest.param(4, 40.0, marks=pytest.mark.slow)],
+    indirect=["rig"],
+)
 def test_gates_keep_the_planned_times(rig, duration_s):
     record = submit(rig, build_trains(len(rig.cores), duration_s))
     plan = rig.queue.waiting[0].planned.plan
@@ -137,6 +146,7 @@ def test_many_frames_are_streamed(wide_rig):
     check_beams(rig)
 
 
+@pytest.mark.parametrize("rig", [2, 4], indirect=True)
 def test_stop_ends_the_light_of_all_boards(rig):
     record = submit(rig, build_trains(len(rig.cores), 3.0))
     rig.until(lambda: record.executed_count > 20)
@@ -161,6 +171,7 @@ def test_the_result_of_stop_waits_for_the_last_board(rig):
     assert rig.await_result(OPERATOR, request)["error"] is None
 
 
+@pytest.mark.parametrize("rig", [2, 4], indirect=True)
 def test_a_fault_of_one_board_ends_the_light_of_all_and_is_named(rig):
     record = submit(rig, build_trains(len(rig.cores), 3.0))
     rig.until(lambda: record.executed_count > 20)
@@ -174,6 +185,7 @@ def test_a_fault_of_one_board_ends_the_light_of_all_and_is_named(rig):
     assert record.status == "failed"
 
 
+@pytest.mark.parametrize("rig", [2, 4], indirect=True)
 def test_a_board_that_falls_silent_ends_the_light_of_all(rig):
     record = submit(rig, build_trains(len(rig.cores), 9.0))
     rig.until(lambda: record.executed_count > 20)

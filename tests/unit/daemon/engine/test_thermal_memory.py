@@ -43,7 +43,7 @@ def test_a_successor_knows_the_heat_of_ended_plans(rig):
 
 
 def test_a_running_plan_counts_up_to_now_and_not_to_its_end(rig):
-    plan = submit(rig, build_train(600.0))
+    plan = submit(rig, build_train(60.0))
     rig.until(lambda: plan.executed_count > 50)
     inherited, starts_in_s = levels(restart(rig), rig)
     assert starts_in_s < 2.0

@@ -19,8 +19,8 @@ FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 5
 """The frames of README's chain."""
 TRUTHS = (
     ("membrane_creep", {"share": 0.2, "time": 0.1, "spread": 1.5}),
-    ("membrane_creep", {"share": 0.2, "time": 1.0, "spread": 1.0}),
-    ("membrane_creep", {"share": 0.5, "time": 0.1, "spread": 8.0}),
+    pytest.param("membrane_creep", {"share": 0.2, "time": 1.0, "spread": 1.0}, marks=pytest.mark.slow),
+    pytest.param("membrane_creep", {"share": 0.5, "time": 0.1, "spread": 8.0}, marks=pytest.mark.slow),
     ("heat_capacity", {"slope": 0.004}),
     ("neighbour_crosstalk", {"share": 0.1, "lag": 1.0}),
 )

@@ -148,8 +148,15 @@ def test_delay_waits_and_reports_infeasibility():
     assert never.value.feasibility["reason"] == "absorber_temperature"
 
 
-@pytest.mark.parametrize("how", [{"display": with_caps(touch_k=2.0)}, {}])
-@pytest.mark.parametrize("fit", ["even", "priority"])
+@pytest.mark.parametrize(
+    ("fit", "how"),
+    [
+        ("even", {"display": with_caps(touch_k=2.0)}),
+        ("priority", {}),
+        pytest.param("even", {}, marks=pytest.mark.slow),
+        pytest.param("priority", {"display": with_caps(touch_k=2.0)}, marks=pytest.mark.slow),
+    ],
+)
 def test_best_effort_passes_every_policy(fit, how):
     frames = HOT_FRAMES if how else [LATE_FRAME]
     planned, report = check(*frames, fit=fit, policy="refuse", **how)
