@@ -49,7 +49,13 @@ def test_the_grid_is_placed_by_first_corner_and_rotation():
 
 @pytest.mark.parametrize(
     ("cameras", "grid"),
-    [((CAMERA,), GRID), ((CAMERA,), DOTS), ((WIDE_ANGLE,), GRID), ((UPSIDE_DOWN,), GRID), ((PORTRAIT,), GRID)],
+    [
+        ((CAMERA,), GRID),
+        ((CAMERA,), DOTS),
+        ((WIDE_ANGLE,), GRID),
+        pytest.param((UPSIDE_DOWN,), GRID, marks=pytest.mark.slow),
+        pytest.param((PORTRAIT,), GRID, marks=pytest.mark.slow),
+    ],
     ids=["chessboard", "dots", "wide lens", "upside down", "upright"],
 )
 def test_one_picture_of_the_grid_is_enough_for_5_um(cameras, grid):

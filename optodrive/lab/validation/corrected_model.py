@@ -84,8 +84,18 @@ class CorrectedModel:
             return log(height_m / RATE_HEIGHTS_M[datum.id])
         return log(self.compute_outcome(datum.id) / datum.value)
 
+    @cached_property
+    def _pixels(self) -> dict[tuple[float, bool], Pixel]:
+        return {}
+
     def _build_pixel(self, width_m: float, from_table: bool = True) -> Pixel:
         """Return the pixel with scaled parameters; R and C from Table S3, or from the smooth law between its rows."""
+        key = (width_m, from_table)
+        if key not in self._pixels:
+            self._pixels[key] = self._scale_pixel(width_m, from_table)
+        return self._pixels[key]
+
+    def _scale_pixel(self, width_m: float, from_table: bool) -> Pixel:
         base, values = self.base, self.values
         pixel = base.build_pixel(width_m)
         if not from_table:
