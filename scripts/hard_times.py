@@ -41,11 +41,19 @@ def read_proc(pid, name):
         return ""
 
 
+def list_threads(pid):
+    """Return the threads of a process, none if it has ended."""
+    try:
+        return sorted(int(path.name) for path in Path(f"/proc/{pid}/task").iterdir())
+    except OSError:
+        return []
+
+
 def list_descendants(pid):
     """Return the process ids below a process."""
     found = []
-    for task in Path(f"/proc/{pid}/task").glob("*"):
-        for child in map(int, read_proc(pid, f"task/{task.name}/children").split()):
+    for thread in list_threads(pid):
+        for child in map(int, read_proc(pid, f"task/{thread}/children").split()):
             found += [child, *list_descendants(child)]
     return found
 
@@ -60,9 +68,8 @@ def can_freeze(pid):
 
 def freeze(pid, duration_s):
     """Freeze all threads of a process for a time."""
-    threads = sorted(int(path.name) for path in Path(f"/proc/{pid}/task").glob("*"))
     frozen = []
-    for thread in threads:
+    for thread in list_threads(pid):
         if libc.ptrace(PTRACE_SEIZE, thread, None, None) == 0:
             libc.ptrace(PTRACE_INTERRUPT, thread, None, None)
             frozen.append(thread)
