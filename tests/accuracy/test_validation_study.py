@@ -241,7 +241,7 @@ def test_the_command_prints_one_json_object(found, capsys, monkeypatch):
 
 def test_it_needs_no_extra():
     check = "import sys; sys.modules['scipy'] = None; import optodrive.lab.validation.narrative"
-    subprocess.run([sys.executable, "-c", check], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", check], check=True)
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(8, marks=pytest.mark.slow)])

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 def made(script, out):
     command = [sys.executable, ROOT / "scripts" / script, "--out", out]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -18,5 +18,5 @@ def engine(board, tmp_path):  # noqa: F811
 
 @pytest.fixture
 def armed(engine):
-    engine.arm().result(10)
+    engine.arm().result()
     return engine

@@ -57,7 +57,7 @@ def test_metrics_before_and_after_plans_and_a_stop(board, daemon):
 
 def test_faults_are_counted_once_by_name(armed):
     engine = armed
-    plan = engine.submit(lambda: BuiltRequest(_frames(engine)), "asked").result(10)
+    plan = engine.submit(lambda: BuiltRequest(_frames(engine)), "asked").result()
     ended(engine, plan)
     engine._planner._progress_at_s = -1e9  # as if it had stalled: no lease from now on
     engine._planner._pending_count = 1

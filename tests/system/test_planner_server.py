@@ -110,11 +110,11 @@ def rig(tmp_path_factory):
 def web(rig):
     """A client of an armed display; all plans end with the test."""
     engine, path = rig
-    engine.arm().result(10)
+    engine.arm().result()
     web = Web(path, engine)
     yield web
     web.socket.close()
-    engine.stop().result(10)
+    engine.stop().result()
 
 
 def test_a_plan_is_submitted_reported_and_ends_with_the_state_before_each_reply(web):
@@ -157,8 +157,8 @@ def test_errors_are_problems(web):
 
 def test_a_submit_from_before_stop_is_answered_stopped_after_arming_again(web):
     epoch = web.engine.web.status["epoch"]
-    web.engine.stop().result(10)
-    web.engine.arm().result(10)
+    web.engine.stop().result()
+    web.engine.arm().result()
     assert web.problem(web.submit(build_frame(), epoch)) == (409, "stopped")
 
 

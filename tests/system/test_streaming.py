@@ -25,7 +25,7 @@ def frame(pixels, height_um=100.0):
 
 
 def stream(armed, sequence):
-    return armed.submit(lambda: BuiltRequest(sequence), "stream", streamed=True).result(10)
+    return armed.submit(lambda: BuiltRequest(sequence), "stream", streamed=True).result()
 
 
 @pytest.mark.parametrize("reserved_s", [RESERVED_S, pytest.param(None, marks=pytest.mark.slow)])
@@ -48,10 +48,13 @@ def test_the_newest_frame_wins_without_a_pause(armed, board, reserved_s):
     pulses = board.of("pulse")
     assert len(pulses) == sum(record.executed for record in records)
     assert [pulse["index"] for pulse in pulses] == sorted({pulse["index"] for pulse in pulses})
-    # One job from START to END: the gate is off between frames for no longer than a move.
-    gaps_us = [after["on_us"] - before["off_us"] for before, after in pairwise(pulses)]
-    assert max(gaps_us) < 3_000
-    assert armed.snapshot().board.underruns == 0
+    # One job from START to END: the gate is off for no longer than a move, unless the board waits for points.
+    states = board.of("state")
+    assert [state["reason"] for state in states].count("start") == 1
+    holds_us = [state["t_us"] for state in states if state["state"] == "HOLD"]
+    for before, after in pairwise(pulses):
+        off_us, on_us = before["off_us"], after["on_us"]
+        assert on_us - off_us < 3_000 or any(off_us <= hold_us <= on_us for hold_us in holds_us)
 
 
 def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
@@ -103,8 +106,8 @@ def test_an_empty_frame_ends_the_previous_one(armed, board):
 
 def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
     train = FrameSequence((), (PulseTrain(200, 0.0, 5.0, 0.01, 0.01, 1.0),))
-    running = armed.submit(lambda: BuiltRequest(train), "train").result(10)
-    waiting = armed.submit(lambda: BuiltRequest(frame(range(50))), "waiting").result(10)
+    running = armed.submit(lambda: BuiltRequest(train), "train").result()
+    waiting = armed.submit(lambda: BuiltRequest(frame(range(50))), "waiting").result()
     wait_for(lambda: armed.get_plan(running.plan).executed >= 3, "a part of the train")
     newest = ended(armed, stream(armed, frame(range(5), 200.0)))
     assert newest.status == "done"
@@ -115,7 +118,7 @@ def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
 
 def test_a_plan_after_a_stream_waits_for_its_end(armed):
     first = stream(armed, frame(range(30)))
-    second = armed.submit(lambda: BuiltRequest(frame(range(30))), "second").result(10)
+    second = armed.submit(lambda: BuiltRequest(frame(range(30))), "second").result()
     records = [ended(armed, answer) for answer in (first, second)]
     assert [record.status for record in records] == ["done", "done"]
     for record in records:
@@ -126,11 +129,11 @@ def test_a_stop_ends_a_stream_and_the_heat_is_kept(armed, board):
     first = stream(armed, frame(range(60), 300.0))
     wait_for(lambda: armed.get_plan(first.plan).executed >= 5, "a part of the frame")
     second = stream(armed, frame(range(60, 120), 300.0))
-    armed.stop().result(10)
+    armed.stop().result()
     for answer in (first, second):
         assert ended(armed, answer).status in ("failed", "superseded")
     count = len(board.of("pulse"))
-    armed.arm().result(10)
+    armed.arm().result()
     assert len(board.of("pulse")) == count
     assert ended(armed, stream(armed, frame(range(60), 300.0))).status == "done"
 

@@ -179,7 +179,5 @@ build_budget(config, parameters, build_display_pixels(config, parameters))
 def test_a_new_term_is_a_new_file_and_nothing_else(tmp_path):
     """The term is simulated, searched for, loaded from a parameter set and bounded by the limiter."""
     (tmp_path / "heat_leak.py").write_text(LEAK)
-    finished = subprocess.run(
-        [sys.executable, "-c", USE, str(tmp_path)], capture_output=True, text=True, timeout=110, check=False
-    )
+    finished = subprocess.run([sys.executable, "-c", USE, str(tmp_path)], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr

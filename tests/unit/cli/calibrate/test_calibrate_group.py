@@ -55,7 +55,7 @@ def test_a_no_on_the_terminal_ends_before_the_board_is_opened(monkeypatch, tmp_p
     command = [sys.executable, "-m", "optodrive.cli.main", "calibrate", "board"]
     with subprocess.Popen(command, cwd=tmp_path, stdin=terminal, stderr=subprocess.PIPE, text=True) as process:
         os.write(master, b"n\n")
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate()
     os.close(terminal)
     os.close(master)
     assert process.returncode == 130
