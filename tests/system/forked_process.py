@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import cached_property
 from pathlib import Path
 
 import fork_server
@@ -39,8 +40,12 @@ class _Server:
     """Fork server, which starts with the first request."""
 
     def __init__(self):
-        self.environment = dict(os.environ)
         self._control = None
+
+    @cached_property
+    def environment(self):
+        """Environment of the first request: importing a test may have changed it, as OpenCV does."""
+        return dict(os.environ)
 
     def request(self, fields, descriptors):
         if self._control is None:
