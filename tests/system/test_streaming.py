@@ -30,13 +30,13 @@ def stream(armed, sequence):
 
 @pytest.mark.parametrize("reserved_s", [RESERVED_S, pytest.param(None, marks=pytest.mark.slow)])
 def test_the_newest_frame_wins_without_a_pause(armed, board, reserved_s):
-    """A frame of 85 pixels takes seconds. A new one follows when a part of the previous one was executed."""
+    """A frame of 85 pixels takes four seconds. A new one follows when a part of the previous one was executed."""
     answers = []
     for k in range(5):
         if reserved_s is not None:
             for _ in range(2):
                 armed._planner._planning_time.record(reserved_s / FACTOR)
-        answers.append(stream(armed, frame(range(85 * k, 85 * k + 85), 300.0 if k < 4 else 60.0)))
+        answers.append(stream(armed, frame(range(85 * k, 85 * k + 85), 500.0 if k < 4 else 60.0)))
         wait_for(lambda: armed.get_plan(answers[-1].plan).executed >= 12, "a part of the frame")
     records = [ended(armed, answer) for answer in answers]
     assert [record.status for record in records] == ["superseded"] * 4 + ["done"]
