@@ -8,14 +8,10 @@ from all_scenarios import MODULES, SCENARIOS
 from bench import Bench
 from process_board import has_subject
 from scenario import GUARDS, judge
-from test_conformance_pty import CASES
+from test_conformance_pty import list_cases, name_case
 
 
-def name_case(case):
-    return f"{case.subject}-{case.name}"
-
-
-@pytest.mark.parametrize("case", CASES, ids=name_case)
+@pytest.mark.parametrize("case", list_cases("qemu"), ids=name_case)
 def test_emulated_chip_conforms(case, virtual):
     judge(virtual("qemu"), case)
 

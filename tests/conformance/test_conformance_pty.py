@@ -27,7 +27,7 @@ IN_EVERY_RUN = (
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[kind.name for kind in PROCESS_KINDS])
 def board_kind(request, ready):
     return ready(request.param, 0)
 
@@ -47,21 +47,27 @@ def in_every_run(case):
     return case.name in IN_EVERY_RUN
 
 
-MARKS = {True: (), False: (pytest.mark.slow,)}
-CASES = [pytest.param(case, marks=MARKS[in_every_run(case)]) for case in SCENARIOS]
+def name_case(case):
+    return f"{case.subject}-{case.name}"
 
 
-@pytest.mark.parametrize(
-    ("board_kind", "case"),
-    [
-        pytest.param(kind.name, case, id=f"{kind.name}-{case.subject}-{case.name}", marks=MARKS[in_every_run(case)])
-        for kind in PROCESS_KINDS
+def list_cases(name, without=None):
+    """Return the scenarios of a kind of board, those of another one left out; only some are played in every run."""
+    return [
+        case if in_every_run(case) else pytest.param(case, marks=pytest.mark.slow)
         for case in SCENARIOS
-        if has_subject(kind.name, case.subject)
-    ],
-    indirect=["board_kind"],
-)
+        if has_subject(name, case.subject) and not (without and has_subject(without, case.subject))
+    ]
+
+
+@pytest.mark.parametrize("case", list_cases("python"), ids=name_case)
 def test_conforms(case, board_kind, outcomes):
+    outcomes[case.name].result()
+
+
+@pytest.mark.parametrize("board_kind", ["host"], indirect=True)
+@pytest.mark.parametrize("case", list_cases("host", without="python"), ids=name_case)
+def test_conforms_beyond_the_simulated_board(case, board_kind, outcomes):
     outcomes[case.name].result()
 
 
