@@ -19,8 +19,8 @@ from optodrive.device.config_file import locate_shipped
 
 TOKEN = "a-token-for-tests"
 NAP_MAX_S = 0.02
-PATIENT_LEASE_S, PATIENT_LEAD_S = 1.0, 0.06
-"""Maximum lease, and a long lead of streams, for tests that are about neither.
+PATIENT_LEASE_S, PATIENT_LEAD_S = 1.0, 0.2
+"""Maximum lease, and the maximum lead of streams, for tests that are about neither.
 
 A busy machine may stall a host for 0.1 s, and the bytes on a pseudo-terminal for some 10 ms."""
 ENDED = ("done", "superseded", "failed", "cancelled")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from firmware_ports import build_board
-from forked_process import SHORT_INDICATOR
+from forked_process import FULL_INDICATOR
 from optodrive.link.session.board_group import SEND_AHEAD_MAX_S
 from optodrive.link.session.clock_sync import DRIFT_MAX
 from optodrive.link.simulator.board_clock import BoardClock
@@ -23,7 +23,7 @@ LATE = "light would have been"
 """Error of a plan whose points this computer did not hand over in time."""
 CLOCKS = BoardClock(50e-6), BoardClock(-50e-6, 10e-6)
 DRIFTING = [
-    [*SHORT_INDICATOR, "--clock-ppm", str(1e6 * clock.drift), "--clock-wander-ppm", str(1e6 * clock.wander)]
+    [*FULL_INDICATOR, "--clock-ppm", str(1e6 * clock.drift), "--clock-wander-ppm", str(1e6 * clock.wander)]
     for clock in CLOCKS
 ]
 STAGE = """

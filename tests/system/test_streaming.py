@@ -24,6 +24,17 @@ def frame(pixels, height_um=100.0):
     return FrameSequence((TactileFrame("f", 0.0, 10.0, target),))
 
 
+def wait_for_pulses(armed, answer, count):
+    """Wait until a number of a plan's pulses were executed. Raise AssertionError if the plan has failed."""
+
+    def look():
+        report = armed.get_plan(answer.plan)
+        assert report.status != "failed", report.error
+        return report.executed >= count
+
+    wait_for(look, f"{count} pulses")
+
+
 def stream(armed, sequence):
     return armed.submit(lambda: BuiltRequest(sequence), "stream", streamed=True).result()
 
@@ -37,7 +48,7 @@ def test_the_newest_frame_wins_without_a_pause(armed, board, reserved_s):
             for _ in range(2):
                 armed._planner._planning_time.record(reserved_s / FACTOR)
         answers.append(stream(armed, frame(range(85 * k, 85 * k + 85), 500.0 if k < 4 else 60.0)))
-        wait_for(lambda: armed.get_plan(answers[-1].plan).executed >= 12, "a part of the frame")
+        wait_for_pulses(armed, answers[-1], 12)
     records = [ended(armed, answer) for answer in answers]
     assert [record.status for record in records] == ["superseded"] * 4 + ["done"]
     for record in records:
@@ -61,7 +72,7 @@ def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
     """After two late splices the running stream is truncated, so the third plan has no deadline."""
     stream(armed, frame(range(30)))
     first = stream(armed, frame(range(437), 200.0))  # seconds, long beside the naps
-    wait_for(lambda: armed.get_plan(first.plan).executed >= 4, "a part of the frame")
+    wait_for_pulses(armed, first, 4)
     tries = []
 
     def slowly(*arguments, **more):
@@ -78,7 +89,6 @@ def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
     for record, height_um in zip(records, (200.0, 100.0), strict=True):
         assert record.executed + record.dropped == record.planned
         assert np.array(record.executed_pulses.simulated_um) == pytest.approx(height_um, rel=0.01)
-    assert armed.snapshot().board.underruns == 0
 
 
 def test_frames_reach_their_targets_in_sequence(armed):
