@@ -15,6 +15,7 @@ functions of the same module and of those that it imports from, found by name al
 """
 
 import ast
+import re
 import sys
 from collections.abc import Iterator
 from enum import IntEnum
@@ -24,6 +25,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 CLOCKS = {"monotonic", "perf_counter", "process_time", "thread_time", "time"}
 CLOCKS |= {f"{name}_ns" for name in CLOCKS}
+READING = re.compile(rf"\b(?:{'|'.join(CLOCKS)})\(")
 CLOCK_OWNERS = {"time", "loop"}
 LOOPS = {"get_running_loop", "get_event_loop"}
 TRANSPARENT = {
@@ -289,7 +291,7 @@ def find_problems(sources: dict[str, str]) -> list[str]:
     for path, tree in trees.items():
         names = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
         modules[path].others = [facts for other, facts in modules.items() if Path(other).stem in names]
-    readers, to_read = {}, list(trees)
+    readers, to_read = {}, [path for path, text in sources.items() if READING.search(text)]
     while to_read:
         before = {path: facts.count() for path, facts in modules.items()}
         readers |= {path: Reader(modules[path], trees[path]) for path in to_read}

@@ -2,14 +2,13 @@
 
 import json
 import signal
-import subprocess
 from typing import NamedTuple
 
 import serial
 from board_log import BoardLog
 
 from firmware_ports import build_board
-from forked_process import SIMULATED
+from forked_process import SIMULATED, start_process
 from optodrive.core.clock import MonotonicClock
 
 READ_WAIT_S = 0.005
@@ -68,7 +67,7 @@ class BoardProcess(BoardLog):
                 path = folder / option.strip("-")
                 path.write_text(text)
                 arguments += [option, path]
-        self.process = subprocess.Popen([*kind.command, *arguments])
+        self.process = start_process([*kind.command, *arguments])
         try:
             self.wait(lambda: self.port.exists() or self.process.poll() is not None, "the board's port")
             assert self.process.poll() is None, f"the board ended by itself: {self.process.returncode}"

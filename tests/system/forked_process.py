@@ -7,6 +7,7 @@ import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from functools import cached_property
 from pathlib import Path
@@ -41,6 +42,7 @@ class _Server:
 
     def __init__(self):
         self._control = None
+        self._lock = threading.Lock()
 
     @cached_property
     def environment(self):
@@ -48,13 +50,17 @@ class _Server:
         return dict(os.environ)
 
     def request(self, fields, descriptors):
-        if self._control is None:
-            self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            with theirs:
-                number = theirs.fileno()
-                subprocess_command = [sys.executable, fork_server.__file__, str(number)]
-                self._process = subprocess.Popen(subprocess_command, pass_fds=[number], env=self.environment)
+        with self._lock:
+            if self._control is None:
+                self._start()
         socket.send_fds(self._control, [json.dumps(fields).encode()], descriptors)
+
+    def _start(self):
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            number = theirs.fileno()
+            command = [sys.executable, fork_server.__file__, str(number)]
+            self._process = subprocess.Popen(command, pass_fds=[number], env=self.environment)
 
     def close(self):
         if self._control is not None:
