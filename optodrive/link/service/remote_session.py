@@ -29,7 +29,9 @@ from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.staged_job import StagedJob
 
-REPLY_TIMEOUT_S = 0.2
+REPLY_TIMEOUT_S = 0.6
+"""Longest wait for the link process: longer than a stall of a busy computer, which is for the lease to judge, and
+shorter than the age of a beat at which the link process counts its caller as stalled."""
 NO_EPOCH = 0
 """Epoch while the link process is not reached. No request carries it."""
 EXECUTED_RECORD = np.dtype([("on_tick", "<u8"), ("on_ticks", "<u4"), ("duty", "<u2")])
