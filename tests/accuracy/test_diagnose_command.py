@@ -41,6 +41,7 @@ def test_the_narrative_and_three_files(recording, tmp_path, capsys):
     assert [item["runs"] for item in answer["held_out"]] == [3, 3]
 
 
+@pytest.mark.slow
 def test_json_on_stdout_and_nothing_else(recording, capsys):
     assert run(["diagnose", str(recording), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["verdict"] == "cause"

@@ -12,7 +12,7 @@ from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 ALL = range(10)
-SOME = ALL[:4]
+SOME = ALL[:2]
 
 
 @pytest.fixture(params=[SOME, pytest.param(ALL, marks=pytest.mark.slow)], ids=["some", "all"])

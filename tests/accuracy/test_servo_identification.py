@@ -33,7 +33,7 @@ def altered(measurement, change):
     return Measurement(tuple(change(run) for run in measurement.runs))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=3 * settings.default.max_examples // 20, deadline=None)
 @given(st.floats(300, 3000), st.floats(0.3, 0.99), st.floats(0, 1e-4), st.floats(30, 300), st.integers(0, 99))
 def test_the_closed_form_is_what_integration_gives_also_where_steps_overlap(hz, damping, delay_s, slew, seed):
     random = np.random.default_rng(seed)
@@ -44,7 +44,8 @@ def test_the_closed_form_is_what_integration_gives_also_where_steps_overlap(hz, 
     assert reported == pytest.approx(HiddenServo(hz, damping, delay_s, slew).follow(at_s, command_rad, t_s), abs=1e-7)
 
 
-@pytest.mark.parametrize("seed", [900, *(pytest.param(k, marks=pytest.mark.slow) for k in range(901, 912))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(900, 912))
 def test_hidden_servos_are_found_on_both_axes(seed):
     random = np.random.default_rng(seed)
     servos = HiddenServo.sample(random), HiddenServo.sample(random)

@@ -44,6 +44,7 @@ def test_the_quicker_mirrors_acceleration_lowers_the_galvo_cap(unlike):
     assert any("the galvo cap is multiplied by" in line for line in format_report_lines(found))
 
 
+@pytest.mark.slow
 def test_a_mirror_that_does_more_than_a_servo_is_said(unlike):
     def ringing(run):
         signal = run.signals["mirror_y_rad"]

@@ -29,7 +29,9 @@ class Draw(NamedTuple):
     unknown_named_max: int
 
 
-FIXED = Draw(2_500_000, {"none": range(1), "single": range(1, 2), "pair": range(1), "unknown": range(1)}, 0, 0, 0, 0)
+FIXED = Draw(
+    2_500_000, {"none": range(1, 2), "single": range(1, 2), "pair": range(1, 2), "unknown": range(1)}, 0, 0, 0, 0
+)
 DRAWN = Draw(
     int(os.environ.get("BLIND_SEED") or secrets.randbelow(1_000_000) + 2_000_000),
     {"none": range(2), "single": range(4), "pair": range(1), "unknown": range(2)},

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 FUZZ = Path(__file__).with_name("fuzz")
-INPUTS = {"decoder": 100_000, "board": 5_000}
+INPUTS = {"decoder": 30_000, "board": 2_500}
 LONG_INPUTS = {"decoder": 1_000_000, "board": 50_000}
 """Half a minute. The last of the disabled guards is noticed after a tenth to a fifth of them."""
 LONGEST = {"decoder": 1024, "board": 512}

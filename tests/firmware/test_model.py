@@ -8,7 +8,6 @@ import pytest
 from optodrive.device.config_file import locate_shipped
 
 MODELS = locate_shipped().parent / "firmware_protocol" / "model"
-MUTANTS = range(1, 7)
 
 
 def explored(folder, mutant, name="board.pml"):
@@ -34,10 +33,7 @@ def test_no_interleaving_violates_a_rule(tmp_path):
     assert states > 3_000_000
 
 
-@pytest.mark.parametrize(
-    "mutant",
-    [mutant if k % 2 == 0 else pytest.param(mutant, marks=pytest.mark.slow) for k, mutant in enumerate(MUTANTS)],
-)
+@pytest.mark.parametrize("mutant", [1, 2, 3, 4, pytest.param(5, marks=pytest.mark.slow), 6])
 def test_a_removed_rule_is_detected(tmp_path, mutant):
     errors, _, reported = explored(tmp_path, mutant)
     assert errors == 1

@@ -211,6 +211,7 @@ def test_the_verdict_agrees_with_an_exhaustive_search(seed):
     check_agreement(seed)
 
 
+@pytest.mark.slow
 def test_both_verdicts_are_common_among_the_seeds():
     """The seeds are fixed, because hypothesis draws its own distribution."""
     fits = [check_agreement(seed).fits for seed in range(100)]

@@ -200,7 +200,7 @@ def helios_display(display, points_per_s):
     return DisplayModel.from_config(Config.model_validate(table))
 
 
-@settings(max_examples=60)
+@settings(max_examples=3 * settings.default.max_examples // 5)
 @given(data=st.data())
 def test_on_a_helios_whose_steps_are_coarse(data):
     try:

@@ -59,7 +59,7 @@ def sequences(draw, name):
 @pytest.mark.parametrize(
     "name", [name if name != "display-16" else pytest.param(name, marks=pytest.mark.slow) for name in sorted(DISPLAYS)]
 )
-@settings(max_examples=12)
+@settings(max_examples=12 * settings.default.max_examples // 100)
 @given(data=st.data())
 def test_prediction_target_and_cap_hold_in_an_independent_integrator(name, data):
     display = DISPLAYS[name]

@@ -30,7 +30,7 @@ PATIENT = replace(REQUIREMENTS, lease_s=LEASE_S, limits=replace(REQUIREMENTS.lim
 LONG_STEP_S = 0.1
 SEND_AHEAD_S = 0.04
 ACTIONS = 40
-IN_EVERY_RUN, MANY = 150, 10_000
+IN_EVERY_RUN, MANY = 60, 10_000
 INPUTS = {"interlock": (False, True), "key": (False, True), "estop": (True, False)}
 """Unsafe and safe value of each input."""
 

@@ -8,6 +8,8 @@ was answered, and no plan is lit beyond its pulses. All parts are real; time is 
 import random
 from typing import NamedTuple
 
+import pytest
+
 from link_service_rig import OPERATOR, WEB, ServiceRig
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
@@ -195,12 +197,13 @@ class Interleaving:
         return [epoch for begun_s, epoch in self.epochs if begun_s <= at_s or begun_s == 0.0][-1]
 
 
-def test_nothing_of_an_older_epoch_is_accepted_or_lit(monkeypatch):
-    played = [Interleaving(monkeypatch, seed).play() for seed in SEEDS]
-    assert sum(len(one.rig.list_emitted()) for one in played) > 300
-    assert sum(one.accepted for one in played) > 40
-    assert sum(len(one.epochs) for one in played) > 60
-    assert sum(len(one.pauses) for one in played) > 40
+@pytest.mark.parametrize("seeds", [SEEDS[8:], pytest.param(SEEDS, marks=pytest.mark.slow)], ids=["some", "all"])
+def test_nothing_of_an_older_epoch_is_accepted_or_lit(monkeypatch, seeds):
+    played = [Interleaving(monkeypatch, seed).play() for seed in seeds]
+    assert sum(len(one.rig.list_emitted()) for one in played) > 25 * len(seeds)
+    assert sum(one.accepted for one in played) > 4 * len(seeds)
+    assert sum(len(one.epochs) for one in played) > 5 * len(seeds)
+    assert sum(len(one.pauses) for one in played) > 4 * len(seeds)
 
 
 class UncheckedQueue(PlanQueue):

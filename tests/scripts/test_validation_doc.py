@@ -23,6 +23,7 @@ def test_the_calibrated_set_is_what_the_fit_gives(tmp_path):
         assert f"\n{parameter}" in "\n" + printed
 
 
+@pytest.mark.slow
 def test_the_validation_page_is_current(tmp_path):
     made("validation_doc.py", tmp_path / "page.md")
     page = ROOT / "docs" / "explanation" / "validation.md"

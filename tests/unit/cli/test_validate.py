@@ -70,6 +70,7 @@ def test_json_is_one_object_in_si_units(rows):
         assert facts[name]["extended_role"] == "fitted"
 
 
+@pytest.mark.slow
 def test_it_loads_nothing_heavy():
     check = (
         "import sys; import optodrive.cli.validation_table as v; v.print_validation(True);"

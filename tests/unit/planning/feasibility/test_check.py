@@ -133,6 +133,10 @@ def test_a_refusal_carries_the_report():
         check(LATE_FRAME, policy="refuse")
     assert late.value.code == "refused"
     assert late.value.feasibility["name"] == "f"
+
+
+@pytest.mark.slow
+def test_a_refusal_for_a_cap_carries_the_report():
     with pytest.raises(OverBudgetError) as hot:
         check(*HOT_FRAMES, display=with_caps(touch_k=2.0), policy="refuse")
     assert hot.value.feasibility["reason"] == "touch_temperature"
@@ -151,9 +155,9 @@ def test_delay_waits_and_reports_infeasibility():
 @pytest.mark.parametrize(
     ("fit", "how"),
     [
-        ("even", {"display": with_caps(touch_k=2.0)}),
+        ("even", {}),
         ("priority", {}),
-        pytest.param("even", {}, marks=pytest.mark.slow),
+        pytest.param("even", {"display": with_caps(touch_k=2.0)}, marks=pytest.mark.slow),
         pytest.param("priority", {"display": with_caps(touch_k=2.0)}, marks=pytest.mark.slow),
     ],
 )
@@ -197,6 +201,7 @@ def test_a_large_frame_loses_few_pixels():
     assert len(left.pixels) < 20
 
 
+@pytest.mark.slow
 def test_a_long_animation_is_reduced_in_bulk():
     frames = [build_frame(range(k % 7, 40 + k % 7), 60 + k % 5, 0.12 * k, 0.12, f"f{k}") for k in range(100)]
     planned, report = check(*frames, fit="priority")
