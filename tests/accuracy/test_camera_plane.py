@@ -50,7 +50,7 @@ def test_the_grid_is_placed_by_first_corner_and_rotation():
 @pytest.mark.parametrize(
     ("cameras", "grid"),
     [
-        ((CAMERA,), GRID),
+        pytest.param((CAMERA,), GRID, marks=pytest.mark.slow),
         ((CAMERA,), DOTS),
         ((WIDE_ANGLE,), GRID),
         pytest.param((UPSIDE_DOWN,), GRID, marks=pytest.mark.slow),

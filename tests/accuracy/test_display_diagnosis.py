@@ -63,54 +63,69 @@ def tasks_of(runs):
 
 @pytest.fixture(scope="module")
 def answers_by_pixel(recording):
-    """Diagnose all pixels on two processes, one of which is killed; one task kills its worker each time."""
-    compile_kernels()
-    runs = DisplayRuns.open([recording])
+    """Diagnose all pixels in this process."""
+    return {task.pixel: diagnose_pixel(task) for task in tasks_of(DisplayRuns.open([recording]))}
+
+
+def run_with_killer(client, tasks):
+    """Yield the pixel, answer and error of each task, and of one that kills its worker each time."""
     killer = PixelTask(KILLER, partial(signal.raise_signal, signal.SIGKILL))
+    for task, answer, error in run_tasks(client, diagnose_pixel, [*tasks, killer]):
+        yield task.pixel, answer, error
+
+
+def check_is_alike(remote, local):
+    assert remote.discrepancy.parameters == local.discrepancy.parameters
+    assert remote.discrepancy.candidates == local.discrepancy.candidates
+    assert remote.discrepancy.gain == local.discrepancy.gain
+
+
+def check_is_reported(answer, error):
+    assert answer is None
+    assert "worker died" in error
+
+
+@pytest.mark.slow
+def test_every_pixel_has_an_answer_although_workers_were_killed(answers_by_pixel, recording):
+    """Two processes, one of which is killed, beside the task that kills its worker."""
+    compile_kernels()
     answers = {}
     with open_client(workers=2) as client:
         before = client.run(os.getpid)
         assert len(set(before.values())) == 2
-        for task, answer, error in run_tasks(client, diagnose_pixel, [*tasks_of(runs), killer]):
+        for pixel, answer, error in run_with_killer(client, tasks_of(DisplayRuns.open([recording]))):
             if not answers:
                 os.kill(next(iter(before.values())), signal.SIGKILL)
-            answers[task.pixel] = (answer, error)
-    return answers
-
-
-@pytest.mark.slow
-def test_every_pixel_has_an_answer_although_workers_were_killed(answers_by_pixel):
-    assert sorted(answers_by_pixel) == [*HIDDEN, BAD, KILLER]
+            answers[pixel] = (answer, error)
+    assert sorted(answers) == [*HIDDEN, BAD, KILLER]
+    check_is_reported(*answers[KILLER])
     for pixel, terms in HIDDEN.items():
-        answer, error = answers_by_pixel[pixel]
+        answer, error = answers[pixel]
         assert not error
         assert answer.discrepancy.causes == tuple(terms)
+        check_is_alike(answer, answers_by_pixel[pixel])
 
 
-def test_answers_are_those_of_one_process(answers_by_pixel, recording):
-    for task in tasks_of(DisplayRuns.open([recording]))[:2]:
-        local, remote = diagnose_pixel(task).discrepancy, answers_by_pixel[task.pixel][0].discrepancy
-        assert local.parameters == remote.parameters
-        assert local.candidates == remote.candidates
-        assert local.gain == remote.gain
+def test_a_pixel_that_kills_its_workers_is_reported_and_affects_no_other(answers_by_pixel, recording):
+    compile_kernels()
+    with open_client(workers=1) as client:
+        answers = {pixel: own for pixel, *own in run_with_killer(client, tasks_of(DisplayRuns.open([recording]))[:2])}
+    assert sorted(answers) == [*list(HIDDEN)[:2], KILLER]
+    check_is_reported(*answers.pop(KILLER))
+    for pixel, (answer, error) in answers.items():
+        assert not error
+        check_is_alike(answer, answers_by_pixel[pixel])
 
 
 def test_bad_data_are_that_pixels_error_alone(answers_by_pixel):
-    answer, _ = answers_by_pixel[BAD]
+    answer = answers_by_pixel[BAD]
     assert answer.discrepancy is None
     assert "pixel31-run/displacement_m/t_s[7]" in answer.error
     assert "\n" not in answer.error
 
 
-def test_a_pixel_that_kills_its_workers_is_reported_and_affects_no_other(answers_by_pixel):
-    answer, error = answers_by_pixel[KILLER]
-    assert answer is None
-    assert "worker died" in error
-
-
 def test_narrative_and_answer_of_a_display(answers_by_pixel):
-    pixels = tuple(answers_by_pixel[pixel][0] for pixel in [*HIDDEN, BAD])
-    found = DisplayAnswer(pixels, None, 1.0)
+    found = DisplayAnswer(tuple(answers_by_pixel.values()), None, 1.0)
     lines = build_display_narrative(found)
     assert lines[0].startswith("Of 7 pixels, each diagnosed separately, 2 show an error of the nominal model")
     assert any("2 pixels: the laser's power falls while it is on (laser_droop): 21, 25." in line for line in lines)
@@ -126,7 +141,7 @@ def test_narrative_and_answer_of_a_display(answers_by_pixel):
 
 
 def test_the_map_follows_the_layout_and_is_self_contained(answers_by_pixel):
-    found = DisplayAnswer(tuple(answers_by_pixel[pixel][0] for pixel in [*HIDDEN, BAD]), None, 1.0)
+    found = DisplayAnswer(tuple(answers_by_pixel.values()), None, 1.0)
     html = build_display_report(found, "display.h5", load_config("display-437"))
     assert html.count("<title>pixel ") == 437
     assert "<title>pixel 21: the laser&#x27;s power falls while it is on (laser_droop); laser_droop.share 0." in html

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
+
 from labs import lab
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.recording import sandboxed_probe, write_recording
 
 
+@pytest.mark.slow
 def test_a_sound_file_of_many_runs_may_take_its_time(tmp_path, monkeypatch):
     monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
     (run,) = lab(1, {}, groups=("weak",), repeats=1).runs

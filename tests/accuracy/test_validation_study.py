@@ -223,7 +223,10 @@ def test_the_answer_as_json(found):
     assert document["gain"]["factor_each"]["extended"] < document["gain"]["factor_each"]["nominal"]
 
 
-def test_the_command_tells_the_story(found, capsys):
+@pytest.mark.parametrize("is_run_again", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["once", "again"])
+def test_the_command_tells_the_story(found, capsys, monkeypatch, is_run_again):
+    if not is_run_again:
+        monkeypatch.setattr("optodrive.lab.validation.study.run_study", lambda *_: found)
     assert run(["validate", "--diagnose"]) == 0
     keys = capsys.readouterr().out
     flat = " ".join(keys.split())

@@ -241,7 +241,7 @@ ATTRIBUTES = st.dictionaries(
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
 
-@settings(max_examples=60)
+@settings(max_examples=3 * settings.default.max_examples // 5)
 @given(
     st.lists(FINITE, min_size=6, max_size=12, unique=True),
     st.lists(FINITE | st.just(np.nan), min_size=12, max_size=12),

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from optodrive.cli import main
 from optodrive.cli.validation_table import build_validation_rows, format_cells
 from optodrive.lab.validation.paper_outcomes import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, NOT_MODELLED, OUTCOMES
 
@@ -54,8 +55,9 @@ def test_the_table_shows_every_fact_whole_also_without_a_terminal(rows):
     assert "…" not in text
 
 
-def test_json_is_one_object_in_si_units(rows):
-    document = json.loads(run("--json"))
+def test_json_is_one_object_in_si_units(rows, capsys):
+    assert main.run(["validate", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
     facts = {item["id"]: item for item in document["facts"]}
     assert list(facts) == list(rows)
     assert facts["z_tp8_w040"]["value"] == pytest.approx(155.2e-6)

@@ -21,6 +21,8 @@ SMALL = Neighbours.from_display(DISPLAYS["display-16"].config.display)
 ARRAY = PixelArray.uniform(PIXEL, 16)
 AMBIENT_K, FULL_W = 296.15, 2.45
 SINGLE = sorted(term.key for term in TERMS if any(term.kernels))
+OF_EACH_KIND = ("", "laser_lag", "panel_heating", "neighbour_crosstalk", "radiation", "gas_leak", "membrane_creep")
+"""No term, and one each of laser, panel, neighbours, absorber, gas and membrane."""
 
 
 def default_values(*keys):
@@ -172,7 +174,9 @@ def test_a_pulse_asked_to_be_wide_and_to_count_late_is(key):
             assert duty == pytest.approx(theirs[1], rel=1e-2)
 
 
-@pytest.mark.parametrize("key", ["", *SINGLE])
+@pytest.mark.parametrize(
+    "key", [pytest.param(key, marks=() if key in OF_EACH_KIND else pytest.mark.slow) for key in ("", *SINGLE)]
+)
 @pytest.mark.parametrize("pixel", [pytest.param(0, marks=pytest.mark.slow), 5])
 def test_heights_from_the_heat_there_are_those_of_the_whole_run(key, pixel):
     keys = key.split("+")

@@ -94,6 +94,8 @@ def test_a_recording_in_a_wrong_unit_is_refused_in_one_line(command, quantity, u
     assert f"likely in {unit}" in error
 
 
-@pytest.mark.parametrize("command", RECORDINGS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=pytest.mark.slow if name == "servo" else ()) for name in RECORDINGS]
+)
 def test_a_sound_recording_is_calibrated(command, tmp_path, capsys):
     assert calibrate(command, tmp_path, RECORDINGS[command]()) == 0, capsys.readouterr().err

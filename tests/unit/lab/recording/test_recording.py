@@ -314,7 +314,9 @@ def test_what_is_no_hdf5_file_is_refused(tmp_path):
     assert "neither file nor folder" in refusal(path)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize(
+    "share", [0.02, *(pytest.param(share, marks=pytest.mark.slow) for share in (0.1, 0.5, 0.9)), 0.999]
+)
 def test_truncated_files_are_refused(path, share):
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])

@@ -51,7 +51,7 @@ def test_move_energy_bounds_the_integral_closely(damping, move_rad):
     assert bound <= 1.4 * exact
 
 
-@pytest.mark.parametrize("damping", [0.3, 0.7, 0.9])
+@pytest.mark.parametrize("damping", [0.3, pytest.param(0.7, marks=pytest.mark.slow), 0.9])
 def test_the_ringing_envelope_bounds_all_phases_tightly(damping):
     galvo = SERVO._replace(damping=damping)
     pole = galvo.omega_rad_per_s * complex(-damping, np.sqrt(1 - damping**2))
