@@ -20,6 +20,8 @@ del test_equal_seeds_give_equal_faults  # noqa: F821
 del test_goodput_of_a_full_line_at_one_percent_loss  # noqa: F821
 del test_goodput_of_a_job_at_one_percent_loss  # noqa: F821
 
+FEW_FAULTS, *FAULT_RATES = python_board.FAULT_RATES
+
 
 SEEDS = range(5, 13)
 CHIP_FAULTS = 5_000
@@ -39,6 +41,11 @@ def test_the_emulated_chip_under_link_faults_emits_each_pulse_as_sent_once_and_i
         pulses += rig.check()
     assert pulses > 0
     rig.core.close()
+
+
+@pytest.mark.parametrize(("seed", "loss"), [pytest.param(*FEW_FAULTS, marks=pytest.mark.slow), *FAULT_RATES])
+def test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(seed, loss):
+    python_board.test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(seed, loss)
 
 
 @pytest.mark.parametrize("guard", [1, 12, 13])
