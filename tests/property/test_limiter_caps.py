@@ -146,7 +146,7 @@ def check_caps(compute_fractions, kind, seed):
         assert fraction <= 1 + 1e-6, f"{name} cap exceeded: {fraction}"
 
 
-@settings(deadline=None)
+@settings(max_examples=3 * settings.default.max_examples // 5, deadline=None)
 @given(kind=st.sampled_from((*KINDS, LONG)), seed=st.integers(0, 2**40))
 def test_no_sequence_exceeds_a_cap(kind, seed):
     check_caps(cap_fractions, kind, seed)
