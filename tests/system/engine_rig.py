@@ -1,7 +1,6 @@
 """The engine in this process on a real link process, with a stand-in for the web process."""
 
 import threading
-import time
 from concurrent.futures import Future
 
 from link_process_rig import BEAT_INTERVAL_S, Client, LinkProcess
@@ -75,7 +74,6 @@ class RiggedEngine(Engine):
         warm_up(self.display)
         self._thread.start()
         wait_for(lambda: self.is_linked, "the link")
-        time.sleep(2 * BEAT_INTERVAL_S)  # for the first beats
         return self
 
     def _run_until_end(self):
@@ -85,6 +83,7 @@ class RiggedEngine(Engine):
             self.failure = error
 
     def arm(self):
+        wait_for(lambda: self.web.status and not self.web.status["stalled"], "beats of planner and web")
         return self._command("arm", lambda result: self.board_state == "ARMED")
 
     def stop(self):
