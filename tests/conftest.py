@@ -19,7 +19,7 @@ from displays import DISPLAYS
 settings.register_profile(
     "thorough", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
 )
-settings.register_profile("every run", settings.get_profile("thorough"), max_examples=40)
+settings.register_profile("every run", settings.get_profile("thorough"), max_examples=25)
 
 
 def pytest_configure(config):

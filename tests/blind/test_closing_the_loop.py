@@ -9,8 +9,7 @@ SEED = 9_700_000
 """A development seed; `scripts/bench loop` covers all causes."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cause", ["laser_turn_on", "membrane_creep"])
+@pytest.mark.parametrize("cause", ["laser_turn_on", pytest.param("membrane_creep", marks=pytest.mark.slow)])
 def test_planning_with_the_diagnosed_model_takes_most_of_the_error_away(cause, tmp_path):
     loop = close_loop(draw_case("single", SEED, tmp_path, cause=cause), tmp_path)
     assert loop.trimmed == 0
