@@ -40,10 +40,10 @@ def shorten_certificates(config):
 def pytest_sessionstart():
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a job in the background; commands would inherit it
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    forked_process.enable()
 
 
 def pytest_collection_finish():
+    forked_process.enable()  # in the environment that all tests share: OpenCV has changed it, no test has yet
     gc.collect()
     gc.freeze()  # what was imported and collected lives to the end; each collection would visit it again
 

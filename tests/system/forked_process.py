@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from functools import cached_property
 from pathlib import Path
 
 import fork_server
@@ -41,13 +40,9 @@ class _Server:
     """Fork server, which starts with the first request."""
 
     def __init__(self):
+        self.environment = dict(os.environ)
         self._control = None
         self._lock = threading.Lock()
-
-    @cached_property
-    def environment(self):
-        """Environment of the first request: importing a test may have changed it, as OpenCV does."""
-        return dict(os.environ)
 
     def request(self, fields, descriptors):
         with self._lock:
