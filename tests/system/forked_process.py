@@ -20,6 +20,8 @@ FULL_INDICATOR = (*SHORT_INDICATOR, "--full-indicator")
 PROGRAMS = {(str(OPTODRIVE),): "optodrive", SIMULATED: "board", SHORT_INDICATOR: "short_indicator_board"}
 LOADED_VARIABLES = ("HOME", "LD_", "NUMBA_", "OPENBLAS_", "PYTHON", "XDG_CACHE_HOME")
 """Beginnings of the variables that a process reads while it loads: with others than the server's, it starts anew."""
+IRRELEVANT = "PYTHONHASHSEED"
+"""A variable that Dask leaves behind, and that changes no result."""
 _server = None
 
 
@@ -104,7 +106,8 @@ def _is_forkable(options):
     environment = options.get("env") or os.environ
     names = {*environment, *_server.environment}
     return not any(
-        name.startswith(LOADED_VARIABLES) and environment.get(name) != _server.environment.get(name) for name in names
+        name.startswith(LOADED_VARIABLES) and environment.get(name) != _server.environment.get(name)
+        for name in names - {IRRELEVANT}
     )
 
 
