@@ -13,6 +13,7 @@ import argparse
 import ctypes
 import os
 import random
+import re
 import subprocess
 import sys
 import time
@@ -114,10 +115,10 @@ def list_live_tests(part, parts):
 
 def parse_part(text):
     """Return K and M of K/M."""
-    part, parts = map(int, text.split("/"))
-    if not 1 <= part <= parts:
-        raise ValueError
-    return part, parts
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected K/M with K from 1 to M")
+    return int(match[1]), int(match[2])
 
 
 def main():
