@@ -64,22 +64,11 @@ SLOW = (
     *("test_diagnosis.py", "test_validation_study.py", "accuracy", "property", "firmware"),
 )
 """Files and folders that take longest, in the order of their start: a worker with the last one keeps none waiting."""
-LIVE = ("system", "browser", "conformance", "docs")
-"""Folders of tests in real time, which mostly wait."""
-
-
-def find_places(items):
-    """Return the place of each file among those in real time or those that compute, 0 to 1: so both end together."""
-    files = list(dict.fromkeys(item.path for item in items))
-    groups = [[path for path in files if (path.parent.name in LIVE) is is_live] for is_live in (True, False)]
-    return {path: number / len(group) for group in groups for number, path in enumerate(group)}
 
 
 def pytest_collection_modifyitems(config, items):
     order = {name: number for number, name in enumerate(SLOW)}
     items.sort(key=lambda item: min(order.get(name, len(SLOW)) for name in (item.path.name, item.path.parent.name)))
-    places = find_places(items)
-    items.sort(key=lambda item: places[item.path])
     if config.getoption("--board") is None:
         skip = pytest.mark.skip(reason="needs a real board: --board PORT")
         for item in items:
