@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config import Config, PixelLayout
 
 DERIVATIVE_STEP_M = 1e-4
@@ -31,8 +31,8 @@ class IdealField:
         return x_m / (2.0 * self.focal_length_m), y_m / (2.0 * self.focal_length_m)
 
 
-def max_neighbour_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatArray) -> float:
-    """Return the largest angle of either mirror between adjacent pixels, diagonals included; 0 without neighbours."""
+def list_adjacent_pixels(layout: PixelLayout) -> IntArray:
+    """Return the pairs of adjacent pixels, diagonals included, [2, n]."""
     rows, columns = layout.row.tolist(), layout.column.tolist()
     place = {(row, column): at for at, (row, column) in enumerate(zip(rows, columns, strict=True))}
     pairs = [
@@ -41,9 +41,14 @@ def max_neighbour_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatA
         for up, right in ((0, 1), (1, 0), (1, 1), (1, -1))
         if (row + up, column + right) in place
     ]
-    if not pairs:
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+
+
+def max_neighbour_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatArray) -> float:
+    """Return the largest angle of either mirror between adjacent pixels, diagonals included; 0 without neighbours."""
+    one, other = list_adjacent_pixels(layout)
+    if not len(one):
         return 0.0
-    one, other = np.array(pairs).T
     return float(max(np.abs(angle[one] - angle[other]).max() for angle in (x_rad, y_rad)))
 
 

@@ -5,9 +5,11 @@ from math import ceil
 
 import numpy as np
 
+from optodrive.core.types.arrays import IntArray
 from optodrive.device.config import Config
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.pixel_map import build_aim_layout
+from optodrive.device.scan_field import list_adjacent_pixels
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
 from optodrive.link.session.board_requirements import TICK_HZ, BoardRequirements, ConfiguredValues
@@ -17,19 +19,23 @@ from optodrive.link.transport.port_settings import PortSettings
 CAP_MARGIN = 1.05
 """Ratio of the board's caps to the limiter's. The board is the second line of defence behind the limiter."""
 FIELD_MARGIN_CODES = 64
+SIMULATED_CELL_MAX_CODES = 1300
+"""Size of the spot guards' cells on a simulated board whose pixels do not need smaller ones."""
 MIRROR_RANGE = ("x_min", "x_max", "y_min", "y_max")
 
 
 def build_port_settings(config: Config) -> PortSettings:
     """Return the address of the board of a configuration with one stage.
 
-    A simulated board is built for the display: its own limits are those that the display requires. Its range of the
-    mirrors is that of the scanner.
+    A simulated board is built for the display: its own limits are those that the display requires, and no pixel shares
+    a cell of its spot guards with another. Its range of the mirrors is that of the scanner.
     """
-    board, own_limits = config.board, {}
+    board, own_settings = config.board, {}
     if board.transport == "simulated":
-        limits = permit_retiming(build_board_requirements(config).limits)
-        own_limits = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
+        requirements = build_board_requirements(config)
+        limits = permit_retiming(requirements.limits)
+        own_settings = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
+        own_settings["cell_codes"] = min(SIMULATED_CELL_MAX_CODES, requirements.cell_max_codes)
     return PortSettings(
         transport=board.transport,
         port=board.port,
@@ -37,7 +43,7 @@ def build_port_settings(config: Config) -> PortSettings:
         vendor_id=board.vendor_id,
         product_id=board.product_id,
         serial_number=board.serial_number,
-        own_limits=own_limits,
+        own_settings=own_settings,
     )
 
 
@@ -65,13 +71,18 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
     margin_codes: DAC codes by which the permitted range extends beyond the outermost pixels
     """
     (scale,) = build_scales(config)
+    layout = build_aim_layout(config)
+    angles_rad = load_scan_field(config).angles_rad(layout.x_m, layout.y_m)
+    codes = np.stack([scale.to_codes(angle_rad) for angle_rad in angles_rad])
     return BoardRequirements(
-        limits=_build_limits(config, scale, margin_codes),
+        limits=_build_limits(config, scale, codes, margin_codes),
+        cell_max_codes=_compute_cell_max(codes, list_adjacent_pixels(layout), scale, config),
         scale=scale,
         lease_s=config.board.lease_s,
         baud=config.board.baud,
         uid=config.board.uid,
         values=ConfiguredValues(
+            pitch_m=config.display.pitch_m,
             bandwidth_hz=config.scanner.bandwidth_hz,
             slew_rad_per_s=config.scanner.slew_rad_per_s,
             pulse_width_max_s=config.limits.pulse_width_max_s,
@@ -82,11 +93,23 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
     )
 
 
-def _build_limits(config: Config, scale: WireScale, margin_codes: int) -> m.Limits:
-    limits, layout = config.limits, build_aim_layout(config)
+def _compute_cell_max(codes: IntArray, adjacent: IntArray, scale: WireScale, config: Config) -> int:
+    """Return the largest cell of the board's spot guards that no two pixels share, in codes.
+
+    codes: [2, p] of the pixels; adjacent: [2, n] pairs of adjacent ones. Pixels a whole cell apart along one axis share
+    none.
+    """
+    one, other = adjacent
+    if codes.shape[1] == 1:
+        return CODE_MAX
+    if not len(one):  # two pitches apart or more
+        return int(config.display.pitch_m / (2.0 * config.scanner.focal_length_m * scale.rad_per_code))
+    return int(np.abs(codes[:, one] - codes[:, other]).max(axis=0).min())
+
+
+def _build_limits(config: Config, scale: WireScale, codes: IntArray, margin_codes: int) -> m.Limits:
+    limits, (x_codes, y_codes) = config.limits, codes
     settle_us, settle_ns_per_code = _compute_settling(config, scale)
-    angles_rad = load_scan_field(config).angles_rad(layout.x_m, layout.y_m)
-    x_codes, y_codes = (scale.to_codes(angle_rad) for angle_rad in angles_rad)
     return m.Limits(
         max_on_us=ceil(limits.pulse_width_max_s * 1e6),
         max_duty=65535,

@@ -20,6 +20,7 @@ BITS_PER_BYTE = 10
 class ConfiguredValues:
     """Values of the configuration that a board may contradict, under their keys, in SI units."""
 
+    pitch_m: float
     bandwidth_hz: float
     slew_rad_per_s: float
     pulse_width_max_s: float
@@ -32,11 +33,13 @@ class ConfiguredValues:
 class BoardRequirements:
     """Requirements of one configuration.
 
-    limits: the limits that the host requests; lease_s: time for which the board may emit without a renewal by the host
+    limits: the limits that the host requests; cell_max_codes: largest cell of its spot guards that no two pixels share
+    lease_s: time for which the board may emit without a renewal by the host
     baud: bit rate of the port, 1/s; uid: the only board that is accepted, hexadecimal, '' for any
     """
 
     limits: m.Limits
+    cell_max_codes: int
     scale: WireScale
     lease_s: float
     baud: int
@@ -85,6 +88,10 @@ class BoardRequirements:
             max_w = limits.spot_leak_uw * 1e-6
             key = "limits.pixel_mean_power_max_w"
             raise InputError(key, values.pixel_mean_power_max_w, f"at most {max_w:g}", "board")
+        if peer.cell_codes > self.cell_max_codes:
+            distance = f"{self.cell_max_codes}, the distance of neighbouring pixels"
+            expected = f"a board whose cell_codes are at most {distance}; this one's are {peer.cell_codes}"
+            raise InputError("display.pitch_m", values.pitch_m, expected, "board")
         for axis in ("x", "y"):
             low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
             if getattr(requested, f"{axis}_min") < low or getattr(requested, f"{axis}_max") > high:

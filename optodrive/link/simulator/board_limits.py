@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from re import fullmatch
+from typing import Any
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
@@ -62,6 +63,11 @@ def load_settings(path: Path) -> BoardSettings:
         if name not in known:
             raise InputError(f"{path}", name, f"a known key, {suggest_nearest(name, known)}")
         _check_setting(f"{path}: {name}", name, value)
+    return build_settings(table)
+
+
+def build_settings(table: dict[str, Any]) -> BoardSettings:
+    """Return the settings with the values of a table of known keys."""
     limits = replace(DEFAULT_LIMITS, **{name: value for name, value in table.items() if hasattr(DEFAULT_LIMITS, name)})
     return BoardSettings(limits, **{name: value for name, value in table.items() if not hasattr(DEFAULT_LIMITS, name)})
 

@@ -13,6 +13,7 @@ from optodrive.link.service.link_settings_builder import build_board_settings
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_limits import build_settings
 from optodrive.link.simulator.memory_link import MemoryLink
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.planned_sequence import PlannedSequence
@@ -48,7 +49,12 @@ def execute(
 def _build_boards(config: Config) -> BoardGroup:
     clock, settings = ManualClock(1.0), build_board_settings(config)
     sessions = [
-        BoardSession(MemoryLink(BoardCore(seed=1 + stage), clock), clock, one.requirements, len(settings) > 1)
+        BoardSession(
+            MemoryLink(BoardCore(build_settings(one.port.own_settings), seed=1 + stage), clock),
+            clock,
+            one.requirements,
+            len(settings) > 1,
+        )
         for stage, one in enumerate(settings)
     ]
     return BoardGroup(sessions, clock, [one.stage for one in settings])

@@ -8,7 +8,7 @@ class PortSettings:
     """Address of a board. transport: name of a transport; port: serial device; baud: its bit rate, 1/s.
 
     vendor_id, product_id, serial_number: of a USB device; an empty serial number accepts the only device of its kind
-    own_limits: the limits that a simulated board has by itself, by their name in LIMITS
+    own_settings: the settings that a simulated board has by itself, by their name in its file of limits
     """
 
     transport: str
@@ -17,4 +17,4 @@ class PortSettings:
     vendor_id: int | None = None
     product_id: int | None = None
     serial_number: str = ""
-    own_limits: dict[str, int] = field(default_factory=dict)
+    own_settings: dict[str, int] = field(default_factory=dict)

@@ -19,7 +19,7 @@ LINGER_S = 5.0
 class SimulatedBoard(SerialPort):
     """Serial port of a board process that open() starts if none is running.
 
-    settings: its address and its own limits
+    settings: its address and its own settings
     display: file or shipped name of the configuration; with it the process also simulates a spot sensor
     stage: whose scanner moves the spot, None for the only one
     log: path of the board's log
@@ -30,7 +30,7 @@ class SimulatedBoard(SerialPort):
         self._folder = tempfile.TemporaryDirectory(prefix="optodrive-board-")
         super().__init__(settings.port or str(Path(self._folder.name) / "tty"), settings.baud)
         self._limits = Path(self._folder.name) / "limits.toml"
-        self._limits.write_text("".join(f"{name} = {value}\n" for name, value in settings.own_limits.items()))
+        self._limits.write_text("".join(f"{name} = {value}\n" for name, value in settings.own_settings.items()))
         self.log = Path(self._folder.name) / "board.jsonl"
         self.sensor_port = str(Path(self._folder.name) / "sensor")
         self._display, self._stage = display, stage

@@ -174,6 +174,11 @@ def changed(section, **values):
         ),
         (BoardSettings(replace(DEFAULT_LIMITS, x_min=31_000)), CONFIG, "display x"),
         (BoardSettings(replace(DEFAULT_LIMITS, y_max=33_000)), CONFIG, "display y"),
+        (
+            BoardSettings(),
+            changed("display", pitch_m=2.5e-3),
+            "display.pitch_m: got 0.0025, expected a board whose cell_codes are at most 1066, the distance of",
+        ),
     ],
 )
 def test_an_incompatible_board_is_rejected_with_the_key(settings, config, says):

@@ -1,11 +1,30 @@
 import numpy as np
 import pytest
 
+from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.device.config import Config
 from optodrive.link.simulator.instruments import INSTRUMENT_SIGMA, measure
 from optodrive.link.simulator.traces import compute_traces
 from optodrive.link.simulator.virtual_run import execute
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
+
+OWN = {
+    "display": {"rows": 6, "columns": 6, "pitch_m": 2.5e-3},
+    "laser": {"max_power_w": 1.2, "pwm_hz": 2000.0},
+    "scanner": {"focal_length_m": 0.4, "bandwidth_hz": 900.0, "damping": 0.5, "slew_rad_per_s": 40.0},
+    "limits": {"pixel_mean_power_max_w": 0.2},
+    "board": {"lease_s": 0.3},
+}
+"""A display whose neighbours are 586 codes apart, as no other test has it."""
+
+
+def build_own_display():
+    table = DISPLAYS["display-16"].config.model_dump()
+    for section, values in OWN.items():
+        table[section] |= values
+    return DisplayModel.from_config(Config.model_validate(table))
 
 
 def sequence(display, count=30, height_m=50e-6):
@@ -23,6 +42,15 @@ def test_what_is_planned_is_executed_on_every_display(any_display):
     assert executed.width_s == pytest.approx(plan.width_s, abs=1e-12)
     assert executed.power_w == pytest.approx(plan.power_w, rel=1e-3)
     assert executed.pixel.tolist() == plan.pixel.tolist()
+
+
+def test_a_display_of_one_s_own_is_executed():
+    """Neighbours take turns without a rest, each near its caps: none may count on the account of another."""
+    display = build_own_display()
+    trains = tuple(PulseTrain(pixel, 0.1 * turn, 0.09, 0.04, 0.005, 1.2) for turn, pixel in enumerate((0, 1, 7, 6)))
+    prepared = plan_sequence(display, FrameSequence((), trains), *display.build_cold_state())
+    assert prepared.plan.power_w.tolist() == [1.2] * 8, "nothing trimmed"
+    assert execute(display, prepared).complete
 
 
 @pytest.mark.parametrize(
