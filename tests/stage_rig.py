@@ -42,6 +42,24 @@ class DriftingLink(MemoryLink):
         return b"" if self.is_cut else data
 
 
+class BusyLink(DriftingLink):
+    """Link over a computer that wakes its programs late: what the board sends arrives after delay_s."""
+
+    delay_s = 0.0
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self._late = []
+
+    def read(self, timeout_s):
+        data = super().read(timeout_s)
+        if data:
+            self._late.append((self._clock.now_s() + self.delay_s, data))
+        due = [late for late in self._late if late[0] <= self._clock.now_s()]
+        self._late = self._late[len(due) :]
+        return b"".join(data for _, data in due)
+
+
 def build_stages(name, count, **changes):
     """Build a display with equal stages. changes: of its [limits]."""
     config = DISPLAYS[name].config

@@ -7,17 +7,15 @@ import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.link.session.clock_sync import DRIFT_MAX, SAMPLES_MAX
-from optodrive.link.session.session import CLOCK_INTERVAL_S
+from optodrive.link.session.clock_sync import CLOCK_SPAN_S, DRIFT_MAX
 from rig import ended, wait_for
 
 LATE = FrameSequence((), (PulseTrain(17, 0.7, 0.2, 0.01, 0.03, 1.0),))
-SAMPLE_AGE_S = SAMPLES_MAX * CLOCK_INTERVAL_S
 
 
 def find_clock_error_s(engine):
     """Return the uncertainty of the board's clock by the round trip that the link states."""
-    return 0.5 * (1e-3 * engine.web.status["stats"]["round_trip_ms"] + DRIFT_MAX * SAMPLE_AGE_S)
+    return 0.5 * (1e-3 * engine.web.status["stats"]["round_trip_ms"] + DRIFT_MAX * CLOCK_SPAN_S)
 
 
 def read_gate_on_s(board):

@@ -243,8 +243,14 @@ class PlanQueue:
     # --- running plans ------------------------------------------------------------------------------------------
 
     def start_next(self) -> None:
-        """Start the next plan if the board is ready for it."""
+        """Start the next plan if the board is ready for it.
+
+        Several boards emit nothing late: a plan whose time has passed while it waited for them is proven again for now.
+        """
         if self.running or not self.waiting or not self._session.is_ready or self.pause.off_s is not None:
+            return
+        if len(self._session.scales) > 1 and self._find_start_s(self.waiting[0]) < self._session.board_s():
+            self.pause.begin(self._session.board_s())
             return
         with self.lock:
             plan = self.waiting.popleft()
@@ -254,8 +260,13 @@ class PlanQueue:
                 return
             record.status = "running"
             ahead_s = self._stream_lead_s if record.streamed else inf
-            job = self._session.begin(plan.points, record.start_s + plan.zero_s, plan.epoch, ahead_s, plan.crc)
+            job = self._session.begin(plan.points, self._find_start_s(plan), plan.epoch, ahead_s, plan.crc)
             self.running.append(PlanRun(plan, job))
+
+    @staticmethod
+    def _find_start_s(plan: ActivePlan) -> float:
+        """Return the board time at which the points of a plan begin, s."""
+        return plan.record.start_s + plan.zero_s
 
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""

@@ -26,6 +26,10 @@ from optodrive.link.session.staged_job import StagedJob
 
 SEND_AHEAD_MAX_S = 0.3
 """Longest time for which points are sent ahead to several boards; meanwhile their clocks drift."""
+CLOCK_PATIENCE_S = 3.0
+"""Time for which a start waits until the boards' clocks are known well enough, then it is refused."""
+CLOCK_SEEK_SHARE = 0.5
+"""Clocks are compared more often while one may be further off than this share of what a start permits."""
 SUMS = ("done_index", "queued", "underruns", "crc_errors", "format_errors", "seq_errors", "laser_on_s")
 STATE_ORDER = (
     BoardState.RUNNING,
@@ -56,6 +60,7 @@ class BoardGroup:
         self._skew_max_s = skew_max_s
         self._refusal: str | None = None
         self._failed: BoardSession | None = None
+        self._clocks_awaited_s = clock.now_s()
         self.has_several = len(self.sessions) > 1
         self.on_executed: Callable[[int, m.Executed], None] = lambda stage, message: None
         for stage, session in enumerate(self.sessions):
@@ -128,8 +133,28 @@ class BoardGroup:
 
     @property
     def is_ready(self) -> bool:
-        """Whether a job may start now."""
+        """Whether a job may start now, or is refused because the time of a board has not become known in seconds."""
+        return self._are_boards_ready and (self._are_clocks_known or self._waited_for_clocks_s > CLOCK_PATIENCE_S)
+
+    @property
+    def _are_boards_ready(self) -> bool:
         return all(session.is_ready for session in self.sessions)
+
+    @property
+    def _are_clocks_known(self) -> bool:
+        """Whether the time of each of several boards is known as exactly as a start needs it."""
+        return not self.has_several or all(
+            self._find_clock_error_s(session) <= self._skew_max_s for session in self.sessions
+        )
+
+    @property
+    def _waited_for_clocks_s(self) -> float:
+        """Time for which boards that are ready have waited until their clocks are known, s."""
+        return self._clock.now_s() - self._clocks_awaited_s
+
+    def _find_clock_error_s(self, session: BoardSession) -> float:
+        fit = session.clock_sync.fit(self._clock.now_s())
+        return inf if fit is None else fit.uncertainty_s
 
     @property
     def is_acknowledged(self) -> bool:
@@ -233,10 +258,20 @@ class BoardGroup:
     def step(self, wait_s: float, renew_lease: bool, stalled: str = "planner") -> None:
         """Run one iteration of each session, as `BoardSession.step`; only the first waits for bytes."""
         self._drop_late_points()
+        self._seek_clocks()
         for session in self.sessions:
             self._failed = session
             session.step(wait_s if session is self.sessions[0] else 0.0, renew_lease, stalled)
         self._failed = None
+
+    def _seek_clocks(self) -> None:
+        """Compare the clocks more often while they are not known well enough for the start of a plan."""
+        if not self.has_several:
+            return
+        for session in self.sessions:
+            session.seeks_clock = self._find_clock_error_s(session) > CLOCK_SEEK_SHARE * self._skew_max_s
+        if self._are_clocks_known or not self._are_boards_ready:
+            self._clocks_awaited_s = self._clock.now_s()
 
     def _drop_late_points(self) -> None:
         """Drop the points of all boards if one would execute its next point late."""
@@ -321,7 +356,8 @@ class BoardGroup:
             fit = self._fit_clock(session)
             if fit.uncertainty_s > self._skew_max_s:
                 raise NotReadyError(
-                    f"{self._name(session)}its clock is known to {1e6 * fit.uncertainty_s:.0f} µs, "
+                    f"{self._name(session)}after {self._waited_for_clocks_s:.1f} s of repeated exchanges its clock "
+                    f"is known to {1e6 * fit.uncertainty_s:.0f} µs, "
                     f"limits.stage_skew_max_s permits {1e6 * self._skew_max_s:.0f} µs"
                 )
             if abs(fit.rate - 1.0) > DRIFT_MAX:

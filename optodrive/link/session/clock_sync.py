@@ -5,10 +5,12 @@ Every exchange brackets a board tick between its request and its reply.
 
 import secrets
 from collections.abc import Sequence
+from math import floor
 from typing import NamedTuple
 
-SAMPLES_MAX = 16
-"""Number of recent exchanges, unless stated otherwise."""
+CLOCK_SPAN_S = 16.0
+"""Time over which the clocks are compared."""
+CLOCK_INTERVAL_S = 1.0
 PENDING_MAX = 64
 WIDTH_MIN_S = 1e-6
 WANDER_MAX = 2e-6
@@ -53,11 +55,12 @@ class _FittedLine(NamedTuple):
 class ClockSync:
     """Map from host time to board time (ticks / tick_hz). One thread adds samples, any thread may read.
 
-    samples_max: number of recent exchanges that count
+    interval_s: of each interval the narrowest exchange counts
     """
 
-    def __init__(self, samples_max: int = SAMPLES_MAX) -> None:
-        self._samples_max = samples_max
+    def __init__(self, interval_s: float = CLOCK_INTERVAL_S) -> None:
+        self._interval_s = interval_s
+        self._samples_max = round(CLOCK_SPAN_S / interval_s)
         self._request_s: dict[int, float] = {}
         # An immutable tuple, because another thread may be reading it.
         self._samples: tuple[tuple[float, float, float], ...] = ()
@@ -77,10 +80,16 @@ class ClockSync:
         request_s = self._request_s.pop(stamp, None)
         if request_s is None:
             return
-        sample = (reply_s - request_s, (request_s + reply_s) / 2, board_s)
-        self._samples = (*self._samples[1 - self._samples_max :], sample)
+        sample, samples = (reply_s - request_s, (request_s + reply_s) / 2, board_s), self._samples
+        if not samples or self._number_interval(samples[-1]) != self._number_interval(sample):
+            self._samples = (*samples[1 - self._samples_max :], sample)
+        elif sample[0] < samples[-1][0]:
+            self._samples = (*samples[:-1], sample)
         # All brackets widen alike, so that the narrowest is the same at all times.
         self._best = min(self._samples, key=lambda each: each[0] - DRIFT_MAX * each[1])[1:]
+
+    def _number_interval(self, sample: tuple[float, float, float]) -> int:
+        return floor(sample[1] / self._interval_s)
 
     @property
     def is_synchronised(self) -> bool:

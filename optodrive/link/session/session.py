@@ -19,7 +19,7 @@ from optodrive.link.protocol.quantisation import WirePoints, WireScale
 from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
-from optodrive.link.session.clock_sync import ClockSync
+from optodrive.link.session.clock_sync import CLOCK_INTERVAL_S, ClockSync
 from optodrive.link.session.lease_renewal import RENEWAL_FRACTION, LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.plan_job import PlanJob, PointTiming
@@ -32,10 +32,8 @@ CONNECT_TIMEOUT_S = 2.5
 HANDSHAKE_INTERVAL_S = 0.02
 """Interval between two requests of the handshake; a board that answers only some of them is not polled faster."""
 STATUS_INTERVAL_S = 0.2
-CLOCK_INTERVAL_S = 1.0
 STAGE_CLOCK_INTERVAL_S = 0.25
-CLOCK_SPAN_S = 16.0
-"""Time over which the clocks are compared."""
+CLOCK_SEEK_INTERVAL_S = 0.02
 CLOCK_INITIAL_SAMPLES = 8
 SILENCE_TIMEOUT_S = 2.0
 """The link counts as lost after this time without a message from the board."""
@@ -53,6 +51,7 @@ class BoardSession:
     lease: schedule and statistics of the lease renewals
     board: latest reported state of the board
     on_executed: called with every report of executed points
+    seeks_clock: whether the clocks are compared more often, because that of the board is not known well enough
     is_one_of_several: whether other boards share its display. It is then asked often: for its clock, because all keep
     the host's time, and for its status, because its silence must end the light of the others within a lease.
     """
@@ -85,7 +84,7 @@ class BoardSession:
         self.lease = LeaseRenewal(requirements.lease_s)
         self._watch = LinkWatch(transport.name, requirements.lease_s)
         self.board = BoardView()
-        self.connected = False
+        self.connected = self.seeks_clock = False
         self.last_event_reason = ""
         self.abort_confirmed = False
         """Whether the board has confirmed the last ABORT: gate off, queue dropped, DISARMED."""
@@ -101,7 +100,7 @@ class BoardSession:
         return self._requirements.scale
 
     def _build_clock_sync(self) -> ClockSync:
-        return ClockSync(round(CLOCK_SPAN_S / self._clock_interval_s))
+        return ClockSync(self._clock_interval_s)
 
     @property
     def clock_sync(self) -> ClockSync:
@@ -274,7 +273,8 @@ class BoardSession:
             self._send_lease(now_s)
         if now_s - self._status_requested_s >= self._status_interval_s:
             self._request_status()
-        if now_s - self._clock_requested_s >= self._clock_interval_s:
+        clock_interval_s = CLOCK_SEEK_INTERVAL_S if self.seeks_clock else self._clock_interval_s
+        if now_s - self._clock_requested_s >= clock_interval_s:
             self._request_clock()
         self._retry_hello()
         self._stream_points()

@@ -11,7 +11,7 @@ CLOCKS = [BoardClock(60e-6, 0.0, 5.0), BoardClock(-40e-6, 10e-6), BoardClock()]
 
 def compare(clock, count, seed=1, width_s=3e-4):
     """Return the comparison after `count` exchanges, and the host time of the last."""
-    rng, sync = np.random.default_rng(seed), ClockSync(64)
+    rng, sync = np.random.default_rng(seed), ClockSync(0.25)
     sent_s = 0.0
     for k in range(count):
         sent_s = 1000.0 + 0.25 * k
@@ -28,6 +28,19 @@ def test_the_error_is_within_its_bound(clock, count):
     error_s = fit.to_board_s(last_s + 0.2) - clock.read_s(last_s + 0.2)
     assert abs(error_s) < fit.uncertainty_s < 1e-3
     assert fit.to_host_s(fit.to_board_s(1234.5)) == pytest.approx(1234.5, abs=1e-9)
+
+
+def test_repeated_exchanges_leave_the_narrowest_of_each_interval():
+    """A hundred wide ones within two seconds neither displace a narrow one nor what is known of the rate."""
+    clock = CLOCKS[0]
+    sync, last_s = compare(clock, 64)
+    before = sync.fit(last_s)
+    for k in range(100):
+        sent_s = last_s + 0.25 + 0.02 * k
+        sync.finish_exchange(sync.start_exchange(sent_s), sent_s + 0.02, clock.read_s(sent_s))
+    after_s = last_s + 2.25
+    assert sync.fit(after_s).uncertainty_s < 5e-4
+    assert sync.fit(after_s).rate == pytest.approx(before.rate, abs=2e-6)
 
 
 def test_after_some_seconds_the_rate_is_known():
