@@ -68,6 +68,12 @@ def test_a_hidden_cause_is_named_measured_and_gains(droop):
     assert "Ruled out" in text
 
 
+def test_a_right_model_is_off_in_planned_heights_by_no_more_than_the_noise(droop, clean):
+    for error in (droop.height_error_held_out, droop.height_error_fitted):
+        assert error.extended_rms < 3.0 * error.noise < error.nominal_max
+    assert clean.height_error_fitted.nominal_rms < 3.0 * clean.height_error_fitted.noise
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("time_s", [3e-4, 1e-3])
 def test_a_laser_that_is_slow_at_both_edges_is_no_late_clock(time_s):

@@ -96,6 +96,22 @@ class HeldOutError:
     noise_floor: float
 
 
+@dataclass(frozen=True)
+class HeightError:
+    """Error of heights planned with either model, measured / predicted − 1 of recorded pushes: rms and largest.
+
+    pushes, experiments: their number, repeats counting once; noise: rms of the measured heights' own, relative
+    """
+
+    pushes: int
+    experiments: int
+    nominal_rms: float
+    nominal_max: float
+    extended_rms: float
+    extended_max: float
+    noise: float
+
+
 @dataclass(frozen=True, eq=False)
 class ResidualTrace:
     """One signal of one run: measured values and residuals, [m].
@@ -133,7 +149,8 @@ class Discrepancy:
     verdict: "cause", "none", "unexplained" or "ambiguous"; terms: the extension, term → parameter → value; base:
     nominal parameters as refitted with it; residual_traces: the first run of every group, with the models fitted to all
     runs; held_out_traces, held_out_errors: with the models fitted to the other runs; explained_fraction: share of the
-    detected excess
+    detected excess of χ²; doubts: why the size of a named cause is uncertain, a clause by cause; height_error_held_out,
+    height_error_fitted: on pushes to which the models were not fitted, and on all; None if none was measured
     """
 
     verdict: str
@@ -154,4 +171,7 @@ class Discrepancy:
     rivals: tuple[RivalModel, ...]
     remarks: tuple[str, ...]
     explained_fraction: float
+    doubts: dict[str, str]
+    height_error_held_out: HeightError | None
+    height_error_fitted: HeightError | None
     elapsed_s: float

@@ -1,11 +1,9 @@
 """Diagnosis of a recording, separately for pixels and mirrors and then combined."""
 
 from dataclasses import dataclass, replace
-from math import exp
 from time import perf_counter
 
 import numpy as np
-from scipy.stats import t as student
 
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
@@ -23,9 +21,10 @@ from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.candidate_judgement import judge_candidates, list_rivals
 from optodrive.lab.diagnosis.copied_runs import check_copied_runs
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset
-from optodrive.lab.diagnosis.detection import count_noise_degrees
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
+from optodrive.lab.diagnosis.estimates import compute_estimates, describe_doubts, is_at_limit
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, fit
+from optodrive.lab.diagnosis.height_error import compute_height_error
 from optodrive.lab.diagnosis.held_out_gain import compute_held_out_errors, compute_held_out_gain, split_runs
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_selection import (
@@ -41,14 +40,11 @@ from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
-from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, ParameterPoint
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint
 from optodrive.lab.diagnosis.refitting import ProgressCallback, RefittedCandidate
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
-from optodrive.physics.hypothesis import FreeParameter, Hypothesis
+from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
-
-LIMIT_SHARE = 1e-3
-"""A fitted number within this share of a limit of its range counts as at the limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +106,12 @@ def diagnose(
     main = subsystems[0]
     parameters: dict[str, Estimate] = {}
     terms: dict[str, dict[str, float]] = {}
+    doubts: dict[str, str] = {}
     for subsystem in subsystems:
-        parameters |= _compute_estimates(subsystem)
+        estimates = compute_estimates(subsystem.data, subsystem.final, subsystem.covariance)
+        parameters |= estimates
+        chosen = subsystem.verdict.chosen
+        doubts |= {} if chosen is None else describe_doubts(chosen.hypotheses, estimates)
         terms |= {key: dict(values) for key, values in subsystem.final.point.terms.items()}
     has_pixels = any(kind < 3 for kind in main.data.kinds)
     base = (
@@ -149,6 +149,9 @@ def diagnose(
         rivals=tuple(rival for subsystem in subsystems for rival in subsystem.rivals),
         remarks=_build_remarks(subsystems),
         explained_fraction=min(explained_fractions, default=0.0),
+        doubts=doubts,
+        height_error_held_out=compute_height_error(main.problem, main.held_out, *main.blind_points),
+        height_error_fitted=compute_height_error(main.problem, main.data, main.base.point, main.final.point),
         elapsed_s=perf_counter() - began_s,
     )
 
@@ -253,27 +256,6 @@ def _combine_verdicts(subsystems: list[_SubsystemFit]) -> tuple[str, tuple[str, 
     return "cause", causes
 
 
-def _compute_estimates(subsystem: _SubsystemFit) -> dict[str, Estimate]:
-    final = subsystem.final
-    sigma = np.sqrt(np.maximum(np.diag(subsystem.covariance), 0.0))
-    out: dict[str, Estimate] = {}
-    t_quantile = float(student.ppf(0.975, count_noise_degrees(subsystem.data)))
-    if any(kind < 3 for kind in subsystem.data.kinds):
-        for row, name in enumerate(BASE_PARAMETERS):
-            log_value, width = final.point.base[row], t_quantile * float(sigma[row])
-            out[name] = Estimate(exp(log_value), BASE_UNITS[name], exp(log_value - width), exp(log_value + width))
-    for row, free in enumerate(final.free, start=len(BASE_PARAMETERS)):
-        number, width = free.read_value(final.point.terms), t_quantile * float(min(sigma[row], 50.0))
-        ends = (number - width, number + width)
-        value, low, high = (exp(min(x, 300.0)) if free.logarithmic else x for x in (number, *ends))
-        at_limit = _is_at_limit(final, free)
-        if not at_limit:
-            low, high = max(low, free.parameter.low), min(high, free.parameter.high)
-        for name in free.names:
-            out[f"{free.key}.{name}"] = Estimate(value, free.parameter.unit, low, high, at_limit)
-    return out
-
-
 def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: ProgressCallback) -> NextExperiment | None:
     """Return the experiment that separates the best candidate from its first rival, if the verdict is ambiguous."""
     if verdict.verdict != "ambiguous" or not verdict.candidates:
@@ -316,8 +298,8 @@ def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
             if subsystem.verdict.verdict == "cause" and detection.p_omnibus < 1e-3:
                 causes = " and ".join(subsystem.verdict.causes)
                 out.append(
-                    f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of the error remains, because the real "
-                    "effect deviates slightly from the form of its term."
+                    f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of the excess χ² remains, because the "
+                    "real effect deviates slightly from the form of its term."
                 )
         out += _describe_range_limits(subsystem.final)
     return tuple(dict.fromkeys(out))
@@ -327,15 +309,8 @@ def _describe_range_limits(final: ModelFit) -> list[str]:
     out = []
     for free in final.free:
         value = final.point.terms[free.key][free.names[0]]
-        if _is_at_limit(final, free):
+        if is_at_limit(final, free):
             out.append(
                 f"{free.label} is at the limit of its plausible range, {format_quantity(value, free.parameter.unit)}."
             )
     return out
-
-
-def _is_at_limit(final: ModelFit, free: FreeParameter) -> bool:
-    """Return whether a fitted number that is no shape lies at a limit of its range other than zero."""
-    value, item = final.point.terms[free.key][free.names[0]], free.parameter
-    limits = [limit for limit in (item.low, item.high) if limit != 0.0]
-    return not item.is_shape and any(abs(value - limit) <= LIMIT_SHARE * abs(limit) for limit in limits)

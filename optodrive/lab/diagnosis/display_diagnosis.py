@@ -56,13 +56,27 @@ class PixelSpread:
 
 @dataclass(frozen=True, eq=False)
 class PixelGroup:
-    """Pixels with the same verdict and causes; parameters: of the named causes; gain: reduction on held-out runs."""
+    """Pixels with the same verdict and causes.
+
+    parameters: of the named causes; gain: reduction on held-out runs; height_error: rms of planned heights, on held-out
+    pushes where there are any
+    """
 
     verdict: str
     causes: tuple[str, ...]
     answers: tuple[PixelAnswer, ...]
     parameters: dict[str, PixelSpread]
     gain: PixelSpread | None
+    height_error: PixelSpread | None
+
+    @property
+    def doubtful(self) -> list[int]:
+        """Indices of the pixels at which the size of a named cause is not established, sorted."""
+        return sorted(
+            item.pixel
+            for item in self.answers
+            if item.pixel is not None and item.discrepancy is not None and item.discrepancy.doubts
+        )
 
     @property
     def pixels(self) -> list[int]:
@@ -153,7 +167,10 @@ def _build_group(verdict: str, causes: tuple[str, ...], answers: tuple[PixelAnsw
                 units[name] = item.unit
     gains = [discrepancy.gain.reduction for discrepancy in discrepancies if discrepancy.gain is not None]
     parameters = {name: PixelSpread.from_values(pixel_values, units[name]) for name, pixel_values in values.items()}
-    return PixelGroup(verdict, causes, answers, parameters, PixelSpread.from_values(gains, "1") if gains else None)
+    errors = (discrepancy.height_error_held_out or discrepancy.height_error_fitted for discrepancy in discrepancies)
+    rms = [error.extended_rms for error in errors if error is not None]
+    gain, height_error = (PixelSpread.from_values(items, "1") if items else None for items in (gains, rms))
+    return PixelGroup(verdict, causes, answers, parameters, gain, height_error)
 
 
 def _compute_median(values: Iterable[float]) -> float:

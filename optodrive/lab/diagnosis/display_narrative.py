@@ -28,6 +28,14 @@ def build_display_narrative(answer: DisplayAnswer) -> list[str]:
                 f"  The extended model removes {gain.median:.0%} of the avoidable error on held-out runs "
                 f"(median; from {gain.low:.0%} to {gain.high:.0%})."
             )
+        if group.height_error is not None:
+            error = group.height_error
+            lines.append(
+                f"  Heights planned with their models are off by {error.median:.1%} rms "
+                f"(median; from {error.low:.1%} to {error.high:.1%})."
+            )
+        if group.doubtful:
+            lines.append(f"  Sizes not established, see the pixels' doubts: {format_ranges(group.doubtful)}.")
     failed = answer.failed
     if failed:
         lines.append(f"- {format_pixel_count(len(failed))} without an answer: {format_ranges(_list_indices(failed))}.")
@@ -56,11 +64,18 @@ def build_headline(answer: DisplayAnswer) -> str:
     ]
     unexplained = sum(item.verdict == "unexplained" for item in _list_discrepancies(answer))
     wrong += [f"{unexplained} with no known cause"] if unexplained else []
+    doubtful = sum(len(group.doubtful) for group in answer.build_groups())
+    wrong += [f"{doubtful} with a cause of uncertain size"] if doubtful else []
     total = sum(item.verdict != "none" for item in _list_discrepancies(answer))
+    failed = len(answer.failed)
     prefix = f"Of {format_pixel_count(len(answer.pixels))}, each diagnosed separately,"
+    missing = f"; {failed} {'has' if failed == 1 else 'have'} no answer" if failed else ""
+    if failed == len(answer.pixels):
+        return f"{prefix} none has an answer."
     if not total:
-        return f"{prefix} none shows an error of the nominal model."
-    return f"{prefix} {total} show an error of the nominal model: {', '.join(wrong)}."
+        others = f"none of the other {len(answer.pixels) - failed}" if failed else "none"
+        return f"{prefix} {others} shows an error of the nominal model{missing}."
+    return f"{prefix} {total} show an error of the nominal model: {', '.join(wrong)}{missing}."
 
 
 def describe_group(group: PixelGroup) -> str:
@@ -107,6 +122,8 @@ def build_display_answer(answer: DisplayAnswer) -> dict[str, Any]:
                     "pixels": group.pixels,
                     "parameters": {name: _spread_to_json(item) for name, item in group.parameters.items()},
                     "gain": None if group.gain is None else _spread_to_json(group.gain),
+                    "height_error": None if group.height_error is None else _spread_to_json(group.height_error),
+                    "doubtful": group.doubtful,
                 }
                 for group in answer.build_groups()
             ],

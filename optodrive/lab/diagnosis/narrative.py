@@ -1,11 +1,12 @@
 """Diagnosis as narrative text and as JSON."""
 
+from dataclasses import asdict
 from importlib.metadata import version
 from math import isfinite
 from typing import Any
 
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate
+from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate, HeightError
 from optodrive.physics.terms import discover_terms
 
 MAX_RULED_OUT = 6
@@ -31,7 +32,8 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
         ]
         lines.append("")
     if discrepancy.verdict in ("cause", "ambiguous"):
-        lines.append(f"This explains {discrepancy.explained_fraction:.1%} of the error of the nominal model.")
+        lines.append(f"This explains {discrepancy.explained_fraction:.1%} of the excess χ² of the nominal model.")
+    lines.append(_describe_height_error(discrepancy))
     lines += _describe_locations(discrepancy)
     lines += _describe_gain(discrepancy)
     if discrepancy.verdict == "none":
@@ -64,16 +66,40 @@ def _build_headline(discrepancy: Discrepancy) -> str:
     names = [discover_terms()[key].label for key in discrepancy.causes]
     if discrepancy.verdict == "none":
         return "No error found: the refitted nominal model agrees with this recording within its noise."
+    doubts = "".join(f", but {clause}" for clause in discrepancy.doubts.values())
     if discrepancy.verdict == "cause":
-        return f"The nominal model is wrong because {' and '.join(names)}."
+        certainty = ", perhaps" if doubts else ""
+        return f"The nominal model is wrong{certainty} because {' and '.join(names)}{doubts}."
     if discrepancy.verdict == "ambiguous" and len(names) == 1:
         return (
-            f"The nominal model is wrong, perhaps because {names[0]}: not certain, because no run repeats another "
-            "(`group` is missing, or every group has one run)."
+            f"The nominal model is wrong, perhaps because {names[0]}{doubts}: not certain, because no run repeats "
+            "another (`group` is missing, or every group has one run)."
         )
     if discrepancy.verdict == "ambiguous" and names:
-        return f"The nominal model is wrong; this data cannot separate these causes: {'; or '.join(names)}."
+        return f"The nominal model is wrong; this data cannot separate these causes: {'; or '.join(names)}{doubts}."
     return "The nominal model is wrong, and no known cause explains it."
+
+
+def _describe_height_error(discrepancy: Discrepancy) -> str:
+    """Return the error of heights planned with the model, on pushes that it did not see and on those that it did."""
+    held_out, fitted = discrepancy.height_error_held_out, discrepancy.height_error_fitted
+    error = held_out or fitted
+    if error is None or fitted is None:
+        return "The error of heights planned with this model is unknown: no measured push is clear of the noise."
+    nominal = f" ({error.nominal_rms:.1%}, {error.nominal_max:.1%} nominal)" if discrepancy.terms else ""
+    text = f"Heights planned with this model are off by {error.extended_rms:.1%} rms, {error.extended_max:.1%} at most"
+    text += f"{nominal}, on {_count_pushes(error)}"
+    if held_out is None:
+        text += " that were fitted"
+    else:
+        text += f" held out of the fit; on all {_count_pushes(fitted)}, {fitted.extended_rms:.1%} and"
+        text += f" {fitted.extended_max:.1%}"
+    return f"{text}; their noise is {error.noise:.1%}. Pushes unlike the recorded ones may be further off."
+
+
+def _count_pushes(error: HeightError) -> str:
+    pushes = f"{error.pushes} push{'es' if error.pushes > 1 else ''}"
+    return f"{pushes} of {error.experiments} experiment{'s' if error.experiments > 1 else ''}"
 
 
 def _describe_locations(discrepancy: Discrepancy) -> list[str]:
@@ -136,6 +162,11 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
             for name, item in discrepancy.parameters.items()
         },
         "explained_fraction": discrepancy.explained_fraction,
+        "doubts": discrepancy.doubts,
+        "height_error": {
+            "held_out": _height_error_to_json(discrepancy.height_error_held_out),
+            "fitted": _height_error_to_json(discrepancy.height_error_fitted),
+        },
         "gain": None
         if gain is None
         else {
@@ -196,3 +227,7 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
         "elapsed_s": discrepancy.elapsed_s,
         "version": version("optodrive"),
     }
+
+
+def _height_error_to_json(error: HeightError | None) -> dict[str, Any] | None:
+    return None if error is None else asdict(error)

@@ -29,6 +29,7 @@ def build_report(discrepancy: Discrepancy, title: str, provenance: Provenance | 
         "<div class='grid'>",
         *(draw_example(example, has_extension) for example in discrepancy.example_traces),
         "</div>",
+        *_build_height_errors(discrepancy, has_extension),
         *_build_held_out(discrepancy, models, has_extension),
         "<h2>Evidence for each cause</h2>",
         f"<p>Likelihood ratio against the nominal model, on a logarithmic scale. The dashed line is at "
@@ -48,6 +49,31 @@ def build_report(discrepancy: Discrepancy, title: str, provenance: Provenance | 
 
 def _select_traces(traces: tuple[ResidualTrace, ...]) -> list[ResidualTrace]:
     return sorted(traces, key=lambda item: -float((item.nominal**2).mean()))[:MAX_TRACES]
+
+
+def _build_height_errors(discrepancy: Discrepancy, has_extension: bool) -> Iterator[str]:
+    """Return the section on heights: the errors of plans made with either model, on recorded pushes."""
+    errors = (("held out of the fit", discrepancy.height_error_held_out), ("all", discrepancy.height_error_fitted))
+    yield "<h2>Error of planned heights</h2>"
+    if discrepancy.height_error_fitted is None:
+        yield "<p>Unknown: no measured push is clear of the noise.</p>"
+        return
+    yield (
+        "<p>Measured height against the height for which the model would have chosen the recorded drive. Pushes unlike "
+        "the recorded ones may be further off.</p>"
+    )
+    rows = (
+        (
+            *(name, str(error.pushes), str(error.experiments), f"{error.nominal_rms:.1%}", f"{error.nominal_max:.1%}"),
+            *((f"{error.extended_rms:.1%}", f"{error.extended_max:.1%}") if has_extension else ()),
+            f"{error.noise:.1%}",
+        )
+        for name, error in errors
+        if error is not None
+    )
+    extended = ("extended, rms", "largest") if has_extension else ()
+    header = ("pushes", "number", "experiments", "nominal, rms", "largest", *extended, "noise")
+    yield render_table(header, rows, frozenset(range(1, len(header))), "Error of planned heights")
 
 
 def _build_held_out(discrepancy: Discrepancy, models: str, has_extension: bool) -> Iterator[str]:

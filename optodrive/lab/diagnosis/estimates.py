@@ -1,0 +1,74 @@
+"""Fitted parameters with their intervals, and the doubts that these leave about a named cause."""
+
+from collections.abc import Iterable
+from math import exp
+
+import numpy as np
+from scipy.stats import t as student
+
+from optodrive.core.quantity import format_range
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.discrepancy import Estimate
+from optodrive.lab.diagnosis.dataset import Dataset
+from optodrive.lab.diagnosis.detection import count_noise_degrees
+from optodrive.lab.diagnosis.fitting import ModelFit
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS
+from optodrive.physics.hypothesis import FreeParameter, Hypothesis
+
+LIMIT_SHARE = 1e-3
+"""A fitted number within this share of a limit of its range counts as at the limit."""
+
+
+def compute_estimates(data: Dataset, final: ModelFit, covariance: FloatArray) -> dict[str, Estimate]:
+    """Return the estimate of each fitted parameter by name; covariance: of base, then free parameters."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    out: dict[str, Estimate] = {}
+    t_quantile = float(student.ppf(0.975, count_noise_degrees(data)))
+    if any(kind < 3 for kind in data.kinds):
+        for row, name in enumerate(BASE_PARAMETERS):
+            log_value, width = final.point.base[row], t_quantile * float(sigma[row])
+            out[name] = Estimate(exp(log_value), BASE_UNITS[name], exp(log_value - width), exp(log_value + width))
+    for row, free in enumerate(final.free, start=len(BASE_PARAMETERS)):
+        number, width = free.read_value(final.point.terms), t_quantile * float(min(sigma[row], 50.0))
+        ends = (number - width, number + width)
+        value, low, high = (exp(min(x, 300.0)) if free.logarithmic else x for x in (number, *ends))
+        at_limit = is_at_limit(final, free)
+        if not at_limit:
+            low, high = max(low, free.parameter.low), min(high, free.parameter.high)
+        for name in free.names:
+            out[f"{free.key}.{name}"] = Estimate(value, free.parameter.unit, low, high, at_limit)
+    return out
+
+
+def is_at_limit(final: ModelFit, free: FreeParameter) -> bool:
+    """Return whether a fitted number that is no shape lies at a limit of its range other than zero."""
+    value, item = final.point.terms[free.key][free.names[0]], free.parameter
+    limits = [limit for limit in (item.low, item.high) if limit != 0.0]
+    return not item.is_shape and any(abs(value - limit) <= LIMIT_SHARE * abs(limit) for limit in limits)
+
+
+def describe_doubts(hypotheses: Iterable[Hypothesis], estimates: dict[str, Estimate]) -> dict[str, str]:
+    """Return, by cause, a clause for each named cause whose size the data do not establish.
+
+    A size is established if its interval excludes no effect: zero, or for a positive size the least plausible one. A
+    cause with several sizes is in doubt if all of them are.
+    """
+    doubts = {}
+    for item in hypotheses:
+        sizes = item.free if item.is_linear else item.free[:1]
+        clauses = [_describe_doubt(free, estimates[f"{free.key}.{free.names[0]}"]) for free in sizes]
+        if all(clauses):
+            doubts[item.key] = " and ".join(clauses)
+    return doubts
+
+
+def _describe_doubt(free: FreeParameter, estimate: Estimate) -> str:
+    """Return the doubt about one size, or nothing."""
+    if estimate.at_limit:
+        return f"{free.label} lies at a limit of its plausible range"
+    least = free.parameter.low if free.logarithmic else 0.0
+    if not estimate.low <= least <= estimate.high:
+        return ""
+    interval = format_range(estimate.low, estimate.high, free.parameter.unit)
+    contained = "the least plausible size" if free.logarithmic else "zero"
+    return f"the 95 % interval of {free.label}, {interval}, contains {contained}"

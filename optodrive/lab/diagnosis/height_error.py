@@ -1,0 +1,90 @@
+"""Error of the heights that a plan made with a fitted model would reach, estimated from the recorded pushes.
+
+The drive of a recorded push is the one that a plan would choose for the height that the model predicts for it. The
+measured height is then what a finger would feel in its place.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.discrepancy import HeightError
+from optodrive.lab.diagnosis.dataset import SIGNALS, Block, Dataset
+from optodrive.lab.diagnosis.fitting import FitProblem, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+
+DISPLACEMENT = SIGNALS.index("displacement_m")
+NEAR_PEAK = 0.9
+"""Samples of a push above this share of its predicted height give the measured one."""
+MAX_NOISE = 0.1
+"""Pushes whose height is known less well than to this share are not judged."""
+MODELS = ("nominal_m", "extended_m")
+"""Predicted heights of a push."""
+
+
+@dataclass(frozen=True)
+class _Push:
+    """One push in one run: measured and predicted heights, m; noise: standard deviation of the measured one."""
+
+    measured_m: float
+    nominal_m: float
+    extended_m: float
+    noise_m: float
+
+
+def compute_height_error(
+    problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint
+) -> HeightError | None:
+    """Return the error of planned heights over all pushes; None if no measured push is clear of the noise."""
+    if not len(data.value):
+        return None
+    problem = replace(problem, data=data)
+    predictions = [predict(data, point, problem.epsilon) for point in (nominal, extended)]
+    power = compute_jitter_sensitivity(data, extended, problem.epsilon, predictions[1]).power
+    repeats: dict[tuple[str, int, int], list[_Push]] = {}
+    for block in data.blocks:
+        if block.kind == DISPLACEMENT:
+            for number, push in _list_pushes(problem, block, predictions, power):
+                repeats.setdefault((data.runs[block.run].group, block.pixel, number), []).append(push)
+    errors, experiments = [], set()
+    for (group, pixel, _), pushes in repeats.items():
+        measured_m = float(np.mean([push.measured_m for push in pushes]))
+        noise = float(np.sqrt(np.mean([push.noise_m**2 for push in pushes]) / len(pushes))) / measured_m
+        if 0.0 < noise <= MAX_NOISE:
+            predicted_m = [float(np.mean([getattr(push, name) for push in pushes])) for name in MODELS]
+            errors.append([*(measured_m / height_m - 1.0 for height_m in predicted_m), noise])
+            experiments.add((group, pixel))
+    if not errors:
+        return None
+    table = np.abs(errors)
+    rms, largest = np.sqrt((table**2).mean(axis=0)).tolist(), table.max(axis=0).tolist()
+    return HeightError(len(errors), len(experiments), rms[0], largest[0], rms[1], largest[1], rms[2])
+
+
+def _list_pushes(
+    problem: FitProblem, block: Block, predictions: list[FloatArray], power: FloatArray
+) -> list[tuple[int, _Push]]:
+    """Return the number of each pulse on the block's pixel that lifts it, with the push."""
+    pulses = problem.data.runs[block.run].pulses
+    starts_s = np.sort(pulses[pulses[:, 3] == block.pixel, 0])
+    noise = problem.noise
+    coloured = noise.coloured[DISPLACEMENT]
+    slow2 = coloured.sigma[0] ** 2 + coloured.sigma[1] ** 2 + noise.baseline_sigma[DISPLACEMENT] ** 2
+    out = []
+    for number, (start_s, end_s) in enumerate(pairwise([*starts_s, np.inf])):
+        rows = block.part.start + np.flatnonzero((block.t_s >= start_s) & (block.t_s < end_s))
+        if not len(rows):
+            continue
+        nominal_m, shape_m = (prediction[rows] for prediction in predictions)
+        height_m = float(shape_m.max())
+        near = shape_m >= NEAR_PEAK * height_m
+        if height_m <= 0.0 or nominal_m.max() <= 0.0 or shape_m.argmax() == 0:  # it still falls from an earlier push
+            continue
+        near_m = shape_m[near]
+        measured_m = height_m * float(near_m @ problem.data.value[rows][near]) / float(near_m @ near_m)
+        jitter_m = noise.power_sigma * float(np.abs(power[rows][near]).mean())
+        noise_m = float(np.sqrt(coloured.white**2 / len(near_m) + slow2 + jitter_m**2))
+        out.append((number, _Push(measured_m, float(nominal_m.max()), height_m, noise_m)))
+    return out
