@@ -18,7 +18,7 @@ from optodrive.daemon.web.acceptor_client import AcceptorClient
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.listeners import open_tcp_listener
 from optodrive.daemon.web.request_head import peek_head
-from optodrive.daemon.web.server_state import ARRIVED_S, CALLER
+from optodrive.daemon.web.server_state import ARRIVED_S, CALLER, EARLIEST_S
 from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config_sections import DaemonSection
@@ -36,7 +36,8 @@ LONG_S = 1e6
 class Application:
     """Answers 200; waits on /wait, blocks the loop on /block, reads bodies on /body, echoes WebSocket messages.
 
-    arrivals: paths of the requests with the times at which they arrived; message_arrivals: those times of messages
+    arrivals: paths of the requests with the times at which they arrived
+    message_arrivals: earliest and actual times of the messages
     blocked, go_on: begin, and end, of a request for /block; release: of those for /wait, and of the message "wait"
     """
 
@@ -63,7 +64,7 @@ class Application:
         await receive()
         await send({"type": "websocket.accept"})
         while (message := await receive())["type"] == "websocket.receive":
-            self.message_arrivals.append(message[ARRIVED_S])
+            self.message_arrivals.append((message[EARLIEST_S], message[ARRIVED_S]))
             if message.get("text") == "wait":
                 await self.release.wait()
             await send({"type": "websocket.send", "text": str(len(message.get("text") or message["bytes"]))})
@@ -487,6 +488,51 @@ def test_a_message_that_waited_is_not_taken_for_new(port, server, application):
         new_s = time.monotonic()
         stream.send("new")
         stream.recv()
-    assert application.message_arrivals[0] >= begin_s
-    assert application.message_arrivals[2] < waiting_s
-    assert application.message_arrivals[3] >= new_s
+    assert application.message_arrivals[0][0] >= begin_s
+    assert application.message_arrivals[2][1] < waiting_s
+    assert application.message_arrivals[3][0] >= new_s
+
+
+def test_a_message_soon_after_another_arrived_when_it_was_sent(port, application):
+    """It may have waited beside the one before, so its earliest time is older."""
+    with open_websocket(port) as stream:
+        for number in range(20):
+            begin_s = time.monotonic()
+            stream.send("next")
+            end_s = time.monotonic()
+            stream.recv()
+            earliest_s, arrived_s = application.message_arrivals[number]
+            assert earliest_s <= arrived_s
+            assert begin_s <= arrived_s <= end_s
+
+
+def test_a_message_that_is_read_late_arrived_when_it_was_sent(open_client, port, application):
+    with open_websocket(port) as stream:
+        stream.send("first")
+        stream.recv()
+        blocking = open_client()
+        blocking.send(GET.replace(b"/v1/state", b"/block"))
+        application.blocked.acquire()
+        stream.send("while the loop is blocked")
+        sent_s = time.monotonic()
+        application.go_on.release()
+        stream.recv()
+    assert application.message_arrivals[1][1] <= sent_s
+
+
+def test_a_message_arrives_with_its_first_byte(open_client, server, application):
+    stream = open_client()
+    stream.send(HANDSHAKE)
+    stream.receive()
+    (protocol,) = server.server_state.connections
+    stream.send(PING)
+    assert PONG in stream.receive()
+    ping_s = time.monotonic()
+    stream.send(MESSAGE[:3])
+    first_s = time.monotonic()
+    wait_for(lambda: protocol.conn.reader.buffer, "the first bytes of the message")
+    stream.send(MESSAGE[3:])
+    assert ECHO in stream.receive()
+    ((earliest_s, arrived_s),) = application.message_arrivals
+    assert earliest_s <= arrived_s
+    assert ping_s <= arrived_s <= first_s

@@ -10,7 +10,11 @@ PlanStatus = Literal["planned", "queued", "running", "paused", "done", "supersed
 
 
 class PlanLatency(JsonModel):
-    """Seconds from the request's arrival to three events of its plan; None before the event."""
+    """Seconds from the request's arrival to three events of its plan; None before the event.
+
+    arrival: when the kernel received the head of a request, or the first byte of a WebSocket's message
+    planned_s: accepted into the queue; first_byte_s: handed to the link; first_light_s: gate on by the board's clock
+    """
 
     planned_s: float | None
     first_byte_s: float | None

@@ -8,6 +8,7 @@ import socket
 import struct
 
 from optodrive.daemon.web.request_head import Rank
+from optodrive.daemon.web.timed_socket import TimedSocket
 from optodrive.daemon.web.waiting_room import Waiting
 
 BEAT = b"beat"
@@ -28,7 +29,7 @@ def receive_packet(link: socket.socket) -> Waiting | bytes:
     data, descriptors, _, _ = socket.recv_fds(link, 64, 1)
     if not descriptors:
         return data
-    sock = socket.socket(fileno=descriptors[0])
+    sock = TimedSocket(fileno=descriptors[0])
     sock.setblocking(False)
     number, rank, since_s = _CONNECTION.unpack(data)
     return Waiting(sock, since_s, Rank(rank), number)

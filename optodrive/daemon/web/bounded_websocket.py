@@ -1,18 +1,20 @@
 """The WebSocket protocol of the web server: bounded messages, fragments and control frames.
 
 What a client sends is parsed in small slices. Control frames and fragments, which carry no message by themselves, are
-paced; what exceeds the pace waits in the client's socket. A message states when it arrived, or an earlier time if it
-may have waited there, because a frame from before a STOP must not be shown after it.
+paced; what exceeds the pace waits in the client's socket. A message states when its first byte arrived, and the
+earliest time at which that may have been, because a frame from before a STOP must not be shown after it: of bytes that
+wait together in the socket, the kernel knows only when the newest arrived.
 """
 
 import asyncio
-from typing import Any, cast
+from collections import deque
+from typing import Any, NamedTuple, cast
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
 
 from optodrive.daemon.web.connections import PhaseOfRequest
-from optodrive.daemon.web.server_state import ARRIVED_S, CALLER, ServerState
+from optodrive.daemon.web.server_state import ARRIVED_S, CALLER, EARLIEST_S, ServerState
 from optodrive.daemon.web.tokens import ANONYMOUS, Token
 
 MESSAGE_MAX_BYTES = 262_144
@@ -28,6 +30,11 @@ EMPTY_S = 0.05
 """A socket that has had no input for this time while it was read is empty: what comes later arrives then."""
 
 
+class _Arrival(NamedTuple):
+    arrived_s: float
+    earliest_s: float
+
+
 class BoundedWebSocket(WebSocketsSansIOProtocol):
     """uvicorn's protocol with bounded and paced input."""
 
@@ -37,7 +44,9 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         super().__init__(server_state=server_state, **options)
         self._state = server_state
         self._unparsed = bytearray()
-        self._arrived_s = self.loop.time()
+        self._read = _Arrival(self.loop.time(), self.loop.time())
+        self._begun: _Arrival | None = None  # of the message that is not complete yet
+        self._arrivals: deque[_Arrival] = deque()  # of the messages in the queue
         self._unread_since_s: float | None = None
         self._empty_handle: asyncio.TimerHandle | None = None
         self._allowance = FRAMES_BURST
@@ -77,11 +86,12 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         if not self.handshake_initiated:
             super().data_received(data)
             return
-        self._arrived_s = self._state.pop_arrival_s(self.transport)
-        if self._unread_since_s is not None:
-            self._arrived_s = min(self._arrived_s, self._unread_since_s)
+        arrived_s = self._state.pop_arrival_s(self.transport)
         # Input that filled the buffer, or arrived while nothing was read, may be as old as the last empty socket.
-        self._unread_since_s = self._arrived_s if len(data) >= READ_BYTES else self.loop.time()
+        earliest_s = arrived_s if self._unread_since_s is None else min(arrived_s, self._unread_since_s)
+        self._unread_since_s = earliest_s if len(data) >= READ_BYTES else self.loop.time()
+        self._read = _Arrival(arrived_s, earliest_s)
+        self._begun = self._begun or self._read
         if self._empty_handle is not None:
             self._empty_handle.cancel()
         self._unparsed += data
@@ -100,7 +110,8 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
     async def receive(self) -> Any:
         """Return the next message, and continue to parse once the application has taken all."""
         message: Any = await self.queue.get()
-        message[ARRIVED_S] = self._arrived_s
+        if message["type"] == "websocket.receive":
+            message[ARRIVED_S], message[EARLIEST_S] = self._arrivals.popleft()
         if self.read_paused and self.queue.empty():
             self.read_paused = False
             self._pump()
@@ -135,12 +146,28 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
     def handle_ping(self) -> None:
         """Answer a ping, at its pace."""
         self._allowance -= 1.0
+        self._end_control_frame()
         super().handle_ping()
 
     def handle_pong(self, event: Frame) -> None:
         """Take a pong, at its pace."""
         self._allowance -= 1.0
+        self._end_control_frame()
         super().handle_pong(event)
+
+    def send_receive_event_to_app(self) -> None:
+        """Queue a message that is complete, with its arrival."""
+        self._arrivals.append(self._begun or self._read)
+        self._begin_next()
+        super().send_receive_event_to_app()
+
+    def _end_control_frame(self) -> None:
+        if not self.frames:  # it is not within a message
+            self._begin_next()
+
+    def _begin_next(self) -> None:
+        """Let the next message begin with what has been read, if there is more of it."""
+        self._begun = self._read if self._unparsed or self.conn.reader.buffer else None
 
     def handle_cont(self, event: Frame) -> None:
         """Add a fragment; close the connection if its message has too many."""

@@ -6,6 +6,7 @@ from contextlib import suppress
 from ipaddress import ip_address
 
 from optodrive.core.errors import InputError
+from optodrive.daemon.web.timed_socket import enable_timestamps
 
 BACKLOG = 1024
 DESCRIPTORS_MIN = 1024
@@ -17,6 +18,7 @@ def open_tcp_listener(host: str, port: int) -> socket.socket:
     # With an explicit protocol, asyncio disables Nagle's algorithm, which would delay each response by 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    enable_timestamps(listener)
     try:
         listener.bind((host, port))
         listener.listen(BACKLOG)  # connections are accepted from the line that prints the address on

@@ -1,7 +1,6 @@
 """Streamed frames over a WebSocket: the newest frame wins, and the client gets the result of every frame."""
 
 import asyncio
-import time
 from typing import NamedTuple
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -14,7 +13,7 @@ from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.web.daemon_client import DaemonClient, PushFields
-from optodrive.daemon.web.server_state import ARRIVED_S
+from optodrive.daemon.web.server_state import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.web.socket_token import select_subprotocol
 from optodrive.planning.stimuli.sequence_codec import encode_sequence
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
@@ -71,11 +70,10 @@ class LiveStream:
             if message["type"] == "websocket.disconnect":
                 return
             data: str | bytes = message.get("text") or message.get("bytes") or b""
-            arrived_s = message.get(ARRIVED_S) or time.monotonic()
             try:
-                epoch = self._daemon.link.require_epoch_at(arrived_s)
+                epoch = self._daemon.link.require_epoch_at(message[EARLIEST_S])
                 number, sequence = parse_live_frame(data, self._next_number, self._pixels)
-                frame = _Frame(number, encode_sequence(sequence), arrived_s, epoch)
+                frame = _Frame(number, encode_sequence(sequence), message[ARRIVED_S], epoch)
             except OptodriveError as error:
                 self._publish(FrameResult(frame=None, status="refused", problem=build_error_problem(error)))
                 continue

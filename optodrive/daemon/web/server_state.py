@@ -11,6 +11,8 @@ CALLER = "optodrive.caller"
 """Key in the ASGI scope of the token that the request presented, ANONYMOUS without one."""
 ARRIVED_S = "arrived_s"
 """Key in the state of an ASGI scope, and in a WebSocket's message, of the monotonic time at which it arrived."""
+EARLIEST_S = "earliest_s"
+"""Key in a WebSocket's message of the earliest monotonic time at which it may have arrived."""
 
 
 class ServerState(uvicorn.server.ServerState):
@@ -22,7 +24,7 @@ class ServerState(uvicorn.server.ServerState):
         self.selector = selector
 
     def pop_arrival_s(self, transport: asyncio.BaseTransport) -> float:
-        """Return the monotonic time at which the input of a connection arrived that is read now."""
+        """Return the monotonic time at which the input of a connection arrived that was just read."""
         return self.selector.pop_arrival_s(transport.get_extra_info("socket").fileno())
 
     def forget(self, transport: asyncio.Transport) -> None:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable
 
 from optodrive.daemon.web.request_head import peek_head
+from optodrive.daemon.web.timed_socket import TimedSocket
 
 CLIENTS_PER_TURN = 6
 STOP_LINE = b"POST /v1/stop"
@@ -40,8 +41,11 @@ class StopFirstSelector(selectors.EpollSelector):
         self._arrived_s.pop(fileno, None)
 
     def pop_arrival_s(self, fileno: int) -> float:
-        """Return the monotonic time at which the input of a client arrived that is read now."""
-        return self._arrived_s.pop(fileno, None) or time.monotonic()
+        """Return the monotonic time at which the input of a client arrived that was just read."""
+        sock = self._clients.get(fileno)
+        received_s = sock.received_s if isinstance(sock, TimedSocket) else None
+        waiting_s = self._arrived_s.pop(fileno, None)
+        return min(at_s for at_s in (received_s, waiting_s, time.monotonic()) if at_s is not None)
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Return what is ready: everything but clients, STOP first, then the clients that have waited longest."""
