@@ -133,13 +133,14 @@ def check_free_space(folder: Path, free_bytes: int) -> Finding:
 
 def check_kernels() -> Finding:
     """Check whether compiled kernels are cached."""
-    from optodrive.core.kernels import CACHED, is_cold
+    from optodrive.core.kernels import CACHED, is_cached
+    from optodrive.planning.limiter.pulse_application import apply_pulses
 
     if not CACHED:
         return report_warning(
             "kernels", "compiled kernels cannot be cached", "make ~/.cache/optodrive writable, or set NUMBA_CACHE_DIR"
         )
-    if is_cold():
+    if not is_cached(apply_pulses):  # the last kernel that a plan compiles
         return report_warning(
             "kernels", "not compiled yet", "the first start takes half a minute: run `optodrive serve` once"
         )

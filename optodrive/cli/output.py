@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 def print_json(document: object) -> None:
@@ -19,11 +20,28 @@ def _convert_model(value: object) -> object:
 
 
 def announce_compilation() -> None:
-    """Announce on stderr that kernels will be compiled, if they are not cached."""
-    from optodrive.core.kernels import is_cold
+    """Announce on stderr that kernels are compiled, once the first is; count them where stderr is a terminal."""
+    from optodrive.core.kernels import observe_compilation
 
-    if is_cold():
-        print("optodrive: compiling kernels, half a minute, once", file=sys.stderr)
+    shown: Any = None
+
+    def show_begin(count: int) -> None:
+        nonlocal shown
+        if count == 1:
+            print("optodrive: compiling kernels, up to half a minute, once", file=sys.stderr)
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.status import Status
+
+            shown = shown or Status("", console=Console(stderr=True))
+            shown.update(f"compiling kernels: {count}")
+            shown.start()
+
+    def show_end() -> None:
+        if shown is not None:
+            shown.stop()
+
+    observe_compilation(show_begin, show_end)
 
 
 @contextmanager

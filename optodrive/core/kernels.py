@@ -23,6 +23,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numba
 import numpy as np
+from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 P = ParamSpec("P")
@@ -44,10 +45,11 @@ def _is_writable(folder: Path) -> bool:
     return os.access(folder, os.W_OK)
 
 
-CACHE_VERSION = "4"
+CACHE_VERSION = "5"
 """Changes with what cached machine code refers to and with the compiler's options.
 
-1 named generated modules by their content; 2 counted references in every kernel; 3 did not tell those that do so apart.
+1 named generated modules by their content; 2 counted references in every kernel; 3 did not tell those that do so apart;
+4 held an entry for callers in C, which took a sixth of the compilation.
 """
 _FOLDER = _cache_dir()
 CACHED = _is_writable(_FOLDER)
@@ -209,12 +211,52 @@ class _KernelCache(FunctionCache):
 
 
 _new_cache: Callable[[Any], _KernelCache] = _KernelCache  # numba has no types
-_caches: list[_KernelCache] = []
 
 
-def is_cold() -> bool:
-    """Return whether most imported kernels have no machine code yet, so that their first use takes seconds."""
-    return 2 * sum(cache.is_empty() for cache in _caches) > len(_caches) if CACHED else True
+def is_cached(function: Callable[..., Any]) -> bool:
+    """Return whether machine code of a kernel is cached, so that its first use compiles nothing."""
+    cache: Any = getattr(function, "_cache", None)
+    return isinstance(cache, _KernelCache) and not cache.is_empty()
+
+
+COMPILATION = "numba:compile"
+"""Name of numba's event."""
+
+
+class _CompilationListener(event.Listener):
+    """Counts the compilations of a process and reports when one begins and when none is left in progress."""
+
+    def __init__(self, on_begin: Callable[[int], None], on_end: Callable[[], None]) -> None:
+        self._on_begin, self._on_end = on_begin, on_end
+        self._count = self._depth = 0
+        self._process = os.getpid()
+
+    def on_start(self, data: Any) -> None:
+        if os.getpid() == self._process:  # a fork has no terminal of its own
+            self._depth += 1
+            self._count += 1
+            self._on_begin(self._count)
+
+    def on_end(self, data: Any) -> None:
+        if os.getpid() == self._process:
+            self._depth -= 1
+            if self._depth == 0:
+                self._on_end()
+
+
+_listeners: list[_CompilationListener] = []
+
+
+def observe_compilation(on_begin: Callable[[int], None], on_end: Callable[[], None]) -> None:
+    """Call `on_begin` with the count so far when this process compiles a kernel, and `on_end` when it has done so.
+
+    A kernel whose machine code is cached is loaded, not compiled. A later observer replaces an earlier one.
+    """
+    change: Any = event  # numba has no types
+    while _listeners:
+        change.unregister(COMPILATION, _listeners.pop())
+    _listeners.append(_CompilationListener(on_begin, on_end))
+    change.register(COMPILATION, _listeners[0])
 
 
 def kernel(function: Callable[P, T]) -> Callable[P, T]:
@@ -235,11 +277,12 @@ _njit: Any = numba.njit  # numba's types lack _nrt
 
 
 def _compile(function: Callable[P, T], counts_references: bool) -> Callable[P, T]:
-    compiled = _njit(nogil=True, error_model="numpy", _nrt=counts_references)(function)
+    # No kernel is passed as a value or called from C: an entry for that would be compiled with all that it inlines.
+    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": counts_references}
+    compiled = _njit(**options)(function)
     if CACHED:
         compiled._cache = _new_cache(function)
         compiled._cache.counts_references = counts_references
-        _caches.append(compiled._cache)
     result: Callable[P, T] = compiled
     return result
 

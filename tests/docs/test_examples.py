@@ -137,7 +137,7 @@ def test_output_is_shown_only_where_it_is_compared(block):
         ("…\nlast\n", "one\ntwo\nlast\n"),
         ("first\n…\n", "first\n"),
         ("a 1        # a note\n", "a 1\n"),
-        ("a 1\n", "optodrive: compiling kernels, half a minute, once\na 1\n"),
+        ("a 1\n", "optodrive: compiling kernels, up to half a minute, once\na 1\n"),
         ("", ""),
     ],
 )

@@ -178,11 +178,11 @@ def test_packages_missing_or_too_old_are_named():
 
 
 @pytest.mark.parametrize(
-    ("cached", "cold", "status"), [(True, False, "ok"), (True, True, "warning"), (False, True, "warning")]
+    ("writable", "cached", "status"), [(True, True, "ok"), (True, False, "warning"), (False, False, "warning")]
 )
-def test_the_compiled_kernels(monkeypatch, cached, cold, status):
-    monkeypatch.setattr("optodrive.core.kernels.CACHED", cached)
-    monkeypatch.setattr("optodrive.core.kernels.is_cold", lambda: cold)
+def test_the_compiled_kernels(monkeypatch, writable, cached, status):
+    monkeypatch.setattr("optodrive.core.kernels.CACHED", writable)
+    monkeypatch.setattr("optodrive.core.kernels.is_cached", lambda kernel: cached)
     assert host.check_kernels().status == status
 
 

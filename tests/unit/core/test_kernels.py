@@ -13,10 +13,18 @@ from numba.core.errors import TypingError
 
 from optodrive.core.kernels import COMPILER_LIBRARY, array_kernel, code_stamp, kernel, release_compiler
 
-IS_COLD = (
-    "import optodrive.planning.limiter.pulse_application, optodrive.core.kernels as c;"
-    " print(c.is_cold(), c.CACHED, c._FOLDER)"
+IS_CACHED = (
+    "from optodrive.planning.scheduler.visiting_path import path_rad; import optodrive.core.kernels as c;"
+    " print(c.is_cached(path_rad), c.CACHED, c._FOLDER)"
 )
+ANNOUNCED = """
+import sys
+from optodrive.cli.output import announce_compilation
+from optodrive.planning.scheduler.visiting_path import compile_kernels
+sys.stderr = sys.stdout
+announce_compilation()
+compile_kernels()
+"""
 OTHER = """
 from typing import NamedTuple
 
@@ -150,13 +158,17 @@ def test_machine_code_is_loaded_until_the_kernel_changes(tmp_path):
     assert run_python(code, tmp_path / "cache") == ["15.0", "0", "False"]
 
 
-def test_an_empty_folder_is_cold(tmp_path):
-    assert run_python(IS_COLD, tmp_path) == ["True", "True", str(tmp_path)]
+def test_compilation_is_announced_once_and_only_when_a_kernel_is_compiled(tmp_path):
+    """Most kernels of the imported modules have no machine code yet in either run."""
+    assert run_python(IS_CACHED, tmp_path) == ["False", "True", str(tmp_path)]
+    assert run_python(ANNOUNCED, tmp_path) == "optodrive: compiling kernels, up to half a minute, once".split()
+    assert run_python(IS_CACHED, tmp_path) == ["True", "True", str(tmp_path)]
+    assert run_python("import optodrive.planning.pipeline\n" + ANNOUNCED, tmp_path) == []
 
 
 def test_without_a_writable_folder_nothing_is_cached():
-    is_cold, cached, _ = run_python(IS_COLD, "/proc/self/nowhere")
-    assert (is_cold, cached) == ("True", "False")
+    is_cached, cached, _ = run_python(IS_CACHED, "/proc/self/nowhere")
+    assert (is_cached, cached) == ("False", "False")
 
 
 def read_compiler_mib():
