@@ -1,6 +1,35 @@
 """Queue of running and waiting plans, and the heat and budget after them.
 
-The points of a streamed plan are sent shortly before they are due, so that a newer plan can replace the rest.
+Theory of operation
+
+Problem. A plan is computed by another thread, from a heat and a budget that lie in the future: those after all plans
+accepted so far. Until it is accepted that future may change: a plan ends late, fails, is cancelled or replaced, the
+board restarts, the light is paused. A plan from a wrong past must never reach the board: its pulses would be too
+strong.
+
+Invariants. `_thermal.estimate` is the state after everything that runs or waits, and is replaced by a new object
+whenever it changes. A snapshot holds that object; `commit` accepts a plan only if it is still the same one, so one
+comparison finds every change, and the planner plans again otherwise. An estimate may be too warm (a plan that was cut
+short), never too cold: heat is taken back only by recomputing it from executed pulses (`rewind`). Plans run in the
+order of acceptance. What has left for the board is never withdrawn, except by turning the gate off (`flush`), which
+ends all running plans. Every pulse is counted exactly once: as executed, dropped, or left in the plan that waits for
+its rest.
+
+Lateness. A plan may start later than it was planned for, because the heat that it relied on can only have decayed; all
+plans behind it are then delayed by as much (`_delay_all`). It may not start so much later that a bump comes out lower
+than `cooling_max_m` allows. Several boards emit nothing late, so such a plan is paused and limited again instead.
+
+Streams. A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed
+plan leave only `stream_lead_s` before they are due; a newer plan cuts the running one at the first point that has not
+left (`build_cut_snapshot`) and is spliced behind it, one job for the board. The lead is longer without real-time
+priority, because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is
+refused by link, and the plan is made again; `truncate_stream` is the last resort, which always succeeds.
+
+Pauses. The board drops its queue; what was not executed becomes the rest of the same plan, which waits at the front and
+is limited again for the time at which the light returns (decision 37). A stream is dropped, as it shows the present.
+
+Threads. The loop that owns the session calls everything; the planning thread takes snapshots and reads `is_busy` and
+`must_preempt`. `lock` guards the estimate and both deques between them.
 """
 
 import threading

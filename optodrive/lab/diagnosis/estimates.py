@@ -50,7 +50,7 @@ def is_at_limit(final: ModelFit, free: FreeParameter) -> bool:
 def describe_doubts(hypotheses: Iterable[Hypothesis], estimates: dict[str, Estimate]) -> dict[str, str]:
     """Return, by cause, a clause for each named cause whose size the data do not establish.
 
-    A size is established if its interval excludes no effect: zero, or for a positive size the least plausible one. A
+    A size is established if its interval excludes no effect: zero, or for a positive size the smallest plausible one. A
     cause with several sizes is in doubt if all of them are.
     """
     doubts = {}
@@ -66,9 +66,9 @@ def _describe_doubt(free: FreeParameter, estimate: Estimate) -> str:
     """Return the doubt about one size, or nothing."""
     if estimate.at_limit:
         return f"{free.label} lies at a limit of its plausible range"
-    least = free.parameter.low if free.logarithmic else 0.0
-    if not estimate.low <= least <= estimate.high:
+    absent = free.parameter.low if free.logarithmic else 0.0
+    if not estimate.low <= absent <= estimate.high:
         return ""
     interval = format_range(estimate.low, estimate.high, free.parameter.unit)
-    contained = "the least plausible size" if free.logarithmic else "zero"
+    contained = "the smallest plausible size" if free.logarithmic else "zero"
     return f"the 95 % interval of {free.label}, {interval}, contains {contained}"

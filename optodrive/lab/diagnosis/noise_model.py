@@ -1,8 +1,33 @@
 """Noise of each signal kind, white plus two coloured parts, on arbitrary sample times, and jitters common to a run.
 
-Σ = white + σ₁² exp(−|Δt| / τ₁) + σ₂² exp(−|Δt| / τ₂) cos(ω Δt), whitened by a Kalman filter, which handles missing
-samples. Each run also has a power jitter, a timing jitter and a baseline per signal. All parameters are estimated from
-repeats: contrasts between runs of one group are independent of any pixel model.
+Theory of operation
+
+Problem. Whether a residual is an effect or noise depends on the noise, which nobody states, and which is hardly ever
+white: thermometers drift, converters quantise, lines hum, a laser's power differs from run to run. A model of the noise
+that is fitted to the residuals would absorb the effect that is sought.
+
+Way out. Runs are repeated. Contrasts between the runs of one group contain no pixel at all, of any physics, so
+everything here is estimated from them (`replicate_contrasts.py`); only without repeats are residuals used, and the
+model says so (`from_replicates`).
+
+Model. Per signal kind Σ = white + σ₁² exp(−|Δt| / τ₁) + σ₂² exp(−|Δt| / τ₂) cos(ω Δt): drift, and a slower or
+oscillating part such as hum. Both parts are Markov processes (Ornstein-Uhlenbeck, and a damped rotation in two states),
+so a Kalman filter with three states whitens a block in linear time, at any sample times and with gaps; a matrix of all
+samples would take their number cubed. Whitening is linear: it is applied to data and to columns of predictions alike,
+after which everything else in the diagnosis is least squares with unit noise. Each run also has a power factor, a time
+offset and a baseline per signal, which are shared by all its samples; they enter as columns (sensitivities of the
+prediction) with a normal prior and are marginalised, never fitted per run.
+
+Estimation. Maximum likelihood by Nelder-Mead in logarithms of ratios to robust guesses; jitters are projected out of
+the first fit and estimated by a second one. The oscillating form must gain more than 6 in −2 ln L over the smooth one.
+Weak priors keep what the data do not determine where it started.
+
+Floors. Samples of a converter are rounded; the noise is at least the quantum / √12 and 5e-5 of the range, to which the
+pixel's closed form and its integrator agree. If all repeats are equal to the last digit the recording is a simulation
+without noise: rounding errors are then equal in all runs, do not average out, and are taken as slow noise.
+
+Checks. `replicate_excess` says by how much repeats differ beyond the model (something changes between runs that it does
+not contain, or an effect shifts the jitters' sensitivities: decision 11). Above a threshold no cause is named.
 """
 
 from collections.abc import Callable

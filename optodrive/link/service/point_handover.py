@@ -1,4 +1,26 @@
-"""Handover of the planner's points to the session, and the reports of their execution to the planner."""
+"""Handover of the planner's points to the session, and the reports of their execution to the planner.
+
+Theory of operation
+
+Problem. The planner computes for milliseconds and may stall, crash or restart; the link process must renew the lease
+and carry out STOP meanwhile. So the planner hands over the points of a whole plan at once, under a job number of its
+own, and link streams them. Everything that crosses this border may be outdated by the time it arrives.
+
+Invariants. Points reach a board only if four things hold at that moment, in one place (`_require_allowed`): they are of
+the present epoch (no STOP, disarm, fault or lost process since the request), they know the last pause (else they could
+be lit now and again as a part of the paused plan's rest), the boards are armed, and the checksum over the bytes that
+the limiter verified is that of the bytes that arrived. A refusal is an answer with a reason, never silence. Numbers of
+jobs are the planner's, indices of points the board's; only this module knows both.
+
+Reports. The planner learns per job how many points have left, when the first one did, and which were executed, at what
+times and duties; it needs the latter for heat and budget, so none may be lost or reported twice: a record is forwarded
+with its index in the job, adjacent records as one message, at most each `REPORT_INTERVAL_S`, and always before the news
+that a job has finished, a flush or the end of a pause. After a pause the planner must know all that was lit before it
+plans the rest: `drained` is sent only when the boards have shown that no report is under way (decision 37).
+
+Why binary. A full frame is thousands of points; they travel as the bytes that the board gets, so that the check sum
+covers them from the limiter's verification to here. Only the fields around them are JSON.
+"""
 
 import struct
 import zlib

@@ -1,4 +1,31 @@
-"""Plan one batch: train pulses at their times, and the pulses of a frame's round in the beam time between them."""
+"""Plan one batch: train pulses at their times, and the pulses of a frame's round in the beam time between them.
+
+Theory of operation
+
+Problem. A pulse's width and power follow from the residual heat of its pixel at its start, its start from the end of
+the pulse before it on the same beam and from the move to it, and the residual heat from what the limiter granted
+earlier. A plan can therefore neither be computed pulse by pulse through the limiter (which checks many at once) nor as
+a whole. It is planned in batches: pulses whose shape does not depend on what the limiter makes of the others.
+
+Invariants. A batch ends before the first pulse that heats a pixel of the batch a second time by height
+(`_is_heat_known`): no pulse is computed from heat that the limiter may have trimmed. The planner changes neither the
+given state nor the heat; the scheduler accepts a batch, plans it again for a later time, or inserts a pause of the
+mirrors, and each is the same call from the same state. Starts are whole microseconds, widths whole PWM periods. Rows of
+a draft are in order of their starts, those of all stages.
+
+Order. Trains have requested times, frames only a deadline: a train pulse goes first if the next pulse of a round would
+delay it (`_is_train_due`, decision 3). With several stages each has one candidate pulse, and the earliest of them is
+drafted next, so that no stage runs ahead of heat that another adds (decision 41). A candidate of another stage stays
+valid, because stages share no pixel; a drafted train pulse invalidates all, because it moves a beam.
+
+Why two ways. `extend_round` is the general way and calls the thermal state once per pulse. A round without trains and
+without sub-pulses on the nominal model, which is nearly every streamed frame, is planned per stage in one kernel
+(`nominal_round.py`), because a frame of 1,511 pixels is due every few tens of milliseconds. Both give the same pulses,
+which tests compare. Where only some rows of several stages are wanted, the kernel first plans all of them to find how
+many of each stage belong to the first ones.
+
+Decisions: 3 (trains and frames), 14 (trains by height, sub-pulses), 41 (several stages).
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

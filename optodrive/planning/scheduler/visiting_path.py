@@ -1,8 +1,26 @@
 """The order in which the beam visits the pixels of a frame: a short open path in the maximum norm of mirror angles.
 
-A full or nearly full lattice has a path of single steps, row by row or column by column. Other frames start from the
-shorter of both paths, which is improved by reversing and moving segments between near pixels (2-opt, Croes 1958;
-Or-opt, Or 1976).
+Theory of operation
+
+Problem. One beam draws a frame pixel by pixel; between two pixels the gate is off while the mirrors move and settle.
+Both mirrors move at once, so that a move takes as long as the larger of the two angles needs: the length of a path is
+its sum of maximum norms. The path is open: it begins where the beam stands (`origin`, if known) and may end anywhere.
+This is a travelling-salesman path of up to 1,511 pixels, needed anew for each streamed frame within a few milliseconds.
+
+Why this way. A full lattice has a path of single steps, row by row or column by column, and nothing is shorter. So the
+shorter of both serpentines, or of their reverses, is taken first, and kept if it is within `GOOD_ENOUGH_RATIO` of as
+many of its shortest steps. Only sparse frames (letters, outlines, random dots) are improved: by reversing segments
+(2-opt, Croes 1958) and by moving segments of up to `MAX_SEGMENT` pixels, either way round (Or-opt, Or 1976), until
+neither shortens the path. Only changes that put a pixel next to one of its `NEIGHBOUR_COUNT` nearest are tried, and
+only around pixels whose neighbourhood has changed (`pending`), which makes a pass linear in the number of pixels.
+
+Invariants. `tour` stays a permutation of the active pixels, and `place[tour[k]] == k`. Every accepted change shortens
+the path by more than `min_gain_rad`, so that rounding cannot keep it from ending. A missing neighbour (before an
+unknown origin, behind the end) is −1, at distance 0: the search is then free to choose the ends. Nothing is random: a
+frame always gets the same path.
+
+How good. `scripts/bench order` draws the same pulses in the order of a solver (LKH on the actual settling times): its
+frames take the same time as ours or up to 0.7 % less, and the solver takes up to a minute.
 """
 
 import numpy as np
