@@ -27,6 +27,10 @@ class Control(NamedTuple):
         """Return whether the client that holds the arming has stopped to beat."""
         return self.held_s is not None and now_s - self.held_s > HOLD_MAX_S
 
+    def describe_caller(self) -> str:
+        """Return who requested the arming, as the begin of a sentence."""
+        return repr(self.caller) if self.caller else "another caller"
+
     def to_dict(self, now_s: float) -> dict[str, Any]:
         """Return the fields of the status at a host time, s."""
         return {

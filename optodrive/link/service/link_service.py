@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.ipc import IpcError, Message
-from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, UNARMED_STATES
+from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES
 from optodrive.link.service.clients import Clients
 from optodrive.link.service.control import Control
 from optodrive.link.service.epoch import Epoch
@@ -71,7 +71,6 @@ class LinkService:
         self._connecting: Iterator[float] | None = None
         self._connecting_wait_s = 0.0
         self._retry_at_s = -inf
-        self._arm_requested = self._was_armed = False
         self._control: Control | None = None
         self._attended_s = 0.0
         self._seen_fault = ""
@@ -114,9 +113,12 @@ class LinkService:
         self._status.mark_due()
 
     def on_client_lost(self, client: int) -> None:
-        """Forget a client that has left. Without planner, or without web unless it may be lost, go dark."""
-        self._waiters.drop_client(client)
-        reason = self._clients.remove(client)
+        """Forget a client that has left. Without planner, or without web unless it may be lost, go dark.
+
+        An arming that is not complete ends with its caller, even if a plan would continue.
+        """
+        is_arming = self._waiters.drop_client(client)
+        reason = self._clients.remove(client) or ("the client that was arming the board has left" if is_arming else "")
         if reason:
             self.go_dark(reason)
 
@@ -152,8 +154,8 @@ class LinkService:
                 self._boards.disarm()
             elif command == "arm":
                 self._clients.require_lease()
+                self._require_no_control()
                 self._boards.arm()
-                self._arm_requested = True
                 self._control = self._build_control(message.fields)
             elif command == "pause":
                 self._pause()
@@ -178,6 +180,13 @@ class LinkService:
         board = self._boards.board
         if board.state not in ARMED_STATES:
             raise NotReadyError(f"the board is {board.state}; only an armed board can be {purpose}")
+
+    def _require_no_control(self) -> None:
+        """Raise NotReadyError while a caller is arming the board or has armed it: one arming at a time."""
+        if self._control is not None:
+            state = self._boards.board.state
+            doing = "has armed the board" if state in ARMED_STATES else "is arming the board"
+            raise NotReadyError(f"{self._control.describe_caller()} {doing}; only a DISARMED board can be armed")
 
     def _build_control(self, fields: dict[str, Any]) -> Control:
         """Build the control of an arming that is requested now; `hold`: whether it needs beats from now on."""
@@ -220,10 +229,9 @@ class LinkService:
 
     def _end_epoch(self, reason: str) -> None:
         self.epoch.end(reason)
-        self._arm_requested = self._was_armed = False
         self._control = None
         self.pauses.end()
-        self._boards.hold_points()
+        self._boards.end_arming()
         self._handover.clear()
         for waiter in self._waiters.pop_ended():
             self._reply(waiter.client, waiter.request_id, NotReadyError(f"the board is not armed: {reason}"))
@@ -250,8 +258,13 @@ class LinkService:
             self._outgoing.append(Outgoing(self._clients.list_observers(), status))
         refusal = self._boards.pop_refusal()
         now_s = self._clock.now_s()
+        failed_arming: OptodriveError | None = None
         for waiter, error in self._waiters.pop_results(self._boards, refusal, self._describe_link_error(), now_s):
             self._reply(waiter.client, waiter.request_id, error)
+            if error is not None and waiter.command == "arm":
+                failed_arming = error
+        if failed_arming is not None and self._control is not None:
+            self.go_dark(f"arming failed: {failed_arming}")
         if refusal is not None:
             self._send_to_planner(Message("refusal", {"reason": refusal}))
         self._handover.report_progress()
@@ -272,27 +285,31 @@ class LinkService:
             self._end_epoch(f"the link to the board was lost: {message}")
 
     def _watch_board(self) -> None:
-        """End the epoch when the board has left the armed states, or has a new fault."""
+        """End the epoch when a board has left its arming, or has a new fault. ABORT goes out in any case.
+
+        It does not end what has ended; but a report that it has may be false.
+        """
         board = self._boards.board
-        if self._arm_requested and board.state in ARMED_STATES:
-            self._was_armed = True
-        split = self._boards.describe_split() if self._was_armed else ""
-        if split:
-            self.go_dark(split)
-        elif (board.fault and board.fault != self._seen_fault) or (self._was_armed and board.state in UNARMED_STATES):
-            reason = self._boards.last_event_reason
-            if board.fault:
-                cause = self._boards.likely_cause if board.fault == "LINK" else None
-                reason = f"{board.fault}: {get_fault_hint(board.fault) if cause is None else cause.message}"
-            self._end_epoch(f"the board went to {board.state} ({reason})")
-            if self._boards.has_several:
-                self._boards.abort()
+        is_new_fault = board.fault and board.fault != self._seen_fault
+        if is_new_fault or (self._control is not None and not self._boards.has_arming):
+            self.go_dark(self._boards.describe_split() or f"the board went to {board.state} ({self._find_reason()})")
         self._seen_fault = board.fault
+
+    def _find_reason(self) -> str:
+        fault = self._boards.board.fault
+        if not fault:
+            return self._boards.last_event_reason
+        cause = self._boards.likely_cause if fault == "LINK" else None
+        return f"{fault}: {get_fault_hint(fault) if cause is None else cause.message}"
+
+    @property
+    def _is_armed(self) -> bool:
+        return self._control is not None and self._boards.board.state in ARMED_STATES
 
     def _end_unattended(self) -> None:
         """Go dark when a plan that was allowed to finish without the web process has ended, and none has come back."""
         now_s = self._clock.now_s()
-        if not self._was_armed or self._boards.has_points or self._clients.is_attended:
+        if not self._is_armed or self._boards.has_points or self._clients.is_attended:
             self._attended_s = now_s
         elif now_s - self._attended_s > UNATTENDED_MAX_S:
             self.go_dark("nobody could disarm: the web process has ended")

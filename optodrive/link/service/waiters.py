@@ -38,9 +38,11 @@ class StateWaiters:
         """Add a client. command: one of AWAITED_STATES."""
         self._waiters.append(Waiter(client, request_id, command, now_s + TIMEOUT_S))
 
-    def drop_client(self, client: int) -> None:
-        """Forget a client that has left."""
+    def drop_client(self, client: int) -> bool:
+        """Forget a client that has left; return whether it was arming the board."""
+        dropped = [waiter for waiter in self._waiters if waiter.client == client]
         self._waiters = [waiter for waiter in self._waiters if waiter.client != client]
+        return any(waiter.command == "arm" for waiter in dropped)
 
     def pop_ended(self) -> list[Waiter]:
         """Remove and return the clients that wait for an armed board, when something has ended the epoch."""

@@ -132,6 +132,11 @@ class BoardGroup:
         return min(renewals, key=lambda lease: inf if lease.slack_s is None else lease.slack_s)
 
     @property
+    def has_arming(self) -> bool:
+        """Whether the arming of all boards is present: none has left what it had reached."""
+        return all(session.has_arming for session in self.sessions)
+
+    @property
     def is_ready(self) -> bool:
         """Whether a job may start now, or is refused because the time of a board has not become known in seconds."""
         return self._are_boards_ready and (self._are_clocks_known or self._waited_for_clocks_s > CLOCK_PATIENCE_S)
@@ -316,10 +321,10 @@ class BoardGroup:
         for session in self.sessions:
             session.abort()
 
-    def hold_points(self) -> None:
-        """Send nothing of the points handed over so far, and do not confirm an arming."""
+    def end_arming(self) -> None:
+        """End the arming of all boards: neither lease nor confirmation, nor points handed over so far."""
         for session in self.sessions:
-            session.hold_points()
+            session.end_arming()
 
     def flush(self) -> None:
         """Turn all gates off and drop the queues. The boards stay armed."""

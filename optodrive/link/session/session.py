@@ -16,7 +16,8 @@ from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints, WireScale
-from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, BoardState
+from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, LEASED_STATES, BoardState
+from optodrive.link.session.arming import Arming
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import CLOCK_INTERVAL_S, ClockSync
@@ -72,12 +73,11 @@ class BoardSession:
         self._status_interval_s = RENEWAL_FRACTION * requirements.lease_s if is_one_of_several else STATUS_INTERVAL_S
         self._clock_sync = self._build_clock_sync()
         self._points = PointStream()
-        self._points_held = False
+        self._arming = Arming()
         self._drain: PointDrain | None = None
         self.on_executed: Callable[[m.Executed], None] = lambda message: None
         self._hello_sent_s = 0.0
         self._refusal: str | None = None
-        self._arm_nonce: int | None = None
         self._status_requested_s = self._clock_requested_s = self._last_received_s = 0.0
         self._queue_points = self._reset_code = 0
         self.faults: Counter[str] = Counter()
@@ -87,7 +87,7 @@ class BoardSession:
         self.connected = self.seeks_clock = False
         self.last_event_reason = ""
         self.abort_confirmed = False
-        """Whether the board has confirmed the last ABORT: gate off, queue dropped, DISARMED."""
+        """Whether the board has confirmed the last ABORT: gate off, queue dropped, not armed."""
 
     @property
     def port(self) -> str:
@@ -115,6 +115,11 @@ class BoardSession:
     def clock_sample(self) -> tuple[float, float] | None:
         """Host time and board time of the exchange that board_s() uses, s, None before the first."""
         return self._clock_sync.best_sample
+
+    @property
+    def has_arming(self) -> bool:
+        """Whether the board was armed from here, or is being armed, and has not left what it had reached."""
+        return self._arming.is_present
 
     @property
     def is_ready(self) -> bool:
@@ -168,7 +173,7 @@ class BoardSession:
 
     def _handshake(self) -> Iterator[float]:
         """Send what is due in each step of the handshake, and yield how long to wait for bytes."""
-        self.hold_points()
+        self.end_arming()
         self._reset()
         self._send_hello()
         deadline_s = self._clock.now_s() + CONNECT_TIMEOUT_S
@@ -212,7 +217,6 @@ class BoardSession:
     def _reset(self) -> None:
         self._connection = HostConnection(self._requirements.rto_s)
         self._clock_sync = self._build_clock_sync()
-        self._arm_nonce = None
         self._refusal = None
         self.board = BoardView()
         self._last_received_s = self._clock.now_s()
@@ -261,13 +265,16 @@ class BoardSession:
     def step(self, wait_s: float, renew_lease: bool, stalled: str = "planner") -> None:
         """Run one loop iteration: send what is due, wait at most wait_s for bytes and process them.
 
+        The lease is renewed only while an arming from here is present. ABORT goes out when the board has left it, and
+        when it is armed without one.
+
         renew_lease: whether the processes that the running plan needs are alive
         stalled: process to name if the lease expires because it was not renewed
         Raise LinkError if the link failed or the board does not answer.
         """
         now_s = self._clock.now_s()
         self._watch.on_loop(now_s, "" if renew_lease else stalled, self._count_errors())
-        if self.board.state not in LEASED_STATES:
+        if not self._may_have_lease:
             self.lease.pause()
         elif renew_lease:
             self._send_lease(now_s)
@@ -279,9 +286,20 @@ class BoardSession:
         self._retry_hello()
         self._stream_points()
         self._exchange(wait_s)
+        if self._arming.is_lost or self._is_armed_by_itself:
+            self.abort()
         silence_max_s = self._silence_max_s
         if now_s - self._last_received_s > silence_max_s:
             raise LinkError(f"{self.port}: the board sent nothing for {silence_max_s:g} s; {self._describe_errors()}")
+
+    @property
+    def _may_have_lease(self) -> bool:
+        return self.has_arming and self.board.state in LEASED_STATES
+
+    @property
+    def _is_armed_by_itself(self) -> bool:
+        """Whether the board needs a lease although nobody has armed it, or its arming has ended."""
+        return not self.has_arming and self.is_acknowledged and self.board.state in LEASED_STATES
 
     @property
     def _silence_max_s(self) -> float:
@@ -332,6 +350,7 @@ class BoardSession:
     def _on_ack(self, message: m.Ack, now_s: float) -> None:
         self.board.free_points, self.board.done_index = message.free_points, message.done_index
         self.board.set_state(m.STATES[message.state])
+        self._follow_state()
 
     def _on_nak(self, message: m.Nak, now_s: float) -> None:
         reason = m.NAK_REASONS[message.reason]
@@ -342,6 +361,7 @@ class BoardSession:
         fault = m.FAULTS[message.fault]
         self._count_fault(fault)
         self.board.apply_status(message)
+        self._follow_state()
         self._watch.on_status(fault, now_s, self._count_errors())
 
     def _on_event(self, message: m.Event, now_s: float) -> None:
@@ -350,7 +370,13 @@ class BoardSession:
         fault = m.FAULTS[message.fault]
         self._count_fault(fault)
         self.board.set_state(m.STATES[message.state], fault)
+        self._follow_state()
         self._watch.on_status(fault, now_s, self._count_errors())
+
+    def _follow_state(self) -> None:
+        self._arming.follow(self.board.state)
+        # A session begins after the ABORT: what its messages report is the state after it.
+        self.abort_confirmed |= self._connection.peer is not None and self.board.state in IDLE_STATES
 
     def _count_fault(self, fault: str) -> None:
         if fault and fault != self.board.fault:
@@ -362,9 +388,9 @@ class BoardSession:
             self._drain.on_clock_reply(message.host_t, self._count_errors().host_bad_frames)
 
     def _on_arm_challenge(self, message: m.ArmChallenge, now_s: float) -> None:
-        if message.host_nonce == self._arm_nonce:
-            self._arm_nonce = None
-            self._connection.send(m.ArmConfirm(board_nonce=message.board_nonce, host_nonce=message.host_nonce))
+        confirmation = self._arming.confirm(message)
+        if confirmation is not None:
+            self._connection.send(confirmation)
 
     def _on_executed(self, message: m.Executed, now_s: float) -> None:
         # A report frees queue space at once. With a small queue, waiting for ACK or STATUS would cause an underrun.
@@ -381,34 +407,33 @@ class BoardSession:
         self.require_disarmed()
         self._refusal = None
         self._drop_held_points()
-        self._points_held = False
-        self._arm_nonce = secrets.randbits(32)
-        self._connection.send(m.ArmReq(host_nonce=self._arm_nonce))
+        self._connection.send(self._arming.begin())
 
     def require_disarmed(self, which: str = "") -> None:
         """Raise NotReadyError unless the board can be armed. which: prefix of the message."""
         if self.board.state != BoardState.DISARMED:
             fault = f" {self.board.fault}" if self.board.fault else ""
             raise NotReadyError(f"{which}the board is {self.board.state}{fault}; only a DISARMED board can be armed")
+        if self.has_arming:
+            raise NotReadyError(f"{which}the board is being armed already")
 
     def disarm(self) -> None:
         """Disarm the board, or acknowledge its fault in FAULT."""
         self._refusal = None
-        self.hold_points()
+        self.end_arming()
         self._connection.send(m.ClearFault() if self.board.state == BoardState.FAULT else m.Disarm())
 
     def abort(self) -> None:
         """Turn the gate off, drop the queue and disarm, before all other queued messages."""
         self._refusal = None
-        self.hold_points()
+        self.end_arming()
         self.abort_confirmed = False
         self._connection.abort()
         self._send_hello()
 
-    def hold_points(self) -> None:
-        """Send nothing of the points handed over so far, and do not confirm an arming. The next arming drops them."""
-        self._points_held = True
-        self._arm_nonce = None
+    def end_arming(self) -> None:
+        """End the arming: neither lease nor confirmation, nor points handed over so far. The next one drops them."""
+        self._arming.end()
         self._drain = None
 
     def _drop_held_points(self) -> None:
@@ -495,7 +520,7 @@ class BoardSession:
         if self._drain is not None:
             self._step_drain(self._drain)
             return
-        if not self._points or self._points_held:
+        if not self._points or not self.has_arming:
             return
         if self.board.state in ARMED_STATES:  # else the board has ended the job: only collect its reports
             now_tick = self.board_s() / self.scale.tick_s
@@ -517,7 +542,7 @@ class BoardSession:
             wait_s = min(wait_s, 0.5 * RENEWAL_FRACTION * self._requirements.lease_s)
         if self._connection.outstanding or self.is_draining:
             wait_s = min(wait_s, RETRANSMISSION_WAIT_S)
-        if not self._points_held and self.board.state in ARMED_STATES:
+        if self.has_arming and self.board.state in ARMED_STATES:
             due_tick = self._points.find_due_tick()
             if due_tick is not None:
                 wait_s = min(wait_s, max(due_tick * self.scale.tick_s - self.board_s(), BATCH_WAIT_S))

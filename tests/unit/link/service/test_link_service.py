@@ -5,12 +5,16 @@ import pytest
 
 from link_service_rig import OPERATOR, PLANNER, SUPERVISOR, WEB, ServiceRig
 from optodrive.core.ipc import IpcError, Message
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.framing import FrameDecoder, encode_frame
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service import control
 from optodrive.link.service.control import HOLD_MAX_S
+from optodrive.link.service.link_service import LinkService
 from optodrive.link.service.point_handover import EXECUTED
 from optodrive.link.service.remote_session import EXECUTED_RECORD
 from optodrive.link.service.results import build_error
+from optodrive.link.session.session import BoardSession
 from wire_points import build_points
 
 DUTY = 1000
@@ -482,3 +486,75 @@ def test_a_client_that_leaves_while_the_board_arms_ends_the_arming(rig):
     assert "the client has left" in rig.await_result(WEB, request_id)["error"]["message"]
     rig.run(3.0)
     assert rig.session.board.state == BoardState.DISARMED
+
+
+# --- one arming at a time -------------------------------------------------------------------------------------------
+
+
+def arm_twice(rig, delay_s):
+    """Request two armings, the second after a delay; return both results."""
+    first = rig.request(WEB, "arm", caller="ann")
+    rig.run(delay_s)
+    second = rig.request(WEB, "arm", caller="ben")
+    return rig.await_result(WEB, first)["error"], rig.await_result(WEB, second)["error"]
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "says"),
+    [(0.0, "'ann' is arming"), (0.001, "'ann' is arming"), (0.5, "'ann' is arming"), (2.5, "'ann' has armed")],
+)
+def test_a_second_arming_is_refused_with_the_caller_of_the_first_and_does_not_touch_it(rig, delay_s, says):
+    before = rig.epoch
+    first, second = arm_twice(rig, delay_s)
+    assert first is None
+    assert f"{says} the board" in second["message"]
+    rig.run(0.5)
+    assert (rig.core.state, rig.epoch, find_control(rig)["caller"]) == (BoardState.ARMED, before, "ann")
+
+
+def test_without_that_rule_neither_would_arm(rig, monkeypatch):
+    """Mutant: both reach the board, whose challenge answers the first and is expected for the second."""
+    monkeypatch.setattr(LinkService, "_require_no_control", lambda _: None)
+    monkeypatch.setattr(BoardSession, "has_arming", property(lambda session: session._arming.is_present and False))
+    first, second = arm_twice(rig, 0.0)
+    assert first
+    assert second
+
+
+def test_an_arming_that_takes_too_long_ends_dark(rig):
+    """A caller who is told that the board did not arm never finds it armed."""
+    lost, rig.link.read = rig.link.read, lambda timeout_s: drop_frames(lost(timeout_s), m.Ack)
+    result = rig.await_result(WEB, rig.request(WEB, "arm", caller="ann"))
+    assert "did not arm within" in result["error"]["message"]
+    rig.run(0.1)
+    assert rig.core.state == BoardState.DISARMED
+    assert find_control(rig) is None
+    rig.link.read = lost
+    rig.await_result(WEB, rig.request(WEB, "disarm"))
+    rig.arm()
+
+
+def test_stop_is_confirmed_by_a_status_while_no_acknowledgement_arrives(rig):
+    rig.arm()
+    rig.begin(build_points(500, DUTY))
+    rig.run(0.3)
+    lost = rig.link.read
+    rig.link.read = lambda timeout_s: drop_frames(lost(timeout_s), m.Ack, m.Event)
+    began_s = rig.clock.now_s()
+    assert rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))["error"] is None
+    assert rig.clock.now_s() - began_s < 0.5
+
+
+def test_an_arming_ends_with_its_caller_even_if_plans_may_finish():
+    rig = ServiceRig("finish").hello_all().connect()
+    rig.request(WEB, "arm", caller="ann")
+    rig.run(0.5)
+    rig.leave(WEB)
+    rig.run(0.01)
+    assert rig.core.state == BoardState.DISARMED
+
+
+def drop_frames(data, *kinds):
+    """Return the frames in bytes from the board, without those of some messages."""
+    kept = (frame for frame in FrameDecoder().feed(data) if frame.type not in [kind.TYPE for kind in kinds])
+    return b"".join(encode_frame(frame) for frame in kept)
