@@ -32,6 +32,10 @@ A [parameter set](formats/parameter-sets.md) (`model.toml`) states a term by the
 a value under "if omitted" need not be stated: the value has no effect, or is the usual shape. `planner_terms` names the
 terms that heights are planned with. `simulate --truth model.toml` simulates these and every term that the file itself
 states; those of its base count only if `planner_terms` names them. "Start" is where a diagnosis begins its search.
+
+The states of a term have time constants of 2.5 ms or more; one that is faster than the integrator's steps, or whose
+states or signals leave their range, is refused by name. A diagnosis that cannot compute a term says so and has the
+verdict `incomplete` in place of `none`. CONTRIBUTING.md states what the integrator asks of a new term.
 """
 
 

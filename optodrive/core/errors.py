@@ -37,6 +37,12 @@ class InputError(OptodriveError):
         super().__init__(f"{where}: got {abbreviate(value)}, expected {expected}")
 
 
+class DivergedError(InputError):
+    """A model whose states leave their range, or whose signals are no numbers, at the given parameters."""
+
+    code = "diverged"
+
+
 class RefusedError(OptodriveError):
     """A well-formed request that is refused because of limits, deadlines or reach."""
 

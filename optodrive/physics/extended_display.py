@@ -33,6 +33,7 @@ from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.snapshot import SnapshotCache, compute_snapshot
+from optodrive.physics.stability import check_time_constants
 from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, TermValues
 from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import discover_terms
@@ -44,7 +45,8 @@ BATCH = 128
 class ExtendedThermalState:
     """Mutable thermal state of every pixel, see `ThermalState`.
 
-    values: term → parameter → SI value; terms without kernels have no effect. full_w: full power of the laser.
+    values: term → parameter → SI value; terms without kernels have no effect. full_w: full power of the laser. Raises
+    DivergedError, which names the term, if one is too fast for the integrator.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class ExtendedThermalState:
     ) -> None:
         self.pixels = pixels
         self._values, self._active = values, ActiveTerms.from_values(values)
+        check_time_constants(values)
         is_coupled = any(discover_terms()[key].couples_neighbours for key in values)
         indices = neighbours.indices if is_coupled else np.zeros((len(pixels), 0), dtype=np.int64)
         self._neighbours = np.ascontiguousarray(indices)

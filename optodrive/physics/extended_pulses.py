@@ -137,7 +137,8 @@ def peak_after_off_m(
         peak_m = max(peak_m, interval_m)
         done_s += interval_s
         has_decayed = done_s > DECAYED_TIME_CONSTANTS * pixel.tau_g_s
-        if has_decayed and output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL) <= DECAYED_SHARE * peak_m:
+        displacement_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
+        if has_decayed and not displacement_m > DECAYED_SHARE * peak_m:  # so that what is no number ends it, too
             break
     return peak_m
 

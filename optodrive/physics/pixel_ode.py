@@ -13,6 +13,7 @@ import numpy as np
 
 from optodrive.core.kernels import array_kernel, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.physics.divergence import MAX_STATE, build_signal_error, build_state_error
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.term import (
     ABSORBER,
@@ -138,7 +139,8 @@ def simulate_signals(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return measured temperature rise, K, displacement, m, and force, N, at the experiment's sample times.
 
-    clock_delay_s: delay of the clock of each signal, s
+    clock_delay_s: delay of the clock of each signal, s. Raises DivergedError if the states leave their range or a
+    signal is no number.
     """
     out = (np.zeros(len(experiment.t_s[0])), np.zeros(len(experiment.t_s[1])), np.zeros(len(experiment.t_s[2])))
     context = np.zeros(CONTEXT_SIZE)
@@ -148,18 +150,14 @@ def simulate_signals(
         experiment.pixel,
     )
     span = (experiment.dose_before, experiment.dose_per_j, experiment.session_time, experiment.session_time_per_s)
-    _simulate(
-        experiment.pulses,
-        experiment.pixel,
-        experiment.t_s,
-        clock_delay_s,
-        span,
-        pixel,
-        active,
-        context,
-        np.zeros((8, STATE_COUNT)),
-        out,
+    work = np.zeros((8, STATE_COUNT))
+    stays = _simulate(
+        experiment.pulses, experiment.pixel, experiment.t_s, clock_delay_s, span, pixel, active, context, work, out
     )
+    if not stays:
+        raise build_state_error(np.flatnonzero(active.on).tolist(), active.state_rows.tolist(), work[0])
+    if not all(np.isfinite(signal).all() for signal in out):
+        raise build_signal_error(np.flatnonzero(active.on).tolist(), out)
     return out
 
 
@@ -307,8 +305,11 @@ def _simulate(
     c: FloatArray,
     work: FloatArray,
     out: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    """Integrate pixel `index` from its cold state through the pulses and write its signals to `out` at t_s."""
+) -> bool:
+    """Integrate pixel `index` from its cold state through the pulses and write its signals to `out` at t_s.
+
+    Return False, with the states in work[0], as soon as one leaves its range.
+    """
     until_s = 0.0
     for signal in range(3):
         if len(t_s[signal]):
@@ -348,9 +349,13 @@ def _simulate(
             for state in active.state_rows:
                 work[0, state], work[1, state] = work[2, state], work[3, state]
             work[0, SENSOR], work[1, SENSOR] = work[2, SENSOR], work[3, SENSOR]
+            for state in active.state_rows:
+                if not abs(work[0, state]) <= MAX_STATE:
+                    return False
         now_s = end_s if reaches_edge else now_s + h_s
         if reaches_edge:
             edge_s, after_edge = now_s, True
             if gate_on:
                 gate_on, row = False, row + 1
                 c[POWER_W] = 0.0
+    return True

@@ -29,6 +29,7 @@ from optodrive.lab.diagnosis.prediction import ParameterPoint
 from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.diagnosis.refitting import RefittedCandidate
 from optodrive.lab.diagnosis.report import build_report
+from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.terms import discover_terms
 
@@ -151,7 +152,7 @@ def test_a_pair_is_not_named_for_a_cause_whose_own_fit_had_ended_elsewhere():
     singles.sort(key=lambda item: item.bic)
     assert singles[0].causes == ("membrane_creep",)
     detection = detect(problem, base, hypotheses, 0)
-    verdict = select_from(problem, base, hypotheses, detection, singles, 0, lambda stage: None)
+    verdict = select_from(problem, base, hypotheses, detection, singles, 0, SearchLog())
     assert (verdict.verdict, verdict.causes) == ("cause", ("wall_heating",))
 
 

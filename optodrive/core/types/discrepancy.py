@@ -146,11 +146,13 @@ class ExampleTrace:
 class Discrepancy:
     """Diagnosis of a recording.
 
-    verdict: "cause", "none", "unexplained" or "ambiguous"; terms: the extension, term → parameter → value; base:
+    verdict: "cause", "none", "unexplained", "ambiguous", or "incomplete" if no error was found but failures prevent
+    "none"; terms: the extension, term → parameter → value; base:
     nominal parameters as refitted with it; residual_traces: the first run of every group, with the models fitted to all
     runs; held_out_traces, held_out_errors: with the models fitted to the other runs; explained_fraction: share of the
-    detected excess of χ²; doubts: why the size of a named cause is uncertain, a clause by cause; height_error_held_out,
-    height_error_fitted: on pushes to which the models were not fitted, and on all; None if none was measured
+    detected excess of χ²; doubts: why the size of a named cause is uncertain, a clause by cause; failures: hypotheses
+    that could not be computed, with the reasons; height_error_held_out, height_error_fitted: on pushes to which the
+    models were not fitted, and on all, None if none was measured
     """
 
     verdict: str
@@ -172,6 +174,7 @@ class Discrepancy:
     remarks: tuple[str, ...]
     explained_fraction: float
     doubts: dict[str, str]
+    failures: dict[str, str]
     height_error_held_out: HeightError | None
     height_error_fitted: HeightError | None
     elapsed_s: float

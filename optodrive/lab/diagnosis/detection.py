@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_squared
 from scipy.stats import f as fisher
 
+from optodrive.core.errors import DivergedError, OptodriveError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
 from optodrive.lab.diagnosis.fitting import (
@@ -24,6 +25,7 @@ from optodrive.lab.diagnosis.fitting import (
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
+from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.physics.hypothesis import Hypothesis
 
 DRAWS = 4000
@@ -79,23 +81,39 @@ class SimulatedEffects:
     sensitivity: JitterSensitivity
 
 
-def simulate_effects(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis]) -> SimulatedEffects:
-    """Simulate every start of every hypothesis beside a fit, nominal or extended."""
+def simulate_effects(
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog
+) -> SimulatedEffects:
+    """Simulate every start of every hypothesis beside a fit, nominal or extended.
+
+    A hypothesis of which one start diverges is left out, here and later, and noted in the log.
+    """
     sensitivity = compute_jitter_sensitivity(problem.data, base.point, problem.epsilon, base.prediction)
     fitted_columns = compute_jacobian(problem, base.point, base.free, base.prediction)
-    starts = tuple((item, start) for item in hypotheses for start in _select_starts(item))
-    terms = [{**base.point.terms, item.key: start} for item, start in starts]
-    effects = [
-        predict(problem.data, ParameterPoint(base.point.base, values), problem.epsilon) - base.prediction
-        for values in terms
-    ]
+    starts: list[tuple[Hypothesis, dict[str, float]]] = []
+    effects: list[FloatArray] = []
+    for item in hypotheses:
+        if item.label in log.failures:
+            continue
+        points = [
+            ParameterPoint(base.point.base, {**base.point.terms, item.key: start}) for start in _select_starts(item)
+        ]
+        try:
+            changes = [predict(problem.data, point, problem.epsilon) - base.prediction for point in points]
+        except DivergedError as error:
+            log.add_failure(item.label, error)
+            continue
+        starts += [(item, start) for start in _select_starts(item)]
+        effects += changes
     stacked = np.stack(effects, axis=1) if effects else np.zeros((len(problem.data.value), 0))
-    return SimulatedEffects(starts, stacked, fitted_columns, sensitivity)
+    return SimulatedEffects(tuple(starts), stacked, fitted_columns, sensitivity)
 
 
-def detect(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int) -> Detection:
+def detect(
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, log: SearchLog | None = None
+) -> Detection:
     """Score every hypothesis beside a fit, nominal or extended."""
-    return score_effects(problem, base, simulate_effects(problem, base, hypotheses), seed)
+    return score_effects(problem, base, simulate_effects(problem, base, hypotheses, log or SearchLog()), seed)
 
 
 def score_effects(
@@ -119,6 +137,8 @@ def score_effects(
     omnibus = compute_omnibus(problem, np.column_stack([fitted_columns, residual]), sensitivity)
     scores, p_score = _compute_scores(simulated.starts, projected, scale, independent, seed, count_noise_degrees(data))
     residual_chi2 = float(projected[-1, -1])
+    if not np.isfinite([p_score, omnibus.p_value, residual_chi2]).all():  # no comparison with a level would reject it
+        raise OptodriveError("the test of the residuals gave no number; nothing is concluded from it")
     return Detection(tuple(scores), p_score, omnibus.chi2, omnibus.degrees, omnibus.p_value, residual_chi2)
 
 

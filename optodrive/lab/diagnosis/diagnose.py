@@ -41,7 +41,8 @@ from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fi
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint
-from optodrive.lab.diagnosis.refitting import ProgressCallback, RefittedCandidate
+from optodrive.lab.diagnosis.refitting import RefittedCandidate
+from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, ignore_progress
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
@@ -62,6 +63,7 @@ class _SubsystemFit:
     candidates: tuple[CandidateCause, ...]
     rivals: tuple[RivalModel, ...]
     next_experiment: NextExperiment | None
+    failures: dict[str, str]
 
     @property
     def comparison(self) -> ModelComparison:
@@ -80,7 +82,7 @@ def diagnose(
     seed: int = 0,
     prior: BaseParameterPrior = BROAD_PRIOR,
     epsilon: float = DEFAULT_EPSILON,
-    on_progress: ProgressCallback = lambda stage: None,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> Discrepancy:
     """Diagnose a recording.
 
@@ -99,7 +101,8 @@ def diagnose(
             candidates = [item for item in candidates if len(discover_terms()[item.key].subsystems) == 1]
         subsystems.append(
             _diagnose_subsystem(
-                part, candidates, seed, prior, epsilon, timing_s, _find_clock_offset_s(subsystems), on_progress
+                *(part, candidates, seed, prior, epsilon, timing_s, _find_clock_offset_s(subsystems)),
+                SearchLog(on_progress),
             )
         )
     verdict, causes = _combine_verdicts(subsystems)
@@ -150,6 +153,7 @@ def diagnose(
         remarks=_build_remarks(subsystems),
         explained_fraction=min(explained_fractions, default=0.0),
         doubts=doubts,
+        failures={label: reason for subsystem in subsystems for label, reason in subsystem.failures.items()},
         height_error_held_out=compute_height_error(main.problem, main.held_out, *main.blind_points),
         height_error_fitted=compute_height_error(main.problem, main.data, main.base.point, main.final.point),
         elapsed_s=perf_counter() - began_s,
@@ -164,15 +168,15 @@ def _diagnose_subsystem(
     epsilon: float,
     min_timing_sigma_s: float,
     clock_offset_s: float,
-    on_progress: ProgressCallback,
+    log: SearchLog,
 ) -> _SubsystemFit:
     fitted, held_out_runs = split_runs(data)
     fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
-    on_progress("noise and nominal model")
+    log.on_progress("noise and nominal model")
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
     if has_replicate_excess(problem):
         # Jitter sensitivities are those of the true model; a large effect changes them, and repeats seem to differ.
-        best = find_best_candidate(problem, base, hypotheses, seed, on_progress)
+        best = find_best_candidate(problem, base, hypotheses, seed, log)
         if best is not None:
             other = update_noise(problem, best.fit, min_timing_sigma_s)
             other = replace(
@@ -181,14 +185,14 @@ def _diagnose_subsystem(
             )
             if not has_replicate_excess(other):
                 problem, base = other, fit(other, base.point)
-    verdict = select_causes(problem, base, hypotheses, seed, on_progress)
+    verdict = select_causes(problem, base, hypotheses, seed, log)
     gains: dict[str, float] = {}
     for candidate in verdict.candidates:
         candidate_gain = compute_held_out_gain(problem, held_out, base.point, candidate.fit.point, seed)
         if candidate_gain is not None:
             gains[candidate.label] = candidate_gain.reduction
     all_data = FitProblem(data, problem.noise, prior, epsilon)
-    on_progress("fitting all runs")
+    log.on_progress("fitting all runs")
     chosen = verdict.chosen
     gain = None if chosen is None else compute_held_out_gain(problem, held_out, base.point, chosen.fit.point, seed)
     start = base if chosen is None else chosen.fit
@@ -198,12 +202,12 @@ def _diagnose_subsystem(
         final = min((fit(all_data, point, start.free, iterations=1) for point in points), key=lambda item: item.chi2)
     if verdict.verdict == "none" and held_out_runs:
         # Only the held-out, hottest runs may show an effect: repeat the selection with all runs.
-        wider = select_causes(all_data, final, hypotheses, seed, on_progress)
+        wider = select_causes(all_data, final, hypotheses, seed, log)
         if wider.verdict != "none":
             problem, base, held_out, verdict = all_data, final, data.select([]), wider
             if wider.chosen is not None:
                 final = wider.chosen.fit
-    experiment = _propose_experiment(problem, verdict, on_progress)
+    experiment = _propose_experiment(problem, verdict, log.on_progress)
     named = () if verdict.chosen is None else verdict.chosen.hypotheses
     covariance = compute_covariance(all_data, final, named, hypotheses)
     return _SubsystemFit(
@@ -218,6 +222,7 @@ def _diagnose_subsystem(
         judge_candidates(verdict, gains),
         list_rivals(verdict, gains),
         experiment,
+        log.failures,
     )
 
 
@@ -245,10 +250,13 @@ def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
 
 
 def _combine_verdicts(subsystems: list[_SubsystemFit]) -> tuple[str, tuple[str, ...]]:
-    """Return the weakest verdict of the subsystems that have an error, with all their causes."""
+    """Return the weakest verdict of the subsystems that have an error, with all their causes.
+
+    Without an error the verdict is "incomplete" if a hypothesis could not be computed.
+    """
     verdicts = [subsystem.verdict for subsystem in subsystems if subsystem.verdict.verdict != "none"]
     if not verdicts:
-        return "none", ()
+        return "incomplete" if any(subsystem.failures for subsystem in subsystems) else "none", ()
     causes = tuple(dict.fromkeys(cause for item in verdicts for cause in item.causes))
     for verdict in ("unexplained", "ambiguous"):
         if any(item.verdict == verdict for item in verdicts):

@@ -8,9 +8,11 @@ considered.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 
+from optodrive.core.errors import DivergedError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
@@ -62,14 +64,18 @@ def compute_discrepancy_basis(
             effect * heat,
             *(_separate_signals(data, effect) if separate_signals else ()),
         ]
+        alternatives: list[ParameterPoint] = []
         for other in all_hypotheses:
             if other.key == item.key and other.label != item.label:
                 sizes = {free.names[0]: other.starts[0][free.names[0]] for free in other.free}
-                alternative = ParameterPoint(fitted.point.base, {**terms, item.key: {**terms[item.key], **sizes}})
-                columns.append(predict(data, alternative, problem.epsilon) - fitted.prediction)
+                alternatives.append(
+                    ParameterPoint(fitted.point.base, {**terms, item.key: {**terms[item.key], **sizes}})
+                )
         for start in () if item.is_linear or item.fit_every_start else item.starts:
-            alternative = ParameterPoint(fitted.point.base, {**others, item.key: start})
-            columns.append(predict(data, alternative, problem.epsilon) - fitted.prediction)
+            alternatives.append(ParameterPoint(fitted.point.base, {**others, item.key: start}))
+        for alternative in alternatives:
+            with suppress(DivergedError):  # no form of the effect
+                columns.append(predict(data, alternative, problem.epsilon) - fitted.prediction)
     nonzero = [column for column in columns if np.abs(column).max(initial=0.0) > 0.0]
     return np.stack(nonzero, axis=1) if nonzero else np.zeros((len(data.value), 0))
 

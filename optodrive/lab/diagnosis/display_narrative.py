@@ -66,14 +66,16 @@ def build_headline(answer: DisplayAnswer) -> str:
     wrong += [f"{unexplained} with no known cause"] if unexplained else []
     doubtful = sum(len(group.doubtful) for group in answer.build_groups())
     wrong += [f"{doubtful} with a cause of uncertain size"] if doubtful else []
-    total = sum(item.verdict != "none" for item in _list_discrepancies(answer))
+    total = sum(count for count, _ in counts) + unexplained
+    incomplete = sum(item.verdict == "incomplete" for item in _list_discrepancies(answer))
     failed = len(answer.failed)
     prefix = f"Of {format_pixel_count(len(answer.pixels))}, each diagnosed separately,"
     missing = f"; {failed} {'has' if failed == 1 else 'have'} no answer" if failed else ""
+    missing += f"; for {incomplete}, the search is incomplete" if incomplete else ""
     if failed == len(answer.pixels):
         return f"{prefix} none has an answer."
     if not total:
-        others = f"none of the other {len(answer.pixels) - failed}" if failed else "none"
+        others = f"none of the other {len(answer.pixels) - failed - incomplete}" if failed or incomplete else "none"
         return f"{prefix} {others} shows an error of the nominal model{missing}."
     return f"{prefix} {total} show an error of the nominal model: {', '.join(wrong)}{missing}."
 
@@ -83,6 +85,8 @@ def describe_group(group: PixelGroup) -> str:
     named = [f"{discover_terms()[key].label} ({key})" for key in group.causes]
     if group.verdict == "none":
         return "no error found"
+    if group.verdict == "incomplete":
+        return "no error found, but not every cause could be computed"
     if group.verdict == "cause":
         return " and ".join(named)
     if group.verdict == "ambiguous" and named:
@@ -107,7 +111,7 @@ def format_ranges(pixels: list[int]) -> str:
 def build_display_answer(answer: DisplayAnswer) -> dict[str, Any]:
     """Return JSON values: a summary, and per pixel index the same answer as for a recording of that pixel only."""
     model, _, reason = answer.build_model()
-    verdicts = ("none", "cause", "ambiguous", "unexplained")
+    verdicts = ("none", "cause", "ambiguous", "unexplained", "incomplete")
     return {
         "summary": {
             "pixels": len(answer.pixels),

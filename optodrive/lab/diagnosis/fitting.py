@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from optodrive.core.errors import DivergedError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.noise_model import NoiseModel
@@ -129,6 +130,9 @@ def fit(
 ) -> ModelFit:
     """Minimise χ² from a point by Levenberg–Marquardt steps within the ranges of the parameters.
 
+    A step to where the model diverges is shortened, as one that increases χ². Raises DivergedError if it does so at the
+    start.
+
     chi2_abandon: from the second step on, the fit ends early if neither twice the predicted improvement nor as much as
     the last one brings χ² below this value.
     """
@@ -148,6 +152,8 @@ def fit(
             compute_normal_equations(data, residual, problem.noise, sensitivity.power, sensitivity.timing).total[0, 0]
         )
         cost += float(precision @ deviation**2)
+        if best is None and not np.isfinite(cost):
+            raise DivergedError("the fit", Unquoted("a χ² that is no number"), "a finite one at its start")
         if best is not None and not cost <= best.chi2 - 1e-9:
             damping = max(DAMPING_INCREASE * damping, MIN_DAMPING)
             if float(np.abs(step).max()) < 1e-4:
@@ -173,5 +179,8 @@ def fit(
                 break
         step = solve_within(hessian, gradient, *limits, damping)
         trial = apply_step(best.point, free, step)
-        prediction = predict(data, trial, problem.epsilon)
+        try:
+            prediction = predict(data, trial, problem.epsilon)
+        except DivergedError:
+            prediction = np.full_like(prediction, np.nan)  # its χ² is no number, and the step is refused
     return best

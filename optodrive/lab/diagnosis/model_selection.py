@@ -9,12 +9,12 @@ from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 from optodrive.lab.diagnosis.refitting import (
-    ProgressCallback,
     RefittedCandidate,
     refit_alone,
     refit_pairs,
     refit_strongest,
 )
+from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.physics.hypothesis import Hypothesis
 
 FAMILY_ALPHA = 0.001
@@ -72,27 +72,27 @@ def has_replicate_excess(problem: FitProblem) -> bool:
 
 
 def find_best_candidate(
-    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, on_progress: ProgressCallback
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, log: SearchLog
 ) -> RefittedCandidate | None:
     """Return the best refit of the strongest hypotheses, or None if none is promising."""
-    scores = detect(problem, base, hypotheses, seed).scores
-    return next(iter(refit_strongest(problem, base, (), scores, on_progress)), None)
+    scores = detect(problem, base, hypotheses, seed, log).scores
+    return next(iter(refit_strongest(problem, base, (), scores, log)), None)
 
 
 def select_causes(
-    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, on_progress: ProgressCallback
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, log: SearchLog
 ) -> Verdict:
     """Return the verdict on one subsystem."""
-    on_progress("testing the nominal model")
-    nominal_detection = detect(problem, base, hypotheses, seed)
+    log.on_progress("testing the nominal model")
+    nominal_detection = detect(problem, base, hypotheses, seed, log)
     if has_replicate_excess(problem):
         return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
     if not is_rejected(nominal_detection):
         return Verdict("none", (), None, (), nominal_detection, None, 0.0)
-    singles = refit_strongest(problem, base, (), nominal_detection.scores, on_progress)
+    singles = refit_strongest(problem, base, (), nominal_detection.scores, log)
     if not singles:
         return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
-    return select_from(problem, base, hypotheses, nominal_detection, singles, seed, on_progress)
+    return select_from(problem, base, hypotheses, nominal_detection, singles, seed, log)
 
 
 def select_from(
@@ -102,13 +102,13 @@ def select_from(
     nominal_detection: Detection,
     singles: list[RefittedCandidate],
     seed: int,
-    on_progress: ProgressCallback,
+    log: SearchLog,
 ) -> Verdict:
     """Return the verdict that follows from refitted single causes, best first."""
     best = singles[0]
-    on_progress(f"testing the residuals of {best.label}")
+    log.on_progress(f"testing the residuals of {best.label}")
     others = [item for item in hypotheses if item.key not in best.causes]
-    simulated = simulate_effects(problem, best.fit, others)
+    simulated = simulate_effects(problem, best.fit, others, log)
     residual_detection = score_effects(problem, best.fit, simulated, seed)
     single_explained = _compute_explained_fraction(residual_detection, base, best)
     if not is_rejected(residual_detection) and single_explained >= MIN_EXPLAINED:
@@ -127,16 +127,16 @@ def select_from(
         - basis_detection.residual_chi2
         - basis_columns.shape[1] * np.log(len(problem.data.value))
     )
-    candidates = refit_pairs(problem, base, hypotheses, singles, residual_detection, seed, on_progress)
+    candidates = refit_pairs(problem, base, hypotheses, singles, residual_detection, seed, log)
     pairs = [item for item in candidates if _is_pair_needed(item, singles, form_gain)]
     if pairs:
-        restarted = refit_alone(problem, base, pairs[0], singles, on_progress)
+        restarted = refit_alone(problem, base, pairs[0], singles, log)
         if singles[0].bic - restarted[0].bic > BIC_INDISTINGUISHABLE:
-            return select_from(problem, base, hypotheses, nominal_detection, restarted, seed, on_progress)
+            return select_from(problem, base, hypotheses, nominal_detection, restarted, seed, log)
         pair = pairs[0]
-        on_progress(f"testing the residuals of {pair.label}")
+        log.on_progress(f"testing the residuals of {pair.label}")
         others = [item for item in hypotheses if item.key not in pair.causes]
-        simulated = simulate_effects(problem, pair.fit, others)
+        simulated = simulate_effects(problem, pair.fit, others, log)
         pair_detection = score_effects(problem, pair.fit, simulated, seed)
         pair_explained = _compute_explained_fraction(pair_detection, base, pair)
         # A second cause may only correct the first one's form; it is named if the residuals are insignificant.

@@ -22,7 +22,7 @@ def _format_interval(item: Estimate) -> str:
 def build_narrative(discrepancy: Discrepancy) -> list[str]:
     """Return the lines of the narrative: headline, causes, gain, rejected causes, next experiment and remarks."""
     lines = [_build_headline(discrepancy), ""]
-    if discrepancy.causes and discrepancy.verdict != "none":
+    if discrepancy.causes:
         lines += [
             f"- {discover_terms()[key].label} ({key}); visible in {discover_terms()[key].signature}."
             for key in discrepancy.causes
@@ -36,7 +36,10 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
     lines.append(_describe_height_error(discrepancy))
     lines += _describe_locations(discrepancy)
     lines += _describe_gain(discrepancy)
-    if discrepancy.verdict == "none":
+    if discrepancy.failures:
+        lines.append("Could not be computed, and may explain what was measured:")
+        lines += [f"- {label}: {reason}" for label, reason in discrepancy.failures.items()]
+    if discrepancy.verdict in ("none", "incomplete"):
         lines += ["Detection limit of each effect:"]
         lines += [f"- {item.label}: {item.detection_limit}" for item in _deduplicate_by_label(discrepancy.candidates)]
     else:
@@ -66,18 +69,23 @@ def _build_headline(discrepancy: Discrepancy) -> str:
     names = [discover_terms()[key].label for key in discrepancy.causes]
     if discrepancy.verdict == "none":
         return "No error found: the refitted nominal model agrees with this recording within its noise."
+    failed = ", ".join(discrepancy.failures)
+    if discrepancy.verdict == "incomplete":
+        return f"The search is incomplete, for {failed} could not be computed; nothing else shows an error."
     doubts = "".join(f", but {clause}" for clause in discrepancy.doubts.values())
+    others = f"; {failed} could not be computed and may explain it" if failed else ""
+    wrong = f"The nominal model is wrong{', perhaps' if doubts or failed else ''}"
     if discrepancy.verdict == "cause":
-        certainty = ", perhaps" if doubts else ""
-        return f"The nominal model is wrong{certainty} because {' and '.join(names)}{doubts}."
+        return f"{wrong} because {' and '.join(names)}{doubts}{others}."
     if discrepancy.verdict == "ambiguous" and len(names) == 1:
         return (
-            f"The nominal model is wrong, perhaps because {names[0]}{doubts}: not certain, because no run repeats "
-            "another (`group` is missing, or every group has one run)."
+            f"The nominal model is wrong, perhaps because {names[0]}{doubts}{others}: not certain, because no run "
+            "repeats another (`group` is missing, or every group has one run)."
         )
     if discrepancy.verdict == "ambiguous" and names:
-        return f"The nominal model is wrong; this data cannot separate these causes: {'; or '.join(names)}{doubts}."
-    return "The nominal model is wrong, and no known cause explains it."
+        causes = "; or ".join(names)
+        return f"The nominal model is wrong; this data cannot separate these causes: {causes}{doubts}{others}."
+    return f"The nominal model is wrong, and no known cause explains it{others}."
 
 
 def _describe_height_error(discrepancy: Discrepancy) -> str:
@@ -104,7 +112,7 @@ def _count_pushes(error: HeightError) -> str:
 
 def _describe_locations(discrepancy: Discrepancy) -> list[str]:
     """Return the two groups with the largest change of residuals, or the largest residuals if unexplained."""
-    if discrepancy.verdict == "none":
+    if discrepancy.verdict in ("none", "incomplete"):
         return []
     rows = []
     for trace in discrepancy.residual_traces:
@@ -163,6 +171,7 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
         },
         "explained_fraction": discrepancy.explained_fraction,
         "doubts": discrepancy.doubts,
+        "failures": discrepancy.failures,
         "height_error": {
             "held_out": _height_error_to_json(discrepancy.height_error_held_out),
             "fitted": _height_error_to_json(discrepancy.height_error_fitted),

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optodrive.core.errors import DivergedError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.servo import simulate_servo
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, PIXEL_KINDS, Dataset
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, simulate_signals
+from optodrive.physics.stability import check_time_constants
 from optodrive.physics.term import SignalDelays, TermValues
 from optodrive.physics.terms import discover_terms
 
@@ -34,13 +36,17 @@ class ParameterPoint:
 def predict(
     data: Dataset, point: ParameterPoint, epsilon: float = 0.66, power_factor: float = 1.0, delay_s: float = 0.0
 ) -> FloatArray:
-    """Predict all samples [m]; power_factor scales all optical power, delay_s delays all signals."""
+    """Predict all samples [m]; power_factor scales all optical power, delay_s delays all signals.
+
+    Raises DivergedError if a term is too fast for the integrator, a state leaves its range, or a sample is no number.
+    """
     out = np.zeros(len(data.value))
     pixel = point.pixel(epsilon * power_factor)
     terms = [(discover_terms()[key], values) for key, values in point.terms.items()]
     signal_delays = [term.signal_delays(values) for term, values in terms]
     signal_count = len(SignalDelays._fields)
     delays_s = [delay_s + sum(delays[signal] for delays in signal_delays) for signal in range(signal_count)]
+    check_time_constants(point.terms)
     active = ActiveTerms.from_values(point.terms)
     if any(term.varies_between_runs for term, _ in terms):
         for experiment, numbers in data.experiments:
@@ -59,4 +65,6 @@ def predict(
         if block.kind in MIRROR_KINDS and commands is not None:
             column = commands[:, 1 + MIRROR_KINDS.index(block.kind)]
             out[block.part] = simulate_servo(commands[:, 0], column, block.t_s - delays_s[3], servo)
+    if not np.isfinite(out).all():
+        raise DivergedError(", ".join(point.terms) or "the nominal model", Unquoted("no number"), "finite predictions")
     return out

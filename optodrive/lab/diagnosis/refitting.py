@@ -1,14 +1,16 @@
 """Refits of the hypotheses that a detection found strongest, alone and in pairs, ranked by BIC."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from optodrive.core.errors import DivergedError
 from optodrive.lab.diagnosis.detection import Detection, Score, detect
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
 CHI2_ABANDON = 300.0
@@ -19,8 +21,6 @@ MAX_STARTS, MAX_RESTARTS = 6, 6
 """Number of starts refitted of a hypothesis with many, and maximum number of restarts of each."""
 MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
 """Number of second causes refitted beside each of the best first causes, and number of those."""
-
-ProgressCallback = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def refit_strongest(
     base: ModelFit,
     given: tuple[Hypothesis, ...],
     scores: Sequence[Score],
-    on_progress: ProgressCallback,
+    log: SearchLog,
 ) -> list[RefittedCandidate]:
     """Refit the strongest scores in full, best first."""
     samples = len(problem.data.value)
@@ -55,13 +55,17 @@ def refit_strongest(
     promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(6.0, 0.05 * scores[0].ratio)]
     chi2_abandon = np.inf
     for score in promising:
-        on_progress(f"fitting {score.hypothesis.label}")
+        log.on_progress(f"fitting {score.hypothesis.label}")
         free = (*base.free, *score.hypothesis.free)
         start = _build_start(base.point, score)
-        if score.hypothesis.fit_every_start:
-            result = _refit_every_start(problem, base, score.hypothesis, free)
-        else:
-            result = fit(problem, start, free, chi2_abandon=chi2_abandon)
+        try:
+            if score.hypothesis.fit_every_start:
+                result = _refit_every_start(problem, base, score.hypothesis, free)
+            else:
+                result = fit(problem, start, free, chi2_abandon=chi2_abandon)
+        except DivergedError as error:
+            log.add_failure(score.hypothesis.label, error)
+            continue
         chi2_abandon = min(chi2_abandon, result.chi2 + CHI2_ABANDON)
         candidates.append(
             RefittedCandidate((*given, score.hypothesis), result, result.chi2 + len(free) * np.log(samples))
@@ -76,16 +80,14 @@ def refit_pairs(
     singles: list[RefittedCandidate],
     residual_detection: Detection,
     seed: int,
-    on_progress: ProgressCallback,
+    log: SearchLog,
 ) -> list[RefittedCandidate]:
     """Refit second causes beside each of the best first causes; best pairs first."""
     candidates: list[RefittedCandidate] = []
     for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
         others = [item for item in hypotheses if item.key not in first.causes]
-        detection = residual_detection if row == 0 else detect(problem, first.fit, others, seed)
-        candidates += refit_strongest(
-            problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], on_progress
-        )
+        detection = residual_detection if row == 0 else detect(problem, first.fit, others, seed, log)
+        candidates += refit_strongest(problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], log)
     unique: dict[frozenset[str], RefittedCandidate] = {}
     for item in sorted(candidates, key=lambda candidate: candidate.bic):
         unique.setdefault(frozenset(part.label for part in item.hypotheses), item)
@@ -97,7 +99,7 @@ def refit_alone(
     base: ModelFit,
     pair: RefittedCandidate,
     singles: list[RefittedCandidate],
-    on_progress: ProgressCallback,
+    log: SearchLog,
 ) -> list[RefittedCandidate]:
     """Return the single causes with those of a pair refitted from where the pair ended; best first.
 
@@ -105,10 +107,14 @@ def refit_alone(
     """
     best = {item.label: item for item in singles}
     for item in pair.hypotheses:
-        on_progress(f"fitting {item.label} again")
+        log.on_progress(f"fitting {item.label} again")
         point = ParameterPoint(pair.fit.point.base, {**base.point.terms, item.key: pair.fit.point.terms[item.key]})
         free = (*base.free, *item.free)
-        result = fit(problem, point, free)
+        try:
+            result = fit(problem, point, free)
+        except DivergedError as error:
+            log.add_failure(item.label, error)
+            continue
         candidate = RefittedCandidate((item,), result, result.chi2 + len(free) * np.log(len(problem.data.value)))
         best[item.label] = min(best.get(item.label, candidate), candidate, key=lambda each: each.bic)
     return sorted(best.values(), key=lambda each: each.bic)

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
+from optodrive.core.errors import DivergedError
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics import extended_display
 from optodrive.physics.extended_display import ExtendedThermalState
+from optodrive.physics.extended_pulses import peak_after_off_m
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.pulse_for_height import DriveRange
-from optodrive.physics.term import ELSEWHERE
-from optodrive.physics.term_kernels import TERMS
+from optodrive.physics.term import CONTEXT_SIZE, ELSEWHERE, GAS
+from optodrive.physics.term_kernels import STATE_COUNT, TERMS
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
 DRIVE = DriveRange.from_laser(2.45, 5000.0, 0.050)
@@ -38,6 +40,17 @@ def some_pulses(seed, count=40, pixels=(0, 1, 5, 15)):
     width_s = generator.integers(1, 60, count) * 2e-4
     start_s = np.cumsum(np.concatenate([[0.0], width_s[:-1]]) + generator.exponential(4e-3, count))
     return generator.choice(pixels, count), start_s, width_s, generator.uniform(0.2, FULL_W, count)
+
+
+def test_a_display_with_a_term_that_diverges_is_refused_by_name():
+    with pytest.raises(DivergedError, match="term gas_leak: got a time constant of 200 µs"):
+        ExtendedThermalState(ARRAY, {"gas_leak": {"rate": 5000.0}}, AMBIENT_K, FULL_W, SMALL)
+
+
+def test_the_search_for_a_peak_ends_where_there_is_no_number():
+    active, work = ActiveTerms.from_values({}), np.zeros((8, STATE_COUNT))
+    work[0, GAS] = np.nan
+    assert np.isnan(peak_after_off_m(PIXEL, active, np.zeros(CONTEXT_SIZE), work, 0.0, 0.0))
 
 
 def select_acting(keys, columns, pixel):

@@ -2,13 +2,16 @@
 
 import subprocess
 import sys
+from itertools import product
 
 import numpy as np
 import pytest
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import DivergedError, InputError
+from optodrive.physics import stability
 from optodrive.physics.pixel import Pixel, advance
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.stability import check_time_constants
 from optodrive.physics.term_kernels import CHAINS
 from optodrive.physics.terms import check_requirements, discover_terms, find_term
 from optodrive.physics.terms.gas_membrane import equilibrium_height_m
@@ -113,6 +116,58 @@ def test_the_generated_module_keeps_its_name_whatever_its_terms():
     assert {getattr(chain, "__module__", None) for chain in CHAINS} == {"optodrive_chains"}
 
 
+@pytest.mark.parametrize(("rate", "found"), [(500.0, "2 ms"), (1000.0, "1 ms"), (5000.0, "200 µs")])
+def test_a_term_that_is_too_fast_for_the_integrator_is_refused_by_name(rate, found):
+    """Steps grow to 6 ms; between 2 ms and half of that, an error may grow without leaving the range."""
+    values = {"gas_leak": {"rate": rate}, "wall_heating": {"resistance": 20.0, "capacity": 0.06}}
+    message = f"term gas_leak: got a time constant of {found}, expected 2.2 ms or more"
+    with pytest.raises(DivergedError, match=message) as caught:
+        check_time_constants(values)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_oscillating_pair_of_states_is_judged_by_its_frequency(monkeypatch):
+    """No state of the pair has a time constant of its own."""
+    monkeypatch.setattr(stability, "_compute_jacobian", lambda *_: np.array([[0.0, 2e3], [-2e3, 0.0]]))
+    with pytest.raises(DivergedError, match="a time constant of 500 µs"):
+        stability._check_term.__wrapped__("gas_leak", (("gas_leak", (("rate", 1.0),)),))
+
+
+def test_a_state_that_leaves_its_range_is_refused_by_name():
+    with pytest.raises(
+        DivergedError, match=r"term gas_leak: got -[0-9.e+]+ as state 'leaked_k', expected at most ±1e"
+    ) as e:
+        simulate({"gas_leak": {"rate": 5000.0}, "wall_heating": {"resistance": 20.0, "capacity": 0.06}})
+    assert "\n" not in str(e.value)
+
+
+def test_a_signal_that_is_no_number_is_refused_by_name():
+    with pytest.raises(DivergedError, match="term sensor_scale: got a temperature that is no number"):
+        simulate({"sensor_scale": {"gain": np.inf, "offset": 0.0}})
+
+
+def test_a_pixel_without_terms_that_leaves_its_range_is_refused():
+    experiment = PixelExperiment(np.array([[0.0, 0.1, 1e9, 0.0]]), 0, AMBIENT_K, (T_S, T_S, T_S))
+    with pytest.raises(DivergedError, match=r"the pixel: got .* as state"):
+        simulate_signals(experiment, PIXEL, ActiveTerms.from_values({}))
+
+
+def test_every_term_stays_in_range_at_the_limits_and_starts_of_its_parameters():
+    """Of a slow gas, whose integrator takes the longest steps."""
+    t_s = np.array([0.5, 1.0])
+    experiment = PixelExperiment(
+        np.array([[0.0, 0.5, 2.45, 0.0]]), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=0.5, session_time=1.0
+    )
+    for key, term in discover_terms().items():
+        ends = [dict.fromkeys((item.low, item.high, *item.starts)) for item in term.parameters]
+        for numbers in product(*ends):
+            values = {key: dict(zip((item.name for item in term.parameters), numbers, strict=True))}
+            for required in term.requires:
+                values[required] = {item.name: item.default for item in discover_terms()[required].parameters}
+            check_time_constants(values)
+            simulate_signals(experiment, PIXEL._replace(tau_g_s=0.02), ActiveTerms.from_values(values))
+
+
 LEAK = """
 from optodrive.core.kernels import kernel
 from optodrive.physics.hypothesis import TermParameter
@@ -146,6 +201,7 @@ import numpy as np
 from optodrive.device.config_file import load_config
 from optodrive.physics.hypothesis import RecordingScope
 from optodrive.physics.parameters import build_display_pixels, load_parameters
+from optodrive.physics import stability
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.planning.budget_setup import build_budget
