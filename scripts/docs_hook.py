@@ -1,12 +1,10 @@
-"""Hook of `mkdocs build` that adds the protocol pages from outside docs/ and all decisions, and looks up named code."""
+"""Hook of `mkdocs build` that adds the protocol pages from outside docs/, and all decisions."""
 
 import posixpath
 import re
 from pathlib import Path
 
-from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
-from named_code import find_missing
 
 ROOT = Path(__file__).resolve().parent.parent
 PROTOCOL_FOLDER = "firmware_protocol"
@@ -34,9 +32,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Look up named code. Adapt links: to the protocol pages, and from them to files outside docs/, as plain text."""
-    if missing := find_missing(markdown):
-        raise PluginError(f"{page.file.src_uri} names code that does not exist: {', '.join(missing)}")
+    """Adapt links: to the protocol pages, and from them to files outside docs/, which become plain text."""
     if page.file.src_uri.removeprefix("reference/") in PROTOCOL_PAGES:
         return re.sub(r"\[([^\]]+)\]\((?!#|https?:)[^)]+\)", r"\1", markdown)
     folder = posixpath.relpath("reference", posixpath.dirname(page.file.src_uri) or ".")

@@ -3,6 +3,9 @@
 from collections.abc import Mapping
 from difflib import get_close_matches
 
+MESSAGE_MAX = 1000
+"""Longest message about invalid input, characters."""
+
 
 class OptodriveError(Exception):
     """Base of all errors that this package raises deliberately; `code` is stable and machine-readable."""
@@ -34,7 +37,8 @@ class InputError(OptodriveError):
         self.value = value
         self.expected = expected
         self.code = code
-        super().__init__(f"{where}: got {abbreviate(value)}, expected {expected}")
+        message = escape_unprintable(f"{where}: got {abbreviate(value)}, expected {expected}")
+        super().__init__(message if len(message) <= MESSAGE_MAX else message[: MESSAGE_MAX - 1] + "…")
 
 
 class DivergedError(InputError):
@@ -110,6 +114,11 @@ class LocalProtocolError(ProtocolError):
 
 class RemoteProtocolError(ProtocolError):
     """The other side violated the protocol."""
+
+
+def escape_unprintable(text: str) -> str:
+    """Return a text in one line, with escapes for line ends and other control characters, as of a terminal."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def abbreviate(value: object, limit: int = 60) -> str:

@@ -1,14 +1,13 @@
-"""Atomic writing of files, and reading of TOML with one-line errors."""
+"""Atomic writing of files, and reading of regular files of bounded size."""
 
 import os
+import stat
 import tempfile
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 
 
 @contextmanager
@@ -67,11 +66,36 @@ def create_folder(path: Path) -> None:
         raise InputError(str(path), error.strerror or str(error), "a folder that can be created") from None
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return a TOML file as a table. Raise InputError if it cannot be read or parsed."""
+def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> bytes:
+    """Return the content of a regular file of bounded size; never open a device, never wait for a pipe.
+
+    private: require that only the file's owner can read it. Raise InputError for any other file.
+    """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        _require_regular(path, path.stat().st_mode)  # to open a serial port may reset a board
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        try:
+            mode = os.fstat(descriptor).st_mode  # of what was opened: another file may have the name by now
+            _require_regular(path, mode)
+            if private and mode & 0o077:
+                expected = f"0600, for it holds secrets: chmod 600 {path}"
+                raise InputError(str(path), f"mode {stat.S_IMODE(mode):04o}", expected)
+            with os.fdopen(descriptor, "rb", closefd=False) as file:
+                content = file.read(bytes_max + 1)
+        finally:
+            os.close(descriptor)
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(str(path), str(error), "valid TOML") from None
+    except ValueError as error:  # a null character in the path
+        raise InputError(str(path), Unquoted(str(error)), "the path of a file") from None
+    if len(content) > bytes_max:
+        raise InputError(str(path), Unquoted("a larger file"), f"at most {bytes_max} bytes")
+    return content
+
+
+def _require_regular(path: Path, mode: int) -> None:
+    if stat.S_ISREG(mode):
+        return
+    kinds = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
+    kind = next((name for is_kind, name in kinds.items() if is_kind(mode)), "a device")
+    raise InputError(str(path), Unquoted(kind), "a regular file")

@@ -1,7 +1,7 @@
 """Plausible ranges of quantities, and the unit that a value outside its range is probably in."""
 
 from collections.abc import Mapping
-from math import pi
+from math import inf, pi
 from typing import NamedTuple
 
 from optodrive.core.errors import InputError
@@ -49,8 +49,8 @@ OTHER_UNITS = {
 """Units in which numbers are given by mistake, likelier first, by the unit that is expected."""
 
 
-LARGEST = 1e300
-"""Larger numbers of a file are left to its schema; an integer of thousands of digits is no float."""
+ABSURD_FACTOR = 1e9
+"""A value outside its range by more is in no unit at all; what is computed from it would leave the range of floats."""
 
 
 class PlausibleRange(NamedTuple):
@@ -81,9 +81,9 @@ def check_plausible(where: str, value: float, plausible: PlausibleRange) -> None
 
 
 def check_table(where: str, table: Mapping[str, object], ranges: Mapping[str, PlausibleRange]) -> None:
-    """Raise InputError for the first number of a decoded file whose value suits another unit than its own.
+    """Raise InputError for the first number of a decoded file whose value suits another unit than its own, or none.
 
-    ranges: by dotted key, without the indices of lists. A value that no unit explains is left to the schema.
+    ranges: by dotted key, without the indices of lists. Other values outside their ranges are left to the schema.
     """
     for key, value in table.items():
         _check_value(where, key, key, value, ranges)
@@ -100,5 +100,9 @@ def _check_value(where: str, key: str, place: str, value: object, ranges: Mappin
             _check_value(where, key, f"{place}[{index}]", item, ranges)
     elif isinstance(value, int | float) and not isinstance(value, bool):
         plausible = ranges.get(key)
-        if plausible is not None and abs(value) < LARGEST and guess_unit(value, plausible) is not None:
+        if plausible is None or not 0 < abs(value) < inf:
+            return
+        if not plausible.low / ABSURD_FACTOR <= abs(value) <= plausible.high * ABSURD_FACTOR:
+            raise InputError(f"{where}: {place}", value, format_range(*plausible), "unit")
+        if guess_unit(value, plausible) is not None:
             check_plausible(f"{where}: {place}", value, plausible)

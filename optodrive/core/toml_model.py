@@ -1,9 +1,9 @@
 """Tables of TOML files as pydantic models, with one-line errors."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from optodrive.core.errors import InputError, suggest_nearest
 
@@ -12,6 +12,16 @@ class Section(BaseModel):
     """Base of all configuration tables: immutable, without unknown keys; field docstrings are their descriptions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+def _require_name(text: str) -> str:
+    if not text.isprintable() or set(text) & {'"', "\\"}:
+        raise ValueError("printable characters, no quotation mark and no backslash")
+    return text
+
+
+Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_require_name)]
+"""A name that fits in one line and in a TOML string."""
 
 
 def check_format(path: Path, table: dict[str, Any], expected: str, version: int) -> None:
@@ -35,7 +45,7 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if first["type"] == "missing":
         return InputError(label, None, "this key")
-    if first["type"] == "value_error":
+    if first["type"] == "value_error" and not isinstance(first["input"], str):
         return InputError(label, "inconsistent values", message)
     return InputError(label, first["input"], message)
 

@@ -49,6 +49,13 @@ class CalibratedField:
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
+    @cached_property
+    def is_finite(self) -> bool:
+        """Whether all codes have finite positions, which are not all one."""
+        with np.errstate(all="ignore"):
+            positions_m = np.array(self._block_position_m(*_build_nodes()))
+            return bool(np.all(np.isfinite(positions_m * positions_m)) and np.all(np.ptp(positions_m, axis=1) > 0.0))
+
     def position_m(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the beam's position on the display for codes, which may be fractional, m; any shape."""
         return _apply_blockwise(self._block_position_m, x_code, y_code)
@@ -118,8 +125,7 @@ class CalibratedField:
     @cached_property
     def _guess_polynomial(self) -> tuple[float, FloatArray]:
         """Scale, m, and coefficients [powers, 2] of the polynomial from positions to codes."""
-        node = np.cos(np.pi * (np.arange(GUESS_NODES) + 0.5) / GUESS_NODES) * GUESS_MARGIN * (CODE_MAX - CENTRE_CODE)
-        x_code, y_code = (CENTRE_CODE + axis.ravel() for axis in np.meshgrid(node, node))
+        x_code, y_code = _build_nodes()
         x_m, y_m = self._block_position_m(x_code, y_code)
         scale_m = float(max(np.abs(x_m).max(), np.abs(y_m).max()))
         target = np.column_stack([x_code, y_code])
@@ -128,6 +134,13 @@ class CalibratedField:
         powers = _build_monomials(x_m / scale_m, y_m / scale_m)
         coefficients = np.asarray(np.linalg.lstsq(powers * weight, target * weight, rcond=None)[0], dtype=np.float64)
         return scale_m, coefficients
+
+
+def _build_nodes() -> tuple[FloatArray, FloatArray]:
+    """Return the codes at which the polynomial for the initial guess is fitted, [n] each."""
+    node = np.cos(np.pi * (np.arange(GUESS_NODES) + 0.5) / GUESS_NODES) * GUESS_MARGIN * (CODE_MAX - CENTRE_CODE)
+    x_code, y_code = (CENTRE_CODE + axis.ravel() for axis in np.meshgrid(node, node))
+    return x_code, y_code
 
 
 def _build_monomials(x: FloatArray, y: FloatArray) -> FloatArray:

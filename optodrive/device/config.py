@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from optodrive.core.errors import InputError
-from optodrive.core.toml_model import Section
+from optodrive.core.toml_model import Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.device.config_sections import (
     HALF_RANGE_CODES,
@@ -37,7 +37,7 @@ class Config(Section):
     """Name of the format."""
     version: Literal[4]
     """Version of the format."""
-    name: str
+    name: Name
     """Name of the display."""
     ambient_c: Annotated[float, Field(ge=-20, le=60)]
     """Ambient temperature, °C."""

@@ -1,5 +1,6 @@
 """Configuration files: shipped ones, loading, and the measured servo that a configuration may name."""
 
+import os
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -7,9 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 
 from optodrive.core.errors import InputError
-from optodrive.core.files import read_toml
 from optodrive.core.plausibility import check_table
 from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.config import FORMAT, VERSION, Config
 from optodrive.device.config_sections import ServoSection
@@ -41,7 +42,7 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
     """
     source = DEFAULT_CONFIG if source is None else source
     path = Path(source)
-    if not path.exists():
+    if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises for a path that is too long
         if str(source) not in list_shipped_configs():
             raise InputError("--config", str(source), "a file, or " + ", ".join(list_shipped_configs()))
         path = locate_shipped(f"{source}.toml")

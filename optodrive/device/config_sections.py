@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from optodrive.core.toml_model import Section
+from optodrive.core.toml_model import Name, Section
 
 WIRE_ON_MAX_S = 65_535e-6
 """Longest gate-on time that one point of the protocol can carry (16 bit, microseconds), s."""
@@ -140,7 +140,7 @@ class UncertaintySection(Section):
     absorber_capacity: HalfWidth = 0.05
     """Heat capacity of an absorber."""
     exponent: Annotated[float, Field(ge=0, le=0.5)] = 0.02
-    """Exponent of the bridge resistance in temperature, absolute; it is 0 in a set without bridge_conductivity."""
+    """Exponent of the bridge resistance in temperature, absolute."""
     gas_lag: HalfWidth = 0.25
     """Time constant of the gas."""
     wall_resistance: HalfWidth = 0.02
@@ -167,9 +167,9 @@ class LimitsSection(Section):
     absorber_max_c: float
     """Highest absorber temperature, °C."""
     wall_max_c: float
-    """Highest wall temperature, °C, if the parameter set has walls and touch_max_c is not lower."""
+    """Highest wall temperature, °C, if the parameter set has walls."""
     touch_max_c: float
-    """Highest temperature of all that a finger touches, °C: touch surfaces and walls, if any, and the panel."""
+    """Highest temperature of the touch surface, °C, if the parameter set has one."""
     galvo_acceleration_rms_max_rad_per_s2: Positive
     """Root mean square of either mirror's angular acceleration, rad/s²."""
     galvo_mean_s: Annotated[float, Field(ge=0.05, allow_inf_nan=False)]
@@ -260,7 +260,7 @@ class StageSection(Section):
     stages, those sections describe the only one.
     """
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     """Name of the stage."""
     rows: tuple[int, int] | None = None
     """First and last row that its beam reaches; by default all."""

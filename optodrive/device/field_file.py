@@ -7,10 +7,10 @@ import numpy as np
 from pydantic import Field as Item
 from pydantic import ValidationError
 
-from optodrive.core.errors import InputError
-from optodrive.core.files import read_toml
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import check_table
 from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.calibrated_field import CalibratedField
 from optodrive.device.field_geometry import FieldGeometry
@@ -95,7 +95,7 @@ def load_field(path: Path) -> CalibratedField:
     grid = content.uncertainty.sigma_m
     if any(len(row) != len(grid) for row in grid):
         raise InputError(f"{path}: uncertainty.sigma_m", [len(row) for row in grid], "as many columns as rows")
-    return CalibratedField(
+    field = CalibratedField(
         geometry=FieldGeometry(**content.geometry),
         surface_m=np.array([content.surface.x_m, content.surface.y_m]),
         extent=Extent(**content.extent.model_dump()),
@@ -104,3 +104,10 @@ def load_field(path: Path) -> CalibratedField:
         sigma_grid_m=np.array(grid),
         display=str(content.about.get("display", "")),
     )
+    if not field.is_finite:
+        raise InputError(
+            f"{path}: geometry and surface",
+            Unquoted("infinite or equal positions"),
+            "one position on the display per code",
+        )
+    return field

@@ -9,10 +9,11 @@ import numpy as np
 from pydantic import Field as Item
 from pydantic import ValidationError
 
-from optodrive.core.errors import InputError
-from optodrive.core.files import atomic_write, read_toml
+from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.files import atomic_write
 from optodrive.core.plausibility import check_table
 from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.core.types.arrays import BoolArray, FloatArray, StrArray, freeze_arrays
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
@@ -20,6 +21,8 @@ from optodrive.device.config_sections import DisplaySection
 
 FORMAT = "optodrive-pixels"
 VERSION = 1
+BYTES_MAX = 16_000_000
+"""Largest size of a file, bytes: 40,000 pixels with every value."""
 GAIN_MIN, GAIN_MAX = 0.2, 5.0
 """Range of plausible gains; a pixel with a lower gain is dead."""
 MEASURED, DEAD, NOT_MEASURED = "measured", "dead", "not measured"
@@ -125,8 +128,10 @@ def load_pixel_map(config: Config) -> PixelMap | None:
     path = Path(config.display.pixel_map)
     try:
         status = path.stat()
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise InputError(
+            str(path), Unquoted(getattr(error, "strerror", None) or str(error)), "a readable file"
+        ) from None
     content = _read_file(path, status.st_mtime_ns, status.st_size)
     _check_display(path, content.display, config)
     return _build_map(path, content, config)
@@ -172,7 +177,7 @@ def _format_entry(pixel_map: PixelMap, index: int) -> str:
 
 @lru_cache(maxsize=8)
 def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
-    table = read_toml(path)
+    table = read_toml(path, BYTES_MAX)
     check_format(path, table, FORMAT, VERSION)
     check_table(str(path), table, RANGES["pixels"])
     try:

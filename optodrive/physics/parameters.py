@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.core.errors import InputError, suggest_nearest
-from optodrive.core.files import read_toml
 from optodrive.core.plausibility import PlausibleRange, check_table, guess_unit
 from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import build_input_error, check_format
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import Config, build_pixel_layout
@@ -215,11 +215,13 @@ def _merge_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     base = table.pop("base", None)
     if base is None:
         return table
-    base_path = locate_shipped("parameters", f"{base}.toml")
-    if not base_path.is_file():
-        raise InputError(f"{path}: base", base, "the name of a shipped parameter set")
-    base_table = _merge_base(base_path, read_toml(base_path))
-    terms = {**base_table.get("terms", {}), **table.get("terms", {})}
+    shipped = {item.stem: item for item in locate_shipped("parameters").glob("*.toml")}
+    if not isinstance(base, str) or base not in shipped:
+        raise InputError(f"{path}: base", base, "the name of a shipped parameter set, " + ", ".join(sorted(shipped)))
+    base_table = _merge_base(shipped[base], read_toml(shipped[base]))
+    terms = table.get("terms", {})
+    if isinstance(terms, dict):  # else the schema refuses it
+        terms = {**base_table.get("terms", {}), **terms}
     return {**base_table, **table, "terms": terms}
 
 

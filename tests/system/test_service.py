@@ -254,3 +254,52 @@ def innermost_status(pid):
         pid = int(children[0])
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return dict(line.split(":\t", 1) for line in lines if ":\t" in line)
+
+
+DAMAGED = {
+    "a pipe": os.mkfifo,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a larger file": lambda path: path.write_bytes(b"#" * 1_000_001),
+    "an integer of more digits": lambda path: path.write_text(f"version = {'1' * 5000}"),
+    "deeper nesting": lambda path: path.write_text(f"version = {'[' * 5000}"),
+    "line 1": lambda path: path.write_text(f"{'.'.join('a' * 30_000)} = 1"),
+}
+
+
+@pytest.mark.parametrize("is_armed", [True, False])
+def test_sighup_with_a_damaged_file_changes_nothing_and_ends_nothing(manager, board, make_daemon, tmp_path, is_armed):
+    """Every kind of file in place of the tokens, and of the configuration: one line, and the audit says so."""
+    kept, audit = tmp_path / "kept.toml", tmp_path / "audit.jsonl"
+    sound = HEAD + ENTRY.format("rig", TOKEN) + ENTRY.format("ben", "another-token-for-ben")
+    kept.write_text(sound)
+    kept.chmod(0o600)
+    daemon = make_daemon(
+        board, replace=[("lease_s = 1.0", f'lease_s = 1.0\n[daemon]\ntokens = "{kept}"\naudit = "{audit}"\n#')]
+    )
+    if is_armed:
+        daemon.arm()
+    refusals = 0
+    for path in (kept,) if is_armed else (kept, daemon.config):
+        content = path.read_text()
+        for naming, damage in DAMAGED.items():
+            path.unlink()
+            damage(path)
+            if path.is_file():
+                path.chmod(0o600)
+            lines, ready = daemon.errors.read_text(), manager.listen().count("READY=1")
+            daemon.process.send_signal(signal.SIGHUP)
+            wait_for(lambda ready=ready: manager.listen().count("READY=1") > ready, "the end of the reload")
+            (said,) = daemon.errors.read_text().removeprefix(lines).splitlines()
+            assert said.startswith(f"optodrive: not reloaded, nothing changed: {path}")
+            assert naming in said
+            refusals += 1
+            path.unlink()
+            path.write_text(content)
+            path.chmod(0o600)
+    assert daemon.board_state() == ("ARMED" if is_armed else "DISARMED")
+    ben = {"Authorization": "Bearer another-token-for-ben"}
+    daemon.call("GET", "/v1/state", headers=ben)
+    kept.write_text(HEAD + ENTRY.format("rig", TOKEN))
+    assert "tokens revoked: ben" in reload(daemon, manager, lambda text: text)
+    daemon.call("GET", "/v1/state", status=401, headers=ben)
+    wait_for(lambda: audit.read_text().count('"reload_refused"') == refusals, "the audit")

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from optodrive.core.errors import OptodriveError
+from optodrive.core.errors import OptodriveError, escape_unprintable
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import ConfigReloader, ReloadResult
@@ -26,8 +26,10 @@ class ReloadHandler:
         try:
             result = self._reloader.reload(self._supervisor.link_view.board_state)
         except OptodriveError as error:
-            self._log.write(f"not reloaded, nothing changed: {error}", "err", EVENT="reload-refused")
-            self._notifier.send("READY=1", f"STATUS=not reloaded: {error}")
+            self._refuse(str(error))
+            return
+        except Exception as error:  # of no file that was foreseen: this process must go on, for it watches the others
+            self._refuse(escape_unprintable(f"{type(error).__name__}: {error}"))
             return
         self._number += 1
         self._applied = result
@@ -36,6 +38,11 @@ class ReloadHandler:
             if result.revoked:
                 self._supervisor.link_view.stop()
             self._finish(result)
+
+    def _refuse(self, reason: str) -> None:
+        self._log.write(f"not reloaded, nothing changed: {reason}", "err", EVENT="reload-refused")
+        self._supervisor.record_audit({"event": "reload_refused", "reason": reason})
+        self._notifier.send("READY=1", f"STATUS=not reloaded: {reason}")
 
     def on_web_message(self, fields: dict[str, Any]) -> None:
         """End the reload when the web process has applied it."""

@@ -11,8 +11,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.files import read_regular_file
 from optodrive.daemon.web.roles import Role
-from optodrive.daemon.web.tokens import FORMAT, NAME_PATTERN, VERSION, Token, read_private_tokens, read_tokens
+from optodrive.daemon.web.tokens import (
+    FILE_MAX_BYTES,
+    FORMAT,
+    NAME_PATTERN,
+    VERSION,
+    Token,
+    read_private_tokens,
+    read_tokens,
+)
 
 HEAD = f'format = "{FORMAT}"\nversion = {VERSION}\n'
 TABLE = re.compile(r"^(?:[ \t]*#[^\n]*\n)*[ \t]*\[", re.MULTILINE)
@@ -32,10 +41,10 @@ def add_token(path: Path, token: Token) -> None:
     Raises InputError, which never contains a secret, for a name that is taken and for a file that cannot be used.
     """
     with _lock_folder(path):
-        text = _read_text(path) if path.exists() else HEAD
-        if path.exists() and token.name in {other.name for other in read_private_tokens(path).all}:
+        text, known = (_read_text(path), read_private_tokens(path).all) if path.exists() else (HEAD, ())
+        if token.name in {other.name for other in known}:
             raise InputError("NAME", token.name, f"a name that no token in {path} has; revoke that one first")
-        _replace(path, text + ("" if text.endswith("\n") else "\n") + format_token(token))
+        _replace(path, text + ("" if text.endswith("\n") else "\n") + format_token(token), {*known, token})
 
 
 def remove_token(path: Path, name: str) -> Token:
@@ -89,13 +98,10 @@ def _lock_folder(path: Path) -> Iterator[None]:
 
 
 def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(str(path), error.strerror, "a readable file") from None
+    return read_regular_file(path, FILE_MAX_BYTES).decode("utf-8", "replace")
 
 
-def _replace(path: Path, text: str, expected: set[Token] | None = None) -> None:
+def _replace(path: Path, text: str, expected: set[Token]) -> None:
     """Replace the file atomically, with mode 0600 and the owner that it had, or that its folder has.
 
     expected: the tokens that the new text must have. Raises InputError, and changes nothing, if it has others.
@@ -111,7 +117,7 @@ def _replace(path: Path, text: str, expected: set[Token] | None = None) -> None:
             owner = (path if path.exists() else path.absolute().parent).stat()
             with suppress(PermissionError):  # only root may give a file away
                 os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
-        if expected is not None and set(read_tokens(temporary).all) != expected:
+        if set(read_tokens(temporary).all) != expected:
             raise InputError(str(path), "tables that cannot be told apart", "one [[token]] per token: edit it by hand")
         temporary.replace(path)
     except OSError as error:

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import secrets
-import stat
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError
 
 from optodrive.core.errors import InputError
-from optodrive.core.files import read_toml
+from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format
 from optodrive.daemon.web.roles import ROLES, Role
 
@@ -24,6 +23,8 @@ NAME_PATTERN = r"^[\w.@ -]{1,40}$"
 SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
 FORMAT = "optodrive-tokens"
 VERSION = 1
+FILE_MAX_BYTES = 64_000
+"""Largest size of a file of tokens, bytes: several hundred, which one message to the web process holds."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,12 @@ def build_tokens_path(port: int) -> Path:
     return Path(runtime) / "optodrive" / f"token-{port}"
 
 
-def read_tokens(path: Path) -> Tokens:
-    """Read the tokens of a file; InputError, which never contains a secret, if the file is unreadable or invalid."""
-    table = read_toml(path)
+def read_tokens(path: Path, *, private: bool = False) -> Tokens:
+    """Read the tokens of a file; InputError, which never contains a secret, if the file is unreadable or invalid.
+
+    private: refuse a file that others than its owner can read
+    """
+    table = read_toml(path, FILE_MAX_BYTES, private=private)
     check_format(path, table, FORMAT, VERSION)
     try:
         entries = _TokensFile.model_validate(table).token
@@ -101,11 +105,7 @@ def read_tokens(path: Path) -> Tokens:
 
 def read_private_tokens(path: Path) -> Tokens:
     """Read a daemon's own tokens; InputError if others than the file's owner can read them."""
-    tokens = read_tokens(path)
-    mode = stat.S_IMODE(path.stat().st_mode)
-    if mode & 0o077:
-        raise InputError(str(path), f"mode {mode:04o}", f"0600, for it holds secrets: chmod 600 {path}")
-    return tokens
+    return read_tokens(path, private=True)
 
 
 def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
@@ -144,7 +144,7 @@ def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
     """
     if tokens_file:
         path = Path(tokens_file)
-        return (read_private_tokens(path) if path.exists() else create_tokens(path)), path
+        return (read_private_tokens(path) if os.path.lexists(path) else create_tokens(path)), path
     path = build_tokens_path(port)
     return create_tokens(path, os.environ.get(ENVIRONMENT_VARIABLE)), path
 

@@ -4,7 +4,6 @@ import csv
 import json
 import shutil
 import tempfile
-import tomllib
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.toml_file import read_toml
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run, Signal
 from optodrive.lab.recording.storage import (
@@ -136,16 +136,9 @@ class CsvTree:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    with convert_errors(str(path), "a TOML file that describes the recording"):
-        if not path.is_file():
-            raise InputError(str(path), None, "a TOML file that describes the recording")
-        if path.stat().st_size > TOML_BYTES_MAX:
-            raise InputError(str(path), f"{path.stat().st_size} bytes", f"at most {TOML_BYTES_MAX}")
-        try:
-            return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        except tomllib.TOMLDecodeError as error:
-            message, _, place = str(error).partition(" (at ")
-            raise InputError(f"{path}, {place.rstrip(')')}", Unquoted(message), "valid TOML") from None
+    if not path.is_file():
+        raise InputError(str(path), None, "a TOML file that describes the recording")
+    return read_toml(path, TOML_BYTES_MAX)
 
 
 def _check_header(place: str, header: list[str], columns: tuple[str, ...]) -> None:

@@ -151,9 +151,16 @@ def test_a_table_is_checked_at_any_depth_and_the_place_is_named():
         check_table("file", sound, ranges)
 
 
-@pytest.mark.parametrize("value", [10**400, float("nan"), float("inf"), True, "5", None, {"deep": 1}])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), True, "5", None, {"deep": 1}])
 def test_what_no_unit_explains_is_left_to_the_schema(value):
     check_table("file", {"grid": {"corner_m": value}}, {"grid.corner_m": PlausibleRange(0.0, 0.5, "m")})
+
+
+@pytest.mark.parametrize("value", [10**400, 1e308, -1e308, 1e-320])
+def test_a_number_that_no_quantity_can_have_is_refused(value):
+    """What is computed from it would leave the range of floats."""
+    with pytest.raises(InputError, match=r"^file: grid\.corner_m\[0\]: got .*, expected 1 mm to 500 mm$"):
+        check_table("file", {"grid": {"corner_m": [value]}}, {"grid.corner_m": PlausibleRange(1e-3, 0.5, "m")})
 
 
 def test_a_quantity_out_of_range_in_every_unit_is_refused_without_a_guess():

@@ -1,6 +1,7 @@
 """Reader of pictures.toml, which describes the pictures of a folder and the codes of the beam in each."""
 
 import csv
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +11,9 @@ from pydantic import Field as Item
 from pydantic import ValidationError, model_validator
 
 from optodrive.core.errors import InputError
-from optodrive.core.files import read_toml
 from optodrive.core.plausibility import check_plausible, check_table
 from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.field_geometry import CODE_MAX
 
@@ -125,7 +126,7 @@ def read_picture_folder(folder: Path) -> PictureFolder:
 
 
 def _require_picture(folder: Path, name: str, where: str) -> Path:
-    if not (folder / name).is_file():
+    if not os.path.isfile(folder / name):  # noqa: PTH113 - Path.is_file raises for a path that is too long
         raise InputError(where, name, f"a picture in {folder}")
     return folder / name
 
