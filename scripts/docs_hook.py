@@ -1,10 +1,12 @@
-"""Hook of `mkdocs build` that adds the protocol pages from outside docs/, and all decisions."""
+"""Hook of `mkdocs build` that adds the protocol pages from outside docs/ and all decisions, and looks up named code."""
 
 import posixpath
 import re
 from pathlib import Path
 
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
+from named_code import find_missing
 
 ROOT = Path(__file__).resolve().parent.parent
 PROTOCOL_FOLDER = "firmware_protocol"
@@ -32,7 +34,9 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Adapt links: to the protocol pages, and from them to files outside docs/, which become plain text."""
+    """Look up named code. Adapt links: to the protocol pages, and from them to files outside docs/, as plain text."""
+    if missing := find_missing(markdown):
+        raise PluginError(f"{page.file.src_uri} names code that does not exist: {', '.join(missing)}")
     if page.file.src_uri.removeprefix("reference/") in PROTOCOL_PAGES:
         return re.sub(r"\[([^\]]+)\]\((?!#|https?:)[^)]+\)", r"\1", markdown)
     folder = posixpath.relpath("reference", posixpath.dirname(page.file.src_uri) or ".")

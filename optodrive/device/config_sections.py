@@ -140,7 +140,7 @@ class UncertaintySection(Section):
     absorber_capacity: HalfWidth = 0.05
     """Heat capacity of an absorber."""
     exponent: Annotated[float, Field(ge=0, le=0.5)] = 0.02
-    """Exponent of the bridge resistance in temperature, absolute."""
+    """Exponent of the bridge resistance in temperature, absolute; it is 0 in a set without bridge_conductivity."""
     gas_lag: HalfWidth = 0.25
     """Time constant of the gas."""
     wall_resistance: HalfWidth = 0.02
@@ -167,9 +167,9 @@ class LimitsSection(Section):
     absorber_max_c: float
     """Highest absorber temperature, °C."""
     wall_max_c: float
-    """Highest wall temperature, °C, if the parameter set has walls."""
+    """Highest wall temperature, °C, if the parameter set has walls and touch_max_c is not lower."""
     touch_max_c: float
-    """Highest temperature of the touch surface, °C, if the parameter set has one."""
+    """Highest temperature of all that a finger touches, °C: touch surfaces and walls, if any, and the panel."""
     galvo_acceleration_rms_max_rad_per_s2: Positive
     """Root mean square of either mirror's angular acceleration, rad/s²."""
     galvo_mean_s: Annotated[float, Field(ge=0.05, allow_inf_nan=False)]

@@ -24,8 +24,8 @@ from optodrive.planning.limiter.nominal_model import (
 )
 from optodrive.planning.limiter.worst_case import build_heat_bound
 
-BOUNDED_TERMS = ("bridge_conductivity", "wall_heating", "lateral_conduction", "touch_surface")
-"""Terms that the thermal bound models explicitly; with walls, also panel_heating."""
+BOUNDED_TERMS = ("bridge_conductivity", "wall_heating", "lateral_conduction", "touch_surface", "panel_heating")
+"""Terms that the thermal bound models explicitly."""
 
 
 def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -> Budget:
@@ -60,15 +60,15 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     return Budget(caps, heat, GalvoModels.from_models(*map(build_galvo_model, stages)))
 
 
-def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelArray) -> NominalPanel | None:
-    """Build the panel without the walls, None without walls; raises InputError for less capacity than theirs.
+def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelArray) -> NominalPanel:
+    """Build the panel without the walls; raises InputError for less capacity than theirs.
 
     A parameter set with panel_heating states it, else the configuration does. The bound heats it by what the absorbers
     absorb: where the term has a larger share, resistance and capacity stand for the larger heat.
     """
-    if "wall_heating" not in parameters.terms:
-        return None
-    walls_j_per_k = len(pixels) * parameters.term_values("wall_heating")["capacity"]
+    walls_j_per_k = 0.0
+    if "wall_heating" in parameters.terms:
+        walls_j_per_k = len(pixels) * parameters.term_values("wall_heating")["capacity"]
     if "panel_heating" in parameters.terms:
         values, where = parameters.term_values("panel_heating"), "terms.panel_heating.capacity"
         more = max(1.0, values["share"] / float(pixels.epsilon.min()))
@@ -130,7 +130,7 @@ def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnve
     power = capacity = 1.0
     uniform_rise_k = 0.0
     for key in terms:
-        if key in BOUNDED_TERMS or (key == "panel_heating" and "wall_heating" in terms):
+        if key in BOUNDED_TERMS:
             continue
         term_gain = discover_terms()[key].bound_heat_gain(terms[key], envelope)
         if term_gain is None:
@@ -151,9 +151,7 @@ def _compute_uncertainty_factor(config: Config, terms: Mapping[str, TermValues],
     """
     uncertainty = config.limits.uncertainty
     temperature_ratio = (config.limits.absorber_max_c + ZERO_CELSIUS_K) / (config.ambient_c + ZERO_CELSIUS_K)
-    exponent = (
-        terms["bridge_conductivity"]["exponent"] + uncertainty.exponent if "bridge_conductivity" in terms else 0.0
-    )
+    exponent = terms.get("bridge_conductivity", {}).get("exponent", 0.0) + uncertainty.exponent
     capacity_ratio = (1 + uncertainty.absorber_capacity) / (1 - uncertainty.absorber_capacity) * capacity
     return float(
         (1 + uncertainty.absorbed_power)
@@ -174,7 +172,7 @@ def build_nominal_model(
     """Build the limiter's thermal model from a parameter set.
 
     ambient_k: ambient temperature, K; heat_gain: bound on the terms outside the model; panel: None for one that stays
-    at ambient temperature, as it does without walls
+    at ambient temperature
     """
     terms = {key: parameters.term_values(key) for key in parameters.terms}
     wall, lateral, touch = (terms.get(key) for key in ("wall_heating", "lateral_conduction", "touch_surface"))
@@ -199,5 +197,5 @@ def build_nominal_model(
         frame_edges=neighbours.frame_edges,
         walls=walls,
         touch=NominalTouch(touch["gas_share"], touch["wall_share"], touch["lag"]) if touch else None,
-        panel=panel if walls else None,
+        panel=panel,
     )

@@ -1,4 +1,4 @@
-"""Whatever a board is made to report, no light is emitted in an epoch in which nobody has armed it.
+"""False reports of a board: no light is emitted in an epoch in which nobody has armed it.
 
 A proxy between daemon and board falsifies fields of the board's messages for a while, with a right CRC, and is honest
 again. Every epoch that ends, ends dark within a few milliseconds; a board is never armed for longer than a lease unless

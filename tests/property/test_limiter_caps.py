@@ -15,6 +15,7 @@ from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import (
     KINDS,
     NO_CAPS,
+    TOUCHED,
     build_long_sequence,
     build_plan,
     build_sequence,
@@ -120,11 +121,11 @@ def cap_fractions(kind, seed, mutate=lambda budget: budget):
         return {}
     plan, beams = skew_clocks(rng, limited, skew_s, stages), range(stages)
     real = build_true_display(model, upper_factors(unsure) if rng.random() < 0.3 else sample_factors(rng, unsure))
-    absorber, _, wall, touch, _ = real.peaks(plan)
+    peaks = real.peaks(plan)
     return {
-        "absorber": absorber / caps.absorber_k,
-        "wall": wall / caps.wall_k,
-        "touch": touch / caps.touch_k,
+        "absorber": peaks[0] / caps.absorber_k,
+        "wall": peaks[2] / caps.wall_k if model.walls is not None else 0.0,
+        "touched": max(peaks[row] for row in TOUCHED) / caps.touch_k,
         "galvo": max(galvo_peak(plan, budget, stage) for stage in beams) / caps.galvo_rad2_per_s4,
         "diode": max(window_peak_w(select_rows(plan, plan.stage == stage), caps.display_window_s) for stage in beams)
         / caps.display_mean_w,

@@ -24,12 +24,12 @@ from optodrive.planning.limiter.nominal_model import (
 
 NO_CAPS = CapValues(
     **dict.fromkeys(CapValues._fields, inf)
-    | {"absorber_k": 1e6, "wall_k": 1e6, "touch_k": 1e6, "pulse_energy_j": 1e3, "pulse_width_s": 0.050}
+    | {"absorber_k": 1e3, "wall_k": 500.0, "touch_k": 500.0, "pulse_energy_j": 1e3, "pulse_width_s": 0.050}
     | {"pulse_gap_s": 5e-4, "pixel_mean_w": 1e3, "pixel_window_s": 1.0, "display_mean_w": 1e3, "display_window_s": 2.0}
     | {"min_power_w": 0.0}
 )
 """Caps that do not bind."""
-SETTLED_AFTER_S = 3.0
+SETTLED_AFTER_S = 1.8
 """Time after a pulse, s, after which absorbers and gas have settled to their walls: over twenty time constants."""
 
 
@@ -37,6 +37,8 @@ SETTLED_AFTER_S = 3.0
 def _fill_leaving_w(y, leaving_w, numbers, neighbours, frame_edges):
     """Fill in the heat flow from each wall [p], W, to the panel and to its neighbours; return that to the panel."""
     rw, rx, rf, into_panel_w = numbers[6], numbers[8], numbers[9], 0.0
+    if numbers[7] == 0.0:  # no walls
+        return 0.0
     for i in range(y.shape[1]):
         leaving_w[i] = (y[2, i] - y[4, 0]) * (1 / rw + frame_edges[i] / rf)
         into_panel_w += leaving_w[i]
@@ -47,21 +49,33 @@ def _fill_leaving_w(y, leaving_w, numbers, neighbours, frame_edges):
 
 
 @array_kernel
-def _rates(y, out, power_w, numbers, neighbours, frame_edges):
-    """Compute dy/dt of y [5, p], light power_w [p]: absorber, gas, wall and touch surface, and the panel in y[4, 0]."""
+def _rates(y, out, power_w, is_settled, numbers, neighbours, frame_edges):
+    """Compute dy/dt of y [5, p], light power_w [p]: absorber, gas, wall and touch surface, and the panel in y[4, 0].
+
+    Absorber and gas of a pixel that is_settled [p] are as warm as its wall. Without walls the absorbers lose their heat
+    to the panel, and y[2] is the panel.
+    """
     eps, r, c, ambient_k, n, tau_g, _, cw, _, _, fg, fw, lag, rp, cp = numbers
-    into_panel = _fill_leaving_w(y, out[2], numbers, neighbours, frame_edges)
+    into_panel, panel = _fill_leaving_w(y, out[2], numbers, neighbours, frame_edges), y[4, 0]
     for i in range(y.shape[1]):
         theta, gas, wall, touch = y[0, i], y[1, i], y[2, i], y[3, i]
+        out[3, i] = (panel + fg * (gas - panel) + fw * (wall - panel) - touch) / lag if lag > 0.0 else 0.0
+        if is_settled[i]:
+            out[0, i] = out[1, i] = out[2, i] = -out[2, i] / (cw + c)
+            continue
         mean = ambient_k + 0.5 * (theta + wall)
-        flow = (theta - wall) / (r * (mean / ambient_k) ** n)
+        flow = (theta - wall) / (r * (mean / ambient_k) ** n) if n != 0.0 else (theta - wall) / r
         out[0, i] = (eps * power_w[i] - flow) / c
         out[1, i] = (0.5 * (theta + wall) - gas) / tau_g
-        out[2, i] = (flow - out[2, i]) / cw if cw > 0.0 else 0.0
-        out[3, i] = (fg * gas + fw * wall - touch) / lag if lag > 0.0 else 0.0
+        if cw > 0.0:
+            out[2, i] = (flow - out[2, i]) / cw
+        else:
+            into_panel += flow
     out[4] = 0.0
     if cp > 0.0:
-        out[4, 0] = (into_panel - y[4, 0] / rp) / cp
+        out[4, 0] = (into_panel - panel / rp) / cp
+    if cw == 0.0:
+        out[2] = out[4, 0]
 
 
 @array_kernel
@@ -69,12 +83,14 @@ def _slow_rates(y, out, numbers, neighbours, frame_edges):
     """Compute dy/dt of walls, touch surfaces and panel when absorbers and gas have settled to their walls."""
     _, _, c, _, _, _, _, cw, _, _, fg, fw, lag, rp, cp = numbers
     out[:] = 0.0
-    into_panel = _fill_leaving_w(y, out[2], numbers, neighbours, frame_edges)
+    into_panel, panel = _fill_leaving_w(y, out[2], numbers, neighbours, frame_edges), y[4, 0]
     for i in range(y.shape[1]):
         out[2, i] = -out[2, i] / (cw + c) if cw > 0.0 else 0.0
-        out[3, i] = ((fg + fw) * y[2, i] - y[3, i]) / lag if lag > 0.0 else 0.0
+        out[3, i] = (panel + (fg + fw) * (y[2, i] - panel) - y[3, i]) / lag if lag > 0.0 else 0.0
     if cp > 0.0:
-        out[4, 0] = (into_panel - y[4, 0] / rp) / cp
+        out[4, 0] = (into_panel - panel / rp) / cp
+    if cw == 0.0:
+        out[2] = out[4, 0]
 
 
 @array_kernel
@@ -117,6 +133,7 @@ def _integrate(y, peak, at, pixel, watts, until, numbers, neighbours, frame_edge
     k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
     ahead = np.empty_like(y)
     power, now = np.zeros(y.shape[1]), 0.0
+    has_walls, is_settled, edge_at = numbers[7] > 0.0, np.zeros(y.shape[1], dtype=np.bool_), np.zeros(y.shape[1])
     for edge in range(len(at) + 1):
         end = at[edge] if edge < len(at) else until
         if end > now:
@@ -127,10 +144,10 @@ def _integrate(y, peak, at, pixel, watts, until, numbers, neighbours, frame_edge
             steps = int(np.ceil((end - now) / (on_step if is_on else off_step)))
             h = (end - now) / steps
             for _ in range(steps):
-                _rates(y, k1, power, numbers, neighbours, frame_edges)
-                _rates(_advance(y, 0.5 * h, k1, ahead), k2, power, numbers, neighbours, frame_edges)
-                _rates(_advance(y, 0.5 * h, k2, ahead), k3, power, numbers, neighbours, frame_edges)
-                _rates(_advance(y, h, k3, ahead), k4, power, numbers, neighbours, frame_edges)
+                _rates(y, k1, power, is_settled, numbers, neighbours, frame_edges)
+                _rates(_advance(y, 0.5 * h, k1, ahead), k2, power, is_settled, numbers, neighbours, frame_edges)
+                _rates(_advance(y, 0.5 * h, k2, ahead), k3, power, is_settled, numbers, neighbours, frame_edges)
+                _rates(_advance(y, h, k3, ahead), k4, power, is_settled, numbers, neighbours, frame_edges)
                 for kind in range(5):
                     for i in range(y.shape[1] if kind < 4 else 1):
                         y[kind, i] += h / 6 * (k1[kind, i] + 2 * k2[kind, i] + 2 * k3[kind, i] + k4[kind, i])
@@ -140,7 +157,14 @@ def _integrate(y, peak, at, pixel, watts, until, numbers, neighbours, frame_edge
                 _rest(y, peak, slow_s, numbers, neighbours, frame_edges)
                 now += slow_s
         if edge < len(at):
-            power[pixel[edge]] = watts[edge]
+            power[pixel[edge]], is_settled[pixel[edge]], edge_at[pixel[edge]] = watts[edge], False, now
+        for i in range(y.shape[1] if has_walls else 0):
+            if not is_settled[i] and power[i] == 0.0 and now - edge_at[i] > SETTLED_AFTER_S:
+                is_settled[i], y[0, i], y[1, i] = True, y[2, i], y[2, i]
+
+
+TOUCHED = (2, 3, 4)
+"""Places that a finger can touch, by their rows in the peaks: walls, touch surfaces and panel."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +207,7 @@ def build_true_display(model, factor=None):
         float(model.r_k_per_w[0]) * f["bridge_resistance"],
         float(model.c_j_per_k[0]) * f["absorber_capacity"],
         model.ambient_k,
-        max(0.0, model.exponent + f["exponent"]) if model.exponent else 0.0,
+        model.exponent + f["exponent"],
         model.tau_g_s * f["gas_lag"],
         walls.r_k_per_w * f["wall_resistance"] if walls else 1.0,
         walls.c_j_per_k * f["wall_capacity"] if walls else 0.0,
@@ -293,8 +317,8 @@ def random_model(rng):
     if rng.random() < 0.85:
         touch = NominalTouch(rng.uniform(0.05, 0.5), rng.uniform(0.1, 0.5), rng.uniform(0.5, 3.0))
     panel = None
-    if walls is not None and rng.random() < 0.7:
-        slowest_s = max(walls.r_k_per_w * walls.c_j_per_k, touch.lag_s if touch else 0.0)
+    if rng.random() < 0.7:
+        slowest_s = max(walls.r_k_per_w * walls.c_j_per_k if walls else 0.5, touch.lag_s if touch else 0.0)
         r_p = 10 ** rng.uniform(0.0, 2.0)
         panel = NominalPanel(r_p, slowest_s * 10 ** rng.uniform(1.0, 2.5) / r_p)
     r = rng.uniform(95, 382)

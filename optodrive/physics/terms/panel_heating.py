@@ -6,11 +6,8 @@ from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParamet
 from optodrive.physics.term import (
     PANEL_HELD,
     POWER_W,
-    HeatGainBound,
     Kernels,
-    OperatingEnvelope,
     Term,
-    TermValues,
     add_follower,
 )
 
@@ -43,10 +40,6 @@ class PanelHeating(Term):
     has_panel_state = True
     kernels = Kernels(rates=rates, wall_rise=add_follower)
     signature = "a rise of all pixels, also those without light, over minutes of light on any"
-
-    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """Return the panel's rise under permanent light of full power as a rise of everything."""
-        return HeatGainBound(uniform_rise_k=values["resistance"] * values["share"] * envelope.all_power_w)
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
         """Return one hypothesis, whose share is the default, if light on one pixel can show on another."""

@@ -5,7 +5,7 @@ from optodrive.physics.term import Term
 
 
 class TouchSurface(Term):
-    """lag · ds/dt = gas_share · γ + wall_share · w − s.
+    """lag · ds/dt = p + gas_share · (γ − p) + wall_share · (w − p) − s, with p the panel's rise.
 
     The limiter's bound on heat accounts for it; neither displacement nor any recorded signal depends on it.
     """

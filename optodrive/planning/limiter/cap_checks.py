@@ -103,7 +103,7 @@ def max_power_w(
         max_w, binding = stage_w, DISPLAY_MEAN_POWER
     wall_w, touch_w = slow_node_limits_w(budget, workspace.nodes, request, lower_bound_k)
     if wall_w < max_w:
-        max_w, binding = wall_w, WALL_TEMPERATURE
+        max_w, binding = wall_w, WALL_TEMPERATURE if caps.wall_k < caps.touch_k else TOUCH_TEMPERATURE
     if touch_w < max_w:
         max_w, binding = touch_w, TOUCH_TEMPERATURE
     absorber_w = _max_absorber_power_w(budget, workspace, request, rise_k, min(max_w, request.power_w))
@@ -182,5 +182,6 @@ def _fill_levels(budget: Budget, workspace: LimiterWorkspace, at_s: float, level
             rise_k + heat.absorber_wall_factor * wall_k + heat.absorber_per_panel * panel_k
         )
         levels[WALL_TEMPERATURE, pixel] = wall_k + heat.wall_per_panel * panel_k
-        levels[TOUCH_TEMPERATURE, pixel] = touch_k + heat.touch_per_panel * panel_k
+        touch_k += heat.touch_per_panel * panel_k
+        levels[TOUCH_TEMPERATURE, pixel] = max(touch_k, levels[WALL_TEMPERATURE, pixel])
         levels[SPOT_ENERGY, pixel] = max(0.0, workspace.budgets.bucket_j[pixel] - off_s * budget.caps.pixel_mean_w)

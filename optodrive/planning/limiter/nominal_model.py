@@ -35,7 +35,7 @@ class NominalWalls:
 
 @dataclass(frozen=True)
 class NominalTouch:
-    """The touch surface: its fractions of the gas's and of the wall's rise, and its lag."""
+    """The touch surface: its fractions of the gas's and of the wall's rise over the panel, and its lag."""
 
     gas_share: float
     wall_share: float
@@ -44,7 +44,10 @@ class NominalTouch:
 
 @dataclass(frozen=True)
 class NominalPanel:
-    """The panel, to which all walls lose their heat: resistance to the room, and capacity without the walls'."""
+    """The panel, to which all walls lose their heat: resistance to the room, and capacity without the walls'.
+
+    Without walls the absorbers lose theirs to it.
+    """
 
     r_k_per_w: float
     c_j_per_k: float
@@ -57,7 +60,7 @@ class NominalThermalModel:
     epsilon, r_k_per_w, c_j_per_k: [p] absorbed fraction, bridge resistance and heat capacity of the absorber
     exponent: n in R = R₀ (T / T₀)ⁿ, with the bridge's mean temperature T
     neighbours: [p, 4] neighbouring pixels, −1 for none; frame_edges: [p] number of edges at the frame
-    walls, touch, panel: None if the model has no such node; without a panel the walls' surroundings stay at ambient
+    walls, touch, panel: None if the model has no such node; without a panel the surroundings stay at ambient
     hot_capacity_factor: factor by which the capacity of a hot absorber may exceed C
     extra_rise_k: rise by terms outside the bound, already subtracted from the caps
     """

@@ -38,7 +38,7 @@ class PulseRequest(NamedTuple):
 
 @kernel
 def _touch_cap_k(budget: Budget, panel_k: float) -> float:
-    """Return the touch surface's cap as a rise over what the panel warms it."""
+    """Return the touch surface's cap as a rise over what the panel warms it; negative if the panel is above the cap."""
     return budget.caps.touch_k - budget.heat.touch_per_panel * panel_k
 
 
@@ -46,12 +46,14 @@ def _touch_cap_k(budget: Budget, panel_k: float) -> float:
 def _wall_cap_k(budget: Budget, panel_k: float) -> float:
     """Return the wall's cap over the panel, or the smaller rise at which the touch surface has its cap when steady.
 
+    A finger between the pixels touches the walls: the touch surface's cap is theirs, too.
+
     Pulses on other pixels lower these caps while they warm the panel. A wall at its cap falls faster than that if the
     cap is above a floor; below it no pulse is allowed. A touch surface falls as fast if its wall is lower by what the
     panel rises within the touch surface's lag.
     """
     heat = budget.heat
-    cap_k = budget.caps.wall_k - heat.wall_per_panel * panel_k
+    cap_k = min(budget.caps.wall_k, budget.caps.touch_k) - heat.wall_per_panel * panel_k
     if heat.touch_per_wall_k > 0.0:
         touch_k = _touch_cap_k(budget, panel_k + heat.panel_k_per_s * heat.touch_lag_s[1])
         cap_k = min(cap_k, touch_k / (heat.touch_per_wall_k * heat.touch_specht_ratio))
@@ -68,7 +70,7 @@ def slow_node_limits_w(
     is credited.
     """
     heat, pixel, width_s = budget.heat, request.pixel, request.width_s
-    wall_w = touch_w = inf
+    wall_w = inf
     cap_k = _wall_cap_k(budget, request.panel_k) / heat.wall_specht_ratio
     for capacity in range(2):
         if heat.wall_k_per_j[capacity] > 0.0:
@@ -76,6 +78,7 @@ def slow_node_limits_w(
             wall_w = min(wall_w, (cap_k - off_k) / (heat.wall_k_per_j[capacity] * width_s))
     wall_k = wall_peak_k(budget, nodes, request, 0.0)
     touch_cap_k = _touch_cap_k(budget, request.panel_k)
+    touch_w = inf if touch_cap_k >= 0.0 else 0.0
     wall_k_per_w = heat.wall_specht_ratio * heat.wall_k_per_j[0] * width_s
     for lag in range(2):
         if heat.touch_k_per_j[lag] > 0.0:

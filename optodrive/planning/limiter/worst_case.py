@@ -112,11 +112,16 @@ def _compute_loss_chords(
 
     The loss is concave, so the chords lie below it.
     """
-    exponent = model.exponent + uncertainty.exponent if model.exponent > 0 else 0.0
+    exponent = model.exponent + uncertainty.exponent
     knot_k = np.linspace(0.0, caps.absorber_k, (CHORDS if exponent > 0 else 1) + 1)
-    wall_k = caps.wall_k if np.isfinite(caps.wall_k) and model.walls is not None else 0.0
-    temperature_ratio = (model.ambient_k + model.extra_rise_k + wall_k + 0.5 * knot_k) / model.ambient_k
-    return knot_k, knot_k * temperature_ratio**-exponent
+    return knot_k, knot_k * _compute_bridge_ratio(model, caps, knot_k) ** -exponent
+
+
+def _compute_bridge_ratio(model: NominalThermalModel, caps: CapValues, rise_k: FloatArray) -> FloatArray:
+    """Return the largest mean temperature of a bridge over ambient, for rises of an absorber over its wall."""
+    wall_k = min(caps.wall_k, caps.touch_k) if model.walls is not None or model.panel is not None else 0.0
+    far_end_k = model.extra_rise_k + (wall_k if np.isfinite(wall_k) else 0.0)
+    return (model.ambient_k + far_end_k + 0.5 * rise_k) / model.ambient_k
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,22 +277,29 @@ def _build_panel_bound(
     The panel also rises by pulses on other pixels, at most at one rate. A wall at its cap over the panel, warmed by
     neighbours that are no hotter, falls meanwhile at least at the rate cap / (R C), which is faster if the cap is above
     a floor.
+
+    A touch surface follows the panel and its share of what gas and wall are above it: the panel as a whole, and more if
+    the shares exceed 1.
     """
     panel, walls = model.panel, model.walls
-    if panel is None or walls is None:
+    if panel is None:
         return _PanelBound(np.zeros(2), np.ones(2), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     signs, count = np.array([-1.0, 1.0]), len(model.epsilon)
     capacities = panel.c_j_per_k * (1 + signs * uncertainty.panel_capacity)
-    capacities += count * walls.c_j_per_k * (1 + signs * uncertainty.wall_capacity)
+    wall_lag_s = 0.0
+    if walls is not None:
+        capacities += count * walls.c_j_per_k * (1 + signs * uncertainty.wall_capacity)
+        wall_lag_s = walls.r_k_per_w * (1 + uncertainty.wall_resistance) * float(wall.j_per_k[1])
     tau_s = panel.r_k_per_w * (1 + uncertainty.panel_resistance) * capacities
-    wall_lag_s = walls.r_k_per_w * (1 + uncertainty.wall_resistance) * float(wall.j_per_k[1])
-    gas_lag_s, touch_lag_s = model.tau_g_s * (1 + uncertainty.gas_lag), float(touch.lag_s[1])
-    if tau_s[0] < PANEL_LAG_RATIO * max(wall_lag_s, touch_lag_s):
+    gas_lag_s = model.tau_g_s * (1 + uncertainty.gas_lag)
+    touch_lag_s = 0.0 if model.touch is None else float(touch.lag_s[1])
+    slowest_s = max(lag_max_s, wall_lag_s, touch_lag_s)
+    if tau_s[0] < PANEL_LAG_RATIO * slowest_s:
         raise InputError(
             "panel",
             f"a time constant of {format_quantity(float(tau_s[0]), 's')}",
-            f"at least {PANEL_LAG_RATIO:g} times that of walls and touch surface, "
-            f"{format_quantity(max(wall_lag_s, touch_lag_s), 's')}",
+            f"at least {PANEL_LAG_RATIO:g} times that of absorbers, walls and touch surface, "
+            f"{format_quantity(slowest_s, 's')}",
         )
 
     def follow(*lags_s: float) -> float:
@@ -298,13 +310,14 @@ def _build_panel_bound(
     k_per_j = epsilon * per_absorber / capacities
     k_per_s = ratio * float(k_per_j[0]) * all_power_w
     shares = 0.0 if model.touch is None else model.touch.gas_share + model.touch.wall_share
+    per_panel = max(1.0, shares * (1 + uncertainty.touch_share))
     return _PanelBound(
         k_per_j=k_per_j,
         tau_s=tau_s,
         specht_ratio=ratio,
         per_absorber=per_absorber,
         per_wall=per_wall,
-        per_touch=shares * (1 + uncertainty.touch_share) * follow(wall_lag_s, lag_max_s, gas_lag_s, touch_lag_s),
+        per_touch=per_panel * follow(wall_lag_s, lag_max_s, gas_lag_s, touch_lag_s),
         k_per_s=k_per_s,
         floor_k=per_wall * k_per_s * wall_lag_s,
     )
@@ -334,15 +347,18 @@ def _build_lower_bound(
 
     panel_k_per_s: fastest rise of the panel
     """
-    r_low = model.r_k_per_w * (1 - uncertainty.bridge_resistance)
+    cold_ratio = _compute_bridge_ratio(model, caps, np.array(caps.absorber_k)) ** min(
+        0.0, model.exponent - uncertainty.exponent
+    )
+    r_low = model.r_k_per_w * (1 - uncertainty.bridge_resistance) * cold_ratio
     coupling_factor = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
     rate_per_s = np.stack([coupling_factor / (r_low * c_high), coupling_factor / (r_low * c_low)], axis=1)
     k_per_w = model.epsilon * (1 - uncertainty.absorbed_power) * r_low / coupling_factor
     inflow_k_per_s = panel_k_per_s
     if wall.lateral_w_per_k > 0.0:
-        max_wall_k = min(
-            caps.wall_k, caps.touch_k / (touch.per_wall_k * touch.specht_ratio) if touch.per_wall_k > 0.0 else inf
-        )
+        max_wall_k = min(caps.wall_k, caps.touch_k)
+        if touch.per_wall_k > 0.0:
+            max_wall_k = min(max_wall_k, caps.touch_k / (touch.per_wall_k * touch.specht_ratio))
         inflow_k_per_s += 4 * wall.lateral_w_per_k * max_wall_k / float(wall.j_per_k[0])
     deficit_k, gas_lag_s = inflow_k_per_s / float(rate_per_s.min()), model.tau_g_s * (1 + uncertainty.gas_lag)
     gas_deficit_k = gas_lag_s * inflow_k_per_s + 0.5 * deficit_k

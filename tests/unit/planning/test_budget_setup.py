@@ -160,9 +160,11 @@ def test_a_panel_that_is_as_fast_as_its_walls_is_refused():
         build_with_panel(resistance_k_per_w=0.5)
 
 
-def test_without_walls_there_is_no_panel():
+def test_without_walls_the_absorbers_warm_the_panel():
     heat = build_budget(CONFIG, load_parameters("calibrated"), DISPLAY.pixels).heat
-    assert not heat.panel_k_per_j.any()
+    walled = build_budget(CONFIG, load_parameters("surroundings"), DISPLAY.pixels).heat
+    assert heat.panel_k_per_j[0] == pytest.approx(walled.panel_k_per_j[0], rel=0.03)
+    assert 1.0 < heat.touch_per_panel < walled.touch_per_panel
 
 
 def with_panel(base="surroundings", **values):
@@ -194,8 +196,10 @@ def test_a_stated_panel_below_the_capacity_of_its_walls_is_refused():
         build_budget(CONFIG, with_panel(capacity=0.1), DISPLAY.pixels)
 
 
-def test_a_panel_without_walls_counts_as_a_rise_of_everything():
-    heat_gain = compute_heat_gain_bound(with_panel("calibrated", resistance=4.0), DISPLAY.pixels, CONFIG)
-    assert heat_gain.uniform_rise_k == pytest.approx(4.0 * 0.6 * CONFIG.laser.max_power_w)
-    with pytest.raises(InputError, match=r"limits\.touch_max_c: .* to which the terms of .* may warm it"):
-        build_budget(CONFIG, with_panel("calibrated"), DISPLAY.pixels)
+def test_a_panel_without_walls_is_bounded_as_with_them():
+    heat = build_budget(CONFIG, with_panel("calibrated"), DISPLAY.pixels).heat
+    unsure = CONFIG.limits.uncertainty
+    assert heat.panel_tau_s[0] == pytest.approx(
+        40.0 * 6.0 * (1 + unsure.panel_resistance) * (1 - unsure.panel_capacity)
+    )
+    assert compute_heat_gain_bound(with_panel("calibrated"), DISPLAY.pixels, CONFIG).uniform_rise_k == 0.0

@@ -1,0 +1,30 @@
+"""Look up the code that a page names as `file:function`: a page must not outlive what it describes."""
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+NAMED = re.compile(r"`([\w/]+\.(?:py|c)):([\w.]+)`")
+
+
+def find_missing(markdown: str, root: Path = ROOT) -> list[str]:
+    """Return what a page names and the code lacks: files below optodrive/ or firmware_protocol/, functions, classes."""
+    return [f"{file}:{name}" for file, name in NAMED.findall(markdown) if not _has(root, file, name)]
+
+
+def _has(root: Path, file: str, name: str) -> bool:
+    path = root / file if file.endswith(".c") else root / "optodrive" / file
+    if not path.is_file():
+        return False
+    text = path.read_text(encoding="utf-8")
+    if file.endswith(".c"):
+        return re.search(rf"^[a-z][^;(]*\b{name}\([^;]*?\) \{{$", text, re.M) is not None
+    scope: ast.AST = ast.parse(text)
+    for part in name.split("."):
+        kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+        found = [each for each in ast.walk(scope) if isinstance(each, kinds) and each.name == part]
+        if not found:
+            return False
+        scope = found[0]
+    return True
