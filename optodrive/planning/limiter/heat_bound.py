@@ -1,8 +1,34 @@
 """Upper bounds on absorber, wall and touch surface temperatures, in closed form between two events. Kernels.
 
-The nodes form a cooperative system: a higher temperature of one node never lowers another one later. By the comparison
-principle a supersolution, which starts above the solution and never changes more slowly, stays above it. Every function
-here computes a supersolution, except the lower bound of the absorber's rise.
+Theory of operation
+
+Problem. A pulse that is granted now heats its absorber for 30 ms, its wall for seconds, its neighbours for longer and
+the panel for minutes. Nothing that is granted may ever pass a cap, for no parameters within the declared uncertainty,
+and a pulse must be judged in microseconds. Simulating the future of every pixel for every pulse is out of the question.
+
+Comparison principle. The nodes form a cooperative system: a higher temperature of one node never lowers another one
+later. A supersolution, which starts above the solution and never rises more slowly or falls faster, therefore stays
+above it at all times. Every function here advances a supersolution, except the lower bound of the absorber's rise. Its
+coefficients are the worst of the parameter box (`worst_case.py`), so it holds for all parameters at once.
+
+Nodes. The absorber's rise over its wall is integrated along chords below the bridge's concave loss, each an
+exponential: warming with the smallest capacity, cooling with the largest. Walls and touch surfaces get a pulse's heat
+at once, at its end, increased so that the bound stays above heat that arrives later. Their capacity or lag is uncertain
+in a direction that changes (a small one warms faster, a large one keeps heat longer), so each carries two bounds, one
+per end; between the ends no sum of responses exceeds the larger by more than Specht's ratio. The panel does likewise,
+and everything else is bounded over it.
+
+Time. Every pixel has a time of its own (`nodes_at_s`) and is advanced when it is touched: a plan of thousands of pulses
+must not touch 1,511 pixels for each. Only the exchange between walls couples pixels. It runs in steps shorter than the
+fastest wall's time constant, growing while nothing is driven, and leaves each pixel an upper bound on its inflow for
+the step and one more pulse (`inflow_w`): a fixed-point bound, from all walls as warm as the warmest to what that inflow
+allows. So between two exchanges a pixel depends on no other.
+
+Invariants. Bounds are never below the truth and never lowered but by cooling at the slowest rate. `panel_at_s`,
+`exchanged_at_s` and `nodes_at_s` never go back. Pulses of another stage may overlap: a pixel's own time then lies ahead
+(`_wall_since_k`).
+
+Decisions: 7 (the bound and what was rejected), 40 and 45 (panel, and what a finger touches), 41 (stages).
 """
 
 from math import exp, inf, log

@@ -1,7 +1,34 @@
 """Largest power of a pulse for its wall and touch surface, with a credit for heat in transit. Kernels.
 
-The bounds of both nodes count the heat of a pulse as if it arrived at once. Where that is too strict, the heat that is
-certainly still in the absorber is subtracted.
+Theory of operation
+
+Problem. Wall and touch surface lag behind the absorber. Their bounds count the heat of a pulse as if it arrived at the
+pulse's end, and their caps must also hold at all times after the pulse, with any other pixels driven meanwhile.
+
+Caps that suffice. With the gate off no wall gets hotter than the hottest wall, and no touch surface hotter than a
+steady one over the hottest wall. If walls are held below the smaller of their cap and of what a touch surface may have
+when steady (`_wall_cap_k`), then the set of states below all caps is left by no cooling, and it is enough to judge each
+pulse when it is granted. Caps are counted over the panel, which rises while other pixels are driven: the set shrinks,
+and a wall at its cap must fall faster than the cap does. It does so above a floor; below it nothing is granted.
+
+Power. The first answer is linear: the power at which all heat at once just reaches the cap. Where it is less than
+requested, the heat that is certainly still in the absorber is credited: y − credit × u, with y the bound and u a lower
+bound of the absorber's rise (smallest power and resistance, largest capacity while warming, smallest while cooling,
+warmed by nothing else, less a deficit for walls that neighbours warm). The power is then bisected, because the
+condition is monotone in it but not linear.
+
+During the pulse y and u are single exponentials, so the maximum of their difference lies at an end or at one point in
+closed form (`_credited_peak_k`). After the pulse u decays and its heat arrives: y − u could rise again. So only as much
+is credited as lets the difference fall at least as fast as the cap may (`_is_within_cap`): y falls at a rate of at
+least λ (y − d) towards its drive d, u at most at its own rate. The drive is taken at its largest (neighbours at their
+caps; for a touch surface, a wall that such neighbours have warmed for two absorber times), and when a larger one could
+have arisen, y alone is below the cap.
+
+Invariants. Without credit the result is a lower bound of the power with credit, and the bisection starts there: a
+credit never costs power. The result never exceeds the requested power. A power of 0 always passes, because the state
+before the pulse was within the set, unless the panel has taken the cap away.
+
+What it is worth: decision 7 (cost, and what was rejected). Decisions 40 and 45 say how the panel enters.
 """
 
 from math import exp, inf, log

@@ -1,8 +1,30 @@
 """Worst-case coefficients of the thermal bound over the declared parameter box.
 
-The temperatures are monotone in every parameter except the heat capacities: they increase with power, resistance and
-coupling. A smaller capacity warms faster and a larger one cools more slowly, so each node is bounded with both extremes
-(`specht_ratio`).
+Theory of operation
+
+Problem. Parameters of a display are known to some percent, and the bound must hold for all of them. Trying the corners
+of the box would take 2⁸ runs, and the worst case need not be a corner. So each coefficient of the bound is taken at the
+end of its range that makes temperatures higher, once, when a display is loaded.
+
+Which end. Temperatures rise monotonically with absorbed power, resistances, coupling, shares and exponent, so these are
+taken at one end. Capacities and lags are not monotone: a smaller one warms faster, a larger one cools more slowly. Each
+such node is bounded with both ends, and `specht_ratio` is the proven price of the values in between.
+
+Concave loss. A bridge conducts better when hot: its loss is concave, and chords from 0 to the cap lie below it. Less
+loss is the worse case. Where the exponent is uncertain, chords are laid even for a nominally constant bridge.
+
+Delays. The bound lets heat arrive at once. Where a node in between delays it, it arrives later, when the counted heat
+has already decayed; a factor 1 / (1 − rate × delay) makes up for that, and exists only if the node is slow enough
+against the delay: otherwise the display is refused by name. The touch surface is bounded by a weighted sum of itself,
+absorber and gas, whose weights are chosen so that the sum obeys an equation of first order (`_build_touch_bound`). The
+panel warms walls and touch surface by its whole rise, increased as each follows it late.
+
+Credits. `wall_transit_credit`, `touch_transit_credit` and the lower bound of the absorber are the opposite: they reduce
+a bound, and are therefore taken at the other end, with deficits for what neighbours and panel warm.
+
+Invariant. Every field of `Uncertainty` and of `HeatBound` enters here and nowhere else; a test walks over all declared
+uncertainties and requires each to be counted. Judged by an integrator that shares no code with the limiter
+(`tests/reference_models`). Decisions: 7, 40, 41 (skew of stages), 45.
 """
 
 from dataclasses import dataclass
