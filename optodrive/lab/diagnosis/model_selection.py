@@ -1,4 +1,34 @@
-"""Selection of the causes: refits ranked by BIC, a verdict, a second cause where one is insufficient, and rivals."""
+"""Selection of the causes: refits ranked by BIC, a verdict, a second cause where one is insufficient, and rivals.
+
+Theory of operation
+
+Problem. A recording differs from the model. Which term of the catalogue explains the difference, does one suffice, and
+can another one do the same? The costly error is a wrong name: it makes somebody repair what is not broken.
+"Unexplained" and "ambiguous" are answers, too.
+
+Detection first. One family of tests asks whether anything is wrong at all: the best candidate's likelihood ratio and an
+omnibus test of the residuals, at 0.1 % together (`FAMILY_ALPHA`), because the noise model is itself an estimate from a
+few repeats. If repeats differ by more than the noise model allows, nothing is named.
+
+Singles. The strongest candidates are refitted with all base parameters free (an effect that base parameters imitate is
+none) and ranked by BIC. The best one is accepted if what remains is noise and it explains most of the excess.
+
+Other forms before other causes. Real effects rarely have exactly their term's form: a droop that does not follow the
+power leaves residuals, and a second, false cause would fit them. So the best single is given columns of its own effect
+that grow or decay with power, heat, dose and time, or have another share in each signal (`discrepancy_basis.py`); if
+they take the rest, the one cause is named. Only then are pairs tried, and a pair must gain more than those columns do,
+by BIC. A pair may also show that the search began with the wrong single: it is then restarted from the pair's parts.
+
+Thresholds are shares of the excess that a cause explains. They rise where a false name is easy: a second node behind
+the absorber passes for a wall, another form for a second cause. They were set on recordings made for that purpose
+(decisions 8 and 11).
+
+Rivals. Candidates within `BIC_INDISTINGUISHABLE` of the chosen one make the verdict ambiguous, unless they merely
+imitate it: more parameters, one of them at its bound, and a prediction that is equivalent.
+
+Invariants. Nothing here changes the data or the noise model. The same recording and seed give the same verdict. A
+hypothesis that cannot be computed is recorded in the log with its reason, and never counts as ruled out.
+"""
 
 from dataclasses import dataclass
 

@@ -1,8 +1,35 @@
 """The link process without its sockets: epochs, the lease's conditions, commands of clients, status.
 
-An epoch ends with everything that stops the light: STOP, disarm, a fault, the loss of the link, of the planner or of
-the web process. Points of an ended epoch are never lit: the handover refuses them (gate 1), and arming drops those
-handed over before (gate 2, in the session).
+Theory of operation
+
+Problem. Several processes act on one board: web for callers, the planner for plans, the supervisor, a shell. Any of
+them may crash or stall with the laser on, and messages cross: a plan that was requested before STOP may arrive after
+it, be accepted after the next arming, and light what nobody asks for any more.
+
+Epochs. Everything that stops the light ends the epoch: STOP, disarm, a fault, a board that has left its arming, the
+loss of the link, of the planner or of the web process, a revoked caller. A request carries the epoch of its arrival,
+and its points are never lit in another one: the handover refuses them (gate 1, `point_handover.py`), and arming drops
+those handed over before (gate 2, in the session). A successor of this process begins with a greater epoch. Ending an
+epoch always sends ABORT, also when the board is said to be dark already: it does not end what has ended, and what is
+said may be false.
+
+Lease. It is renewed while the planner and a web process beat, and the planner is idle or makes progress (`clients.py`):
+a process that could not stop the light must not keep it on. With `on_web_loss = "finish"` a running plan may outlive
+the web process, because a shell or the key can still stop it; then `UNATTENDED_MAX_S` bounds the dark rest.
+
+Control. Who armed the board controls it: an arming may be held by a client that must prove its presence (hold-to-run),
+and ends with it. One arming at a time; a second caller is told who arms.
+
+Pauses are numbered and held here, as STOP is, so that they take effect however busy the planner is (decision 37).
+
+Order of one `step`: bytes of the board first, then what follows from them (ends of epochs), then status, then the
+answers to commands: a caller that learns from an answer that the board is armed may push at once, and the planner must
+know it by then. Results wait until the board has confirmed (`waiters.py`); a caller never learns of a state before it
+is true.
+
+No method blocks and no client is waited for: the process has the highest priority of the daemon, its loop is bounded by
+`WAIT_MAX_S`, and `pop_outgoing` returns what is to be sent. Malformed messages end their client, not the loop. The
+interleavings are checked by a SPIN model (`firmware_protocol/model/epochs.pml`). Decisions: 26, 31, 32, 35, 37.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,7 +1,34 @@
 """Host session with one board: handshake, limits, clock, arming, lease, streaming and faults.
 
-Only `connect` blocks. The loop that owns the session calls `step` repeatedly. The session never arms on its own: after
-a reconnect the board is DISARMED.
+Theory of operation
+
+Problem. A board that can emit stands at the end of a line that loses, damages and delays bytes, beside a host that may
+stall or restart. The board protects itself (rules B1 to B15 of the protocol); the session must never undo that
+protection, and must tell its owner the truth about the board.
+
+Handshake. HELLO with a nonce begins a session number; bytes of an earlier one are discarded. The board states its
+limits, the session refuses a board that does not meet the configuration, tightens the limits to it, and exchanges
+clocks a few times. Only then do commands go out, and the tightened limits before all others. After a reconnect or ABORT
+all of this is done again: the board is DISARMED, and the session never arms on its own.
+
+Arming is an exchange with nonces of both sides (`arming.py`), two seconds with the indicator on, and belongs to one
+epoch of the owner. It is *present* from the request until the board has left the state that it had reached, or until
+`end_arming`.
+
+Lease. The board closes the gate when its lease ends. It is renewed only while an arming is present, the board says that
+it is in a state that needs it, and the owner permits (`renew_lease`): each is necessary, because a report may be old or
+false. A board that needs a lease without a present arming gets ABORT, not a lease.
+
+Points are streamed as the board's queue has room and, for streams, as they become due (`point_stream.py`). Commands and
+points share one sequence, so that their order on the board is that of the calls; ABORT and HELLO stand outside it and
+overtake everything.
+
+Truth. State, position and errors are what the board reports (`board_view.py`), with the instant of the last message:
+silence for `SILENCE_TIMEOUT_S` ends the session, and for a lease where other boards' light depends on it.
+`link_watch.py` keeps what is needed to name the likely cause afterwards (decision 19).
+
+Only `connect` blocks. The loop that owns the session calls `step` repeatedly; all state is that loop's. Decisions: 2,
+5, 19, 26, 42.
 """
 
 import secrets
