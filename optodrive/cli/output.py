@@ -2,15 +2,40 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
+
+TABLE_WIDTH_MAX = 500
+"""Maximum width of a table, which otherwise fits its content, in characters."""
 
 
 def print_json(document: object) -> None:
     """Print one JSON object on stdout; it may be or contain Pydantic models."""
     json.dump(document, sys.stdout, indent=2, ensure_ascii=False, default=_convert_model)
     sys.stdout.write("\n")
+
+
+def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], numeric: frozenset[str] = frozenset()) -> None:
+    """Print a table on stdout, not narrower than its content; numeric: headings of the columns aligned to the right."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading in numeric else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(_escape(cell)) for cell in row))
+    width = max(Console().width, Console(width=TABLE_WIDTH_MAX).measure(table).maximum)
+    Console(width=width, highlight=False).print(table)
+
+
+def _escape(text: str) -> str:
+    """Return text without characters that act on a terminal."""
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii") for letter in text
+    )
 
 
 def _convert_model(value: object) -> object:

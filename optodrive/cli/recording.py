@@ -1,4 +1,4 @@
-"""`optodrive recording convert | show | merge`: convert, inspect and merge recordings."""
+"""`optodrive recording convert | show | merge | trials`: convert, inspect and merge recordings."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optodrive.cli.options import JsonOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_json, print_table
+from optodrive.cli.recording_trials import describe_trials, print_trials, trials
 from optodrive.core.quantity import format_number, format_quantity
 
 if TYPE_CHECKING:
     from optodrive.core.types.measurements import Measurement
 
-TABLE_WIDTH_MAX = 500
-"""Maximum width of the table, which otherwise fits its content, in characters."""
 RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="An HDF5 file, or a folder of CSV files.")]
 
 
@@ -23,6 +22,7 @@ def register(app: typer.Typer) -> None:
     group.command("convert")(convert)
     group.command("show")(show)
     group.command("merge")(merge)
+    group.command("trials")(trials)
     app.add_typer(group, name="recording")
 
 
@@ -61,18 +61,25 @@ def show(
     from optodrive.core.files import check_output
     from optodrive.lab.recording.merge import read_recording_or_session
     from optodrive.lab.recording.summary import build_summary
+    from optodrive.lab.recording.trials import read_trials_if_any
 
     check_output("--out", out, ".png")
     measurement, is_session = read_recording_or_session(recording)
     if is_session and out is not None:
         raise InputError("--out", str(out), "a recording with signals; this is a session, which has pulses alone")
-    runs = build_summary(measurement)
+    runs, found = build_summary(measurement), read_trials_if_any(recording)
     plotted_runs = None if out is None else _draw_signals(out, measurement)
     if json:
         picture = None if out is None else {"file": str(out), "runs": plotted_runs}
-        print_json({"recording": str(recording), "runs": runs, "picture": picture})
+        answer = {"recording": str(recording), "runs": runs, "trials": describe_trials(found), "picture": picture}
+        print_json(answer)
         return
-    _print_table(runs)
+    headings = ("run", "group", "pulses", "energy", "signal", "pixel", "samples", "missing", "span")
+    numbers = frozenset({"pulses", "energy", "pixel", "samples", "missing"})
+    print_table(headings, [cells for run in runs for cells in _format_rows(run)], numbers)
+    if found:
+        print()
+        print_trials(found)
     if is_session:
         print("a session of the daemon: pulses without signals; `recording merge` adds what was measured meanwhile")
     if out is not None:
@@ -113,22 +120,6 @@ def _draw_signals(out: Path, measurement: "Measurement") -> int:
     from optodrive.lab.recording.plot import write_plot
 
     return write_plot(out, measurement)
-
-
-def _print_table(runs: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for heading in ("run", "group", "pulses", "energy", "signal", "pixel", "samples", "missing", "span"):
-        right = heading in ("pulses", "energy", "pixel", "samples", "missing")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=True)
-    for run in runs:
-        for cells in _format_rows(run):
-            table.add_row(*(Text(cell) for cell in cells))
-    width = max(Console().width, Console(width=TABLE_WIDTH_MAX).measure(table).maximum)
-    Console(width=width, highlight=False).print(table)
 
 
 def _format_rows(run: dict[str, Any]) -> list[list[str]]:

@@ -12,6 +12,7 @@ import pytest
 from forked_process import run_process
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import read_recording, write_recording
+from optodrive.lab.recording.trials import CLOCKS, read_trials
 from rig import long_train, wait_for
 
 LABELS = {"subject": "S07 µ", "trial": 12, "practice": False}
@@ -63,6 +64,15 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
         pulses = runs[run]["pulses"][:]
         count = sum(len(runs[name]["pulses"]) for name in runs)
         assert count == sum(answer["executed"] for answer in (*answers, stopped))
+    trials = read_trials(path)
+    assert [(trial.status, trial.labels) for trial in trials] == [("done", LABELS), ("done", LABELS), ("failed", {})]
+    for trial, answer in zip(trials, (*answers, stopped), strict=True):
+        assert trial.executed == {name: answer["onset"][name] for name in CLOCKS}
+        assert trial.planned_pulses == answer["planned"]
+        late_s = {name: trial.executed[name] - trial.requested[name] for name in CLOCKS}
+        assert late_s["monotonic_s"] == pytest.approx(late_s["board_s"], abs=1e-6)
+        assert late_s["unix_s"] == pytest.approx(late_s["board_s"], abs=1e-6)
+        assert late_s["board_s"] == pytest.approx(answer["pulses"]["start_s"][0] if answer["pulses"] else 0.0, abs=0.01)
     lab = tmp_path / "lab"
     t_s = np.linspace(0, 1, 40)
     signal = Signal(17, t_s, 1e-6 * t_s, 1e-7)

@@ -86,6 +86,7 @@ class ActivePlan:
         """Shift the plan's zero by the delay of what was executed, so that the rows that are left are as late."""
         delay_s, self.record.delay_s = max(0.0, self.record.delay_s), 0.0
         self.record.start_s += delay_s
+        self.record.folded_delay_s += delay_s
         if self.executed is not None:
             self.executed = replace(self.executed, start_s=self.executed.start_s - delay_s)
 

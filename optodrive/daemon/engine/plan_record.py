@@ -108,7 +108,7 @@ class PlanRecord:
 
     pulse_count, duration_s: of the whole plan; summary_json: encoded `PlanSummary`, which is larger in memory
     pulses: None if there are too many to list
-    start_s: board time of the plan's zero
+    start_s: board time of the plan's zero; folded_delay_s: by how much interruptions have shifted it
     arrived_s: board time of the request; *_after_s: time from the request to an event
     caller: name of the token that submitted it
     labels, parameters: of the caller, and of the pattern
@@ -136,6 +136,7 @@ class PlanRecord:
     execution: Execution | None = None
     executed_count: int = 0
     delay_s: float = 0.0
+    folded_delay_s: float = 0.0
     timing_error: TimingError | None = None
     dropped: int = 0
     planned_after_s: float | None = None

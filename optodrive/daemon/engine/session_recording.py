@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,14 @@ from typing import Any
 import numpy as np
 
 from optodrive import __version__
+from optodrive.core.types.stimuli import HeightTrain, PulseTrain
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.plan_simulation import compute_simulated_m
 from optodrive.daemon.log import DaemonLog
 from optodrive.lab.recording.session_recorder import SessionRecorder
+from optodrive.link.session.clock_reading import ClockReading
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.effective_config import build_effective_config
 from optodrive.planning.stimuli.train_json import train_to_json
@@ -37,8 +41,11 @@ def describe_display(display: DisplayModel) -> dict[str, Any]:
     }
 
 
-def build_plan_entry(active: ActivePlan, tick_s: float, board_now_s: float) -> PlanEntry:
-    """Return the entry of an ended plan: request, plan, execution on the board's clock, and simulated heights."""
+def build_plan_entry(active: ActivePlan, tick_s: float, board_now_s: float, clocks: ClockReading | None) -> PlanEntry:
+    """Return the entry of an ended plan: request, plan, execution on the board's clock, and simulated heights.
+
+    clocks: a moment on all clocks, for a plan without an onset; None while they are not synchronised
+    """
     record, planned, plan = active.record, active.planned, active.planned.plan
     frames = planned.sequence.frames
     trains = [train_to_json(train) for train in planned.sequence.trains]
@@ -53,6 +60,7 @@ def build_plan_entry(active: ActivePlan, tick_s: float, board_now_s: float) -> P
         "labels": json.dumps(record.labels, ensure_ascii=False),
         "parameters": json.dumps(record.parameters, ensure_ascii=False),
     }
+    attributes |= _describe_onsets(record, [f.show_at_s for f in frames], planned.sequence.trains, clocks)
     arrays = {
         "requested_frames": np.array([(f.show_at_s, f.duration_s, f.simultaneous, f.priority) for f in frames]).reshape(
             -1, 4
@@ -73,6 +81,21 @@ def build_plan_entry(active: ActivePlan, tick_s: float, board_now_s: float) -> P
     return attributes, arrays
 
 
+def _describe_onsets(
+    record: PlanRecord, show_at_s: list[float], trains: Sequence[PulseTrain | HeightTrain], clocks: ClockReading | None
+) -> dict[str, float]:
+    """Return requested and executed onset on the clocks of board and host, as far as they are known."""
+    out: dict[str, float] = {}
+    times_s = [*show_at_s, *(train.start_s for train in trains)]
+    if times_s:
+        requested_s, reading = record.start_s - record.folded_delay_s + min(times_s), record.onset or clocks
+        known = {"board_s": requested_s} if reading is None else reading.convert(requested_s)._asdict()
+        out |= {f"requested_{name}": value for name, value in known.items()}
+    if record.onset is not None:
+        out |= {f"executed_{name}": value for name, value in record.onset._asdict().items()}
+    return out
+
+
 def start_session_recorder(engine: Engine, path: Path | None, log: DaemonLog) -> SessionRecorder | None:
     """Start to record every plan that ends. Return None if neither `path` nor the configuration requests it."""
     folder = engine.display.config.daemon.record
@@ -82,7 +105,7 @@ def start_session_recorder(engine: Engine, path: Path | None, log: DaemonLog) ->
     recorder = SessionRecorder(path, describe_display(engine.display), log.warn)
 
     def record_plan(plan: ActivePlan) -> None:
-        recorder.record(lambda: build_plan_entry(plan, engine.scales[0].tick_s, engine.board_s()))
+        recorder.record(lambda: build_plan_entry(plan, engine.scales[0].tick_s, engine.board_s(), engine.read_clocks()))
 
     engine.add_plan_end_callback(record_plan)
     return recorder

@@ -11,9 +11,12 @@ from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run
 from optodrive.lab.recording.storage import (
+    ATTRIBUTES_MAX,
     COMMANDS,
     FORMAT,
     NUMBERS_MAX,
+    PLAN_TABLES,
+    PLAN_TEXTS,
     PULSES,
     SAMPLE_COLUMNS,
     SIGNALS,
@@ -23,6 +26,8 @@ from optodrive.lab.recording.storage import (
     Attributes,
     MemoryBudget,
     convert_errors,
+    format_name,
+    normalize_attribute,
     normalize_attributes,
 )
 
@@ -65,7 +70,8 @@ class Hdf5Tree:
 
     def list_runs(self) -> list[str]:
         """Return the run names."""
-        return self._list_names(self.format_place(), self._open_group(self.format_place(), self._file, "runs"))
+        place = self.format_place()
+        return self._list_groups(place, self._open_group(place, self._file, "runs"))
 
     def read_run_attributes(self, run: str) -> Attributes:
         """Return the attributes of a run."""
@@ -79,10 +85,35 @@ class Hdf5Tree:
         """Return the attributes of a signal."""
         return self._read_attributes(self.format_place(run, signal), self._open_signal(run, signal))
 
+    def list_plans(self) -> list[str]:
+        """Return the IDs of a session's plans; none for another recording."""
+        if "plans" not in self._file:
+            return []
+        place = f"{self._path}: /plans"
+        return [
+            name for name in self._list_groups(place, self._open_group(place, self._file, "plans")) if name != "config"
+        ]
+
+    def read_plan(self, plan: str) -> tuple[Attributes, dict[str, str], dict[str, FloatArray]]:
+        """Return a plan's attributes, texts (`PLAN_TEXTS`) and tables (`PLAN_TABLES`), those that it has."""
+        place = f"{self._path}: /plans/{plan}"
+        group = self._open_group(place, self._file, f"plans/{plan}")
+        texts: dict[str, str] = {}
+        tables: dict[str, FloatArray] = {}
+        with convert_errors(place, "a readable plan"):
+            for name in (name for name in PLAN_TEXTS if name in group):
+                texts[name] = self._read_text(f"{place}/{name}", group, name)
+            for name, columns in PLAN_TABLES.items():
+                if name in group:
+                    tables[name] = self._read_columns(f"{place}/{name}", group, name, columns)
+        return self._read_attributes(place, group), texts, tables
+
     def read_table(self, run: str, name: str) -> FloatArray:
         """Return a table of a run, [n, columns]."""
-        place, columns = self.format_place(run, name), TABLE_COLUMNS[name]
-        dataset = self._open_dataset(place, self._open_run(run), name)
+        return self._read_columns(self.format_place(run, name), self._open_run(run), name, TABLE_COLUMNS[name])
+
+    def _read_columns(self, place: str, group: Any, name: str, columns: tuple[str, ...]) -> FloatArray:
+        dataset = self._open_dataset(place, group, name)
         with convert_errors(place, "readable data"):
             if len(dataset.shape) != 2 or dataset.shape[1] != len(columns):
                 expected = f"n rows of {len(columns)} columns: {', '.join(columns)}"
@@ -131,6 +162,32 @@ class Hdf5Tree:
             raise InputError(self.format_place(run, signal, "value"), Unquoted(f"the shape {value.shape}"), expected)
         return t_s, value
 
+    def _list_groups(self, place: str, group: Any) -> list[str]:
+        """Return the names in a group; raises InputError at the first link, and for an object of two names.
+
+        Links cost no space: a small file could have any number of runs.
+        """
+        with convert_errors(place, "a readable group"):
+            names, addresses = [], set()
+            for name in group:
+                link = group.id.links.get_info(name.encode("utf-8", "surrogateescape"))
+                if link.type != self._h5.h5l.TYPE_HARD:
+                    raise InputError(f"{place}/{format_name(name)}", Unquoted("a link"), "a group, stored in this file")
+                if link.u in addresses:
+                    raise InputError(
+                        f"{place}/{format_name(name)}", Unquoted("a second name of a group"), "one name of each"
+                    )
+                addresses.add(link.u)
+                names.append(name)
+            return names
+
+    def _read_text(self, place: str, group: Any, name: str) -> str:
+        dataset = self._open_member(place, group, name, self._h5.Dataset, "text")
+        with convert_errors(place, "text"):
+            if dataset.shape != () or self._h5.check_string_dtype(dataset.dtype) is None:
+                raise InputError(place, Unquoted(f"entries of type {dataset.dtype}"), "one text")
+            return str(normalize_attribute(dataset[()]))
+
     def _list_names(self, place: str, group: Any) -> list[str]:
         with convert_errors(place, "a readable group"):
             return list(group)
@@ -138,6 +195,8 @@ class Hdf5Tree:
     def _read_attributes(self, place: str, group: Any) -> Attributes:
         values: dict[str, Any] = {}
         with convert_errors(place, "readable attributes"):
+            if len(group.attrs) > ATTRIBUTES_MAX:
+                raise InputError(place, Unquoted(f"{len(group.attrs)} attributes"), f"at most {ATTRIBUTES_MAX}")
             for name in group.attrs:
                 with suppress(TypeError):  # h5py cannot represent the type
                     attribute = group.attrs.get_id(name)

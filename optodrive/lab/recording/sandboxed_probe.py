@@ -71,10 +71,16 @@ def _extend_cpu_limit(run_limit_s: int) -> None:
 
 def _read_all(path: Path, run_limit_s: int) -> None:
     runs: list[str] = []
+    plans: list[str] = []
     _extend_cpu_limit(run_limit_s)
     with suppress(InputError), Hdf5Tree(path) as tree:
         tree.read_root_attributes()
         runs = tree.list_runs()
+        plans = tree.list_plans()
+    for plan in plans:
+        _extend_cpu_limit(run_limit_s)
+        with suppress(InputError), Hdf5Tree(path) as tree:
+            tree.read_plan(plan)
     for run in runs:
         _extend_cpu_limit(run_limit_s)
         with suppress(InputError), Hdf5Tree(path) as tree:

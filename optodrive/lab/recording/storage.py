@@ -33,12 +33,21 @@ TABLE_COLUMNS = {PULSES: ("start_s", "width_s", "power_W", "pixel"), COMMANDS: (
 SAMPLE_COLUMNS = ("t_s", "value")
 """Columns of a signal."""
 RUN_MEMBERS = (*TABLE_COLUMNS, *SIGNALS)
+PLAN_TABLES = {
+    "planned": ("start_s", "width_s", "power_W", "pixel", "trimmed_J"),
+    "executed": ("start_s", "width_s", "power_W", "pixel"),
+}
+"""Tables of a session's plan and their columns."""
+PLAN_TEXTS = ("labels", "parameters")
+"""JSON objects of a session's plan."""
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 """Suffixes of recordings that are one file; any other name is that of a folder."""
 NUMBERS_MAX = 2**27
 """Maximum of numbers read into memory per call: 1 GiB."""
 TEXT_BYTES_MAX = 2**20
+ATTRIBUTES_MAX = 1000
+"""Maximum number of attributes of a recording, run or signal."""
 NAME_BYTES_MAX = 200
 _INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**64 - 1
 

@@ -10,7 +10,9 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import convert_recording, read_recording, reader, sandboxed_probe, write_recording
+from optodrive.lab.recording.hdf5 import Hdf5Tree
 from optodrive.lab.recording.storage import natural_sort_key
+from optodrive.lab.recording.trials import read_trials
 from recording_samples import T_S, assert_same, recording, sorted_attributes
 
 
@@ -399,3 +401,43 @@ def test_numbers_of_numpy_are_written_as_numbers(tmp_path):
         (read,) = read_recording(tmp_path / name).runs
         assert read.attributes == {"x": 0.5, "n": 3}
         assert (read.ambient_k, read.signals["force_N"].sigma) == (293.15, 0.1)
+
+
+def count_opens(monkeypatch, path):
+    """Read a file as the sandboxed process does; return how many times it opens the file."""
+    opened = []
+
+    class CountingTree(Hdf5Tree):
+        def __init__(self, path):
+            opened.append(path)
+            super().__init__(path)
+
+    monkeypatch.setattr(sandboxed_probe, "Hdf5Tree", CountingTree)
+    monkeypatch.setattr(sandboxed_probe, "_extend_cpu_limit", lambda limit_s: None)
+    sandboxed_probe._read_all(path, 5)
+    return len(opened)
+
+
+@pytest.mark.parametrize(("group", "read"), [("runs", read_recording), ("plans", read_trials)])
+@pytest.mark.parametrize("is_soft", [True, False])
+def test_links_cost_no_work_each_and_are_refused_by_name(path, monkeypatch, group, read, is_soft):
+    """A link takes some bytes; 60,000 of them took minutes, one opened file each."""
+    with h5py.File(path, "r+") as file:
+        first = next(iter(file["runs"].values()))
+        links = file.require_group(group)
+        for number in range(300):
+            links[f"link{number}"] = h5py.SoftLink(first.name) if is_soft else first
+    opens = count_opens(monkeypatch, path)
+    assert opens <= 1 + len(recording().runs)
+    monkeypatch.setattr(reader, "probe_in_sandbox", lambda path: None)
+    with pytest.raises(InputError, match=rf": /{group}/\w+: got a (link|second name of a group), expected"):
+        read(path)
+
+
+def test_more_attributes_than_a_recording_may_have_are_refused(path, monkeypatch):
+    with h5py.File(path, "r+") as file:
+        for number in range(1000):
+            file.attrs[f"a{number}"] = number
+    monkeypatch.setattr(reader, "probe_in_sandbox", lambda path: None)
+    with pytest.raises(InputError, match="got 1003 attributes, expected at most 1000"):
+        read_recording(path)

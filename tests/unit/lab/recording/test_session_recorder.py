@@ -28,7 +28,8 @@ def note(plan, start_s, pulses=3, padding=0):
     columns = [begin_s, np.full(pulses, 0.01), np.full(pulses, 2.0), np.full(pulses, 17.0)]
     executed = np.column_stack(columns)
     random = np.random.default_rng(1).random(padding)
-    return about, {"executed": executed, "planned": executed, "simulated_m": np.full(pulses, 1e-5), "padding": random}
+    planned = np.column_stack([executed, np.zeros(pulses)])
+    return about, {"executed": executed, "planned": planned, "simulated_m": np.full(pulses, 1e-5), "padding": random}
 
 
 def recorded(path, notes, said):
@@ -77,6 +78,119 @@ def test_recording_show_lists_a_session(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["runs"][0]["pulses"] == 3
     assert run(["recording", "show", str(path), "--out", str(tmp_path / "p.png")]) == 2
     assert "a session" in capsys.readouterr().err
+
+
+def trial(plan, start_s, labels, status="done", error=None, **onsets):
+    about, arrays = note(plan, start_s)
+    parameters = json.dumps({"pixel": 17})
+    return about | onsets | {
+        "labels": json.dumps(labels),
+        "parameters": parameters,
+        "status": status,
+        "error": error,
+    }, arrays
+
+
+ONSETS = {
+    "requested_board_s": 5.0,
+    "requested_monotonic_s": 105.0,
+    "requested_unix_s": 1e9 + 5.0,
+    "executed_board_s": 5.002,
+    "executed_monotonic_s": 105.002,
+    "executed_unix_s": 1e9 + 5.002,
+}
+HEAD = (
+    "plan,name,run,status,error,requested_board_s,requested_monotonic_s,requested_unix_s,executed_board_s,"
+    "executed_monotonic_s,executed_unix_s,planned_pulses,executed_pulses"
+)
+
+
+@pytest.fixture
+def session(tmp_path):
+    """Return a session of three plans, the second of which ended before its first pulse, the third without onsets."""
+    path = tmp_path / "a.h5"
+    second = trial("p2", 9.0, {"subject": "S07, µ"}, "cancelled", "stopped by a caller", requested_board_s=9.0)
+    second[1].pop("executed")
+    last = note("p10", 60.0)
+    recorded(path, [trial("p1", 5.002, {"trial": 1, "practice": False}, **ONSETS), second, last], [])
+    return path
+
+
+def test_the_trials_of_a_session_are_a_table(session, tmp_path, capsys):
+    out = tmp_path / "trials.csv"
+    assert run(["recording", "trials", str(session), "--out", str(out)]) == 0
+    output = capsys.readouterr().out
+    assert "trial=1, practice=False" in output
+    assert "2001-09-09 01:46:45.002000Z" in output
+    assert "2 ms" in output
+    assert "0 of 3" in output
+    assert out.read_text().split("\n") == [
+        f"{HEAD},label_trial,label_practice,label_subject",
+        "p1,n,run1,done,,5.0,105.0,1000000005.0,5.002,105.002,1000000005.002,3,3,1,false,",
+        'p2,n,,cancelled,stopped by a caller,9.0,,,,,,3,0,,,"S07, µ"',
+        "p10,n,run2,done,,,,,60.0,,1000000060.0,3,3,,,",
+        "",
+    ]
+
+
+def test_show_lists_the_trials_too(session, capsys):
+    assert run(["recording", "show", str(session)]) == 0
+    output = capsys.readouterr().out
+    assert "stopped by a caller" in output
+    assert "subject=S07, µ" in output
+    assert run(["recording", "show", str(session), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)["trials"]
+    assert run(["recording", "trials", str(session), "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["trials"]
+    assert shown == listed
+    assert [item["plan"] for item in listed] == ["p1", "p2", "p10"]
+    assert listed[0]["requested"] == {"board_s": 5.0, "monotonic_s": 105.0, "unix_s": 1e9 + 5.0}
+    assert listed[1]["executed"] == {"board_s": None, "monotonic_s": None, "unix_s": None}
+    assert listed[0]["parameters"] == {"pixel": 17}
+
+
+def test_a_recording_without_plans_has_no_trials(tmp_path, capsys):
+    measured(tmp_path / "lab", ["run1"])
+    write_recording(tmp_path / "lab.h5", read_recording(tmp_path / "lab"))
+    for path in (tmp_path / "lab", tmp_path / "lab.h5"):
+        assert run(["recording", "trials", str(path)]) == 2
+        assert "got no plans, expected the file of a session" in capsys.readouterr().err
+        assert run(["recording", "show", str(path), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["trials"] == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda plan: plan.attrs.__setitem__("executed_unix_s", 1e300), "/plans/p1/executed_unix_s: got 1e+300"),
+        (lambda plan: plan.attrs.__setitem__("requested_board_s", np.nan), "/plans/p1/requested_board_s: got nan"),
+        (lambda plan: plan.attrs.__setitem__("requested_board_s", "soon"), "got 'soon', expected a time"),
+        (lambda plan: plan.__setitem__("labels", "[" * 100_000), "/plans/p1/labels: got"),
+        (lambda plan: plan.__setitem__("labels", '{"a": NaN}'), "/plans/p1/labels: got NaN, expected finite numbers"),
+        (lambda plan: plan.__setitem__("labels", "[1]"), "/plans/p1/labels: got a list, expected one JSON object"),
+        (lambda plan: plan.__setitem__("labels", [1.0]), "/plans/p1/labels: got entries of type float64"),
+        (lambda plan: plan.__setitem__("executed", np.zeros((2, 3))), "/plans/p1/executed: got the shape (2, 3)"),
+        (lambda plan: plan.__setitem__("planned", h5py.SoftLink("/runs")), "/plans/p1/planned: got a link"),
+    ],
+)
+def test_a_spoilt_plan_is_refused_in_one_line(session, capsys, spoil, message):
+    with h5py.File(session, "r+") as file:
+        plan = file["plans/p1"]
+        for name in ("labels", "executed", "planned"):
+            del plan[name]
+        spoil(plan)
+    assert run(["recording", "trials", str(session)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_labels_do_not_act_on_the_terminal(tmp_path, capsys):
+    recorded(tmp_path / "a.h5", [trial("p1", 5.0, {"subject": "\x1b[31mred\n"})], [])
+    assert run(["recording", "trials", str(tmp_path / "a.h5")]) == 0
+    output = capsys.readouterr().out
+    assert "\x1b" not in output
+    assert "\\x1b[31mred\\n" in output
 
 
 def test_a_full_disk_is_told_in_one_line_and_what_was_written_stays(tmp_path):
