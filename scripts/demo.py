@@ -77,12 +77,11 @@ def print_report(shown: list[tuple[str, Plan]]) -> bool:
     Console().print(table)
     planned, sent, executed = (sum(getattr(plan, key) for _, plan in shown) for key in ("planned", "sent", "executed"))
     print(f"pulses planned {planned}, sent {sent}, executed {executed}")
-    targets = [plan.max_target for _, plan in done if plan.max_target]
-    if targets:
-        highest = max(targets, key=lambda item: item.target_um)
+    if done:
+        name, highest = max(done, key=lambda item: item[1].simulated_max_um or 0.0)
         print(
-            f"largest membrane displacement {highest.simulated_um:.1f} µm, computed from the executed pulses; "
-            f"target {highest.target_um:.1f} µm"
+            f"largest membrane displacement {highest.simulated_max_um or 0.0:.1f} µm, in {name}, "
+            "computed from the executed pulses"
         )
     return planned == sent == executed > 0 and len(done) == len(shown)
 

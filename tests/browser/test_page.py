@@ -59,6 +59,32 @@ def test_draw_preview_arm_play_and_what_was_felt(window, page, daemon):
     assert window.unexpected_errors() == []
 
 
+def test_nothing_moves_from_preview_to_stop_and_play_shows_what_is_felt(page, daemon):
+    draw_line(page)
+    page.locator("#rate").fill("6")
+    page.locator("#seconds").fill("20")
+    page.evaluate("scrollTo(0, 0)")
+    preview(page)
+    expect(page.locator('input[name="show"][value="preview"]')).to_be_checked()
+    play, result = page.get_by_role("button", name="Play", exact=True), page.locator("#result")
+    tops = [play.bounding_box()["y"]]
+    page.get_by_role("button", name="Arm …").click()
+    tops.append(play.bounding_box()["y"])
+    page.get_by_role("button", name="Confirm: arm the laser").click()
+    expect(page.locator("#board-state")).to_have_text("ARMED")
+    tops.append(play.bounding_box()["y"])
+    play.click()
+    expect(page.locator("#now .plan")).to_have_text(re.compile(r"^p\d+ drawing by armer$"))
+    assert page.locator("progress:visible").count() == 1
+    tops.append(play.bounding_box()["y"])
+    assert is_in_view(page, play, result)
+    expect(page.locator('input[name="show"][value="height"]')).to_be_checked()
+    daemon.call("POST", "/v1/stop")
+    expect(result).to_contain_text("highest")
+    assert is_in_view(page, play, result)
+    assert [*tops, play.bounding_box()["y"]] == [tops[0]] * 5
+
+
 def test_keys_alone_draw_preview_and_arm(page, daemon):
     page.locator("#display").focus()
     page.keyboard.press("Space")
@@ -208,44 +234,6 @@ def test_arm_and_confirm_are_in_view_on_a_phone(page):
     assert is_in_view(page, arming)
     arming.tap()
     assert is_in_view(page, arming, page.get_by_role("button", name="Confirm: arm the laser"))
-
-
-def test_a_colour_means_the_same_height_all_the_time(page, daemon):
-    top = page.locator("#legend-high")
-    for height_um in (30, 150):
-        daemon.arm()
-        targets_um = dict.fromkeys(map(str, range(0, 437, 7)), height_um)
-        frames = [{"show_at_s": 0.3 * k, "duration_s": 0.3, "target_um": targets_um} for k in range(200)]
-        daemon.call("POST", "/v1/plans", json={"frames": frames})  # longer than the page needs to show it
-        expect(page.locator("#summary")).to_contain_text("pixels above 1 µm")
-        expect(top).to_have_text("≥ 200 µm")
-        daemon.call("POST", "/v1/stop")
-    page.get_by_text("Options").click()
-    page.get_by_text("100 µm", exact=True).click()
-    expect(top).to_have_text("≥ 100 µm")
-    page.reload()
-    expect(top).to_have_text("≥ 100 µm")
-    page.get_by_text("Temperature", exact=True).click()
-    expect(top).to_have_text("≥ 400 °C")
-
-
-def test_planned_pulses_are_dropped_executed_ones_stay(page):
-    shown = page.evaluate("""async () => {
-        const { Timeline } = await import("/page/timeline.js");
-        const text = document.createElement("p");
-        const timeline = new Timeline(document.createElement("canvas"), text, 1);
-        const batch = (start_s) => ({
-            plan: "p1", row: [start_s], pixel: [1], start_s: [start_s], width_s: [0.01], power_w: [1],
-            trimmed_j: [0], reason: [""],
-        });
-        timeline.addPulses({ board_s: 5, planned: [batch(5.9)], executed: [batch(4.5)] });
-        const describe = () => (timeline.describe(), text.textContent);
-        const before = describe();
-        timeline.dropPlanned();
-        return [before, describe()];
-    }""")
-    executed = "In the last 4 s 1 pulses were executed, none trimmed. "
-    assert shown == [f"{executed}1 start within the next second.", executed]
 
 
 def test_reduced_motion_asks_for_fewer_pictures(page):

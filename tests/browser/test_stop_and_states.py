@@ -39,7 +39,10 @@ def test_stop_ends_what_plays(page, bench, how):
         page.get_by_role("button", name="STOP").click()
     expect(page.locator("#board-state")).to_have_text("DISARMED")
     assert bench.board.of("gate")[-1]["on"] is False
-    expect(page.locator("#result")).to_contain_text("failed: ended by stop")
+    expect(page.locator("#result")).to_contain_text("stopped (ended by stop).")
+    entry = page.locator("#plan-history li").first
+    expect(entry).to_contain_text("stopped (ended by stop)")
+    assert entry.get_attribute("class") == ""  # a caller who stops it is no failure
 
 
 def test_stop_works_without_telemetry_and_is_sent_again_until_it_is_answered(page, daemon):

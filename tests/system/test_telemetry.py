@@ -91,6 +91,10 @@ def heights_um(event):
     return np.frombuffer(base64.b64decode(event["height"]), dtype="<u2") / 10
 
 
+def peaks_um(event):
+    return np.frombuffer(base64.b64decode(event["peak"]), dtype="<u2") / 10
+
+
 def celsius(event):
     return np.frombuffer(base64.b64decode(event["absorber"]), dtype="<u2") / 10
 
@@ -132,8 +136,9 @@ def test_the_display_event_agrees_with_the_executed_pulses(daemon, reader):
     for event in events:
         expected = heat.state_at(event["board_s"])
         assert heights_um(event) == pytest.approx(expected.displacement_m * 1e6, abs=0.2)
+        assert (peaks_um(event) >= heights_um(event)).all()
         assert celsius(event) == pytest.approx(20.0 + expected.absorber_k, abs=0.2)
-    assert max(heights_um(event)[17] for event in events) < done["simulated_max_um"] + 0.2
+    assert max(peaks_um(event)[17] for event in events) == pytest.approx(done["simulated_max_um"], abs=0.1)
     announced = [batch for event in follower.of("pulses") for batch in event["planned"]]
     planned = [batch for batch in announced if batch["plan"] == answer["plan"]]
     assert planned[0]["start_s"] == pytest.approx(batches[0]["start_s"], abs=2e-3)

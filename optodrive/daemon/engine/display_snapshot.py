@@ -63,13 +63,15 @@ class LiveThermalState:
     def __init__(self, display: DisplayModel) -> None:
         self._display = display
         self._heat, self._budget = display.build_cold_state()
+        self._peak_m = np.zeros(len(display.layout))
         self.out_of_order = 0
 
     def apply(self, executed: ExecutedBatch) -> None:
         """Add pulses, in order of time."""
         columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
         try:
-            self._heat.apply_pulses(*columns)
+            peaks = self._heat.apply_pulses(*columns)
+            np.maximum.at(self._peak_m, executed.pixel, peaks.displacement_m)
         except ValueError:
             self.out_of_order += len(executed.row)
         self._budget = commit_executed(executed.pixel, executed.stage, executed, self._budget, self._display.budget)
@@ -81,6 +83,11 @@ class LiveThermalState:
     def state_at(self, board_s: float) -> DisplayState:
         """Return the state of all pixels at a board time, s."""
         return self._heat.state_at(board_s)
+
+    def take_peaks_m(self) -> FloatArray:
+        """Return the peak displacement of the pulses applied since the last call, m, [p]; 0 on pixels without any."""
+        peak_m, self._peak_m = self._peak_m, np.zeros(len(self._peak_m))
+        return peak_m
 
     def compute_usage(self, board_s: float) -> tuple[Usage, ...]:
         """Compute the usage of every cap at a board time, s."""

@@ -18,12 +18,15 @@ HEIGHT_UNIT_M = 1e-7
 TEMPERATURE_UNIT_K = 0.1
 
 
-def build_display_event(board_s: float, warm: bool, state: DisplayState, ambient_c: float) -> DisplayEvent:
-    """Encode displacement and absorber temperature of every pixel at a board time."""
+def build_display_event(
+    board_s: float, warm: bool, state: DisplayState, peak_m: FloatArray, ambient_c: float
+) -> DisplayEvent:
+    """Encode displacement, its peak [p] since the last event, and absorber temperature of every pixel at a time."""
     return DisplayEvent(
         board_s=round(board_s, 6),
         warm=warm,
         height=_encode_base64(state.displacement_m / HEIGHT_UNIT_M),
+        peak=_encode_base64(peak_m / HEIGHT_UNIT_M),
         absorber=_encode_base64((ambient_c + state.absorber_k) / TEMPERATURE_UNIT_K),
     )
 

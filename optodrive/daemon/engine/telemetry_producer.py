@@ -113,6 +113,7 @@ class TelemetryProducer:
         self._collect_executed()
         self._announce_planned(board_s)
         if not self._readers:
+            self._executed_state.take_peaks_m()  # they are older than what the next reader has seen
             return
         self._publish_display(now_s, board_s)
         if self._is_due("budget", now_s, BUDGET_PERIOD_S):
@@ -134,17 +135,15 @@ class TelemetryProducer:
 
     def _publish(self, event: str, model: JsonModel) -> None:
         fields = {"event": event, "warm": self._is_warm, "upcoming": self._has_upcoming}
-        text = f"event: {event}\ndata: {model.model_dump_json()}\n\n"
-        self._publish_message(Message("telemetry", fields, text.encode()))
+        self._publish_message(Message("telemetry", fields, model.model_dump_json().encode()))
 
     def _publish_display(self, now_s: float, board_s: float) -> None:
         pixel_state = self._executed_state.state_at(board_s)
-        was_warm = self._is_warm
-        self._is_warm = bool(
-            pixel_state.displacement_m.max() > WARM_DISPLACEMENT_M or np.abs(pixel_state.absorber_k).max() > WARM_RISE_K
-        )
+        was_warm, peak_m = self._is_warm, np.maximum(self._executed_state.take_peaks_m(), pixel_state.displacement_m)
+        self._is_warm = bool(peak_m.max() > WARM_DISPLACEMENT_M or np.abs(pixel_state.absorber_k).max() > WARM_RISE_K)
         if self._is_warm or was_warm or self._is_due("display", now_s, COLD_DISPLAY_PERIOD_S):
-            self._publish("display", build_display_event(board_s, self._is_warm, pixel_state, self._config.ambient_c))
+            event = build_display_event(board_s, self._is_warm, pixel_state, peak_m, self._config.ambient_c)
+            self._publish("display", event)
 
     def _collect_executed(self) -> None:
         for event in merge_events(self._engine.drain_events()):

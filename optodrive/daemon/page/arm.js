@@ -20,6 +20,7 @@ export class ArmControl {
     this.status = find("arming");
     this.holder = find("control");
     this.idleText = this.status.textContent;
+    this.status.closest(".reserve").dataset.longest = this.idleText;
     this.announce = announce;
     this.onError = onError;
     this.state = "";

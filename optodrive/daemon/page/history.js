@@ -1,5 +1,7 @@
 // History of faults and plans since the page was opened in this tab; a reload keeps it.
 
+import { describeStatus } from "./plan_end.js";
+
 const FAULTS_MAX = 50;
 const PLANS_MAX = 50;
 const LEAVING_MS = 5000; // a page that is left or reloaded ends its own connection
@@ -64,10 +66,10 @@ export class History {
       return false; // an earlier frame of the stream
     }
     const by = plan.caller ? ` by ${plan.caller}` : "";
-    const cause = plan.error ? ` (${plan.error})` : "";
-    const text = `${plan.plan} ${plan.name}${by}: ${plan.status}${cause}, ${plan.executed} of ${plan.planned} pulses`;
+    const status = describeStatus(plan);
+    const text = `${plan.plan} ${plan.name}${by}: ${status.text}, ${plan.executed} of ${plan.planned} pulses`;
     const changed = entry.text !== text;
-    Object.assign(entry, { plan: plan.plan, text, kind: plan.status === "failed" ? "bad" : "" });
+    Object.assign(entry, { plan: plan.plan, text, kind: status.kind });
     return changed;
   }
 

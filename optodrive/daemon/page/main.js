@@ -107,7 +107,7 @@ async function buildRequest() {
   if (!drawing.count) {
     throw new Error("Nothing is drawn yet: raise pixels on the display, or place a picture on it.");
   }
-  return { path: "/v1/plans", body: buildFrames(drawing.heights, readNumber("rate"), readNumber("seconds") || 1) };
+  return { path: "/v1/plans", query: { name: "drawing" }, body: buildFrames(drawing.heights, readNumber("rate"), readNumber("seconds") || 1) };
 }
 
 plans = new PlanControl(find, buildRequest, announce);
@@ -127,6 +127,7 @@ plans.addEventListener("previewed", ({ detail: pulses }) => {
     showQuantity("height");
   }
 });
+plans.addEventListener("played", () => showQuantity("height")); // what is predicted must not look as if it were felt
 drawing.addEventListener("changed", onStimulusChange);
 library.addEventListener("changed", onStimulusChange);
 drawing.addEventListener("selected", () => {
@@ -191,7 +192,8 @@ function describeSelected() {
   const [height, absorber] = [view.values.height[pixel], view.values.absorber[pixel]];
   const drawn = view.drawn[pixel] > 0 ? `, drawn ${view.drawn[pixel].toFixed(0)} µm` : "";
   const predicted = view.values.preview[pixel] > 0 ? `, predicted ${view.values.preview[pixel].toFixed(1)} µm` : "";
-  find("picked").textContent = `Pixel ${pixel}: ${height.toFixed(1)} µm, ${absorber.toFixed(1)} °C${drawn}${predicted}`;
+  const peak = trace.peakUm > 0 ? `, peak ${trace.peakUm.toFixed(1)} µm` : "";
+  find("picked").textContent = `Pixel ${pixel}: ${height.toFixed(1)} µm${peak}, ${absorber.toFixed(1)} °C${drawn}${predicted}`;
 }
 
 function describeDisplay() {
@@ -318,10 +320,10 @@ telemetry.addEventListener("display", ({ detail }) => {
   find("stale").hidden = true;
   freshness.see("display");
   const fromTenths = (values) => Float32Array.from(values, (value) => value / 10);
-  const [height, absorber] = [fromTenths(decodeUint16(detail.height)), fromTenths(decodeUint16(detail.absorber))];
+  const [height, peak, absorber] = [detail.height, detail.peak, detail.absorber].map((column) => fromTenths(decodeUint16(column)));
   view.beamPath = find("beam").checked ? timeline.beamPath() : [];
   view.setValues(height, absorber);
-  trace.add(detail.board_s, height[view.cursor], absorber[view.cursor]);
+  trace.add(detail.board_s, peak[view.cursor], absorber[view.cursor]);
 });
 telemetry.run();
 

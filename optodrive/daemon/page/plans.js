@@ -2,6 +2,8 @@
 
 import { call } from "./api.js";
 import { labelCap } from "./caps.js";
+import { describeStatus } from "./plan_end.js";
+import { formatQuantity } from "./quantities.js";
 
 const POLL_MS = 400;
 const FRAMES_MAX = 500;
@@ -61,8 +63,8 @@ export class PlanControl extends EventTarget {
     this.previewButton.disabled = true;
     try {
       const stimulus = { ...(await this.buildRequest()), policy: readPolicy() };
-      const query = `?dry_run=true&policy=${stimulus.policy}`;
-      const plan = await call("POST", stimulus.path + query, { body: stimulus.body, signal: this.abort.signal });
+      const query = new URLSearchParams({ ...stimulus.query, policy: stimulus.policy, dry_run: true });
+      const plan = await call("POST", `${stimulus.path}?${query}`, { body: stimulus.body, signal: this.abort.signal });
       this.previewed = stimulus;
       this.playButton.disabled = false;
       this.#showSummary(plan);
@@ -80,12 +82,12 @@ export class PlanControl extends EventTarget {
     const fits = summary.feasibility?.fits ?? summary.trimmed.pulses === 0;
     const message = summary.feasibility?.message ?? (fits ? "all of it fits" : "not all of it fits");
     lines.push([fits ? "good" : "warn", `${message[0].toUpperCase()}${message.slice(1)}.`]);
-    lines.push(["", `${summary.pulses} pulses in ${summary.duration_s.toFixed(2)} s, ${(summary.energy_j * 1e3).toFixed(0)} mJ of light.`]);
+    lines.push(["", `${summary.pulses} pulses in ${summary.duration_s.toFixed(2)} s, ${formatQuantity(summary.energy_j, "J")} of light.`]);
     const requested = summary.target_max_um > 0 ? ` of ${summary.target_max_um.toFixed(1)} µm requested` : ""; // a train requests power
     lines.push(["", `Highest predicted: ${summary.predicted_max_um.toFixed(1)} µm${requested}.`]);
     if (summary.trimmed.pulses) {
       const caps = Object.entries(summary.trimmed.by_reason).map(([cap, count]) => `${count} by ${labelCap(cap)}`);
-      lines.push(["warn", `Trimmed: ${summary.trimmed.pulses} pulses (${caps.join(", ")}), ${(summary.trimmed.energy_j * 1e3).toFixed(1)} mJ.`]);
+      lines.push(["warn", `Trimmed: ${summary.trimmed.pulses} pulses (${caps.join(", ")}), ${formatQuantity(summary.trimmed.energy_j, "J")}.`]);
     }
     for (const delay of summary.delays.slice(0, 3)) {
       lines.push(["warn", `${delay.source} is delayed by ${delay.wait_s.toFixed(2)} s: ${labelCap(delay.cap)}.`]);
@@ -107,8 +109,10 @@ export class PlanControl extends EventTarget {
     const stimulus = this.previewed;
     this.playButton.disabled = true; // a second click would play it twice
     try {
-      const plan = await call("POST", `${stimulus.path}?policy=${stimulus.policy}`, { body: stimulus.body });
+      const query = new URLSearchParams({ ...stimulus.query, policy: stimulus.policy });
+      const plan = await call("POST", `${stimulus.path}?${query}`, { body: stimulus.body });
       this.announce(`Playing ${plan.plan}`);
+      this.dispatchEvent(new Event("played"));
       await this.#follow(plan);
     } catch (error) {
       this.#showError(error);
@@ -116,15 +120,11 @@ export class PlanControl extends EventTarget {
     this.playButton.disabled = this.previewed === null;
   }
 
+  // Show the result once the plan has ended. The panel Playing shows its progress.
   async #follow(plan) {
-    const bar = document.createElement("progress");
-    bar.max = Math.max(1, plan.planned);
-    bar.setAttribute("aria-label", "Pulses executed");
     this.followed = plan.plan;
+    this.#showLines(["", `${plan.plan} plays.`]);
     while (!FINAL_STATUSES.includes(plan.status)) {
-      this.#showLines(["", `${plan.plan}: ${plan.executed} of ${plan.planned} pulses executed`]);
-      bar.value = plan.executed;
-      this.result.append(bar);
       await new Promise((resolve) => setTimeout(resolve, POLL_MS));
       plan = await call("GET", `/v1/plans/${plan.plan}?pulses=false`);
       if (this.followed !== plan.plan) {
@@ -132,8 +132,8 @@ export class PlanControl extends EventTarget {
       }
     }
     const height = plan.simulated_max_um === null ? "" : `; highest ${plan.simulated_max_um.toFixed(1)} µm, simulated from the executed pulses`;
-    const cause = plan.error ? `: ${plan.error}` : "";
-    this.#showLines([plan.status === "done" ? "good" : "warn", `${plan.plan} ${plan.status}${cause}`], ["", `${plan.executed} of ${plan.planned} pulses executed${height}.`]);
+    const { text, kind } = describeStatus(plan);
+    this.#showLines([kind, `${plan.plan} ${text}.`], ["", `${plan.executed} of ${plan.planned} pulses executed${height}.`]);
   }
 
   #showError(error) {

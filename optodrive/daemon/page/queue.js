@@ -9,21 +9,20 @@ export class QueueView {
     this.title = find("playing-title");
     this.idle = find("idle");
     this.now = find("now");
+    this.end = find("end");
     this.list = find("queue");
     this.announce = announce;
     this.onError = onError;
     this.rows = new Map();
     this.running = null;
     this.clear();
-    find("end").addEventListener("click", () => this.#cancel(this.running));
+    this.end.addEventListener("click", () => this.#cancel(this.running));
     setInterval(() => this.#showTimeLeft(), TICK_MS);
   }
 
   // Show nothing: what plays is unknown.
   clear(text = "") {
-    this.running = null;
-    this.now.hidden = true;
-    this.idle.hidden = false;
+    this.#showWhether(null);
     this.idle.textContent = text;
     this.#showWaiting([]);
   }
@@ -31,10 +30,8 @@ export class QueueView {
   show(queue) {
     const [first, ...others] = queue.active;
     const isRunning = first?.plan === queue.running && first !== undefined;
-    this.idle.hidden = isRunning;
-    this.now.hidden = !isRunning;
     this.idle.textContent = first ? "The next plan starts." : "Nothing plays.";
-    this.running = isRunning ? first : null;
+    this.#showWhether(isRunning ? first : null);
     this.at = performance.now();
     if (isRunning) {
       this.#showRunning(first);
@@ -42,13 +39,23 @@ export class QueueView {
     this.#showWaiting(isRunning ? others : queue.active);
   }
 
+  // Show whether a plan runs; null: none does.
+  #showWhether(plan) {
+    this.running = plan;
+    this.idle.hidden = plan !== null;
+    for (const element of [this.now, this.end]) {
+      element.toggleAttribute("data-empty", plan === null);
+    }
+  }
+
   #showRunning(plan) {
     const { now } = this;
-    now.querySelector(".plan").textContent = describe(plan);
+    const name = now.querySelector(".plan");
+    name.textContent = name.title = describe(plan);
     const bar = now.querySelector("progress");
     bar.max = Math.max(1, plan.planned);
     bar.value = plan.executed;
-    now.querySelector("button").setAttribute("aria-label", `End ${describe(plan)}`);
+    this.end.setAttribute("aria-label", `End ${describe(plan)}`);
     this.#showTimeLeft();
   }
 

@@ -7,6 +7,7 @@ const HISTORY_S = 4;
 const AHEAD_S = 1;
 const RETENTION_S = 6;
 const BEAM_PULSES_MAX = 400;
+const OUTLINE_MIN_PX = 5; // a narrower pulse has only the upper edge of its outline, because the sides would fill it
 
 export class Timeline {
   constructor(canvas, text, maxPowerW) {
@@ -123,7 +124,14 @@ export class Timeline {
       const left = x(pulse.startS);
       const barWidth = Math.max(ratio, x(pulse.startS + pulse.widthS) - left);
       const barHeight = y(pulse.powerW);
-      (pulse.isExecuted ? executed : planned).rect(left, base - barHeight, barWidth, barHeight);
+      if (pulse.isExecuted) {
+        executed.rect(left, base - barHeight, barWidth, barHeight);
+      } else if (barWidth >= OUTLINE_MIN_PX * ratio) {
+        planned.rect(left, base - barHeight, barWidth, barHeight);
+      } else {
+        planned.moveTo(left, base - barHeight);
+        planned.lineTo(left + barWidth, base - barHeight);
+      }
       if (pulse.trimmedW > 0) {
         const trimmedHeight = Math.max(2 * ratio, y(pulse.powerW + pulse.trimmedW) - barHeight);
         trimmed.rect(left, base - barHeight - trimmedHeight, barWidth, trimmedHeight);

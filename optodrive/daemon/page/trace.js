@@ -1,4 +1,4 @@
-// Height and temperature of the selected pixel over the last ten seconds.
+// Height and temperature of the selected pixel over the last ten seconds; of the height, the peak between two messages.
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 import { readThemeColour } from "./colours.js";
@@ -49,12 +49,18 @@ export class Trace {
     this.plot = new uPlot(options, [[], [], []], this.container);
   }
 
-  add(boardS, heightUm, absorberC) {
+  // The highest displacement of the last ten seconds, µm; 0 without any.
+  get peakUm() {
+    return Math.max(0, ...this.height);
+  }
+
+  // peakUm: the highest since the last call
+  add(boardS, peakUm, absorberC) {
     if (this.t.length && boardS < this.t.at(-1)) {
       this.clear();
     }
     this.t.push(boardS);
-    this.height.push(heightUm);
+    this.height.push(peakUm);
     this.absorber.push(absorberC);
     const first = this.t.findIndex((s) => s > boardS - HISTORY_S);
     for (const column of [this.t, this.height, this.absorber]) {

@@ -17,11 +17,17 @@ class FaultEvent(JsonModel):
 
 
 class DisplayEvent(JsonModel):
-    """Every pixel at a board time; `height` in 0.1 µm, `absorber` in 0.1 °C: base64 of little-endian u16."""
+    """Every pixel at a board time: base64 of little-endian u16, heights in 0.1 µm, temperatures in 0.1 °C.
+
+    height: at the board time
+    peak: the largest height since the previous event that the reader received, also that to which a pulse that was
+    executed since then still raises the pixel
+    """
 
     board_s: float
     warm: bool
     height: str
+    peak: str
     absorber: str
 
 

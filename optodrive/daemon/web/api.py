@@ -53,6 +53,10 @@ PlanId = Annotated[str, Path(max_length=40)]
 DryRunQuery = Annotated[bool, Query(description="plan and limit only; nothing moves")]
 NewestQuery = Annotated[bool, Query(description="replace everything that is not yet committed to the board")]
 StrictQuery = Annotated[bool, Query(description="the same as policy=refuse")]
+NameQuery = Annotated[
+    str,
+    Query(min_length=1, max_length=40, pattern=r"^[\w.-]+( [\w.-]+)*$", description="what the plan is called in lists"),
+]
 PolicyQuery = Annotated[Policy, Query(description="treatment of a frame that exceeds a cap")]
 PatternPolicyQuery = Annotated[
     Policy | None, Query(description="treatment of a frame that exceeds a cap; by default that of the pattern")
@@ -172,9 +176,10 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         policy: PolicyQuery = "trim",
         newest: NewestQuery = False,
         fit: FitQuery = "as_is",
+        name: NameQuery = "push",
     ) -> Response:
         """Plan frames and trains, and show them."""
-        fields = ("push", resolve_policy(policy, strict), fit, newest)
+        fields = (name, resolve_policy(policy, strict), fit, newest)
         return await _plan_body(daemon, request, "sequence", _read_push(daemon, request, *fields, dry_run), dry_run)
 
     @routes.websocket("/v1/stream", "operator")

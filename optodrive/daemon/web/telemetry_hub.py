@@ -15,9 +15,9 @@ from starlette.responses import StreamingResponse
 from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import NotReadyError
 from optodrive.core.ipc import Message
-from optodrive.core.json_model import JsonModel
 from optodrive.daemon.responses.state import StateReport
-from optodrive.daemon.responses.telemetry import FaultEvent
+from optodrive.daemon.responses.telemetry import DisplayEvent, FaultEvent
+from optodrive.daemon.web.peak_hold import PeakHold, decode_peaks
 
 DEFAULT_RATE_HZ = 30.0
 IDLE_RATE_HZ = 20.0
@@ -57,6 +57,8 @@ class TelemetryHub:
         self._rates_hz: list[float] = []
         self._closed = False
         self._latest: dict[str, tuple[int, str]] = {}
+        self._display: DisplayEvent | None = None
+        self._holds: list[PeakHold] = []
         self._event_number = 0
         self._batches: deque[_Batch] = deque(maxlen=BATCHES_MAX)
         self._batch_number = 0
@@ -87,6 +89,8 @@ class TelemetryHub:
         fields = message.fields
         if message.kind == "telemetry":
             self._is_busy = bool(fields["warm"] or fields["upcoming"])
+            if fields["event"] == "display":
+                self._hold_peaks(DisplayEvent.model_validate_json(message.payload))
             self._set_latest(str(fields["event"]), message.payload.decode())
         elif message.kind == "pulses":
             self._batch_number += 1
@@ -107,20 +111,22 @@ class TelemetryHub:
         key = (board.state, board.fault, board.inputs, link.state, state.planner.busy, plans, state.limits)
         if key != self._state_key or now_s >= self._state_due_s:
             self._state_key, self._state_due_s = key, now_s + STATE_PERIOD_S
-            self._publish("state", state)
+            self._set_latest("state", state.model_dump_json())
         fault_key = board.fault, board.hint, link.error
         if fault_key != self._fault_key:
             self._fault_key = fault_key
             fault, hint, link_error = fault_key
             event = FaultEvent(board=board.state, link=link.state, fault=fault, hint=hint, link_error=link_error)
-            self._publish("fault", event)
-
-    def _publish(self, kind: str, event: JsonModel) -> None:
-        self._set_latest(kind, f"event: {kind}\ndata: {event.model_dump_json()}\n\n")
+            self._set_latest("fault", event.model_dump_json())
 
     def _set_latest(self, kind: str, text: str) -> None:
         self._event_number += 1
-        self._latest[kind] = self._event_number, text
+        self._latest[kind] = self._event_number, _format_event(kind, text)
+
+    def _hold_peaks(self, display: DisplayEvent) -> None:
+        self._display, peaks = display, decode_peaks(display)
+        for hold in self._holds:
+            hold.add(peaks)
 
     # --- readers ------------------------------------------------------------------------------------------------
 
@@ -128,10 +134,11 @@ class TelemetryHub:
         """Yield the new events for one reader every 1 / rate_hz seconds, until it disconnects."""
         event_number = batch_number = 0
         next_s, pulses_s = self._clock.now_s(), 0.0
-        self._add_reader(rate_hz)
+        hold = PeakHold()
+        self._add_reader(rate_hz, hold)
         try:
             while not self._closed:
-                text = "".join(event for number, event in self._latest.values() if number > event_number)
+                text = self._format_since(event_number, hold)
                 event_number = self._event_number
                 now_s = self._clock.now_s()
                 if self._newest_batch > batch_number and now_s >= pulses_s:
@@ -143,19 +150,28 @@ class TelemetryHub:
                 next_s = max(next_s + 1.0 / (rate_hz if is_busy else min(rate_hz, IDLE_RATE_HZ)), self._clock.now_s())
                 await asyncio.sleep(next_s - self._clock.now_s())
         finally:
-            self._remove_reader(rate_hz)
+            self._remove_reader(rate_hz, hold)
+
+    def _format_since(self, event_number: int, hold: PeakHold) -> str:
+        """Format the events after a number; that of the display has the peaks since the reader's last one."""
+        texts = {kind: text for kind, (number, text) in self._latest.items() if number > event_number}
+        if "display" in texts and self._display is not None:
+            texts["display"] = _format_event("display", hold.release(self._display).model_dump_json())
+        return "".join(texts.values())
 
     @property
     def _newest_batch(self) -> int:
         """Number of the newest kept batch."""
         return self._batches[-1].number if self._batches else 0
 
-    def _add_reader(self, rate_hz: float) -> None:
+    def _add_reader(self, rate_hz: float, hold: PeakHold) -> None:
         self._rates_hz.append(rate_hz)
+        self._holds.append(hold)
         self.on_readers(*self.readers)
 
-    def _remove_reader(self, rate_hz: float) -> None:
+    def _remove_reader(self, rate_hz: float, hold: PeakHold) -> None:
         self._rates_hz.remove(rate_hz)
+        self._holds.remove(hold)
         if not self._rates_hz:  # the planner repeats its batches for the next reader; its events will be newer
             self._batches.clear()
             self._latest = {kind: self._latest[kind] for kind in ("state", "fault") if kind in self._latest}
@@ -171,4 +187,8 @@ class TelemetryHub:
                 break
             texts[batch.kind].insert(0, batch.text)
         lists = ",".join(f'"{kind}":[{",".join(batches)}]' for kind, batches in texts.items())
-        return f'event: pulses\ndata: {{"board_s":{self._board_s:.6f},{lists}}}\n\n'
+        return _format_event("pulses", f'{{"board_s":{self._board_s:.6f},{lists}}}')
+
+
+def _format_event(kind: str, text: str) -> str:
+    return f"event: {kind}\ndata: {text}\n\n"

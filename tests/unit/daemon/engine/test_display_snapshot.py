@@ -36,6 +36,25 @@ def test_single_reports_equal_one_batch():
     assert shares(batch, 1.32)["pixel_mean_power"] > 0.02
 
 
+@pytest.mark.parametrize("at_once", [True, False])
+def test_every_peak_is_taken_once_however_seldom(at_once):
+    """Three pulses on pixel 1: the peaks are those of its trace, sampled finely."""
+    pixel, start_s = np.array([1, 5, 1, 1]), np.array([1.0, 1.1, 1.2, 1.4])
+    live, widths_s, powers_w = LiveThermalState(DISPLAY), np.full(4, 0.01), np.full(4, 2.0)
+    batches = [slice(None)] if at_once else [slice(row, row + 1) for row in range(4)]
+    taken = []
+    for batch in batches:
+        live.apply(executed(pixel[batch], start_s[batch]))
+        taken.append(live.take_peaks_m())
+    t_s = np.arange(1.0, 2.0, 1e-5)
+    pulses = np.stack([start_s, widths_s, powers_w, pixel], axis=1)
+    for one in (1, 5):
+        trace_m = DISPLAY.build_cold_heat().simulate_displacement_m(pulses, one, t_s)
+        assert max(peaks[one] for peaks in taken) == pytest.approx(trace_m.max(), rel=1e-6)
+    assert not any(peaks[[0, 2, 3, 4]].any() for peaks in taken)
+    assert not live.take_peaks_m().any()
+
+
 def test_a_clock_shift_moves_the_state():
     live, still = LiveThermalState(DISPLAY), LiveThermalState(DISPLAY)
     for one in (live, still):

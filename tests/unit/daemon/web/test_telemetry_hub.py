@@ -3,14 +3,18 @@
 import asyncio
 import json
 
+import numpy as np
 import pytest
 
 from optodrive.core.errors import NotReadyError
 from optodrive.core.ipc import Message
+from optodrive.daemon.engine.telemetry_events import build_display_event
 from optodrive.daemon.responses.state import StateReport
-from optodrive.daemon.responses.telemetry import PulsesEvent
+from optodrive.daemon.responses.telemetry import DisplayEvent, PulsesEvent
 from optodrive.daemon.web import telemetry_hub
+from optodrive.daemon.web.peak_hold import decode_peaks
 from optodrive.daemon.web.telemetry_hub import TelemetryHub
+from optodrive.physics.nominal_display import DisplayState
 
 BOARD = dict.fromkeys(("inputs", "done_index", "queued", "free_points", "underruns", "crc_errors"), 0)
 BOARD |= {"format_errors": 0, "seq_errors": 0, "laser_on_s": 0.0, "temperature_c": None, "uid": "", "firmware": 1}
@@ -38,7 +42,18 @@ def build_state(board="DISARMED", fault=None, error=None):
 
 def build_event(kind, text, warm=True):
     fields = {"event": kind, "warm": warm, "upcoming": False}
-    return Message("telemetry", fields, f"event: {kind}\ndata: {text}\n\n".encode())
+    return Message("telemetry", fields, text.encode())
+
+
+def build_display(peaks_um, height_um=0.0):
+    """Build the display event of a few pixels with these peaks."""
+    heights, peaks = (np.array(each) * 1e-6 for each in (np.full(len(peaks_um), height_um), peaks_um))
+    display = build_display_event(1.5, True, DisplayState(heights, np.zeros(len(peaks_um))), peaks, 20.0)
+    return build_event("display", display.model_dump_json())
+
+
+def read_peaks_um(data):
+    return decode_peaks(DisplayEvent.model_validate_json(data)).tolist()
 
 
 def build_batch(plan, rows, kind="executed"):
@@ -79,11 +94,11 @@ def run(scenario):
 def test_a_reader_gets_the_latest_of_each_kind_and_then_only_changes():
     async def scenario(hub):
         hub.publish_state(build_state())
-        hub.receive(build_event("display", "1"))
-        hub.receive(build_event("display", "2"))
+        hub.receive(build_display([1.0]))
+        hub.receive(build_display([2.0]))
         reader = Reader(hub)
         assert [kind for kind, _ in await reader.until(3)] == ["state", "fault", "display"]
-        assert reader.events[2] == ("display", "2")
+        assert read_peaks_um(reader.events[2][1]) == [20]
         hub.publish_state(build_state())
         hub.receive(build_event("budget", "3"))
         assert (await reader.until(4))[3:] == [("budget", "3")]
@@ -91,6 +106,27 @@ def test_a_reader_gets_the_latest_of_each_kind_and_then_only_changes():
         later = [kind for kind, _ in (await reader.until(6))[4:]]
         assert sorted(later) == ["fault", "state"]
         await reader.leave()
+
+    run(scenario)
+
+
+def test_a_reader_gets_the_peaks_of_the_displays_that_it_has_missed():
+    """The events of the planner follow the fastest reader; the others see every peak as well, and only once."""
+
+    async def scenario(hub):
+        fast, slow = Reader(hub, 60.0), Reader(hub, 1.0)
+        await asyncio.sleep(0)
+        for number, peaks in enumerate([[30.0, 0.0], [150.0, 4.0], [5.0, 6.0]]):
+            hub.receive(build_display(peaks, height_um=3.0))
+            await fast.until(number + 1)
+        assert [read_peaks_um(data) for _, data in fast.events] == [[300, 0], [1500, 40], [50, 60]]
+        ((_, data),) = await slow.until(1)
+        assert read_peaks_um(data) == [1500, 60]
+        assert json.loads(data) | {"peak": None} == json.loads(fast.events[-1][1]) | {"peak": None}
+        hub.receive(build_display([7.0, 8.0]))
+        assert read_peaks_um((await slow.until(2))[1][1]) == [70, 80]
+        await fast.leave()
+        await slow.leave()
 
     run(scenario)
 
@@ -138,7 +174,7 @@ def test_the_planner_is_told_of_the_readers_and_their_highest_rate():
         hub.on_readers = lambda *readers: calls.append(readers)
         first, second = Reader(hub, 10.0), Reader(hub, 50.0)
         await asyncio.sleep(0.01)
-        hub.receive(build_event("display", "old"))
+        hub.receive(build_display([1.0]))
         hub.receive(build_batch("old", [0]))
         await first.leave()
         await second.leave()
