@@ -12,6 +12,7 @@ from typing import Literal
 from optodrive.cli.service_program import check_program
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.files import atomic_write
+from optodrive.core.toml_file import parse_toml
 from optodrive.device.config import Config
 from optodrive.device.config_file import DEFAULT_CONFIG, load_config, locate_shipped
 
@@ -21,6 +22,7 @@ USERS_PATH = Path("/etc/sysusers.d/optodrive.conf")
 RULES_PATH = Path("/etc/udev/rules.d/60-optodrive.rules")
 MANIFEST_PATH = Path("/etc/optodrive/installed.json")
 FORMAT, VERSION = "optodrive-service", 1
+DAEMON_HEADER = re.compile(r"^[ \t]*\[[ \t]*daemon[ \t]*\][ \t]*(?:#.*)?(?:\n|\Z)", re.MULTILINE)
 DEVICE_LINK = "/dev/optodrive-board"
 DAEMON_PATHS = {
     "socket": "/run/optodrive/optodrive.sock",
@@ -63,12 +65,26 @@ def _load_configuration(source: str | Path | None) -> tuple[Config, str]:
     load_config(source)  # reports errors under the given name
     path = Path(DEFAULT_CONFIG if source is None else source)
     text = (path if path.exists() else locate_shipped(f"{path}.toml")).read_text("utf-8")
-    if not re.search(r"^\s*\[daemon\]", text, re.MULTILINE):
-        text += "\n[daemon]\n" + "".join(f'{key} = "{value}"\n' for key, value in DAEMON_PATHS.items())
+    text = _add_daemon_paths(text, str(path))
     with tempfile.NamedTemporaryFile("w", suffix=".toml", encoding="utf-8") as whole:
         whole.write(text)
         whole.flush()
         return load_config(whole.name), text
+
+
+def _add_daemon_paths(text: str, where: str) -> str:
+    """Return a configuration with the service's paths for the keys that its section [daemon] does not state."""
+    stated = parse_toml(text.encode(), where).get("daemon", {})
+    missing = "".join(f'{key} = "{value}"\n' for key, value in DAEMON_PATHS.items() if key not in stated)
+    if not missing:
+        return text
+    header = DAEMON_HEADER.search(text)
+    if header is not None:
+        return f"{text[: header.end()].rstrip()}\n{missing}{text[header.end() :]}"
+    if stated:
+        keys = ", ".join(key for key in DAEMON_PATHS if key not in stated)
+        raise InputError(f"{where}: daemon", stated, f"a section [daemon], or all of {keys}: the service needs them")
+    return f"{text}\n[daemon]\n{missing}"
 
 
 def _render_unit(config: Config, program: Path) -> str:

@@ -50,6 +50,35 @@ def test_what_is_written_is_in_order(install, at):
     assert "only `optodrive arm` arms" in output
 
 
+@pytest.mark.parametrize(
+    ("section", "expected"),
+    [
+        ("[daemon]\nport = 9000\n", ("/run/optodrive/optodrive.sock", "/var/lib/optodrive/tokens.toml", 9000)),
+        ("[ daemon ] # ours\nport = 9000", ("/run/optodrive/optodrive.sock", "/var/lib/optodrive/tokens.toml", 9000)),
+        ('[daemon]\nsocket = ""\n', ("", "/var/lib/optodrive/tokens.toml", 8450)),
+        ('[daemon]\ntokens = "/srv/tokens"\n', ("/run/optodrive/optodrive.sock", "/srv/tokens", 8450)),
+        ("[daemon]", ("/run/optodrive/optodrive.sock", "/var/lib/optodrive/tokens.toml", 8450)),
+    ],
+)
+def test_keys_that_the_daemon_section_does_not_state_are_those_of_the_service(install, at, tmp_path, section, expected):
+    path = board_config(tmp_path, USB_BOARD)
+    path.write_text(f"{path.read_text()}\n{section}")
+    install("--config", path)
+    daemon = load_config(at(CONFIG_PATH)).daemon
+    assert (daemon.socket, daemon.tokens, daemon.port) == expected
+    assert daemon.audit == "/var/lib/optodrive/audit.jsonl"
+    assert section.splitlines()[0] in at(CONFIG_PATH).read_text()
+
+
+def test_a_daemon_table_in_one_line_is_refused_with_the_missing_keys(install, at, tmp_path):
+    path = board_config(tmp_path, USB_BOARD)
+    path.write_text(path.read_text().replace("\nname", '\ndaemon = { port = 9000, audit = "" }\nname', 1))
+    error = install("--config", path, status=2).err
+    assert f"{path}: daemon" in error
+    assert "a section [daemon], or all of socket, tokens" in error
+    assert not at(CONFIG_PATH).exists()
+
+
 def test_once_more_changes_nothing(install, at):
     install()
     before = {
