@@ -182,9 +182,9 @@ class Daemon:
             )
         self.client = httpx.Client(headers={"Authorization": f"Bearer {TOKEN}"}, timeout=None)
         try:
-            first = self.process.stdout.readline()
-            found = re.search(r"(http://[\d.:]+)", first)
-            assert found, first + self.errors.read_text()
+            self.announcement = self.process.stdout.readline()
+            found = re.search(r"(http://[\d.]+:\d+)", self.announcement)
+            assert found, self.announcement + self.errors.read_text()
             self.url = found.group(1)
             self.client.base_url = self.url
             self.call("GET", "/v1/state")

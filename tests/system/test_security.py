@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from forked_process import run_process
 from optodrive.client import AsyncDisplay, Display
-from optodrive.core.errors import NotReadyError
+from optodrive.core.errors import NotReadyError, RefusedError
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
@@ -223,6 +223,63 @@ def test_stop_does_not_wait_for_the_body(running, body):
     secret = read_role_tokens(running)["viewer"]
     given = send_raw(running, f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n{body}")
     assert given.startswith("HTTP/1.1 200 ")
+
+
+@pytest.mark.parametrize("target", ["/v1/stop/", "http://localhost/v1/stop", "HTTP://127.0.0.1:1/v1/stop/?now=1"])
+def test_stop_in_any_form_of_its_address_stops(running, target):
+    request = f"POST {target} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {TOKEN}\r\n\r\n"
+    assert send_raw(running, request).startswith("HTTP/1.1 200 ")
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ("Host: localhost\r\n" + "Origin: http://localhost\r\n", 200),
+        ("Host: localhost\r\n" + "Origin: http://localhost\r\n" * 2, 403),
+        ("Host: localhost\r\n" + "Origin: https://evil.example\r\nOrigin: http://localhost\r\n", 403),
+        ("Host: localhost\r\n" + f"Authorization: Bearer {TOKEN}\r\n", 401),
+    ],
+)
+def test_a_header_that_is_there_twice_counts_as_none_of_both(running, headers, status):
+    request = f"GET /v1/me HTTP/1.1\r\nAuthorization: Bearer {TOKEN}\r\n{headers}\r\n"
+    assert send_raw(running, request).startswith(f"HTTP/1.1 {status} ")
+
+
+def test_a_refusal_names_both_roles_wherever_it_is_read(running, folder):
+    """On REST, on a WebSocket, in its header, by the client and by the command line."""
+    tokens = read_role_tokens(running)
+    roles = "requires a token of role {}; token 'viewer' has role viewer"
+    viewer = build_bearer_header(tokens["viewer"])
+    refused = httpx.post(running.url + "/v1/arm", headers=viewer, timeout=None)
+    assert roles.format("armer") in refused.json()["detail"]
+    assert refused.headers["www-authenticate"] == 'Bearer error="insufficient_scope", scope="armer"'
+    with pytest.raises(InvalidStatus) as refusal:
+        connect(running.url.replace("http", "ws") + "/v1/stream", additional_headers=viewer, proxy=None)
+    response = refusal.value.response
+    assert roles.format("operator") in json.loads(response.body)["detail"]
+    assert response.headers["www-authenticate"] == 'Bearer error="insufficient_scope", scope="operator"'
+    with Display(running.url, tokens["viewer"]) as display:
+        with pytest.raises(RefusedError, match=roles.format("armer")):
+            display.arm()
+        with pytest.raises(RefusedError, match=roles.format("armer")):
+            display.arm(hold=True)
+        with pytest.raises(RefusedError, match=roles.format("operator")), display.stream() as stream:
+            stream.wait(stream.send({5: 60.0}))
+    environment = {**os.environ, "OPTODRIVE_TOKEN": tokens["viewer"]}
+    done = run_process([OPTODRIVE, "arm", "--url", running.url], capture_output=True, text=True, env=environment)
+    assert roles.format("armer") in done.stderr
+
+
+def test_the_start_says_which_token_is_for_what(running):
+    said = running.announcement
+    assert "viewer reads and stops, operator also plays, pauses and dims, armer also arms" in said
+    assert not any(secret in said for secret in read_role_tokens(running).values())
+
+
+def test_a_key_that_is_there_twice_is_refused_also_by_dim(running):
+    problem = running.call("PUT", "/v1/dim", status=422, content='{"share": 0.1, "share": 1.0}')
+    assert problem["code"] == "bad_json"
+    assert "each key of an object once" in problem["detail"]
 
 
 def test_a_host_that_begins_like_an_address_is_refused(running):

@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import os
 import socket
 import sys
 from collections.abc import Callable
@@ -23,7 +24,8 @@ from optodrive.daemon.supervisor.forking import execute_module, fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.reload_handler import ReloadHandler
 from optodrive.daemon.supervisor.supervisor import Supervisor
-from optodrive.daemon.web.listeners import BACKLOG, open_tcp_listener
+from optodrive.daemon.web.listeners import BACKLOG, build_local_url, open_tcp_listener
+from optodrive.daemon.web.roles import PERMISSIONS, ROLES
 from optodrive.daemon.web.tokens import Tokens, load_daemon_tokens
 from optodrive.device.config import Config
 from optodrive.device.config_sections import DaemonSection
@@ -72,6 +74,7 @@ def run(
             exit_stack.callback(listeners[1].close)
         folder = open_runtime_folder(port, unix)
         exit_stack.callback(folder.remove)
+        is_new = bool(config.daemon.tokens) and not os.path.lexists(config.daemon.tokens)
         tokens, tokens_path = load_daemon_tokens(config.daemon.tokens, port)
         if not config.daemon.tokens:  # generated for this run
             exit_stack.callback(_unlink, tokens_path)
@@ -89,8 +92,8 @@ def run(
             supervisor.on_reload, supervisor.on_web_message = handler.request, handler.on_web_message
         *others, web = (Child(name, start, clock) for name, start in starts.items())
         if supervisor.start_others(others, web):
-            address = f"http://{config.daemon.host}:{port}"
-            _announce(config, address, unix, tokens, tokens_path)
+            address = build_local_url(config.daemon.host, port)
+            _announce(config, address, unix, tokens, tokens_path, is_new)
             supervisor.on_board_seen = partial(_announce_board, address=address)
             supervisor.record_audit({"event": "started", "display": config.name})
             supervisor.serve()
@@ -179,9 +182,12 @@ def number_path(path: Path, number: int) -> Path:
     return path if number == 1 else path.with_stem(f"{path.stem}-{number}")
 
 
-def _announce(config: Config, address: str, unix: Path | None, tokens: Tokens, tokens_path: Path) -> None:
+def _announce(config: Config, address: str, unix: Path | None, tokens: Tokens, tokens_path: Path, is_new: bool) -> None:
+    """Print the addresses and the tokens. is_new: whether the configured file did not exist."""
     socket_text = f" and {unix}" if unix else ""
-    print(f"optodrive: {config.name} on {address}{socket_text}, token in {tokens_path}", flush=True)
+    roles = ", ".join(f"{role} {PERMISSIONS[role]}" for role in ROLES if any(each.role == role for each in tokens.all))
+    tokens_text = f"a token per role, created in {tokens_path}" if is_new else f"tokens in {tokens_path}"
+    print(f"optodrive: {config.name} on {address}{socket_text}, {tokens_text}: {roles}", flush=True)
     if sys.stdout.isatty():  # a secret: only on a terminal, never in a log
         print(f"optodrive: personal link to the page: {address}/#token={tokens.highest_role.secret}", flush=True)
 

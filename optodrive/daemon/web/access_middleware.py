@@ -21,6 +21,7 @@ from optodrive.daemon.web.request_limits import (
     Send,
     receive_empty_body,
 )
+from optodrive.daemon.web.request_line import join_headers
 from optodrive.daemon.web.revocation import RequestInProgress, build_revoked_problem
 from optodrive.daemon.web.route_table import ARMING, STOP, RouteTable
 from optodrive.daemon.web.server_state import CALLER
@@ -144,7 +145,7 @@ class CallerLoad:
 
 def read_request(scope: Scope) -> RequestContext:
     """Read the request that an ASGI scope describes."""
-    headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+    headers = join_headers((name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"])
     client = scope.get("client")
     # A caller on the Unix socket has no address.
     address = client[0] if client and client[0] else "unix"

@@ -122,7 +122,10 @@ class AccessPolicy:
         host = request.headers.get("host", "")
         own = _parse_authority(host)
         if own is None or own.name not in self._hosts:
-            detail = f"this daemon does not answer to host {host[:TEXT_MAX]!r}"
+            detail = (
+                f"this daemon does not answer to host {host[:TEXT_MAX]!r}: "
+                "its names besides loopback are those in daemon.hosts of the configuration"
+            )
             return build_problem(421, "host_not_allowed", "Misdirected request", detail)
         origin = request.headers.get("origin")
         if origin is not None and not _is_same_origin(origin, own):

@@ -2,6 +2,7 @@
 
 import resource
 import socket
+from collections.abc import Sequence
 from contextlib import suppress
 from ipaddress import ip_address
 
@@ -28,16 +29,30 @@ def open_tcp_listener(host: str, port: int) -> socket.socket:
     return listener
 
 
-def describe_exposure(host: str) -> str | None:
-    """Return a warning if other computers can reach an address to listen on; None for loopback."""
+def build_local_url(host: str, port: int) -> str:
+    """Build the URL at which a program on this computer reaches an address to listen on."""
+    with suppress(ValueError):
+        address = ip_address(host)
+        if address.is_unspecified:  # every address of this computer: the loopback one is among them
+            address = ip_address("127.0.0.1" if address.version == 4 else "::1")
+        host = str(address) if address.version == 4 else f"[{address}]"
+    return f"http://{host}:{port}"
+
+
+def describe_exposure(host: str, names: Sequence[str]) -> str | None:
+    """Return a warning if other computers can reach an address to listen on; None for loopback.
+
+    names: to which the daemon answers besides loopback
+    """
     with suppress(ValueError):
         if ip_address(host).is_loopback:
             return None
     if host == "localhost":
         return None
+    answered = ", ".join(names) if names else "no name of this computer until daemon.hosts lists it"
     return (
         f"listening on {host}: other computers can reach the daemon, and tokens travel unencrypted; "
-        "a TLS proxy in front of loopback avoids both"
+        f"a TLS proxy in front of loopback avoids both. To them it answers at {answered}"
     )
 
 

@@ -12,6 +12,10 @@ async def send_problem(send: Send, problem: Problem, prefix: str) -> None:
     headers = []
     if problem.status == 401:
         headers.append((b"www-authenticate", b"Bearer"))
+    if problem.required_role is not None:  # RFC 6750, section 3
+        headers.append(
+            (b"www-authenticate", f'Bearer error="insufficient_scope", scope="{problem.required_role}"'.encode())
+        )
     if problem.allow is not None:
         headers.append((b"allow", problem.allow.encode()))
     if problem.status == 413:

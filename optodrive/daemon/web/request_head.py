@@ -5,7 +5,7 @@ from enum import IntEnum
 from urllib.parse import unquote
 
 from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
-from optodrive.daemon.web.stop_priority import STOP_PATH
+from optodrive.daemon.web.request_line import STOP_PATH, join_headers, normalise_path
 
 HEAD_MAX_BYTES = 4096
 """A longer head counts as complete: what precedes its end decides."""
@@ -40,12 +40,9 @@ def parse_head(head: bytes, address: str = "") -> RequestContext | None:
     words = first.split(" ")
     if len(words) != 3:
         return None
-    headers = {}
-    for line in lines:
-        name, colon, value = line.partition(":")
-        if colon:
-            headers[name.lower()] = value.strip(" \t")
-    return RequestContext(words[0], unquote(words[1].partition("?")[0]), headers, address)
+    parts = (line.partition(":") for line in lines)
+    headers = join_headers((name, value.strip(" \t")) for name, colon, value in parts if colon)
+    return RequestContext(words[0], normalise_path(unquote(words[1].partition("?")[0])), headers, address)
 
 
 def rank_request(request: RequestContext | None, policy: AccessPolicy) -> Rank:

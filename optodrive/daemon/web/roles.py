@@ -4,6 +4,12 @@ from typing import Literal, get_args
 
 Role = Literal["viewer", "operator", "armer"]
 """Each role includes those before it. A viewer reads and stops, an operator submits plans, an armer arms."""
+PERMISSIONS: dict[Role, str] = {
+    "viewer": "reads and stops",
+    "operator": "also plays, pauses and dims",
+    "armer": "also arms",
+}
+"""What each role may do besides what those before it may."""
 ROLES: tuple[Role, ...] = get_args(Role)
 
 

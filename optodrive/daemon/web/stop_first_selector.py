@@ -10,10 +10,11 @@ import time
 from collections.abc import Callable, Iterable
 
 from optodrive.daemon.web.request_head import peek_head
+from optodrive.daemon.web.request_line import STOP_PATH
 from optodrive.daemon.web.timed_socket import TimedSocket
 
 CLIENTS_PER_TURN = 6
-STOP_LINE = b"POST /v1/stop"
+STOP = STOP_PATH.encode()
 
 
 class StopFirstSelector(selectors.EpollSelector):
@@ -63,7 +64,7 @@ class StopFirstSelector(selectors.EpollSelector):
     def _is_stop(self, sock: socket.socket) -> bool:
         """Return whether a permitted request for STOP waits in a socket. It stays there."""
         head = peek_head(sock) or b""
-        return head.startswith(STOP_LINE) and self._permits_stop(head)
+        return head.startswith(b"POST ") and STOP in head.partition(b"\r")[0] and self._permits_stop(head)
 
     def _choose(self, filenos: Iterable[int]) -> list[int]:
         ready = dict.fromkeys(filenos)

@@ -6,10 +6,11 @@ Requests start one at a time, and none starts while STOP is being answered.
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
+from urllib.parse import quote
 
 from optodrive.daemon.web.request_limits import App, Receive, Scope, Send
+from optodrive.daemon.web.request_line import STOP_PATH, normalise_path
 
-STOP_PATH = "/v1/stop"
 HOLD_MAX_S = 0.1
 """The longest time that one STOP delays other requests; STOP itself takes seconds if the board does not answer."""
 
@@ -32,7 +33,11 @@ class StopPriorityMiddleware:
         self._stop_done = asyncio.Event()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Forward the request when its turn comes; forward STOP at once."""
+        """Forward the request when its turn comes; forward STOP at once. Routes get the path in its usual form."""
+        if "path" in scope:
+            path = normalise_path(scope["path"])
+            if path != scope["path"]:
+                scope["path"], scope["raw_path"] = path, quote(path).encode()
         if scope["type"] != "http":
             await self._app(scope, receive, send)
         elif scope["path"] == STOP_PATH and self._permits_stop(scope):

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 from optodrive.core.errors import InputError
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format
-from optodrive.daemon.web.roles import ROLES, Role
+from optodrive.daemon.web.roles import PERMISSIONS, ROLES, Role
 
 ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
 FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"
@@ -124,7 +124,8 @@ def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
     )
     lines = [f'format = "{FORMAT}"\nversion = {VERSION}\n']
     lines += [
-        f'\n[[token]]\nname = "{t.name}"\nrole = "{t.role}"\nsecret = {json.dumps(t.secret)}\n' for t in tokens.all
+        f'\n[[token]] # {PERMISSIONS[t.role]}\nname = "{t.name}"\nrole = "{t.role}"\nsecret = {json.dumps(t.secret)}\n'
+        for t in tokens.all
     ]
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -47,7 +47,7 @@ def run_web(
         log = open_daemon_log()
         exit_stack.callback(log.close)
         log.attach_to_root_logger()
-        exposure = describe_exposure(daemon.host)
+        exposure = describe_exposure(daemon.host, daemon.hosts)
         if exposure is not None:
             log.warn(exposure)
         audit = AuditLog(Path(daemon.audit), log.warn) if daemon.audit else None

@@ -1,4 +1,4 @@
-"""Explanation of and remedy for each board fault."""
+"""Explanation of each board fault, and its remedy before disarm acknowledges it."""
 
 FAULT_HINTS = {
     "LINK": "the lease expired: the host stalled, or bytes were lost on the link",
@@ -8,14 +8,15 @@ FAULT_HINTS = {
     "MEAN_POWER": "the mean power of the last second exceeded the board's cap",
     "SPOT": "one spot received more energy than the board permits",
     "UNDERRUN": "the queue ran empty three times within ten seconds: the host or the link is too slow",
-    "INTERLOCK": "the interlock opened: close the enclosure, then acknowledge with disarm",
-    "KEY": "the key was turned off: turn it on, then acknowledge with disarm",
-    "ESTOP": "the emergency stop was pressed: release it, then acknowledge with disarm",
+    "INTERLOCK": "the interlock opened: close the enclosure",
+    "KEY": "the key was turned off: turn it on",
+    "ESTOP": "the emergency stop was pressed: release it",
 }
 
 
 def get_fault_hint(fault: str | None) -> str:
-    """Return the likely cause of a fault in one sentence, '' without a fault."""
+    """Return the likely cause of a fault and its acknowledgement in one sentence, '' without a fault."""
     if not fault:
         return ""
-    return FAULT_HINTS.get(fault, "no likely cause is known; see the board's log")
+    cause = FAULT_HINTS.get(fault, "no likely cause is known; see the board's log")
+    return f"{cause}; then acknowledge the fault with disarm"

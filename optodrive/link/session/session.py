@@ -48,6 +48,7 @@ from optodrive.link.session.arming import Arming
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import CLOCK_INTERVAL_S, ClockSync
+from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.lease_renewal import RENEWAL_FRACTION, LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.plan_job import PlanJob, PointTiming
@@ -438,9 +439,11 @@ class BoardSession:
 
     def require_disarmed(self, which: str = "") -> None:
         """Raise NotReadyError unless the board can be armed. which: prefix of the message."""
+        if self.board.state == BoardState.FAULT:
+            hint = get_fault_hint(self.board.fault)
+            raise NotReadyError(f"{which}the board is in FAULT {self.board.fault}: {hint}, and arm again")
         if self.board.state != BoardState.DISARMED:
-            fault = f" {self.board.fault}" if self.board.fault else ""
-            raise NotReadyError(f"{which}the board is {self.board.state}{fault}; only a DISARMED board can be armed")
+            raise NotReadyError(f"{which}the board is {self.board.state}; only a DISARMED board can be armed")
         if self.has_arming:
             raise NotReadyError(f"{which}the board is being armed already")
 

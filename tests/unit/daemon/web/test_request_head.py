@@ -23,6 +23,12 @@ def policy():
         ("POST /v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
         ("POST /v1/stop?now HTTP/1.1", f"authorization:bearer   {SECRET} ", Rank.STOP),
         ("POST /v1/%73top HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
+        ("POST /v1/stop/ HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
+        ("POST http://localhost:80/v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
+        ("POST HTTPS://lab/v1/stop/?x HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
+        ("POST /v1/stop// HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.TOKEN),
+        ("POST /http://lab/v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.TOKEN),
+        ("POST /v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}\r\nAuthorization: Bearer {SECRET}", Rank.OTHER),
         ("POST /v1/stop HTTP/1.1", "Authorization: Bearer guessed-by-nobody", Rank.OTHER),
         ("POST /v1/stop HTTP/1.1", "Accept: */*", Rank.OTHER),
         ("GET /v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.TOKEN),
@@ -39,7 +45,13 @@ def test_a_valid_token_precedes_and_stop_with_one_comes_first(policy, line, head
 
 
 @pytest.mark.parametrize(
-    "headers", ["", "Host: evil.example\r\n", "Host: localhost\r\nOrigin: https://evil.example\r\n"]
+    "headers",
+    [
+        "",
+        "Host: evil.example\r\n",
+        "Host: localhost\r\nOrigin: https://evil.example\r\n",
+        "Host: localhost\r\n" + 2 * "Origin: http://localhost\r\n",
+    ],
 )
 def test_a_stop_that_the_policy_refuses_has_no_precedence(policy, headers):
     head = f"POST /v1/stop HTTP/1.1\r\n{headers}Authorization: Bearer {SECRET}\r\n\r\n"

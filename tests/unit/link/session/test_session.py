@@ -312,7 +312,7 @@ def test_a_withheld_lease_ends_the_job_within_its_length(rig):
     assert fault["fault"] == "LINK"
     assert fault["t_us"] - stopped_us <= 100_000
     assert not rig.core.gate
-    assert rig.session.board.to_dict()["hint"] == FAULT_HINTS["LINK"]
+    assert rig.session.board.to_dict()["hint"] == f"{FAULT_HINTS['LINK']}; then acknowledge the fault with disarm"
     pulses = len(rig.pulses())
     rig.run(1.0)
     assert len(rig.pulses()) == pulses, "a new lease does not resume the job"
@@ -365,7 +365,7 @@ def test_a_fault_is_reported_with_the_pulse_that_it_truncated(rig):
     assert not done.complete
     assert done.width_s[-1] < planned.width_s[0]
     assert rig.session.board.fault == "INTERLOCK"
-    with pytest.raises(NotReadyError, match="FAULT INTERLOCK"):
+    with pytest.raises(NotReadyError, match=r"in FAULT INTERLOCK: .*close the enclosure.*disarm, and arm again"):
         rig.session.arm()
     rig.session.disarm()
     rig.run(0.05)
