@@ -2,7 +2,7 @@
 
 Entries go to the journal's socket as non-blocking datagrams, and to a pipe or terminal only while it accepts them: a
 reader that has stalled would block the writers, the engine's loop among them. What the log writes per minute is
-bounded, so that no caller can fill a disk with it.
+bounded, so that no caller can fill a disk with it, and equal lines are merged.
 """
 
 import logging
@@ -11,6 +11,7 @@ import select
 import socket
 import sys
 import threading
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
@@ -24,6 +25,10 @@ WRITE_MAX = 4000
 """Bytes per write, not more than a pipe accepts at once when it accepts any."""
 PERIOD_S = 60.0
 """At most BYTES_MAX bytes of lines are written per period; the number of those omitted follows in one line."""
+REPEATS_MAX = 3
+"""Equal lines that are written per period, unless they are events; the number of the others follows in one line."""
+DISTINCT_MAX = 200
+"""Different lines that are compared per period."""
 LogLevel = Literal["err", "warning", "notice", "info"]
 PRIORITY: dict[LogLevel, int] = {"err": 3, "warning": 4, "notice": 5, "info": 6}
 
@@ -39,6 +44,7 @@ class DaemonLog:
         self._lock = threading.Lock()
         self._period_end_s = 0.0
         self._bytes = self._suppressed = 0
+        self._repeats: Counter[str] = Counter()
 
     def write(self, line: str, level: LogLevel = "info", **fields: object) -> None:
         """Write a line, or drop it on failure. fields: additional upper-case fields, for the journal only."""
@@ -48,6 +54,8 @@ class DaemonLog:
             if now_s >= self._period_end_s:
                 self._report_suppressed()
                 self._period_end_s, self._bytes = now_s + PERIOD_S, 0
+            if "EVENT" not in fields and self._is_repeated(line):
+                return
             self._bytes += len(line)
             if self._bytes > BYTES_MAX:
                 self._suppressed += 1
@@ -55,7 +63,16 @@ class DaemonLog:
             if not self._emit(line, level, fields):
                 self._suppressed += 1
 
+    def _is_repeated(self, line: str) -> bool:
+        if line in self._repeats or len(self._repeats) < DISTINCT_MAX:
+            self._repeats[line] += 1
+        return self._repeats[line] > REPEATS_MAX
+
     def _report_suppressed(self) -> None:
+        for line, count in self._repeats.items():
+            if count > REPEATS_MAX:
+                self._emit(f"{count - REPEATS_MAX} times more: {line}", "warning", {})
+        self._repeats.clear()
         if self._suppressed and self._emit(f"{self._suppressed} lines suppressed", "warning", {}):
             self._suppressed = 0
 

@@ -1,9 +1,11 @@
 """The folder of a running daemon's sockets, which only its user can open, and where commands find it."""
 
+import fcntl
 import os
 import shutil
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +15,9 @@ SOCKET_PATH_MAX_BYTES = 100
 """Longest path of a socket; the kernel allows 107."""
 PREFIX = "optodrive-"
 """Start of the name of a folder in the folder for temporary files."""
+KNOWN_PREFIX = "daemon-"
+"""Start of the name under which commands find it; the TCP port follows."""
+FOLDER_FLAGS = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 LINK_MODE, SHARED_LINK_MODE = 0o600, 0o660
 
 
@@ -21,13 +26,14 @@ class RuntimeFolder:
     """The sockets of the daemon's processes.
 
     path: the folder, of mode 0700; link_socket: beside the configured Unix socket if there is one, so that its group
-    reaches it
+    reaches it; lock: descriptor whose lock marks the folder as in use, which every forked process inherits
     """
 
     path: Path
     link_socket: Path
     link_socket_mode: int
     known_as: Path
+    lock: int | None = None
 
     @property
     def planner_socket(self) -> Path:
@@ -55,6 +61,8 @@ class RuntimeFolder:
             with suppress(OSError):
                 path.unlink()
         shutil.rmtree(self.path, ignore_errors=True)
+        if self.lock is not None:
+            os.close(self.lock)
 
 
 def find_link_socket(port: int | None, unix: Path | None) -> Path:
@@ -65,7 +73,7 @@ def find_link_socket(port: int | None, unix: Path | None) -> Path:
 
 
 def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
-    """Create the runtime folder of the daemon on a TCP port, in place of one that a killed daemon left.
+    """Create the runtime folder of the daemon on a TCP port, and remove those that killed daemons left.
 
     unix: the configured Unix socket. InputError if the folder cannot be created.
     """
@@ -74,29 +82,67 @@ def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
         raise InputError("daemon.socket", str(unix), "a shorter path, because the link's socket lies beside it")
     try:
         known_as.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        _remove_left_behind(known_as)
-        if len(os.fsencode(known_as / "acceptor.sock")) <= SOCKET_PATH_MAX_BYTES:
-            known_as.mkdir(mode=0o700)
-            path = known_as
-        else:  # a socket does not fit there
-            path = Path(tempfile.mkdtemp(prefix=PREFIX))
-            known_as.symlink_to(path)
+        with _lock_folder(known_as.parent):  # no other daemon is between creation and lock of its own folder
+            path, lock = _create_folder(known_as)
+            _remove_unused(known_as)
         if unix is not None:  # a command that knows only the TCP port finds it here
             (path / "link.sock").symlink_to(find_link_socket(None, unix.absolute()))
     except OSError as error:
         raise InputError(str(known_as), error.strerror, "a folder that can be created") from None
     if unix is None:
-        return RuntimeFolder(path, path / "link.sock", LINK_MODE, known_as)
-    return RuntimeFolder(path, find_link_socket(None, unix), SHARED_LINK_MODE, known_as)
+        return RuntimeFolder(path, path / "link.sock", LINK_MODE, known_as, lock)
+    return RuntimeFolder(path, find_link_socket(None, unix), SHARED_LINK_MODE, known_as, lock)
+
+
+def _create_folder(known_as: Path) -> tuple[Path, int]:
+    """Create the folder, or one where a socket fits and a link to it; return its path and its lock."""
+    _remove_left_behind(known_as)
+    if len(os.fsencode(known_as / "acceptor.sock")) <= SOCKET_PATH_MAX_BYTES:
+        known_as.mkdir(mode=0o700)
+        path = known_as
+    else:  # a socket does not fit there
+        path = Path(tempfile.mkdtemp(prefix=PREFIX))
+        known_as.symlink_to(path)
+    lock = os.open(path, FOLDER_FLAGS)
+    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return path, lock
+
+
+@contextmanager
+def _lock_folder(folder: Path) -> Iterator[None]:
+    lock = os.open(folder, FOLDER_FLAGS)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _remove_unused(own: Path) -> None:
+    """Remove the folders, and the tokens, of daemons on other ports of which no process is left."""
+    for known_as in set(own.parent.glob(f"{KNOWN_PREFIX}[0-9]*")) - {own}:
+        try:
+            lock = os.open(known_as, FOLDER_FLAGS)
+        except OSError:  # a link to nothing
+            _remove_left_behind(known_as)
+            continue
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            continue
+        finally:
+            os.close(lock)
+        _remove_left_behind(known_as)
+        known_as.with_name(f"token-{known_as.name.removeprefix(KNOWN_PREFIX)}").unlink(missing_ok=True)
 
 
 def _build_known_path(port: int) -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
-    return Path(runtime) / "optodrive" / f"daemon-{port}"
+    return Path(runtime) / "optodrive" / f"{KNOWN_PREFIX}{port}"
 
 
 def _remove_left_behind(known_as: Path) -> None:
-    """Remove the folder of a killed daemon. The caller holds its TCP port, so no other daemon uses it."""
+    """Remove the folder of a killed daemon: of one on the caller's own TCP port, or of one whose lock is free."""
     if known_as.is_symlink():
         target = known_as.readlink()
         if target.name.startswith(PREFIX):

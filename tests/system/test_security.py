@@ -282,6 +282,13 @@ def test_a_key_that_is_there_twice_is_refused_also_by_dim(running):
     assert "each key of an object once" in problem["detail"]
 
 
+def test_what_is_no_request_fills_no_log(running):
+    before = running.errors.read_text()
+    for _ in range(30):
+        assert send_raw(running, "NO REQUEST\r\n\r\n").startswith("HTTP/1.1 400 ")
+    assert running.errors.read_text().removeprefix(before).count("Invalid HTTP request") <= 3
+
+
 def test_a_host_that_begins_like_an_address_is_refused(running):
     given = send_raw(running, "GET /v1/health HTTP/1.1\r\nHost: [::1].evil\r\n\r\n")
     assert given.startswith("HTTP/1.1 421 ")

@@ -7,7 +7,7 @@ import pytest
 
 from optodrive.core.clock import ManualClock
 from optodrive.daemon import log as log_module
-from optodrive.daemon.log import BYTES_MAX, PERIOD_S, DaemonLog, format_entry, open_daemon_log
+from optodrive.daemon.log import BYTES_MAX, PERIOD_S, REPEATS_MAX, DaemonLog, format_entry, open_daemon_log
 
 
 def fields(data):
@@ -54,16 +54,16 @@ def test_lines_go_to_the_journal(journal, tmp_path, capsys):
 def test_a_missing_or_stalled_journal_does_not_block(journal, tmp_path):
     for path in (tmp_path / "journal", tmp_path / "nowhere"):
         with closing(DaemonLog(path)) as log:
-            for _ in range(5000):
-                log.warn("x" * 1000)
+            for number in range(5000):
+                log.warn(f"{number:1000}")
 
 
 def test_a_pipe_whose_reader_has_stalled_does_not_block(monkeypatch):
     reader, writer = os.pipe()
     with open(writer, "w") as pipe, closing(DaemonLog(None, clock := ManualClock())) as log:  # noqa: PTH123 - a descriptor
         monkeypatch.setattr("sys.stderr", pipe)
-        for _ in range(200):  # twice what the pipe holds
-            log.warn("x" * 1000)
+        for number in range(200):  # twice what the pipe holds
+            log.warn(f"{number:1000}")
         kept = os.read(reader, 1 << 20).count(b"\n")
         assert 30 < kept < 70
         clock.sleep(PERIOD_S)
@@ -105,18 +105,46 @@ def test_log_records_of_libraries_are_written(capsys):
 def test_a_minute_of_the_log_is_bounded_and_says_what_is_missing(capsys):
     clock = ManualClock()
     with closing(DaemonLog(None, clock)) as log:
-        for _ in range(1000):
-            log.warn("x" * 1000)
+        for number in range(1000):
+            log.warn(f"{number:1000}")
         written = capsys.readouterr().err
         assert BYTES_MAX - 2000 < len(written) < BYTES_MAX * 1.05
         kept = written.count("\n")
         clock.sleep(PERIOD_S)
         log.warn("the next minute")
         assert capsys.readouterr().err == (f"optodrive: {1000 - kept} lines suppressed\noptodrive: the next minute\n")
-        for _ in range(300):
-            log.warn("y" * 1000)
+        for number in range(300):
+            log.warn(f"{number:1000}")
         capsys.readouterr()
     assert capsys.readouterr().err.endswith("lines suppressed\n")
+
+
+def test_equal_lines_are_merged_and_counted(capsys):
+    """What a caller without a token can provoke, as often as it likes: a record of a library."""
+    clock = ManualClock()
+    with closing(DaemonLog(None, clock)) as log:
+        for number in range(1000):
+            log.write("Invalid HTTP request received.", "warning", LOGGER="uvicorn.error")
+            if number % 100 == 0:
+                log.warn(f"another {number // 300}")
+        lines = capsys.readouterr().err.splitlines()
+        assert lines.count("optodrive: Invalid HTTP request received.") == REPEATS_MAX
+        assert len(lines) == REPEATS_MAX + 10
+        clock.sleep(PERIOD_S)
+        log.warn("the next minute")
+        log.warn("another 0")
+        assert capsys.readouterr().err.splitlines() == [
+            f"optodrive: {1000 - REPEATS_MAX} times more: Invalid HTTP request received.",
+            "optodrive: the next minute",
+            "optodrive: another 0",
+        ]
+
+
+def test_events_are_never_merged(capsys):
+    with closing(DaemonLog(None, ManualClock())) as log:
+        for _ in range(10):
+            log.write("the web process was killed; it starts again", "err", EVENT="restarted")
+    assert capsys.readouterr().err.count("starts again") == 10
 
 
 def test_one_line_is_bounded(capsys):

@@ -1,3 +1,4 @@
+import os
 import stat
 from pathlib import Path
 
@@ -61,3 +62,24 @@ def test_a_link_to_another_folder_is_not_followed(runtime, tmp_path):
     (runtime / "optodrive" / "daemon-8450").symlink_to(other)
     open_runtime_folder(8450, None).remove()
     assert other.exists()
+
+
+def test_folders_and_tokens_of_daemons_without_a_process_are_removed(runtime):
+    """Those of a running daemon on another port stay, also while only a child of it is left."""
+    running, killed = open_runtime_folder(8450, None), open_runtime_folder(8451, None)
+    child_lock = os.dup(running.lock)  # as a fork inherits it
+    os.close(running.lock)
+    os.close(killed.lock)
+    for port in (8450, 8451):
+        (runtime / "optodrive" / f"token-{port}").touch()
+    (runtime / "optodrive" / "daemon-8452").symlink_to(runtime / "gone")
+    (runtime / "optodrive" / "notes").mkdir()
+    own = open_runtime_folder(8453, None)
+    names = {path.name for path in (runtime / "optodrive").iterdir()}
+    assert names == {"daemon-8450", "token-8450", "daemon-8453", "notes"}
+    assert running.path.exists()
+    assert not killed.path.exists()
+    os.close(child_lock)
+    own.remove()
+    open_runtime_folder(8453, None).remove()
+    assert {path.name for path in (runtime / "optodrive").iterdir()} == {"notes"}
