@@ -21,6 +21,8 @@ CAP_MARGIN = 1.05
 FIELD_MARGIN_CODES = 64
 SIMULATED_CELL_MAX_CODES = 1300
 """Size of the spot guards' cells on a simulated board whose pixels do not need smaller ones."""
+WIRE_MAX = 0xFFFF
+"""Largest number that the message of limits holds for the settling, 16 bits."""
 MIRROR_RANGE = ("x_min", "x_max", "y_min", "y_max")
 
 
@@ -131,13 +133,17 @@ def _build_limits(config: Config, scale: WireScale, codes: IntArray, margin_code
 def _compute_settling(config: Config, scale: WireScale) -> tuple[int, int]:
     """Return settle_us and settle_ns_per_code, a line that nowhere exceeds the planned settling time.
 
-    Its slope is the slew rate. The planned time jumps where longer moves start to overshoot, so a steeper line
-    would have to start lower for short moves.
+    Its slope is the slew rate, or less where the slew decides alone and leaves no time to start with. The planned time
+    jumps where longer moves start to overshoot, so a steeper line would have to start lower for short moves.
     """
     settling_table = build_settling_table(config)
-    ns_per_code = int(scale.rad_per_code / config.scanner.slew_rad_per_s * 1e9)
+    ns_per_code = min(WIRE_MAX, int(scale.rad_per_code / config.scanner.slew_rad_per_s * 1e9))
     pitches = np.arange(1, len(settling_table.after_long_dwell[0]))
     # Quantisation may lengthen a move by one code.
     codes = np.floor(pitches * settling_table.pitch_rad / scale.rad_per_code).astype(np.int64) + 2
     times_us = np.minimum(*(np.array(table)[pitches] for table in settling_table.after_long_dwell))
-    return int((times_us + -codes * ns_per_code // 1000).min()), ns_per_code
+    settle_us = int((times_us + -codes * ns_per_code // 1000).min())
+    if settle_us < RETIMING_MAX_TICKS:
+        settle_us = min(RETIMING_MAX_TICKS, int(times_us.min()))
+        ns_per_code = int(((times_us - settle_us) * 1000 // codes).min())
+    return min(WIRE_MAX, settle_us), ns_per_code

@@ -6,6 +6,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.device.config import Config
 from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.session.plan_job import RETIMING_MAX_TICKS
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, tighten
 
 
@@ -47,6 +48,18 @@ def test_a_single_off_centre_pixel_includes_the_move_from_the_centre():
     display = type(DISPLAYS["display-16"]).from_config(Config.model_validate(table))
     codes, planned_us = list_moves(display, np.random.default_rng(1), 1)
     assert np.all(board_us(build_board_requirements(display.config).limits, codes) <= planned_us)
+
+
+@pytest.mark.parametrize("servo", [{"slew_rad_per_s": 3.0, "bandwidth_hz": 2000.0}, {"slew_rad_per_s": 1.0}])
+def test_a_slew_that_decides_alone_leaves_the_board_no_time_to_start_with(servo):
+    table = DISPLAYS["display-16"].config.model_dump()
+    table["scanner"] |= {"delay_s": 0.0, **servo}
+    display = type(DISPLAYS["display-16"]).from_config(Config.model_validate(table))
+    limits = build_board_requirements(display.config).limits
+    codes, planned_us = list_moves(display, np.random.default_rng(1))
+    assert np.all(board_us(limits, codes) <= planned_us)
+    assert limits.settle_us == RETIMING_MAX_TICKS, "as much as a retimed point may miss"
+    assert board_us(limits, codes.max()) >= 0.99 * planned_us.max()
 
 
 def test_the_simulated_board_settles_fast_enough_for_every_display():
