@@ -41,11 +41,11 @@ from optodrive.physics.term_kernels import CHAINS, FOLLOWER_ROW, MAX_PARAMETERS,
 from optodrive.physics.terms import discover_terms
 
 FIRST_STEP, FIRST_STEP_FAST_S = 0.15, 1e-5
-"""First step after a gate edge, in gas time constants; and in seconds, if a term is faster than the gas."""
+"""First step after a gate edge, in time constants of gas or absorber, the faster one; or in s for a faster term."""
 STEP_GROWTH = 0.2
 """Growth of the step per time since the gate edge."""
 MAX_STEP_EARLY, MAX_STEP_LATE, LATE_AFTER = 0.35, 1.2, 12.0
-"""Largest step before and after LATE_AFTER since a gate edge, all in gas time constants."""
+"""Largest step before and after LATE_AFTER since a gate edge, all in the same time constants."""
 MAX_STEP_S = 6e-3
 """Stability limit: 2.78 times the shortest time constant of a term, 2.5 ms, less a margin."""
 
@@ -234,11 +234,12 @@ def step(
 @kernel
 def next_step_s(pixel: Pixel, active: ActiveTerms, since_edge_s: float) -> float:
     """Return the length of the step that begins since_edge_s after a gate edge, s."""
-    max_step = MAX_STEP_LATE if since_edge_s > LATE_AFTER * pixel.tau_g_s else MAX_STEP_EARLY
+    fastest_s = min(pixel.tau_g_s, pixel.r_k_per_w * pixel.c_j_per_k)
+    max_step = MAX_STEP_LATE if since_edge_s > LATE_AFTER * fastest_s else MAX_STEP_EARLY
     return min(
         MAX_STEP_S,
-        STEP_GROWTH * since_edge_s + (FIRST_STEP_FAST_S if active.is_fast else FIRST_STEP * pixel.tau_g_s),
-        max_step * pixel.tau_g_s,
+        STEP_GROWTH * since_edge_s + (FIRST_STEP_FAST_S if active.is_fast else FIRST_STEP * fastest_s),
+        max_step * fastest_s,
     )
 
 

@@ -217,6 +217,20 @@ def test_agrees_with_scipy(name):
         assert np.abs(ours - theirs).max() < 2e-5 * np.abs(theirs).max()
 
 
+@pytest.mark.parametrize("bridge", [(184.0, 126e-6), (87.5, 101e-6), (20.0, 100e-6)], ids=["narrow", "wide", "wider"])
+def test_an_absorber_that_is_faster_than_the_gas(bridge):
+    """A step that is right for the gas of Text S1 is too long for an absorber on wide bridges."""
+    pixel = Pixel(*bridge, 0.66, 64e-3, 4e-6, 2.3e-4)
+    experiment = PixelExperiment(PULSES, 0, AMBIENT_K, (T_S, T_S, T_S))
+    found_k = simulate_signals(experiment, pixel, ActiveTerms.from_values({}))[0]
+    lag_s, exact_k = bridge[0] * bridge[1], np.zeros(len(T_S))
+    for start_s, width_s, power_w, target in PULSES:
+        for edge_s, sign in ((start_s, 1.0), (start_s + width_s, -1.0)):
+            final_k = sign * power_w * pixel.epsilon * bridge[0] * (target == 0)
+            exact_k -= final_k * np.expm1(-np.clip(T_S - edge_s, 0.0, None) / lag_s)
+    assert np.abs(found_k - exact_k).max() < 1e-4 * exact_k.max()
+
+
 def test_every_term_with_kernels_is_checked_here_or_below():
     below = {"sensor_scale", "ambient_drift", "power_nonlinearity", "absorber_ageing"}
     hooked = {key for key, term in discover_terms().items() if any(term.kernels)}
