@@ -2,7 +2,9 @@
 
 from optodrive.core.clock import ManualClock
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
+from optodrive.link.board_setup import build_port_settings
 from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_limits import build_settings
 from optodrive.link.simulator.memory_link import MemoryLink
 from optodrive.planning.display_model import DisplayModel
 
@@ -12,7 +14,8 @@ class ExclusiveRig:
 
     def __init__(self, display, mirror_sink):
         self.log, self.clock = [], ManualClock(3.0)
-        self.core = BoardCore(None, self.log.append, seed=4, mirror_sink=mirror_sink)
+        own = build_settings(build_port_settings(display.config).own_settings)
+        self.core = BoardCore(own, self.log.append, seed=4, mirror_sink=mirror_sink)
         self.held = ExclusiveBoard(display, MemoryLink(self.core, self.clock), self.clock)
 
     def of(self, kind):

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
 from optodrive.device.calibrated_field import CalibratedField
 from optodrive.device.config import Config
 from optodrive.device.field_file import load_field
@@ -12,6 +13,8 @@ from optodrive.device.pixel_map import build_aim_layout, load_pixel_map
 from optodrive.device.scan_field import IdealField, ScanField
 from optodrive.device.settling import SettlingTable
 
+MOVE_MAX_S = 0.06
+"""Longest settling time, that of one gate-off point: a board would be late with a move that takes several."""
 COVERAGE_SIGMAS = 2.0
 """Standard uncertainties of a field that scanner.aim_error_m must cover."""
 
@@ -26,10 +29,22 @@ def load_scan_field(config: Config) -> ScanField:
 
 
 def build_settling_table(config: Config) -> SettlingTable:
-    """Return the settling times between the aim points of the pixels; raises as `load_scan_field`."""
-    if load_pixel_map(config) is not None:
-        return SettlingTable.from_config(config, load_scan_field(config))
-    return SettlingTable.from_config(config, _load_calibrated_field(config))
+    """Return the settling times between the aim points of the pixels.
+
+    Raises as `load_scan_field`, and InputError for a servo that takes longer than MOVE_MAX_S across the display.
+    """
+    field = _load_calibrated_field(config) if load_pixel_map(config) is None else load_scan_field(config)
+    table = SettlingTable.from_config(config, field)
+    longest_s = 1e-6 * max(table.lead_in_us, *(times_us[-1] for times_us in table.after_short_dwell))
+    if longest_s > MOVE_MAX_S:
+        ramp_s = (len(table.after_short_dwell[0]) - 1) * table.pitch_rad / config.scanner.slew_rad_per_s
+        key = "slew_rad_per_s" if ramp_s > 0.5 * longest_s else "bandwidth_hz"
+        expected = (
+            f"a servo that settles within {format_quantity(MOVE_MAX_S, 's')} across the display; this one takes "
+            f"{format_quantity(longest_s, 's')}"
+        )
+        raise InputError(f"scanner.{key}", getattr(config.scanner, key), expected)
+    return table
 
 
 def _load_calibrated_field(config: Config) -> CalibratedField | None:

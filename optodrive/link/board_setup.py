@@ -95,6 +95,25 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
     )
 
 
+def build_bench_requirements(config: Config, margin_m: float) -> BoardRequirements:
+    """Derive the requirements of a task that moves the mirrors around the centre, too, where there may be no pixel.
+
+    margin_m: distance by which the permitted range extends beyond the centre and the outermost pixels, m
+    """
+    margin_codes = ceil(margin_m / (2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code))
+    requirements = build_board_requirements(config, margin_codes)
+    limits = requirements.limits
+    low, high = max(0, CENTRE_CODE - margin_codes), min(CODE_MAX, CENTRE_CODE + margin_codes)
+    limits = replace(
+        limits,
+        x_min=min(limits.x_min, low),
+        x_max=max(limits.x_max, high),
+        y_min=min(limits.y_min, low),
+        y_max=max(limits.y_max, high),
+    )
+    return replace(requirements, limits=limits)
+
+
 def _compute_cell_max(codes: IntArray, adjacent: IntArray, scale: WireScale, config: Config) -> int:
     """Return the largest cell of the board's spot guards that no two pixels share, in codes.
 

@@ -1,6 +1,7 @@
 """Build the limiter's budget from a configuration: caps, worst-case thermal model and galvo model."""
 
 from collections.abc import Mapping
+from math import exp, pi, sqrt
 
 import numpy as np
 
@@ -57,7 +58,30 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     skew_s = limits.stage_skew_max_s if len(stages) > 1 else 0.0
     powers_w = (stage.laser.max_power_w for stage in stages)
     heat = build_heat_bound(model, uncertainty, caps, *powers_w, skew_s=skew_s)
-    return Budget(caps, heat, GalvoModels.from_models(*map(build_galvo_model, stages)))
+    galvos = [build_galvo_model(stage) for stage in stages]
+    check_galvo_cap(limits.galvo_acceleration_rms_max_rad_per_s2, galvos)
+    return Budget(caps, heat, GalvoModels.from_models(*galvos))
+
+
+def compute_long_move_load(galvo: GalvoModel) -> float:
+    """Return the root mean square of the acceleration after one long move, rad/s², as the galvo load counts it.
+
+    Not by its kernel: a check of a configuration compiles none.
+    """
+    ratio = galvo.damping / sqrt(1.0 - galvo.damping**2)
+    energy = galvo.slew_rad_per_s**2 * galvo.omega_rad_per_s / (2.0 * galvo.damping) * (1.0 + exp(-pi * ratio))
+    return sqrt(energy / galvo.averaging_s)
+
+
+def check_galvo_cap(cap_rad_per_s2: float, galvos: list[GalvoModel]) -> None:
+    """Raise InputError for a cap below the load of one long move, and of the next one, for which it always leaves room.
+
+    Under such a cap no pulse fits at any time.
+    """
+    needed_rad_per_s2 = sqrt(2.0) * max(map(compute_long_move_load, galvos))
+    if cap_rad_per_s2 < needed_rad_per_s2:
+        expected = f"at least {needed_rad_per_s2:.3g}, the load of two long moves within galvo_mean_s"
+        raise InputError("limits.galvo_acceleration_rms_max_rad_per_s2", cap_rad_per_s2, expected)
 
 
 def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelArray) -> NominalPanel:

@@ -26,9 +26,9 @@ from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
-from optodrive.device.config import Config
-from optodrive.link.board_setup import build_board_requirements
-from optodrive.link.protocol.quantisation import DUTY_MAX, WirePoints, decode, quantise
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.link.board_setup import build_bench_requirements
+from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX, WirePoints, decode, quantise
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
@@ -42,6 +42,8 @@ SWITCH_INTERVAL_S = 2e-4
 """As in the engine: a computing thread must not delay the lease."""
 FIELD_MARGIN_M = 4e-3
 """Permitted margin beyond the outermost pixels; the error of an uncorrected beam is smaller."""
+HALF_TRAVEL_MIN_M = 3e-3
+"""Shortest way of a mirror from the centre that shows its travel; a smaller display is left by as much."""
 SPOT_POWER_MAX_W = 0.05
 """Maximum power of a spot: 2 % of a pixel's drive power; steady on one absorber it adds a few kelvin."""
 SPOT_SHARE_MAX = 0.05
@@ -66,8 +68,7 @@ class ExclusiveBoard:
     def __init__(self, display: DisplayModel, transport: Transport, clock: Clock) -> None:
         self._display, self._clock = display, clock
         config = display.config
-        code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
-        self.requirements = build_board_requirements(config, ceil(FIELD_MARGIN_M / code_m))
+        self.requirements = build_bench_requirements(config, FIELD_MARGIN_M)
         self._limits = self.requirements.limits
         self.session = BoardSession(transport, clock, self.requirements)
         self._state = display.build_cold_state()[1]
@@ -260,6 +261,19 @@ class ExclusiveBoard:
                     code,
                     f"{low} to {high}, the display and {format_quantity(FIELD_MARGIN_M, 'm')} more",
                 )
+
+    @property
+    def half_travel_codes(self) -> tuple[int, int]:
+        """Way of mirrors x and y from the centre to either side that spans the display, within the board's range."""
+        layout, scanner, limits = build_pixel_layout(self.config.display), self.config.scanner, self._limits
+        code_m = 2.0 * scanner.focal_length_m * scanner.rad_per_code
+        x_codes, y_codes = (
+            round(max(float(np.abs(axis_m).max()), HALF_TRAVEL_MIN_M) / code_m) for axis_m in (layout.x_m, layout.y_m)
+        )
+        return (
+            min(x_codes, limits.x_max - CENTRE_CODE, CENTRE_CODE - limits.x_min),
+            min(y_codes, limits.y_max - CENTRE_CODE, CENTRE_CODE - limits.y_min),
+        )
 
     def clip_codes(self, codes: FloatArray) -> FloatArray:
         """Clip codes [k, 2] to the board's range."""

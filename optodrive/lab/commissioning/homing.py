@@ -8,11 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-
 from optodrive.core.errors import RefusedError
 from optodrive.core.quantity import format_quantity
-from optodrive.device.config import build_pixel_layout
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.commissioning.spot_reader import SpotReader
 from optodrive.link.protocol.messages import INPUTS
@@ -25,7 +22,6 @@ READINGS_PER_SPOT = 3
 """Readings per spot, enough to reject one reflection."""
 CLOCK_TOLERANCE = 1e-3
 """Relative tolerance between the clocks of host and board."""
-TRAVEL_MIN_M = 3e-3
 INPUT_LABELS = {"interlock": ("open", "closed"), "key": ("off", "on"), "estop": ("released", "pressed")}
 """Labels of an input for 0 and 1."""
 SAFE_LABELS = {"interlock": "closed", "key": "on", "estop": "released"}
@@ -211,11 +207,8 @@ class Homing:
         return HomingResult(name, message, {"plus": _position_details(high), "minus": _position_details(low)})
 
     def _end_codes(self, axis: int, sign: int) -> tuple[int, int]:
-        layout = build_pixel_layout(self._board.config.display)
-        half_travel_m = max(float(np.abs((layout.x_m, layout.y_m)[axis]).max()), TRAVEL_MIN_M)
-        code_count = round(half_travel_m / (2.0 * self._board.config.scanner.focal_length_m * self._code_rad))
         codes = [CENTRE_CODE, CENTRE_CODE]
-        codes[axis] += sign * code_count
+        codes[axis] += sign * self._board.half_travel_codes[axis]
         return codes[0], codes[1]
 
     def _check_moved(self, name: str, axis: int, moved: float, commanded: float, unit: str) -> None:

@@ -12,15 +12,12 @@ import numpy as np
 from optodrive.core.errors import InputError, LinkError
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import PulsePlan
-from optodrive.device.config import build_pixel_layout
-from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, find_weakest_pixel
-from optodrive.link.protocol.quantisation import CENTRE_CODE, GATE_OFF_STEP_TICKS, WirePoints
+from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, find_weakest_pixel, max_settling_s
+from optodrive.link.protocol.quantisation import CENTRE_CODE, GATE_OFF_STEP_TICKS, TICKS_MAX, WirePoints
 from optodrive.planning.limiter.limiter import galvo_feasible_prefix
 
 SIZE_FRACTIONS = (1.0, 0.2, 0.033)
 """Sizes of the steps relative to the display: small ones determine the bandwidth, large ones the slew rate."""
-HALF_TRAVEL_MIN_M = 3e-3
-"""As in homing: a smaller display is left by this much."""
 STEPS_MIN, STEPS_MAX = 6, 100
 LEAD_IN_S = 0.1
 """Time at the first position before the first step, in which a mirror comes to rest; the first step's time."""
@@ -45,26 +42,26 @@ class StepRun:
 def plan_step_runs(board: ExclusiveBoard, step_count: int) -> tuple[StepRun, ...]:
     """Plan the runs, one per size; mirror x moves at every step and mirror y at every other one.
 
-    Steps follow each other as fast as the galvo cap permits. Raises InputError for a number of steps outside
-    STEPS_MIN to STEPS_MAX, or if they exceed the cap at HOLD_MAX_S.
+    Steps follow each other as fast as the mirrors settle and the galvo cap permits. Raises InputError for a number of
+    steps outside STEPS_MIN to STEPS_MAX, or if they exceed the cap at HOLD_MAX_S.
     """
     if not STEPS_MIN <= step_count <= STEPS_MAX:
         raise InputError("--steps", step_count, f"{STEPS_MIN} to {STEPS_MAX}")
-    layout, scanner = build_pixel_layout(board.config.display), board.config.scanner
-    code_m = 2.0 * scanner.focal_length_m * scanner.rad_per_code
-    half_codes = [max(float(np.abs(m).max()), HALF_TRAVEL_MIN_M) / code_m for m in (layout.x_m, layout.y_m)]
     number = np.arange(step_count + 1)
     signs = np.column_stack([np.where(number % 2 == 1, 1, -1), np.where((number + 1) // 2 % 2 == 1, 1, -1)])
     jitter_s = np.random.default_rng(0).uniform(0.0, HOLD_JITTER_S, step_count)
     return tuple(
-        _plan_run(board, f"size{k}", CENTRE_CODE + signs * np.rint(fraction * np.array(half_codes)), jitter_s)
+        _plan_run(
+            board, f"size{k}", CENTRE_CODE + signs * np.rint(fraction * np.array(board.half_travel_codes)), jitter_s
+        )
         for k, fraction in enumerate(SIZE_FRACTIONS, 1)
     )
 
 
 def _plan_run(board: ExclusiveBoard, name: str, codes: FloatArray, jitter_s: FloatArray) -> StepRun:
     display = board.display
-    tick_s, hold_s, state = board.session.scale.tick_s, HOLD_S, display.build_cold_state()[1]
+    tick_s, state = board.session.scale.tick_s, display.build_cold_state()[1]
+    hold_s = max(HOLD_S, max_settling_s(display.config))
     while hold_s <= HOLD_MAX_S:
         hold_ticks = np.rint(np.concatenate([[LEAD_IN_S], hold_s + jitter_s]) / tick_s).astype(np.int64)
         run = StepRun(name, codes.astype(np.int64), hold_ticks)
@@ -106,9 +103,9 @@ def build_gate_off_points(run: StepRun) -> WirePoints:
     rows = []
     for (x_code, y_code), hold_ticks in zip(run.codes.tolist(), run.hold_ticks.tolist(), strict=True):
         rest_ticks = hold_ticks
-        while rest_ticks > GATE_OFF_STEP_TICKS:
-            rows.append((x_code, y_code, GATE_OFF_STEP_TICKS // 2, 0, 0))
-            rest_ticks -= GATE_OFF_STEP_TICKS // 2
+        while rest_ticks > TICKS_MAX:  # the first point is long enough for any settling
+            rows.append((x_code, y_code, GATE_OFF_STEP_TICKS, 0, 0))
+            rest_ticks -= GATE_OFF_STEP_TICKS
         rows.append((x_code, y_code, rest_ticks, 0, 0))
     return WirePoints(np.array(rows, dtype=np.uint16), np.arange(len(rows)))
 

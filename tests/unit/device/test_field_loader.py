@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from displays import DISPLAYS
 from hidden_field import CONFIG, LAYOUT, calibrate_hidden_field, config_with_field
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.device.config import Config
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.scan_field import IdealField
@@ -118,3 +120,11 @@ def test_a_field_less_sure_than_the_aim_error_is_refused(tmp_path):
     calibrate_hidden_field(tmp_path / "field.toml", side=3)
     with pytest.raises(InputError, match=r"scanner\.aim_error_m: got 1e-05, expected at least"):
         load_scan_field(config_with_field(tmp_path / "field.toml", aim_error_m=1e-5))
+
+
+@pytest.mark.parametrize(("key", "value"), [("slew_rad_per_s", 1.0), ("bandwidth_hz", 100.0)])
+def test_a_servo_too_slow_for_a_point_of_the_wire_is_refused(key, value):
+    table = DISPLAYS["display-1511"].config.model_dump()
+    table["scanner"] |= {"damping": 0.3, "delay_s": 0.01, "aim_error_m": 4.9e-4, key: value}
+    with pytest.raises(InputError, match=rf"scanner\.{key}: got {value}, expected a servo that settles within 60 ms"):
+        build_settling_table(Config.model_validate(table))

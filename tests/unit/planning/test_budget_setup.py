@@ -16,9 +16,12 @@ from optodrive.planning import budget_setup
 from optodrive.planning.budget_setup import (
     BOUNDED_TERMS,
     build_budget,
+    build_galvo_model,
     build_nominal_panel,
     compute_heat_gain_bound,
+    compute_long_move_load,
 )
+from optodrive.planning.limiter.galvo_load import move_energy
 from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
 
 DISPLAY = DISPLAYS["display-16"]
@@ -203,3 +206,12 @@ def test_a_panel_without_walls_is_bounded_as_with_them():
         40.0 * 6.0 * (1 + unsure.panel_resistance) * (1 - unsure.panel_capacity)
     )
     assert compute_heat_gain_bound(with_panel("calibrated"), DISPLAY.pixels, CONFIG).uniform_rise_k == 0.0
+
+
+def test_a_galvo_cap_under_which_no_pulse_fits_is_refused():
+    galvo = build_galvo_model(CONFIG)
+    load = compute_long_move_load(galvo)
+    assert load == pytest.approx((move_energy(galvo, 1e9) / galvo.averaging_s) ** 0.5)
+    limits = CONFIG.limits.model_copy(update={"galvo_acceleration_rms_max_rad_per_s2": 1.4 * load})
+    with pytest.raises(InputError, match=r"limits\.galvo_acceleration_rms_max_rad_per_s2: got .*, expected at least"):
+        build_budget(CONFIG.model_copy(update={"limits": limits}), DISPLAY.parameters, DISPLAY.pixels)

@@ -10,11 +10,13 @@ from exclusive_rig import ExclusiveRig, limited
 from hidden_servo import HiddenServo
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError
 from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.device.config import Config
 from optodrive.lab.commissioning import mirror_steps
 from optodrive.lab.commissioning.mirror_steps import LEAD_IN_S, plan_step_runs, play_step_runs
 from optodrive.lab.servo_identification.identify import identify
 from optodrive.lab.servo_identification.step_trace import extract_trace
 from optodrive.link.protocol.quantisation import WirePoints
+from optodrive.planning.display_model import DisplayModel
 
 STEPS = 12
 
@@ -108,9 +110,27 @@ def test_steps_wait_for_the_galvo_cap(display):
     assert slow.min() > 2 * fast.min()
 
 
+@pytest.mark.parametrize(
+    ("section", "values"),
+    [
+        ("scanner", {"range_rad": 0.0137}),  # the display and a sixth of a millimetre
+        ("display", {"missing": [[row, column] for row in range(4) for column in range(3)]}),
+        ("scanner", {"slew_rad_per_s": 1.0}),
+    ],
+    ids=["narrow scanner", "pixels aside", "slow servo"],
+)
+def test_steps_of_a_display_of_one_s_own_stay_on_the_board_s_field(section, values):
+    table = DISPLAYS["display-16"].config.model_dump()
+    table[section] |= values
+    rig = Rig(DisplayModel.from_config(Config.model_validate(table)))
+    played = rig.play()
+    assert [run.name for run, _ in played] == ["size1", "size2", "size3"]
+    assert judge_dark(rig.log)
+
+
 def test_steps_that_never_fit_are_refused(display):
-    rig = Rig(limited(display, galvo_acceleration_rms_max_rad_per_s2=1.0))
-    with pytest.raises(InputError, match=r"galvo_acceleration_rms_max_rad_per_s2: got 1\.0"):
+    rig = Rig(limited(display, galvo_acceleration_rms_max_rad_per_s2=1.3e4))
+    with pytest.raises(InputError, match=r"galvo_acceleration_rms_max_rad_per_s2: got 13000\.0"):
         plan_step_runs(rig.held, STEPS)
     with pytest.raises(InputError, match="--steps: got 5, expected 6 to 100"):
         plan_step_runs(Rig(display).held, 5)
