@@ -19,6 +19,7 @@ from optodrive.planning.pipeline import plan_sequence
 ROOMS_C = (23.0, 30.0)
 FULL_SHARE = 0.9
 """Share of the requested height from which a pixel counts as raised."""
+WAIT_S = 0.01
 COLD_PANEL = {"resistance_k_per_w": 1e-3, "capacity_j_per_k": 1e5}
 FINGERTIP = [700 + 39 * row + column for row in range(5) for column in range(5)]
 CASES = (
@@ -26,7 +27,9 @@ CASES = (
     ("display-1511", "all pixels", None, 100.0),
     ("display-1511", "25 pixels under a fingertip", FINGERTIP, 50.0),
     ("display-437", "all pixels", None, 50.0),
+    ("display-357", "all pixels", None, 50.0),
     ("display-16", "all pixels", None, 50.0),
+    ("display-1", "its pixel", None, 50.0),
 )
 
 
@@ -47,7 +50,8 @@ def measure(display, pixels, height_um, duration_s):
     now_s, raised = 0.0, 0
     while now_s < duration_s:
         planned = plan_sequence(display, sequence, heat, budget)
-        end_s = float(planned.plan.start_s[-1] + planned.plan.width_s[-1])
+        # A pixel that is still up needs no light: the next frame follows after a moment.
+        end_s = float((planned.plan.start_s + planned.plan.width_s).max(initial=WAIT_S))
         raised += int(np.count_nonzero(planned.predicted_m >= FULL_SHARE * height_um * 1e-6))
         heat, budget = planned.heat.copy_shifted(-end_s), shift_state(planned.budget, -end_s)
         now_s += end_s
@@ -57,9 +61,10 @@ def measure(display, pixels, height_um, duration_s):
 def main():
     parser = argparse.ArgumentParser(prog="scripts/bench panel", description=__doc__)
     parser.add_argument("--hours", type=float, default=1.0, help="time that is simulated")
+    parser.add_argument("--display", help="only cases of this display")
     options = parser.parse_args()
     for name, what, pixels, height_um in CASES:
-        for room_c in ROOMS_C:
+        for room_c in ROOMS_C if options.display in (None, name) else ():
             without, _ = measure(build_display(name, room_c, False), pixels, height_um, 3600.0 * options.hours)
             rate, panel_k = measure(build_display(name, room_c, True), pixels, height_um, 3600.0 * options.hours)
             case = f"{name}, {what} to {height_um:g} µm, room at {room_c:g} °C"

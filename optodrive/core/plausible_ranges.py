@@ -108,7 +108,7 @@ RANGES: dict[str, dict[str, PlausibleRange]] = {
     },
     "parameters": {
         "epsilon.value": PlausibleRange(0.02, 1.0, "1"),
-        "tau_g.value": PlausibleRange(1e-4, 0.05, "s"),
+        "tau_g.value": PlausibleRange(1e-4, 0.1, "s"),
         "kappa.value": PlausibleRange(1e-7, 1e-4, "m/K"),
         "phi.value": PlausibleRange(1e-5, 5e-3, "N/K"),
         "R_width_product.value": PlausibleRange(5e-3, 1.0, "m K/W"),

@@ -3,15 +3,38 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.core.errors import InputError, suggest_nearest
 
 
-class Section(BaseModel):
-    """Base of all configuration tables: immutable, without unknown keys; field docstrings are their descriptions."""
+class ConflictError(ValueError):
+    """A value of a table that does not go with another one; place: its dotted key within the table."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    def __init__(self, place: str, value: object, expected: str) -> None:
+        self.place, self.value, self.expected = place, value, expected
+        super().__init__(f"{place}: {value!r}, expected {expected}")
+
+
+class Section(BaseModel):
+    """Base of all tables of files: immutable, without unknown keys; field docstrings are their descriptions.
+
+    Types are strict: a number is neither a boolean nor a text, and a whole number has no decimal point.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _freeze_arrays(cls, table: Any) -> Any:
+        """Make tuples of a table's arrays, because a strict tuple accepts no list."""
+        return {key: _freeze(value) for key, value in table.items()} if isinstance(table, dict) else table
+
+
+def _freeze(value: Any) -> Any:
+    return tuple(map(_freeze, value)) if isinstance(value, list) else value
 
 
 def _require_name(text: str) -> str:
@@ -28,7 +51,7 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
     """Raise InputError for a file of another format or version."""
     if table.get("format") != expected:
         raise InputError(f"{path}: format", table.get("format"), f"'{expected}'")
-    if table.get("version") != version:
+    if table.get("version") != version or isinstance(table["version"], bool):
         raise InputError(f"{path}: version", table.get("version"), f"{version}, the one this release reads")
 
 
@@ -46,6 +69,10 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
     if first["type"] == "missing":
         return InputError(label, None, "this key")
     if first["type"] == "value_error" and not isinstance(first["input"], str):
+        conflict = first["ctx"]["error"]
+        if isinstance(conflict, ConflictError):
+            label = f"{where}: {f'{place}.' if place else ''}{conflict.place}"
+            return InputError(label, conflict.value, conflict.expected)
         return InputError(label, "inconsistent values", message)
     return InputError(label, first["input"], message)
 

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from optodrive.core.errors import InputError
-from optodrive.core.toml_model import Name, Section
+from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.device.config_sections import (
     HALF_RANGE_CODES,
@@ -84,21 +84,16 @@ class Config(Section):
         limits = self.limits
         for key in ("absorber_max_c", "wall_max_c", "touch_max_c"):
             if getattr(limits, key) <= self.ambient_c:
-                raise ValueError(f"limits.{key} {getattr(limits, key)} must lie above ambient_c {self.ambient_c}")
-        if limits.wall_max_c > limits.absorber_max_c:
-            raise ValueError(
-                f"limits.wall_max_c {limits.wall_max_c} must not exceed limits.absorber_max_c {limits.absorber_max_c}"
-            )
-        if limits.pixel_mean_power_max_w > limits.display_mean_power_max_w:
-            raise ValueError(
-                f"limits.pixel_mean_power_max_w {limits.pixel_mean_power_max_w} must not exceed "
-                f"limits.display_mean_power_max_w {limits.display_mean_power_max_w}"
-            )
-        for key in ("pixel_mean_window_s", "display_mean_window_s"):
-            if getattr(limits, key) < limits.pulse_width_max_s:
-                raise ValueError(
-                    f"limits.{key} {getattr(limits, key)} must hold pulse_width_max_s {limits.pulse_width_max_s}"
-                )
+                raise ConflictError(f"limits.{key}", getattr(limits, key), f"more than ambient_c {self.ambient_c}")
+        for key, larger in (
+            ("wall_max_c", "absorber_max_c"),
+            ("pixel_mean_power_max_w", "display_mean_power_max_w"),
+            ("pulse_width_max_s", "pixel_mean_window_s"),
+            ("pulse_width_max_s", "display_mean_window_s"),
+        ):
+            if getattr(limits, key) > getattr(limits, larger):
+                expected = f"at most limits.{larger} {getattr(limits, larger)}"
+                raise ConflictError(f"limits.{key}", getattr(limits, key), expected)
         return self
 
     @model_validator(mode="after")
@@ -106,58 +101,65 @@ class Config(Section):
         for number, config in enumerate(self.list_stage_configs()):
             try:
                 config.check_optics()
-            except ValueError as error:
-                raise ValueError(f"stages[{number}]: {error}" if self.stages else str(error)) from None
-        names = [stage.name for stage in self.stages]
-        addresses = [stage.board.address for stage in self.stages if stage.board.address]
-        for what, values in (("name", names), ("board", addresses)):
-            if len(set(values)) < len(values):
-                raise ValueError(f"two stages have the same {what}")
+            except ConflictError as error:
+                place = f"stages[{number}].{error.place}" if self.stages else error.place
+                raise ConflictError(place, error.value, error.expected) from None
+        for number, stage in enumerate(self.stages):
+            for key, ours in (("name", stage.name), ("board", stage.board.address)):
+                for other, earlier in enumerate(self.stages[:number]):
+                    if ours and ours == (earlier.name if key == "name" else earlier.board.address):
+                        value = stage.name if key == "name" else " ".join(map(str, ours))
+                        expected = f"another {key} than that of stages[{other}]"
+                        raise ConflictError(f"stages[{number}].{key}", value, expected)
         unreached = np.flatnonzero(~np.any([stage.reach for stage in self.list_stage_configs()], axis=0))
         if len(unreached):
-            raise ValueError(f"no stage reaches pixel {unreached[0]}; rows and columns of the stages must cover all")
+            raise ConflictError("stages", f"none that reaches pixel {unreached[0]}", "rows and columns that hold all")
         return self
 
     def check_optics(self) -> None:
-        """Check laser, scanner and board of the only stage, and that its beam has pixels; raises ValueError."""
-        if not self.reach.any():
-            raise ValueError("its rows and columns hold no pixel")
+        """Check laser, scanner and board of the only stage, and that its beam has pixels; raises ConflictError."""
+        self._check_reach()
         if self.limits.pulse_width_max_s < 1.0 / self.laser.pwm_hz:
-            raise ValueError(
-                f"limits.pulse_width_max_s {self.limits.pulse_width_max_s} must hold one PWM period, "
-                f"{1 / self.laser.pwm_hz}"
-            )
+            expected = f"at least one period of laser.pwm_hz, {1 / self.laser.pwm_hz}"
+            raise ConflictError("limits.pulse_width_max_s", self.limits.pulse_width_max_s, expected)
         self._check_scan_range()
         self._check_focus()
         self._check_converter_codes()
+
+    def _check_reach(self) -> None:
+        for stage in self.stages[:1]:
+            for key in ("rows", "columns"):
+                span, count = getattr(stage, key), getattr(self.display, key)
+                if span is not None and not 0 <= span[0] <= span[1] < count:
+                    raise ConflictError(key, list(span), f"the first and the last of 0 to {count - 1}")
+        if not self.reach.any():
+            raise ConflictError("rows", "no pixel within rows and columns", "at least one")
 
     def _check_scan_range(self) -> None:
         layout, reach = build_pixel_layout(self.display), self.reach
         half_field_m = 2.0 * self.scanner.range_rad * self.scanner.focal_length_m
         farthest_m = float(max(np.abs(layout.x_m[reach]).max(), np.abs(layout.y_m[reach]).max()))
         if farthest_m > half_field_m:
-            raise ValueError(
-                f"scanner reaches ±{half_field_m:.4f} m (range_rad, focal_length_m), a pixel lies at {farthest_m:.4f} m"
-            )
+            value, expected = f"±{half_field_m:.4f} m by focal_length_m", f"±{farthest_m:.4f} m, where a pixel lies"
+            raise ConflictError("scanner.range_rad", f"a reach of {value}", f"at least {expected}")
 
     def _check_focus(self) -> None:
         display, laser = self.display, self.laser
         min_rad = 2.0 * self.scanner.rad_per_code
         for side, tolerance_rad in zip(("width", "height"), self.tolerance_rad, strict=True):
             if tolerance_rad <= min_rad:
-                raise ValueError(
-                    f"laser.focus_{side}_m {getattr(laser, f'focus_{side}_m')} with scanner.aim_error_m "
-                    f"{self.scanner.aim_error_m} on either side does not fit on display.absorber_{side}_m "
-                    f"{getattr(display, f'absorber_{side}_m')} with two steps of the converter to spare"
+                raise ConflictError(
+                    f"laser.focus_{side}_m",
+                    getattr(laser, f"focus_{side}_m"),
+                    f"to fit, with scanner.aim_error_m {self.scanner.aim_error_m} on either side and two steps of the "
+                    f"converter to spare, on display.absorber_{side}_m {getattr(display, f'absorber_{side}_m')}",
                 )
 
     def _check_converter_codes(self) -> None:
         steps = HELIOS_HALF_RANGE_CODES if self.board.transport == "helios" else HALF_RANGE_CODES
         if self.scanner.half_range_codes != steps:
-            raise ValueError(
-                f"scanner.half_range_codes {self.scanner.half_range_codes} must be {steps}, "
-                f"the converter's steps behind board.transport '{self.board.transport}'"
-            )
+            expected = f"{steps}, the converter's steps behind board.transport '{self.board.transport}'"
+            raise ConflictError("scanner.half_range_codes", self.scanner.half_range_codes, expected)
 
     def list_stage_configs(self) -> tuple["Config", ...]:
         """Return one configuration per stage, whose sections and only stage are that one's; itself without stages."""

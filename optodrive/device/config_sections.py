@@ -1,10 +1,11 @@
 """The sections of a configuration and their keys."""
 
+from os.path import realpath
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from optodrive.core.toml_model import Name, Section
+from optodrive.core.toml_model import ConflictError, Name, Section
 
 WIRE_ON_MAX_S = 65_535e-6
 """Longest gate-on time that one point of the protocol can carry (16 bit, microseconds), s."""
@@ -50,15 +51,25 @@ class DisplaySection(Section):
 
     @model_validator(mode="after")
     def _check_missing_places(self) -> Self:
-        for row, column in self.missing:
+        for number, (row, column) in enumerate(self.missing):
+            place = f"missing[{number}]"
             if not (0 <= row < self.rows and 0 <= column < self.columns):
-                raise ValueError(
-                    f"missing place ({row}, {column}) lies outside {self.rows} rows × {self.columns} columns"
-                )
-        if len(set(self.missing)) != len(self.missing):
-            raise ValueError("a missing place is named twice")
+                within = f"a place within {self.rows} rows and {self.columns} columns, counted from 0"
+                raise ConflictError(place, [row, column], within)
+            if (row, column) in self.missing[:number]:
+                raise ConflictError(place, [row, column], "each place once")
         if len(self.missing) >= self.rows * self.columns:
-            raise ValueError("every place is missing")
+            raise ConflictError("missing", f"all {len(self.missing)} places", "a place with a pixel")
+        return self
+
+    @model_validator(mode="after")
+    def _check_absorbers(self) -> Self:
+        """Refuse absorbers that overlap: pixels in one row are neighbours in x, in one column in y."""
+        for side, count in (("width", self.columns), ("height", self.rows)):
+            size_m = getattr(self, f"absorber_{side}_m")
+            if count > 1 and size_m >= self.pitch_m:
+                expected = f"less than pitch_m {self.pitch_m}, for absorbers do not overlap"
+                raise ConflictError(f"absorber_{side}_m", size_m, expected)
         return self
 
 
@@ -188,7 +199,7 @@ class LimitsSection(Section):
     """Mean incident power of the display over its window, W."""
     display_mean_window_s: Positive
     """Averaging window of the display's mean power, s."""
-    stage_skew_max_s: Annotated[float, Field(ge=0, le=0.01)] = 1e-3
+    stage_skew_max_s: Annotated[float, Field(gt=0, le=0.01)] = 1e-3
     """Largest error of the clock of one of several stages, s; a plan starts on none if one may be further off."""
     uncertainty: UncertaintySection = UncertaintySection()
     """Declared uncertainty of the model."""
@@ -223,9 +234,10 @@ class BoardSection(Section):
     @model_validator(mode="after")
     def _check_address(self) -> Self:
         if self.transport == "serial" and not self.port:
-            raise ValueError("transport 'serial' needs port, for example \"/dev/ttyACM0\"")
-        if self.transport == "usb" and (self.vendor_id is None or self.product_id is None):
-            raise ValueError("transport 'usb' needs vendor_id and product_id, for example 0x1209 and 0x0001")
+            raise ConflictError("port", self.port, "a device for transport 'serial', for example \"/dev/ttyACM0\"")
+        for key, example in (("vendor_id", "0x1209"), ("product_id", "0x0001")):
+            if self.transport == "usb" and getattr(self, key) is None:
+                raise ConflictError(key, None, f"a number for transport 'usb', for example {example}")
         return self
 
     @property
@@ -234,7 +246,7 @@ class BoardSection(Section):
         if self.transport == "simulated":
             return ()
         if self.transport == "serial":
-            return (self.transport, self.port)
+            return (self.transport, realpath(self.port))
         return (self.transport, self.vendor_id, self.product_id, self.serial_number, self.uid)
 
     @property

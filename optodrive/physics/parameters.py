@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.plausibility import PlausibleRange, check_table, guess_unit
 from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import build_input_error, check_format
+from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import locate_shipped
@@ -37,10 +37,9 @@ PARAMETER_UNITS = {
 """Required unit of each parameter."""
 
 
-class Parameter(BaseModel):
+class Parameter(Section):
     """One number with its unit, its standard uncertainty, if the source gives one, and its source."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     value: float
     unit: str
     sigma: Annotated[float, Field(ge=0)] | None = None
@@ -53,7 +52,7 @@ class NonNegativeParameter(Parameter):
     value: Annotated[float, Field(ge=0)]
 
 
-class _SiUnits(BaseModel):
+class _SiUnits(Section):
     """A model that refuses values in other units than those of `PARAMETER_UNITS`."""
 
     @model_validator(mode="after")
@@ -76,7 +75,6 @@ class _SiUnits(BaseModel):
 class Bridge(_SiUnits):
     """Thermal parameters of the absorber at one bridge width, a row of Table S3."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     width_m: Annotated[float, Field(gt=0)]
     R: NonNegativeParameter
     C: NonNegativeParameter
@@ -89,7 +87,6 @@ class ParameterSet(_SiUnits):
     accounts for all of them; planner_terms: those that the planner simulates heights with.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
     format: Literal["optodrive-parameters"]
     version: Literal[1]
     name: str
@@ -101,7 +98,7 @@ class ParameterSet(_SiUnits):
     R_width_product: NonNegativeParameter
     C_mean: NonNegativeParameter
     bridge: tuple[Bridge, ...]
-    terms: dict[str, dict[str, Parameter]] = {}
+    terms: dict[str, dict[str, Parameter]] = Field(default_factory=dict)
     planner_terms: tuple[str, ...] = ()
 
     def term_values(self, key: str) -> dict[str, float]:

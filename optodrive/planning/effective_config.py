@@ -32,7 +32,7 @@ class PixelPlace(Section):
 class EffectiveDisplay(DisplaySection):
     """The section [display] and its pixels, by index."""
 
-    pixels: list[PixelPlace]
+    pixels: tuple[PixelPlace, ...]
 
 
 class CapDescription(Section):

@@ -106,7 +106,7 @@ def test_without_an_external_interlock_one_line_and_no_emission(desk, capsys):
 
 def test_another_converter_width_is_rejected(desk, capsys):
     assert run(["helios", "play", str(desk.frames), *desk.config(steps=32767)]) == 2
-    assert "scanner.half_range_codes 32767 must be 2047" in capsys.readouterr().err
+    assert "scanner.half_range_codes: got 32767, expected 2047" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", helios_cli.TERMINATING_SIGNALS)

@@ -197,16 +197,20 @@ def test_a_dry_run_moves_nothing(armed):
 
 CONFIGS = {
     "unknown key": ("damping =", "dampin =", "nearest is 'damping'"),
-    "crossed limits": ("absorber_max_c = 400.0", "absorber_max_c = 10.0", "must lie above ambient_c"),
-    "a wall hotter than an absorber": ("wall_max_c = 80.0", "wall_max_c = 500.0", "must not exceed"),
-    "a touch surface below ambient": ("touch_max_c = 4", "touch_max_c = -4", "must lie above ambient_c"),
+    "crossed limits": ("absorber_max_c = 400.0", "absorber_max_c = 10.0", "more than ambient_c 20.0"),
+    "a wall hotter than an absorber": ("wall_max_c = 80.0", "wall_max_c = 500.0", "limits.wall_max_c"),
+    "a touch surface below ambient": ("touch_max_c = 4", "touch_max_c = -4", "more than ambient_c 20.0"),
     "uncertainty beyond half": ("wall_capacity = 0.1", "wall_capacity = 1.5", "limits.uncertainty.wall_capacity"),
-    "crossed powers": ("pixel_mean_power_max_w = 1.3", "pixel_mean_power_max_w = 9.0", "must not exceed"),
+    "crossed powers": (
+        "pixel_mean_power_max_w = 1.3",
+        "pixel_mean_power_max_w = 9.0",
+        "at most limits.display_mean_power_max_w 2.45",
+    ),
     "wrong type": ("pwm_hz = 5000.0", 'pwm_hz = "fast"', "laser.pwm_hz"),
     "other version": ("version = 4", "version = 2", "version: got 2, expected 4"),
     "other format": ('format = "optodrive-config"', 'format = "svg"', "format"),
     "no TOML": ("[display]", "[display", "valid TOML"),
-    "unreachable pixel": ("pitch_m = 3.6e-3", "pitch_m = 9e-3", "reaches"),
+    "unreachable pixel": ("pitch_m = 3.6e-3", "pitch_m = 9e-3", "a reach of"),
     "unknown parameters": ('parameters = "surroundings"', 'parameters = "best"', "calibrated"),
 }
 

@@ -151,8 +151,14 @@ def test_a_table_is_checked_at_any_depth_and_the_place_is_named():
         check_table("file", sound, ranges)
 
 
+@pytest.mark.parametrize("value", [3e10, 1e305, 10**400])
+def test_what_no_unit_explains_is_refused(value):
+    with pytest.raises(InputError, match=r"file: grid\.corner_m: got .*, expected 0 m to 500 mm$"):
+        check_table("file", {"grid": {"corner_m": value}}, {"grid.corner_m": PlausibleRange(0.0, 0.5, "m")})
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), True, "5", None, {"deep": 1}])
-def test_what_no_unit_explains_is_left_to_the_schema(value):
+def test_what_is_no_finite_number_is_left_to_the_schema(value):
     check_table("file", {"grid": {"corner_m": value}}, {"grid.corner_m": PlausibleRange(0.0, 0.5, "m")})
 
 

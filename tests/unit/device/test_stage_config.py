@@ -55,18 +55,27 @@ def test_a_single_stage_is_the_configuration(tmp_path):
 @pytest.mark.parametrize(
     ("stages", "message"),
     [
-        (TWO_STAGES.replace('"right"', '"left"'), "two stages have the same name"),
-        (TWO_STAGES.replace("ttyACM1", "ttyACM0").replace("laser =", "#"), "two stages have the same board"),
-        (TWO_STAGES.replace("[1, 3]", "[2, 2]"), "no stage reaches pixel 3"),
-        (TWO_STAGES.replace("1e-5", "9e-4"), r"stages\[0\]: laser.focus_width_m .* does not fit"),
+        (
+            TWO_STAGES.replace('"right"', '"left"'),
+            r"stages\[1\].name: got 'left', expected another name than .* stages\[0\]",
+        ),
+        (
+            TWO_STAGES.replace("ttyACM1", "ttyACM0").replace("laser =", "#"),
+            r"stages\[1\].board: got 'serial /dev/ttyACM0', expected another board",
+        ),
+        (TWO_STAGES.replace("[1, 3]", "[2, 2]"), "stages: got 'none that reaches pixel 3'"),
+        (TWO_STAGES.replace("1e-5", "9e-4"), r"stages\[0\].laser.focus_width_m: got 0.001, expected to fit"),
         (TWO_STAGES.replace("1.5", "-1.5"), r"stages.1.laser.max_power_w: got -1.5"),
         (TWO_STAGES.replace("max_power_w", "max_power"), r"stages.1.laser.max_power: got 'max_power', expected"),
         (TWO_STAGES.replace("1.5", "1500"), r"stages\[1\].laser.max_power_w: got 1500"),
         (TWO_STAGES.replace('name = "left"', ""), r"stages.0.name: got None, expected this key"),
-        (TWO_STAGES.replace("[0, 1]", "[1, 0]"), r"stages\[0\]: its rows and columns hold no pixel"),
+        (TWO_STAGES.replace("[0, 1]", "[1, 0]"), r"stages\[0\].columns: got \[1, 0\], expected .* last of 0 to 3"),
+        (TWO_STAGES.replace("[1, 3]", "[0, 99]"), r"stages\[1\].columns: got \[0, 99\]"),
+        (TWO_STAGES.replace("[1, 3]", "[-5, 3]"), r"stages\[1\].columns: got \[-5, 3\]"),
+        (TWO_STAGES.replace("/dev/ttyACM1", "/dev/./ttyACM0").replace("laser =", "#"), r"stages\[1\].board: got"),
         (
             TWO_STAGES.replace('port = "/dev/ttyACM1"', 'port = "/dev/ttyACM0", baud = 9600'),
-            "two stages have the same board",
+            r"stages\[1\].board: got 'serial /dev/ttyACM0', expected another board",
         ),
     ],
 )
