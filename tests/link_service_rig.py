@@ -26,7 +26,7 @@ class ServiceRig:
         self.log = []
         self.clock = ManualClock(5.0)
         self.boards = self.build_boards(link_type, settings, requirements)
-        self.service = LinkService(self.boards, self.clock, self.open_port, on_web_loss)
+        self.service = LinkService(self.boards, self.clock, on_web_loss)
         self.received = {}
         self.alive = {}
         self.request_ids = itertools.count(1)
@@ -36,7 +36,7 @@ class ServiceRig:
         self.core = BoardCore(settings, sink=self.log.append, seed=3)
         self.link = link_type(self.core, self.clock)
         self.session = BoardSession(self.link, self.clock, requirements)
-        return BoardGroup([self.session], self.clock)
+        return BoardGroup([self.session], self.clock, [self.open_port])
 
     def open_port(self):
         self.link.open()

@@ -1,8 +1,11 @@
 """Planner and link service in virtual time with the simulated boards of several stages, whose clocks drift."""
 
+from functools import partial
+
 import numpy as np
 
 from displays import DISPLAYS
+from optodrive.core.errors import LinkError
 from optodrive.device.config_sections import StageSection
 from optodrive.link.service.link_settings_builder import build_board_settings
 from optodrive.link.session.board_group import BoardGroup
@@ -40,6 +43,27 @@ class DriftingLink(MemoryLink):
     def read(self, timeout_s):
         data = super().read(timeout_s)
         return b"" if self.is_cut else data
+
+
+class BreakingLink(DriftingLink):
+    """Link that may break."""
+
+    is_broken = False
+
+    def read(self, timeout_s):
+        self._require_whole()
+        return super().read(timeout_s)
+
+    def write(self, data):
+        self._require_whole()
+        super().write(data)
+
+    def open(self):
+        self._require_whole()
+
+    def _require_whole(self):
+        if self.is_broken:
+            raise LinkError(f"/dev/{self.name}: unplugged")
 
 
 class BusyLink(DriftingLink):
@@ -88,14 +112,15 @@ class StageRig(PlannerRig):
         ]
         self.session = sessions[0]
         skew_max_s = self.display.config.limits.stage_skew_max_s
-        return BoardGroup(sessions, self.clock, [board.stage for board in boards], skew_max_s)
+        openers = [partial(self.open_link, link) for link in self.links]
+        return BoardGroup(sessions, self.clock, openers, [board.stage for board in boards], skew_max_s)
 
     def build_core(self, stage, settings, sink):
         return BoardCore(settings, sink=sink, seed=3 + stage)
 
-    def open_port(self):
-        for link in self.links:
-            link.open()
+    @staticmethod
+    def open_link(link):
+        link.open()
         return True
 
     def list_pulses(self):

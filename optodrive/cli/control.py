@@ -144,6 +144,8 @@ def _format_board(board: "BoardReport") -> str:
 
 
 def _format_stage(stage: "StageReport") -> str:
+    if not stage.connected:
+        return f"{stage.name} at {stage.port}: no link: {stage.error}"
     clock = "clock unknown"
     if stage.clock_error_us is not None and stage.clock_drift_ppm is not None:
         clock = f"clock known to {stage.clock_error_us:.0f} µs, drifts {stage.clock_drift_ppm:+.1f} ppm"

@@ -71,7 +71,10 @@ def _report_changes(config: str | None, stage: str | None, json: bool) -> None:
 
 
 def examine(config: str | None, root: Path = Path("/"), stage: str | None = None) -> list["Finding"]:
-    """Return all findings in order; `root` replaces / in tests. stage: the only one to examine, of several."""
+    """Return all findings in order; `root` replaces / in tests. stage: the only one to examine, of several.
+
+    Raise InputError for a stage that the configuration does not have.
+    """
     from optodrive.cli import doctor_host as host
     from optodrive.cli.doctor_finding import report_problem
     from optodrive.core.clock import MonotonicClock
@@ -82,12 +85,12 @@ def examine(config: str | None, root: Path = Path("/"), stage: str | None = None
     findings = [host.check_python(), *host.check_packages()]
     try:
         loaded = load_config(config)
-        stages = loaded.list_stage_configs() if stage is None else (loaded.select_stage(stage),)
     except InputError as error:
         return [
             *findings,
             report_problem("configuration", str(error), "correct it; `optodrive config check` checks it again"),
         ]
+    stages = loaded.list_stage_configs() if stage is None else (loaded.select_stage(stage),)
     findings += [host.check_clock(clock, loaded.lease_s), host.check_governor(root)]
     findings += [*host.check_disk(), host.check_kernels()]
     for one in stages:

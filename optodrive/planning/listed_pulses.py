@@ -13,6 +13,7 @@ from optodrive.planning.summary_schema import PulseColumns
 
 PULSES_LISTED_MAX = 20_000
 """The largest number of pulses that a response lists one by one."""
+UInt8Array = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
 Int32Array = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
 
 
@@ -27,11 +28,12 @@ class ListedPulses:
     width_s: FloatArray
     power_w: FloatArray
     pixel: Int32Array
+    stage: UInt8Array
     energy_j: FloatArray
     trimmed_j: FloatArray
     target_m: FloatArray
     predicted_m: FloatArray
-    reason: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
+    reason: UInt8Array
     reasons: tuple[str, ...]
 
     @classmethod
@@ -49,6 +51,7 @@ class ListedPulses:
             width_s=_detach(plan.width_s),
             power_w=_detach(plan.power_w),
             pixel=plan.pixel.astype(np.int32),
+            stage=plan.stage.astype(np.uint8),
             energy_j=_detach(plan.energy_j),
             trimmed_j=_detach(plan.trimmed_j),
             target_m=_detach(plan.target_m),
@@ -72,6 +75,7 @@ class ListedPulses:
             width_s=self.width_s.tolist(),
             power_w=self.power_w.tolist(),
             pixel=self.pixel.tolist(),
+            stage=self.stage.tolist(),
             energy_j=self.energy_j.tolist(),
             trimmed_j=self.trimmed_j.tolist(),
             reason=[self.reasons[index] for index in self.reason.tolist()],

@@ -116,12 +116,16 @@ class PlanSummary(JsonModel):
 
 
 class PulseColumns(JsonModel):
-    """The pulses of a plan by column, in order; `target_um` is None for a pulse without a target height."""
+    """The pulses of a plan by column, in order; `target_um` is None for a pulse without a target height.
+
+    stage: number of the pulse's stage, in the order of the configuration, from 0
+    """
 
     start_s: FloatColumn
     width_s: FloatColumn
     power_w: FloatColumn
     pixel: IntColumn
+    stage: IntColumn
     energy_j: FloatColumn
     trimmed_j: FloatColumn
     reason: TextColumn

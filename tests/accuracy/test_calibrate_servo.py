@@ -61,6 +61,23 @@ def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, 
     assert any("one servo model covers both" in remark for remark in report["remarks"])
 
 
+def test_a_stage_s_servos_are_held_against_its_own_scanner(folder, capsys):
+    config = folder / "stages.toml"
+    stages = [
+        f'\n[[stages]]\nname = "{name}"\nscanner = {{ bandwidth_hz = {hz} }}\n'
+        for name, hz in (("left", 900.0), ("right", 1600.0))
+    ]
+    config.write_text(locate_shipped("display-437.toml").read_text() + "".join(stages))
+    arguments = ["calibrate", "servo", f"{folder}/r.h5", "--json", "--config", str(config)]
+    assert run(arguments) == 2
+    assert capsys.readouterr().err == "optodrive: --stage: got None, expected one of left, right\n"
+    settling_s = []
+    for name in ("left", "right"):
+        assert run([*arguments, "--stage", name]) == 0
+        settling_s.append(json.loads(capsys.readouterr().out)["axes"]["x"]["settling"][0]["gate"]["configured_s"])
+    assert settling_s[0] > settling_s[1]
+
+
 def test_the_one_servo_settles_no_sooner_than_either_mirror(folder):
     config = load_config(write_config(folder))
     for axis, hidden in enumerate(SERVOS):

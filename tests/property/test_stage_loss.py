@@ -7,39 +7,18 @@ from hypothesis import strategies as st
 
 from displays import DISPLAYS
 from link_service_rig import WEB
-from optodrive.core.errors import LinkError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.link.board_setup import build_scales
 from optodrive.link.protocol.states import ARMED_STATES
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.session import session
 from planner_rig import build_frame
-from stage_rig import DriftingLink, StageRig, build_stages
+from stage_rig import BreakingLink, StageRig, build_stages
 
 LEASE_S = DISPLAYS["display-437"].config.board.lease_s
 REACTION_S = 0.02
 """Time from what ends the light until the last gate is off, without the lease."""
 KINDS = ("fault", "silence", "unplugged", "power lost", "emergency stop")
-
-
-class BreakingLink(DriftingLink):
-    """Link that may break."""
-
-    is_broken = False
-
-    def read(self, timeout_s):
-        if self.is_broken:
-            raise LinkError(f"{self.name}: unplugged")
-        return super().read(timeout_s)
-
-    def write(self, data):
-        if self.is_broken:
-            raise LinkError(f"{self.name}: unplugged")
-        super().write(data)
-
-    def open(self):
-        if self.is_broken:
-            raise LinkError(f"{self.name}: unplugged")
 
 
 def break_board(rig, stage, kind):

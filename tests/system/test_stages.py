@@ -219,6 +219,8 @@ def test_status_shows_the_stages_and_the_commands_select_one(drifting, tmp_path)
     drifting.daemon.stop()
     text = run("home", "--stage", "right", "--config", config)[1]
     assert "right/tty" in text
+    status, text = run("doctor", "--stage", "top", "--config", config)
+    assert (status, text) == (2, "optodrive: --stage: got 'top', expected one of left, right\n")
     status, text = run("doctor", "--stage", "right", "--config", config)
     assert "right port" in text
     assert "left port" not in text

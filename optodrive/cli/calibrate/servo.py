@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.cli.output import print_json
 from optodrive.core.errors import InputError
 
@@ -15,6 +15,7 @@ def servo(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording of steps of both mirrors.")],
     out: Annotated[Path | None, typer.Option("--out", metavar="mirrors.toml", help="Write the servos.")] = None,
     config: ConfigOption = None,
+    stage: StageOption = None,
     json: JsonOption = False,
 ) -> None:
     """Identify both mirror servos from a recording of steps, and compare them with the configuration."""
@@ -32,7 +33,7 @@ def servo(
 
     check_output("--out", out, ".toml")
     # Servos measured before are not loaded: an invalid mirrors.toml must not prevent a new identification.
-    loaded, source = load_config(config, measured_servo=False), str(recording)
+    loaded, source = load_config(config, measured_servo=False).select_stage(stage), str(recording)
     measurement = read_recording(recording)
     reference = load_parameters(loaded.pixel_model.parameters).build_pixel(loaded.display.bridge_width_m)
     check_recording_units(measurement, reference, source)

@@ -12,7 +12,7 @@ from optodrive.core.units import m_to_um
 from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport, PlanStatus
 from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.timing_error import TimingError
-from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses
+from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses, UInt8Array
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.summary_schema import PlanSummary
 
@@ -40,8 +40,8 @@ class LargestTarget(NamedTuple):
 class Execution:
     """What the board executed of a plan.
 
-    start_s, width_s, power_w, pixel, simulated_m: [n] columns as in `ExecutedPulses`, and displacements computed from
-    them; all empty if n exceeds PULSES_LISTED_MAX; simulated_m is None until the simulation is done
+    start_s, width_s, power_w, pixel, stage, simulated_m: [n] columns as in `ExecutedPulses`, and displacements computed
+    from them; all empty if n exceeds PULSES_LISTED_MAX; simulated_m is None until the simulation is done
     complete: whether no report is missing; is_listed: whether the columns are complete
     simulated_max_m, simulated_target_m: largest displacement, and that of the plan's largest target
     """
@@ -50,6 +50,7 @@ class Execution:
     width_s: FloatArray
     power_w: FloatArray
     pixel: Int32Array
+    stage: UInt8Array
     complete: bool
     is_listed: bool
     simulated_m: FloatArray | None = None
@@ -77,6 +78,7 @@ class Execution:
             width_s=executed.width_s[kept].copy(),
             power_w=executed.power_w[kept].copy(),
             pixel=executed.pixel[kept].astype(np.int32),
+            stage=executed.stage[kept].astype(np.uint8),
             complete=executed.complete,
             is_listed=is_listed,
             simulated_m=None if simulated_m is None else simulated_m[kept].copy(),
@@ -98,6 +100,7 @@ class Execution:
             width_s=self.width_s.tolist(),
             power_w=self.power_w.tolist(),
             pixel=self.pixel.tolist(),
+            stage=self.stage.tolist(),
             simulated_um=[] if self.simulated_m is None else m_to_um(self.simulated_m).tolist(),
         )
 

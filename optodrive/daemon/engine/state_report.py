@@ -43,7 +43,7 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
             **session.stats,
         ),
         board=_build_board_report(session),
-        stages=build_stage_reports(session.stages if session.connected else ()),
+        stages=build_stage_reports(session.stages),
         control=build_control_report(session.control),
         queue=planner_state.queue,
         totals=planner_state.totals,
@@ -54,7 +54,4 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
 
 def _build_board_report(session: RemoteSession) -> BoardReport:
     """Report the board; without a link its state is unknown, and the last one would be a claim."""
-    report = BoardReport(**session.board.to_dict())
-    if session.connected:
-        return report
-    return report.model_copy(update={"state": "UNKNOWN", "fault": None, "hint": ""})
+    return BoardReport(**(session.board if session.connected else session.board.forget_state()).to_dict())

@@ -43,12 +43,13 @@ class MaxTarget(JsonModel):
 
 
 class ExecutedColumns(JsonModel):
-    """Executed pulses by column, in order; `simulated_um` is empty until the simulation is done."""
+    """Executed pulses by column, in order, as `PulseColumns`; `simulated_um` is empty until the simulation is done."""
 
     start_s: FloatColumn
     width_s: FloatColumn
     power_w: FloatColumn
     pixel: IntColumn
+    stage: IntColumn
     simulated_um: FloatColumn
 
 

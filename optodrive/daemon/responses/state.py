@@ -52,10 +52,15 @@ class BoardReport(JsonModel):
 
 
 class StageReport(JsonModel):
-    """One of several stages: its board, and how well its clock is known against the host's; None before that."""
+    """One of several stages: its board, and how well its clock is known against the host's; None before that.
+
+    connected: whether the link to its board is up; error: why it is not
+    """
 
     name: str
     port: str
+    connected: bool
+    error: str | None
     board: BoardReport
     clock_error_us: float | None
     clock_drift_ppm: float | None
@@ -140,8 +145,8 @@ class PlannerState(JsonModel):
 class StateReport(JsonModel):
     """The daemon's state: display, link, board, queue, totals, planner and limits; `control` is null unless armed.
 
-    `board` is the sum of all boards, with the state of the one nearest to light; `stages` has each of several, and is
-    empty with one.
+    `board` is the sum of all boards, with the state of the one nearest to light; `stages` always has each of several,
+    and is empty with one.
     """
 
     display: str

@@ -6,7 +6,7 @@ from typing import Any
 
 from optodrive.core.clock import Clock
 from optodrive.core.ipc import IpcError, Message, MessageSocket
-from optodrive.link.service.link_service import CONNECTING
+from optodrive.link.session.board_connector import CONNECTING
 
 CONNECT_INTERVAL_S = 0.02
 

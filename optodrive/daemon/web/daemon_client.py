@@ -19,8 +19,8 @@ from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.peer import Peer
 from optodrive.daemon.web.state_merge import merge_state
 from optodrive.daemon.web.telemetry_hub import TelemetryHub
-from optodrive.link.service.link_service import CONNECTING
 from optodrive.link.service.results import build_error
+from optodrive.link.session.board_connector import CONNECTING
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FitMode
 
@@ -238,14 +238,8 @@ class DaemonClient:
     def build_state(self) -> StateReport:
         """Report the state as last known; it is built once per change."""
         if self._state is None:
-            config = self.display.config
-            self._state = merge_state(
-                config.name,
-                len(self.display.layout),
-                config.board.port or config.board.transport,
-                self.link.status,
-                self.planner.state,
-            )
+            pixels = len(self.display.layout)
+            self._state = merge_state(self.display.config, pixels, self.link.status, self.planner.state)
         return self._state
 
     def encode_state(self) -> bytes:

@@ -15,6 +15,8 @@ from optodrive.daemon.responses.state import (
     build_control_report,
     build_stage_reports,
 )
+from optodrive.device.config import Config
+from optodrive.device.config_sections import BoardSection
 from optodrive.link.session.board_view import BoardView
 
 NO_LINK_PROCESS = "the link process does not run; it is being restarted"
@@ -40,14 +42,14 @@ UNKNOWN_BOARD: Mapping[str, Any] = {"state": "UNKNOWN", "fault": None, "hint": "
 
 
 def merge_state(
-    display: str, pixels: int, port: str, status: Mapping[str, Any] | None, planner: PlannerState | None
+    config: Config, pixels: int, status: Mapping[str, Any] | None, planner: PlannerState | None
 ) -> StateReport:
     """Merge the states of the processes; None for a process that does not run.
 
-    display, pixels: name and size of the display; port: as configured; status: of the link process
+    config: names display, stages and ports; pixels: their number; status: of the link process
     """
     if status is None:
-        link = LinkReport(port=port, state="down", error=NO_LINK_PROCESS, **NO_STATS)
+        link = LinkReport(port=_name_port(config.board), state="down", error=NO_LINK_PROCESS, **NO_STATS)
         board = BoardView().to_dict()
     else:
         link = LinkReport(
@@ -61,17 +63,29 @@ def merge_state(
     control = status["control"] if status is not None and status["connected"] else None
     planner = planner or NO_PLANNER
     return StateReport(
-        display=display,
+        display=config.name,
         pixels=pixels,
         link=link,
         board=BoardReport(**board),
-        stages=build_stage_reports(status["stages"] if status is not None and status["connected"] else ()),
+        stages=build_stage_reports(_list_unknown_stages(config) if status is None else status["stages"]),
         control=build_control_report(control),
         queue=_merge_queue(planner.queue, ends_in_s),
         totals=planner.totals,
         planner=planner.planner,
         limits=planner.limits,
     )
+
+
+def _name_port(board: BoardSection) -> str:
+    return board.port or board.transport
+
+
+def _list_unknown_stages(config: Config) -> list[dict[str, Any]]:
+    """Return each of several stages while the link process does not run."""
+    unknown = {"connected": False, "error": NO_LINK_PROCESS, "board": BoardView().to_dict()}
+    unknown |= {"clock_error_us": None, "clock_drift_ppm": None}
+    stages = config.stages if len(config.stages) > 1 else ()
+    return [{"name": stage.name, "port": _name_port(stage.board), **unknown} for stage in stages]
 
 
 def _merge_queue(queue: QueueReport, pause_ends_in_s: float | None) -> QueueReport:

@@ -32,8 +32,6 @@ No method blocks and no client is waited for: the process has the highest priori
 interleavings are checked by a SPIN model (`firmware_protocol/model/epochs.pml`). Decisions: 26, 31, 32, 35, 37.
 """
 
-from collections.abc import Callable, Iterator
-from math import inf
 from typing import Any, NamedTuple
 
 from optodrive.core.clock import Clock
@@ -52,9 +50,6 @@ from optodrive.link.service.waiters import StateWaiters
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.fault_hints import get_fault_hint
 
-RETRY_INTERVAL_S = 1.0
-CONNECTING = "connecting"
-"""Code of link_error until the first connection has succeeded or failed."""
 UNATTENDED_MAX_S = 5.0
 """Time for which an armed board without points may be without a web process, which starts again within 3 s."""
 WAIT_MAX_S = 0.02
@@ -72,7 +67,6 @@ class LinkService:
     """Core of the link process.
 
     Every method returns at once; the caller sends what `pop_outgoing` returns. Clients are numbers given by the caller.
-    open_port: opens the transport; returns False while it needs more time, raises LinkError or InputError on failure
     first_epoch: greater than every epoch of an earlier link process
     """
 
@@ -80,24 +74,17 @@ class LinkService:
         self,
         boards: BoardGroup,
         clock: Clock,
-        open_port: Callable[[], bool],
         on_web_loss: OnWebLoss = "dark",
         first_epoch: int = 1,
     ) -> None:
         self.epoch = Epoch(first_epoch)
-        self.link_error: OptodriveError | None = LinkError("the board is not reached yet")
-        self.link_error.code = CONNECTING
         self._boards = boards
         self._clock = clock
-        self._open_port = open_port
         self._clients = Clients(on_web_loss, clock)
         self._waiters = StateWaiters()
         self._status = StatusPublisher(boards, clock)
         self.pauses = Pauses(clock)
         self._handover = PointHandover(boards, clock, self.epoch, self.pauses, self._send_to_planner)
-        self._connecting: Iterator[float] | None = None
-        self._connecting_wait_s = 0.0
-        self._retry_at_s = -inf
         self._control: Control | None = None
         self._attended_s = 0.0
         self._seen_fault = ""
@@ -241,7 +228,8 @@ class LinkService:
             raise LinkError(self._describe_link_error() or "no link to the board")
 
     def _describe_link_error(self) -> str:
-        return "" if self.link_error is None else str(self.link_error)
+        error = self._boards.link_error
+        return "" if error is None else str(error)
 
     def _reply(self, client: int, request_id: int, error: OptodriveError | None) -> None:
         fields: dict[str, Any] = {"board": self._boards.board.to_dict(), "epoch": self.epoch.number}
@@ -251,8 +239,7 @@ class LinkService:
     def go_dark(self, reason: str) -> None:
         """End the epoch and abort: gate off, queue dropped, DISARMED. reason: for people, as the end of a sentence."""
         self._end_epoch(reason)
-        if self._boards.connected:
-            self._boards.abort()
+        self._boards.abort()
 
     def _end_epoch(self, reason: str) -> None:
         self.epoch.end(reason)
@@ -267,20 +254,18 @@ class LinkService:
 
     def compute_wait_s(self) -> float:
         """Return the longest time for which the loop may wait for bytes of port and clients before step(), s."""
-        if self._boards.connected:
-            return min(self._boards.compute_wait_s(), WAIT_MAX_S)
-        return WAIT_MAX_S if self._connecting is None else min(self._connecting_wait_s, WAIT_MAX_S)
+        return min(self._boards.compute_wait_s(), WAIT_MAX_S)
 
     def step(self, wait_s: float = 0.0) -> None:
         """Send what is due to the board and process what it has sent. wait_s: longest wait for its first byte."""
         if self._boards.connected:
             self._step_session(wait_s)
         else:
-            self._step_connecting(wait_s)
+            self._boards.step_connecting()
         stalled = self._clients.find_stalled()
         control = self._control if self._boards.board.state in LEASED_STATES else None
         commands = self._handover.commands
-        status = self._status.build_if_due(self.epoch, self.link_error, control, self.pauses, commands, stalled)
+        status = self._status.build_if_due(self.epoch, control, self.pauses, commands, stalled)
         if status is not None:  # before the results: who knows of ARMED from one may push to the planner at once
             self._outgoing.append(Outgoing(self._clients.list_observers(), status))
         refusal = self._boards.pop_refusal()
@@ -305,11 +290,8 @@ class LinkService:
             self._end_unattended()
             self._end_abandoned()
             self._end_long_pause()
-        except (LinkError, InputError) as error:
-            message = self._boards.on_lost(error)
-            self.link_error = LinkError(message) if isinstance(error, LinkError) else error
-            self._retry_at_s = self._clock.now_s() + RETRY_INTERVAL_S
-            self._end_epoch(f"the link to the board was lost: {message}")
+        except (LinkError, InputError):
+            self._end_epoch(f"the link to the board was lost: {self._describe_link_error()}")
 
     def _watch_board(self) -> None:
         """End the epoch when a board has left its arming, or has a new fault. ABORT goes out in any case.
@@ -349,29 +331,6 @@ class LinkService:
     def _end_long_pause(self) -> None:
         if self.pauses.is_too_long:
             self.go_dark(f"the light was paused for {PAUSE_MAX_S:g} s")
-
-    def _step_connecting(self, wait_s: float) -> None:
-        if self._connecting is None:
-            if self._clock.now_s() < self._retry_at_s:
-                self._clock.sleep(wait_s)
-                return
-            self._connecting = self._connect()
-        try:
-            self._connecting_wait_s = next(self._connecting)
-        except StopIteration:
-            self._connecting, self.link_error = None, None
-        except (LinkError, InputError) as error:
-            self._connecting, self.link_error = None, error
-            self._retry_at_s = self._clock.now_s() + RETRY_INTERVAL_S
-
-    def _connect(self) -> Iterator[float]:
-        try:
-            while not self._open_port():
-                yield WAIT_MAX_S
-        except (LinkError, InputError):
-            self._boards.on_connect_failed()
-            raise
-        yield from self._boards.connect_step_by_step()
 
     def close(self) -> None:
         """Send ABORT and close the port permanently."""

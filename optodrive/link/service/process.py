@@ -32,25 +32,23 @@ from optodrive.link.transport.registry import find_transport_factory
 from optodrive.link.transport.threaded_transport import ThreadedTransport
 
 PR_SET_PDEATHSIG = 1
-OPENING_WAIT_S = 0.002
 CAPTURES_MAX = 1000
 
 
 class PortOpener:
-    """Opens all ports in a thread, because a driver, or the start of a simulated board, may block for seconds."""
+    """Opens a port in a thread, because a driver, or the start of a simulated board, may block for seconds."""
 
-    def __init__(self, transports: Sequence[Transport]) -> None:
-        self._transports = transports
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
         self._thread: threading.Thread | None = None
         self._error: Exception | None = None
 
     def __call__(self) -> bool:
-        """Return whether the ports are open, False while it needs more time. Raise the error of a failure."""
+        """Return whether the port is open, False while it needs more time. Raise the error of a failure."""
         if self._thread is None:
             self._error = None
             self._thread = threading.Thread(target=self._open, name="open-port", daemon=True)
             self._thread.start()
-        self._thread.join(OPENING_WAIT_S)
         if self._thread.is_alive():
             return False
         self._thread = None
@@ -60,8 +58,7 @@ class PortOpener:
 
     def _open(self) -> None:
         try:
-            for transport in self._transports:
-                transport.open()
+            self._transport.open()
         except Exception as error:  # raised in the loop's thread
             self._error = error
 
@@ -75,7 +72,7 @@ class LinkProcess:
         boards = build_board_group(settings, transports, clock)
         # Later than every epoch of an earlier link process, which began at most once per microsecond.
         first_epoch = int(clock.now_s() * 1e6)
-        self._service = LinkService(boards, clock, PortOpener(transports), settings.on_web_loss, first_epoch)
+        self._service = LinkService(boards, clock, settings.on_web_loss, first_epoch)
         self._transports = transports
         self._supervisor = supervisor
         self._clients = ClientSockets(settings.socket_path, settings.socket_mode, self._service)
@@ -168,7 +165,8 @@ def build_board_group(settings: LinkSettings, transports: Sequence[Transport], c
     """Build the sessions with the boards of all stages."""
     pairs, has_several = zip(transports, settings.boards, strict=True), len(transports) > 1
     sessions = [BoardSession(transport, clock, board.requirements, has_several) for transport, board in pairs]
-    return BoardGroup(sessions, clock, [board.stage for board in settings.boards], settings.skew_max_s)
+    openers = [PortOpener(transport) for transport in transports]
+    return BoardGroup(sessions, clock, openers, [board.stage for board in settings.boards], settings.skew_max_s)
 
 
 def read_settings(path: Path) -> LinkSettings:

@@ -3,7 +3,6 @@
 from math import inf
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message
 from optodrive.core.scheduling import has_realtime_priority
 from optodrive.link.service.control import Control
@@ -30,7 +29,6 @@ class StatusPublisher:
     def build_if_due(
         self,
         epoch: Epoch,
-        link_error: OptodriveError | None,
         control: Control | None,
         pauses: Pauses,
         commands: int,
@@ -41,11 +39,13 @@ class StatusPublisher:
         control: who armed the board; commands: number of the planner's commands carried out since it connected
         stalled: role of the process that withholds the lease, so that the board cannot be armed; '' if none does
         """
-        boards, board = self._boards, self._boards.board
+        boards, board, link_error = self._boards, self._boards.board, self._boards.link_error
         outcome = boards.is_ready, boards.last_event_reason, boards.likely_cause
         causes = None if control is None else control.arming, commands, stalled, *outcome
         pause = pauses.number, pauses.is_paused
-        key = (epoch.number, pause, boards.connected, link_error, board.state, board.fault, *causes)
+        links = boards.connected, None if link_error is None else str(link_error)
+        states = tuple(session.board.state for session in boards.sessions)
+        key = (epoch.number, pause, links, states, board.state, board.fault, *causes)
         now_s = self._clock.now_s()
         if key == self._published and now_s < self._due_s:
             return None

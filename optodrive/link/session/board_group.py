@@ -6,16 +6,17 @@ emitted: all boards drop their points, and stay armed.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf
 from typing import Any
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import LinkError, NotReadyError
+from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, BoardState
+from optodrive.link.session.board_connector import BoardConnector
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import DRIFT_MAX, ClockFit
 from optodrive.link.session.lease_renewal import LeaseRenewal
@@ -47,19 +48,25 @@ STATE_ORDER = (
 class BoardGroup:
     """Sessions with the boards of all stages, under the names of `BoardSession`.
 
-    sessions: of each stage; names: of the stages, '' if there is one
+    sessions: of each stage; open_ports: as for `BoardConnector`; names: of the stages, '' if there is one
     skew_max_s: largest error of a board's clock with which a plan may start
     """
 
     def __init__(
-        self, sessions: Sequence[BoardSession], clock: Clock, names: Sequence[str] = ("",), skew_max_s: float = inf
+        self,
+        sessions: Sequence[BoardSession],
+        clock: Clock,
+        open_ports: Sequence[Callable[[], bool]],
+        names: Sequence[str] = ("",),
+        skew_max_s: float = inf,
     ) -> None:
         self.sessions = tuple(sessions)
         self.names = tuple(names)
+        pairs = zip(self.sessions, open_ports, strict=True)
+        self._connectors = tuple(BoardConnector(session, clock, open_port) for session, open_port in pairs)
         self._clock = clock
         self._skew_max_s = skew_max_s
         self._refusal: str | None = None
-        self._failed: BoardSession | None = None
         self._clocks_awaited_s = clock.now_s()
         self.has_several = len(self.sessions) > 1
         self.on_executed: Callable[[int, m.Executed], None] = lambda stage, message: None
@@ -183,9 +190,8 @@ class BoardGroup:
 
     @property
     def _worst(self) -> BoardSession:
-        """The session to blame: the one that failed last, has a fault, or has left the armed states."""
-        suspects = [self._failed] if self._failed is not None else []
-        suspects += [session for session in self.sessions if session.board.fault]
+        """The session to blame: the one that has a fault, or has left the armed states."""
+        suspects = [session for session in self.sessions if session.board.fault]
         suspects += [session for session in self.sessions if session.board.state not in ARMED_STATES]
         return suspects[0] if suspects else self.sessions[0]
 
@@ -215,43 +221,27 @@ class BoardGroup:
 
     # --- connecting ---------------------------------------------------------------------------------------------
 
-    def connect_step_by_step(self) -> Iterator[float]:
-        """Perform the handshakes over the open ports, and yield the longest wait before the next step.
+    @property
+    def link_error(self) -> OptodriveError | None:
+        """Why a board is not reached, with the name of its stage, None once all are."""
+        for session, connector in zip(self.sessions, self._connectors, strict=True):
+            if connector.error is not None:
+                if not self.has_several:
+                    return connector.error
+                error = LinkError(f"{self._name(session)}{connector.error}")
+                error.code = connector.error.code
+                return error
+        return None
 
-        Raise LinkError without an answer, InputError if a board does not meet the requirements.
-        """
-        self._failed = None
-        pending = {session: session.connect_step_by_step() for session in self.sessions}
-        while pending:
-            wait_s = inf
-            for session in self.sessions:
-                self._failed = session
-                if session in pending:
-                    try:
-                        wait_s = min(wait_s, next(pending[session]))
-                    except StopIteration:
-                        del pending[session]
-                else:
-                    session.step(0.0, renew_lease=False)
-            self._failed = None
-            if pending:
-                yield wait_s
+    def step_connecting(self) -> None:
+        """Go on with the connections of the boards that are not reached, and keep those of the others."""
+        for connector in self._connectors:
+            connector.step()
 
-    def on_connect_failed(self) -> None:
-        """Close all ports after one could not be opened, or its board did not answer."""
-        for session in self.sessions:
-            if session.connected:
-                session.leave()
-            else:
-                session.on_connect_failed()
-
-    def on_lost(self, error: Exception) -> str:
-        """Close all links after an error of one, with ABORT to the other boards; return its message, with the cause."""
-        failed = self._failed or self.sessions[0]
-        for session in self.sessions:
-            if session is not failed:
-                session.leave()
-        return f"{self._name(failed)}{failed.on_lost(error)}"
+    def _lose(self, session: BoardSession, error: OptodriveError) -> None:
+        """Close the link to a board after an error, with ABORT to the others, whose links stay open."""
+        self._connectors[self.sessions.index(session)].lose(error)
+        self.abort()
 
     def close(self) -> None:
         """Send ABORT if possible and close all links permanently."""
@@ -265,9 +255,11 @@ class BoardGroup:
         self._drop_late_points()
         self._seek_clocks()
         for session in self.sessions:
-            self._failed = session
-            session.step(wait_s if session is self.sessions[0] else 0.0, renew_lease, stalled)
-        self._failed = None
+            try:
+                session.step(wait_s if session is self.sessions[0] else 0.0, renew_lease, stalled)
+            except (LinkError, InputError) as error:
+                self._lose(session, error)
+                raise
 
     def _seek_clocks(self) -> None:
         """Compare the clocks more often while they are not known well enough for the start of a plan."""
@@ -289,7 +281,7 @@ class BoardGroup:
 
     def compute_wait_s(self) -> float:
         """Return the longest time for which the next step may wait if no bytes arrive, s."""
-        return min(session.compute_wait_s() for session in self.sessions)
+        return min(connector.compute_wait_s() for connector in self._connectors)
 
     def pop_refusal(self) -> str | None:
         """Return and clear the reason for which a board, or this group, refused the last command."""
@@ -319,7 +311,8 @@ class BoardGroup:
     def abort(self) -> None:
         """Turn all gates off, drop the queues and disarm, before all other queued messages."""
         for session in self.sessions:
-            session.abort()
+            if session.connected:
+                session.abort()
 
     def end_arming(self) -> None:
         """End the arming of all boards: neither lease nor confirmation, nor points handed over so far."""
@@ -430,14 +423,19 @@ class BoardGroup:
         return merged
 
     def list_stages(self) -> list[dict[str, Any]]:
-        """Return name, port, board and clock of each of several stages, for the status; nothing of one."""
+        """Return name, port, board, link and clock of each of several stages, for the status; nothing of one.
+
+        A board without a link has no known state.
+        """
         if not self.has_several:
             return []
         now_s = self._clock.now_s()
         stages = []
-        for name, session in zip(self.names, self.sessions, strict=True):
-            fit = session.clock_sync.fit(now_s)
-            stage: dict[str, Any] = {"name": name, "port": session.port, "board": session.board.to_dict()}
+        for name, session, connector in zip(self.names, self.sessions, self._connectors, strict=True):
+            fit = session.clock_sync.fit(now_s) if session.connected else None
+            stage: dict[str, Any] = {"name": name, "port": session.port, "connected": session.connected}
+            stage["board"] = (session.board if session.connected else session.board.forget_state()).to_dict()
+            stage["error"] = None if connector.error is None else str(connector.error)
             stage["clock_error_us"] = None if fit is None else 1e6 * fit.uncertainty_s
             stage["clock_drift_ppm"] = None if fit is None else 1e6 * (fit.rate - 1.0)
             stages.append(stage)

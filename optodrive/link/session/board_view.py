@@ -1,7 +1,7 @@
 """Latest state of the board as reported to the host."""
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.states import BoardState
@@ -43,6 +43,10 @@ class BoardView:
             self.fault = fault
         if state != BoardState.FAULT:
             self.fault = ""
+
+    def forget_state(self) -> Self:
+        """Return the view without a link: the last state would be a claim."""
+        return replace(self, state="UNKNOWN", fault="")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields of the REST response, with a hint on the fault's likely cause."""

@@ -275,12 +275,6 @@ class BoardSession:
         self.connected = False
         self._transport.release()
 
-    def leave(self) -> None:
-        """Send ABORT if possible and close the link. It may be opened again."""
-        if self.connected:
-            self._send_abort()
-        self.disconnect()
-
     def _send_abort(self) -> None:
         with suppress(LinkError):  # without ABORT the board turns the gate off when its lease expires
             self._connection.abort()

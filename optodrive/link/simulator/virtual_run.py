@@ -10,6 +10,7 @@ from optodrive.link.board_setup import build_scales
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
 from optodrive.link.service.link_settings_builder import build_board_settings
+from optodrive.link.session.board_connector import CONNECTING
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
@@ -30,8 +31,7 @@ def execute(
     Raise BoardFaultError if a board disarms or enters FAULT.
     """
     boards = _build_boards(display.config)
-    for _ in boards.connect_step_by_step():
-        pass
+    _connect(boards)
     boards.arm()
     while boards.board.state != BoardState.ARMED:
         _step(boards)
@@ -57,7 +57,16 @@ def _build_boards(config: Config) -> BoardGroup:
         )
         for stage, one in enumerate(settings)
     ]
-    return BoardGroup(sessions, clock, [one.stage for one in settings])
+    openers: list[Callable[[], bool]] = [lambda: True] * len(sessions)
+    return BoardGroup(sessions, clock, openers, [one.stage for one in settings])
+
+
+def _connect(boards: BoardGroup) -> None:
+    while not boards.connected:
+        boards.step_connecting()
+        error = boards.link_error
+        if error is not None and error.code != CONNECTING:
+            raise error
 
 
 def _step(boards: BoardGroup) -> None:

@@ -230,6 +230,11 @@ def test_the_command_exits_0_without_a_problem_and_1_with_one(tmp_path, capsys, 
     assert "PROBLEM  configuration" in capsys.readouterr().out
 
 
+def test_a_stage_that_is_not_configured_is_refused_and_the_configuration_not_blamed(capsys):
+    assert run(["doctor", "--config", "display-16", "--stage", "top"]) == 2
+    assert capsys.readouterr().err == "optodrive: --stage: got 'top', expected none: the display has one stage\n"
+
+
 def test_watch_reports_what_changed_and_no_numbers_that_vary(tree):
     clock, trips = ManualClock(), iter((0.4, 0.5, 0.6, 0.7))
     (tree / "run/udev/data/c166:0").write_text("E:ID_MM_DEVICE_IGNORE=1\n")

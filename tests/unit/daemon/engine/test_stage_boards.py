@@ -12,7 +12,7 @@ from optodrive.link.protocol.states import ARMED_STATES, BoardState
 from optodrive.link.session import plan_job
 from optodrive.link.simulator.board_clock import BoardClock
 from planner_rig import build_frame, build_train
-from stage_rig import CLOCKS, BusyLink, StageRig, build_stages
+from stage_rig import CLOCKS, BreakingLink, BusyLink, StageRig, build_stages
 
 LEASE_S = DISPLAYS["display-16"].config.board.lease_s
 
@@ -83,6 +83,9 @@ def test_a_frame_is_drawn_by_all_boards_at_once(rig):
     pulses = rig.list_pulses()
     assert len(pulses) == 16
     assert set(pulses[:, 4]) == set(range(len(rig.logs)))
+    columns = record.pulses.to_columns()
+    assert columns.stage == record.execution.to_columns().stage
+    assert sorted(columns.stage) == sorted(pulses[:, 4].tolist())
     assert record.execution.simulated_m == pytest.approx(np.full(16, 60e-6), rel=0.01)
     assert abs(record.timing_error.max_abs_s) < 1e-4
     check_beams(rig)
@@ -203,6 +206,31 @@ def test_a_board_that_falls_silent_ends_the_light_of_all(rig):
     rig.arm()
     rig.run(0.01)
     assert finish(rig, submit(rig, build_frame())).status == "done"
+
+
+@pytest.mark.parametrize("lost_for_s", [0.05, 5.0])
+def test_every_stage_is_listed_with_its_state_after_one_was_lost(monkeypatch, lost_for_s):
+    """The links to the others stay open; what the lost board did last would be a claim."""
+    rig = StageRig(monkeypatch, build_stages("display-16", 3), link_type=BreakingLink).ready()
+    rig.run(2.0)
+    rig.arm()
+    record = submit(rig, build_trains(3, 9.0))
+    rig.until(lambda: record.executed_count > 20)
+    rig.links[1].is_broken = True
+    rig.cores[1].on_link_lost(rig.links[1]._now_us())
+    rig.run(lost_for_s)
+    stages = rig.remote.stages
+    assert [stage["name"] for stage in stages] == ["s0", "s1", "s2"]
+    assert [stage["connected"] for stage in stages] == [True, False, True]
+    assert [stage["board"]["state"] for stage in stages] == ["DISARMED", "UNKNOWN", "DISARMED"]
+    assert [stage["board"]["fault"] for stage in stages] == [None, None, None]
+    assert (stages[0]["error"], stages[2]["error"]) == (None, None)
+    assert "/dev/s1: unplugged" in stages[1]["error"]
+    assert rig.remote.link_error.startswith("stage 's1': /dev/s1: unplugged")
+    assert (stages[1]["clock_error_us"], stages[1]["clock_drift_ppm"]) == (None, None)
+    rig.links[1].is_broken = False
+    rig.until(lambda: rig.remote.connected)
+    assert [stage["error"] for stage in rig.remote.stages] == [None, None, None]
 
 
 def test_arming_is_of_all_boards_or_of_none(monkeypatch):

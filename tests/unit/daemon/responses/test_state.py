@@ -14,6 +14,7 @@ def test_columns_keep_their_types_in_json():
         width_s=column,
         power_w=column,
         pixel=[1, 2],
+        stage=[0, 1],
         energy_j=column,
         trimmed_j=column,
         reason=["", "pulse_energy"],

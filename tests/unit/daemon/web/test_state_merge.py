@@ -1,8 +1,10 @@
 import pytest
 
+from displays import DISPLAYS
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.web.state_merge import NO_PLANNER, NO_STATS, merge_state
 from optodrive.link.session.board_view import BoardView
+from stage_rig import build_stages
 
 STATUS = {
     "connected": True,
@@ -16,8 +18,8 @@ STATUS = {
 }
 
 
-def merge(status=STATUS, planner=NO_PLANNER):
-    state = merge_state("display-16", 16, "/dev/ttyACM0", status, planner)
+def merge(status=STATUS, planner=NO_PLANNER, config=DISPLAYS["display-16"].config):
+    state = merge_state(config, 16, status, planner)
     assert StateReport.model_validate_json(state.model_dump_json()) == state
     return state
 
@@ -36,6 +38,20 @@ def test_a_board_without_a_link_has_no_known_state():
     assert (state.board.state, state.board.fault, state.board.hint) == ("UNKNOWN", None, "")
     assert (state.link.state, state.link.error) == ("down", "the cable is out")
     assert state.control is None
+
+
+def test_every_stage_is_listed_without_a_link_process_or_a_link():
+    config = build_stages("display-16", 2).config
+    unknown = merge(None, config=config).stages
+    assert [(stage.name, stage.connected, stage.board.state) for stage in unknown] == [
+        ("s0", False, "UNKNOWN"),
+        ("s1", False, "UNKNOWN"),
+    ]
+    assert "link process does not run" in unknown[0].error
+    left = unknown[1].model_dump() | {"connected": True, "error": None, "board": BoardView(state="DISARMED").to_dict()}
+    status = {**STATUS, "connected": False, "link_error": "stage 's0': unplugged"}
+    status["stages"] = [unknown[0].model_dump(), left]
+    assert [stage.board.state for stage in merge(status, config=config).stages] == ["UNKNOWN", "DISARMED"]
 
 
 @pytest.mark.parametrize(("status", "planner"), [(None, NO_PLANNER), (STATUS, None), (None, None)])
