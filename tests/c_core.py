@@ -192,7 +192,7 @@ class CBoard:
         """Run ticks every 100 µs up to now_us; loop: whether the main loop runs then."""
         self._library.shim_run(self._handle, now_us)
         if loop:
-            self._library.shim_receive(self._handle, b"", 0)
+            self.run_loop()
         self._drain()
 
     def tick(self, now_us):
@@ -202,6 +202,10 @@ class CBoard:
 
     def receive(self, data, now_us):
         self.advance(now_us)
+        self.run_loop(data)
+
+    def run_loop(self, data=b""):
+        """Run one iteration of the main loop without a tick."""
         self._library.shim_receive(self._handle, data, len(data))
         self._drain()
 
@@ -210,13 +214,12 @@ class CBoard:
         return ctypes.string_at(self._out, length)
 
     def set_input(self, name, value, now_us):
+        """Change an input's level, which the next tick reads."""
         self.advance(now_us)
         self.inputs[name] = value
         self._sink({"t_us": now_us, "event": "input", "input": name, "value": value})
         bits = sum(INPUT_BITS[name] for name, on in self.inputs.items() if on)
         self._library.shim_set_inputs(self._handle, bits)
-        self._library.shim_tick(self._handle, now_us)
-        self._drain()
 
     def stick(self, stuck, on=False):
         """Freeze the gate's readback at `on`, or release it."""

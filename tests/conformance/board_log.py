@@ -39,6 +39,10 @@ class BoardLog:
         edges = self.of("gate")
         return bool(edges) and edges[-1]["on"]
 
+    def output_edges(self):
+        """Return (time, on) of each edge of the gate's output, by default as logged."""
+        return [(entry["t_us"], entry["on"]) for entry in self.of("gate")]
+
     def wait(self, condition, what):
         """Wait until condition() is true, without a host."""
         until_s = self.clock.now_s() + self.patience_s

@@ -141,7 +141,9 @@ def only_a_lease_of_this_session_prevents_fault_link(bench, state):
 
 SPLITS = {
     "the same place": [here(30_000), here(20_001)],
-    "a border between": [here(30_000, x=CENTRE + 649, y=CENTRE - 651), here(20_001, x=CENTRE + 650, y=CENTRE - 650)],
+    "the same cell": [here(30_000), here(20_001, x=CENTRE + 300)],
+    "a border between": [here(30_000, x=CENTRE + 649), here(20_001, x=CENTRE + 650)],
+    "a corner between": [here(30_000, x=CENTRE + 649, y=CENTRE - 651), here(20_001, x=CENTRE + 650, y=CENTRE - 650)],
     "no rest between": [here(30_000), here(20_001, dark_us=499)],
     "hardly any power": [here(25_000, duty=655), here(25_001, duty=655)],
 }
@@ -177,6 +179,19 @@ def only_a_full_rest_clears_the_on_time(bench):
     wait_for_log(host, lambda board: board.of("fault") or len(board.pulse_numbers()) == 6, "the fault")
     assert host.board.faults() == ["ON_TIME"]
     assert len(host.board.pulse_numbers()) == 5
+
+
+@scenario("B4")
+def interrupted_pulse_counts_in_full(bench):
+    host = bench.ready(rest_us=60_000, **PATIENT)
+    host.play(here(40_000, duty=100))
+    host.wait(host.board.is_gate_on, "light")
+    assert host.send_checked("FLUSH") == []
+    host.play(here(20_000, duty=100))
+    wait_for_log(host, lambda board: board.states()[-1][1] in ("fault", "job done"), "the end")
+    (pulse,), (_, second) = host.board.of("pulse")[:1], host.board.changes("start")
+    has_rested = second["t_us"] >= pulse["on_us"] + 40_000 + 60_000
+    assert host.board.faults() == ["ON_TIME"] * (not has_rested)
 
 
 # --- B5 -------------------------------------------------------------------------------------------------------------
@@ -255,20 +270,20 @@ def gate_waits_for_settling_and_dark_us(bench):
         before_us = pulse["off_us"]
 
 
-@scenario("B7")
-def interrupted_move_still_has_to_settle(bench):
+@scenario("B7", {"under way": 0.05, "arrived": 2.5})
+def interrupted_move_still_has_to_settle(bench, pause_s):
     host = bench.ready(settle_ns_per_code=65_000, **{**BRIGHT, "settle_us": 1000})
     move_us = 1000 + 32_000 * 65
     host.play(here(100, x=CENTRE + 32_000))
     host.pause(0.05)
     assert host.send_checked("FLUSH") == []
+    host.pause(pause_s - 0.05)
     host.play(here(100, x=CENTRE + 32_000), here(100, x=CENTRE + 32_000, dark_us=10))
     wait_for_log(host, lambda board: len(board.pulse_numbers()) == 2, "the pulses")
     started = [entry["t_us"] for entry in host.board.changes("start")]
     assert len(started) == 2
-    assert started[1] < started[0] + move_us, "the host was late"
     first, _ = host.board.of("pulse")
-    assert 0 <= first["on_us"] - started[0] - move_us <= host.board.late_us
+    assert 0 <= first["on_us"] - max(started[1], started[0] + move_us) <= host.board.late_us
 
 
 @scenario("B7")

@@ -64,12 +64,19 @@ def other_major_version_gets_a_reply_but_cannot_arm(bench):
 
 @scenario("handshake")
 def reset_clears_all_state_and_hello_reports_it(bench):
-    host = bench.greeted(act("reset"), **PATIENT)
+    host = bench.ready(act("reset"), **BRIGHT)
+    host.play(here(100))
+    host.wait_for_change("job done")
     host.board.next_step()
-    host.board.wait(lambda: len(host.board.of("state")) == 2, "the reset")
+    host.board.wait(lambda: len(host.board.changes("boot")) == 2, "the reset")
     assert_no_session(host)
     assert host.hello().reset_cause == 1
+    status = host.status()
+    assert (status.state, status.done_index, status.queued) == ("DISARMED", 0, 0)
     assert host.send_checked("ARM_REQ", host_nonce=1) == []
+    event, logged = host.of("EVENT")[-1], host.board.of("state")[-1]
+    assert event.reason == logged["reason"] == "arm requested"
+    assert event.tick == logged["t_us"] - host.board.changes("boot")[-1]["t_us"], "the clock starts again"
 
 
 def assert_no_session(host):
@@ -100,7 +107,7 @@ def frames_of_other_sessions_or_from_a_board_have_no_effect(bench):
 def abort_is_accepted_in_any_session(bench):
     host = bench.ready(**BRIGHT)
     host.shine()
-    host.request(host.frame("ABORT", session=host.session ^ 0x1234))
+    host.request(host.frame("ABORT", seq=200, session=host.session ^ 0x1234))
     assert host.board.states()[-1] == ("DISARMED", "abort")
     status = host.status()
     assert (status.state, status.queued) == ("DISARMED", 0)
@@ -188,10 +195,43 @@ def message_in_a_wrong_state_is_refused_with_its_reason(bench):
     assert host.send_checked("DISARM") == []
     host.arm()
     assert host.send_checked("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert host.send_checked("ARM_CONFIRM", host_nonce=1, board_nonce=1) == ["STATE"]
+    assert host.send_checked("CLEAR_FAULT") == ["STATE"]
     assert host.send_checked("LIMITS", **_any_limits()) == ["STATE"]
     assert host.send_checked("START", **{**start, "first_index": 1}) == ["INDEX"]
     assert host.send_checked("END", job=1, end_index=0) == ["STATE"]
     assert host.status().state == "ARMED"
+
+
+@scenario("NAK")
+def refusal_within_a_batch_does_not_stop_the_rest(bench):
+    host = bench.ready(**BRIGHT)
+    start = dict(job=1, start_tick=0, watermark=1)
+    frames = [
+        host.data(here(100), here(100)),
+        host.frame("START", first_index=7, **start),
+        host.frame("START", first_index=0, **start),
+        host.frame("END", job=1, end_index=2),
+    ]
+    answers, _ = host.request(b"".join(frames))
+    answers = [m for m in answers if m.name in ("ACK", "NAK")]
+    assert [(m.reason, m.next_seq) for m in answers if m.name == "NAK"] == [("INDEX", (host.seq - 2) % 256)]
+    assert (answers[-1].name, answers[-1].next_seq) == ("ACK", host.seq)
+    host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
+    assert host.board.pulse_numbers() == [0, 1]
+
+
+@scenario("NAK")
+def batch_is_executed_in_order(bench):
+    host = bench.ready(**BRIGHT)
+    frames = [host.data(*[here(1000)] * 24) for _ in range(4)]
+    frames += [host.frame("START", job=1, first_index=0, start_tick=0, watermark=1)]
+    frames += [host.frame("END", job=1, end_index=96), host.frame("FLUSH"), host.frame("DISARM")]
+    answers, _ = host.request(b"".join(frames))
+    assert "NAK" not in {m.name for m in answers}
+    ack = [m for m in answers if m.name == "ACK"][-1]
+    assert (ack.next_seq, ack.done_index, ack.state) == (host.seq, 96, "DISARMED")
+    assert host.board.states()[-3:] == [("RUNNING", "start"), ("ARMED", "flush"), ("DISARMED", "disarm")]
 
 
 # --- clock and status -----------------------------------------------------------------------------------------------
@@ -243,6 +283,7 @@ def points_without_room_are_refused_and_can_be_resent(bench):
     answers, status = host.request(over)
     assert [(m.name, m.reason, m.next_seq) for m in answers] == [("NAK", "NO_ROOM", (host.seq - 1) % 256)]
     assert status.queued == 24
+    assert host.order(host.frame("END", seq=host.seq, job=1, end_index=24)) == ["SEQUENCE"], "it waits for the frame"
     host.seq, host.index = (host.seq - 1) % 256, 24  # the frame was not consumed
     assert host.send_checked("START", job=1, first_index=0, start_tick=0, watermark=1) == []
     host.wait(lambda: host.status().queued <= 20, "room")

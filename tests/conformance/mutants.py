@@ -1,6 +1,7 @@
 """Simulated boards that violate one guard each: python mutants.py NAME --pty LINK ..., as the board process."""
 
 import sys
+from random import Random
 from types import SimpleNamespace
 
 from optodrive.core.errors import RemoteProtocolError
@@ -12,7 +13,7 @@ from optodrive.link.simulator import board_core as core_module
 from optodrive.link.simulator import board_machine as machine_module
 from optodrive.link.simulator import board_process
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, tighten
 from optodrive.link.simulator.board_machine import BoardMachine
 from optodrive.link.simulator.guards import EmissionGuards
 
@@ -202,6 +203,14 @@ def b10_compares_only_with_the_defaults():
     return machine_module, "tighten", lambda own, requested: tightened(DEFAULT_LIMITS, requested)
 
 
+def b10_compares_only_with_the_own_limits():
+    def tighten_limits(self, requested):
+        self.limits = tighten(self._settings.limits, requested)
+        return ""
+
+    return BoardMachine, "tighten_limits", tighten_limits
+
+
 def b11_any_confirmation():
     def confirm(self, host_nonce, board_nonce):
         self._confirmed, self._key_turned = True, False
@@ -223,6 +232,15 @@ def b11_predictable():
             return 4
 
     return core_module, "random", SimpleNamespace(Random=Counting)
+
+
+def b11_two_sessions_alternate():
+    class Alternating(Random):
+        def randrange(self, low, high):
+            self._last = 15 - getattr(self, "_last", 8)
+            return self._last
+
+    return core_module, "random", SimpleNamespace(Random=Alternating)
 
 
 def b11_key_edge_is_not_consumed():

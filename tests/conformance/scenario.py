@@ -13,6 +13,9 @@ TABLE = tomllib.loads((Path(__file__).parents[2] / "firmware_protocol" / "messag
 TRANSITIONS = {(state, entry["event"], entry["to"]) for entry in TABLE["transition"] for state in entry["from"]}
 AT_ONCE = 4
 """Scenarios in real time, which mostly wait for the two seconds of arming."""
+TICK_US = 100
+"""The longest period of a board's tick, which carries out what is due."""
+AT_ONCE_BY = ("abort", "disarm", "flush", "hello", "link lost", "reset")
 GUARDS = [f"B{k}" for k in range(1, 16)]
 
 
@@ -62,6 +65,7 @@ def unseen(board):
 def audit(board):
     """Check the log of a stopped board."""
     audit_log(board.events())
+    audit_output(board.of("gate"), board.output_edges())
 
 
 def audit_log(events, state="BOOT"):
@@ -86,6 +90,14 @@ def audit_log(events, state="BOOT"):
     pulses = [(f"point {entry['index']}", entry["on_us"], entry["off_us"]) for entry in reported]
     shown = set(pulses)
     assert [edge for edge in pulsed if edge in shown] == pulses, "pulses that the gate does not show"
+
+
+def audit_output(logged, edges):
+    """Check that each edge of the output follows the logged one: at once if the host or a reset ends a pulse."""
+    assert [on for _, on in edges] == [entry["on"] for entry in logged], "edges that the log does not show"
+    for entry, (at_us, _) in zip(logged, edges, strict=True):
+        late_max_us = 0 if entry["reason"] in AT_ONCE_BY else TICK_US
+        assert 0 <= at_us - entry["t_us"] <= late_max_us, f"output at {at_us} µs: {entry}"
 
 
 def run_all(kind, cases: list[Scenario]):

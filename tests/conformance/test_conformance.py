@@ -5,9 +5,9 @@ The emulated chip plays in every run what the processes on ptys play; scripts/te
 
 import pytest
 from all_scenarios import MODULES, SCENARIOS
-from bench import Bench
+from bench import BRIGHT, Bench, set_input
 from process_board import has_subject
-from scenario import GUARDS, judge
+from scenario import GUARDS, audit_output, judge
 from test_conformance_pty import list_cases, name_case
 
 
@@ -27,6 +27,24 @@ def test_emulated_chip_conforms(case, virtual):
 )
 def test_conforms(case, name, virtual):
     judge(virtual(name), case)
+
+
+@pytest.mark.parametrize(("reason", "late_us"), [("abort", 1), ("fault", 101)])
+def test_an_output_later_than_its_log_is_detected(virtual, tmp_path, reason, late_us):
+    bench = Bench(virtual("c"), tmp_path)
+    host = bench.ready(set_input("interlock", False), **BRIGHT)
+    host.shine()
+    if reason == "abort":
+        host.send("ABORT")
+    else:
+        host.board.next_step()
+    host.wait_for_change(reason)
+    logged, edges = host.board.of("gate"), host.board.output_edges()
+    assert logged[-1]["reason"] == reason
+    audit_output(logged, edges)
+    late = (logged[-1]["t_us"] + late_us, False)
+    with pytest.raises(AssertionError, match="output at"):
+        audit_output(logged, [*edges[:-1], late])
 
 
 def test_every_module_and_every_guard_is_looked_at():

@@ -8,6 +8,8 @@ from scenario import scenario
 
 INPUTS = {"interlock": False, "key": False, "estop": True}
 """Unsafe levels."""
+REPORTED = {"interlock": 0b010, "key": 0b001, "estop": 0b111}
+"""Inputs in STATUS while one is unsafe."""
 
 # --- B9 -------------------------------------------------------------------------------------------------------------
 
@@ -47,12 +49,12 @@ def unsafe_input_in_disarmed_is_ended_only_by_clear_fault(bench, name):
     assert host.send_checked("ARM_REQ", host_nonce=1) == ["STATE"]
     status = host.status()
     assert (status.state, status.fault) == ("FAULT", name.upper())
-    assert status.inputs == {"interlock": 0b010, "key": 0b001, "estop": 0b111}[name]
+    assert status.inputs == REPORTED[name]
 
 
-@scenario("B9")
-def input_unsafe_at_power_up_prevents_arming_without_a_fault(bench):
-    steps = set_input("interlock", False), act("reset"), set_input("interlock", True)
+@scenario("B9", {name: name for name in INPUTS})
+def input_unsafe_at_power_up_prevents_arming_without_a_fault(bench, name):
+    steps = set_input(name, INPUTS[name]), act("reset"), set_input(name, not INPUTS[name])
     host = bench.greeted(*steps, **PATIENT)
     board = host.board
     board.next_step()
@@ -61,9 +63,9 @@ def input_unsafe_at_power_up_prevents_arming_without_a_fault(bench):
     host.wait(lambda: [state for state, _ in board.states()] == ["DISARMED", "FAULT", "DISARMED"], "the reset")
     host.hello()
     assert host.send_checked("ARM_REQ", host_nonce=1) == ["INPUT"]
-    assert (host.status().state, host.status().inputs) == ("DISARMED", 0b010)
+    assert (host.status().state, host.status().inputs) == ("DISARMED", REPORTED[name])
     board.next_step()
-    host.wait(lambda: len(board.of("input")) == 2, "the interlock")
+    host.wait(lambda: len(board.of("input")) == 2, "the input's return")
     assert host.arm().status().state == "ARMED"
     assert len(board.of("fault")) == 1, "the one from before the reset"
 
@@ -147,6 +149,20 @@ def next_session_restores_the_own_limits(bench):
     assert host.board.faults() == ["ON_TIME"]
 
 
+@scenario("B10")
+def limits_tightened_in_a_fault_apply_after_it(bench):
+    host = bench.greeted(set_input("estop", True), set_input("estop", False), **OWN)
+    for count in (1, 2):
+        host.board.next_step()
+        host.wait(lambda count=count: len(host.board.of("input")) == count, "the emergency stop")
+    assert host.status().state == "FAULT"
+    limits = host.frame("LIMITS", **tightened(max_on_us=10_000))
+    assert host.order(limits, host.frame("CLEAR_FAULT")) == []
+    host.arm()
+    host.order(host.data(here(10_001, **DIM)))
+    assert host.board.faults() == ["ESTOP", "ON_TIME"]
+
+
 # --- B11 ------------------------------------------------------------------------------------------------------------
 
 WRONG = {
@@ -194,16 +210,18 @@ def unconfirmed_arming_times_out(bench):
 
 @scenario("B11")
 def key_edge_is_required_before_each_arming(bench):
-    host = bench.greeted(set_input("key", False), set_input("key", True), key_edge=True, **PATIENT)
+    turn = set_input("key", False), set_input("key", True)
+    host = bench.greeted(*turn, *turn, key_edge=True, **PATIENT)
     assert host.of("HELLO_REPLY")[-1].capabilities & 1
     assert host.send_checked("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "a key that was on at power-up was not turned"
-    for count in (1, 2):
-        host.board.next_step()
-        host.wait(lambda count=count: len(host.board.of("input")) == count, "the key")
-    assert host.send_checked("CLEAR_FAULT") == []
-    host.arm()
-    assert host.send_checked("DISARM") == []
-    assert host.send_checked("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "one turn arms once"
+    for turned in (2, 4):
+        for count in (turned - 1, turned):
+            host.board.next_step()
+            host.wait(lambda count=count: len(host.board.of("input")) == count, "the key")
+        assert host.send_checked("CLEAR_FAULT") == []
+        host.arm()
+        assert host.send_checked("DISARM") == []
+        assert host.send_checked("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "one turn arms once"
 
 
 @scenario("B11")

@@ -51,7 +51,7 @@ class VirtualBoard(BoardLog):
     def __init__(self, make_core, settings, clock, seed, steps):
         self.clock = clock
         self._log = []
-        self._core = make_core(settings, self._log.append, seed=seed)
+        self.core = make_core(settings, self._log.append, seed=seed)
         self._steps = list(steps)
         self._is_open = self._loop_stopped = False
         self._resumes_us = 0
@@ -61,6 +61,10 @@ class VirtualBoard(BoardLog):
     def events(self):
         """Return all log entries so far."""
         return list(self._log)
+
+    def output_edges(self):
+        """Return the edges of the core's calls; the simulated board's are those that it logs."""
+        return self.core.gate_edges if hasattr(self.core, "gate_edges") else super().output_edges()
 
     # --- time ---
 
@@ -73,30 +77,30 @@ class VirtualBoard(BoardLog):
         if now_us < self._resumes_us:
             return
         if self._resumes_us:
-            self._core.tick(self._resumes_us)
+            self.core.tick(self._resumes_us)
             self._resumes_us = 0
         if not self._loop_stopped:
-            self._core.advance(now_us)
+            self.core.advance(now_us)
             self._receive(now_us)
             return
-        self._core.advance(now_us, loop=False)
-        if now_us - self._core.fed_us > WATCHDOG_US:
-            self._core.reset(now_us, WATCHDOG_CAUSE)
+        self.core.advance(now_us, loop=False)
+        if now_us - self.core.fed_us > WATCHDOG_US:
+            self.core.reset(now_us, WATCHDOG_CAUSE)
             self._loop_stopped = False
 
     def _receive(self, now_us):
         data, self._input = self._input, b""
         if data:
-            self._core.receive(data, now_us)
-        self._output += self._core.bytes_to_send() if self._is_open else b""
+            self.core.receive(data, now_us)
+        self._output += self.core.bytes_to_send() if self._is_open else b""
 
     def next_step(self):
         """Carry out the next step of the script."""
         step, now_us = self._steps.pop(0), self.clock.now_us()
         if "set" in step:
-            self._core.set_input(step["set"], step["value"], now_us)
+            self.core.set_input(step["set"], step["value"], now_us)
         elif step["do"] == "reset":
-            self._core.reset(now_us)
+            self.core.reset(now_us)
             self._output = b""
         elif step["do"] == "stop_loop":
             self._loop_stopped = True
@@ -104,7 +108,7 @@ class VirtualBoard(BoardLog):
             self._resumes_us = now_us + LATE_TICK_US
         else:
             assert step["do"] == "stick_gate"
-            self._core.stick(stuck=True, on=self._core.gate_output)
+            self.core.stick(stuck=True, on=self.core.gate_output)
 
     # --- port ---
 
@@ -113,14 +117,14 @@ class VirtualBoard(BoardLog):
         assert not self._is_open, "one host at a time"
         self._is_open = True
         self._log.append({"t_us": self.clock.now_us(), "event": "port", "open": True})
-        self._core.bytes_to_send()
+        self.core.bytes_to_send()
         return VirtualLine(self)
 
     def close(self):
         """Close the port."""
         if self._is_open:
             self._log.append({"t_us": self.clock.now_us(), "event": "port", "open": False})
-            self._core.on_link_lost(self.clock.now_us())
+            self.core.on_link_lost(self.clock.now_us())
             self._is_open, self._output = False, b""
 
     def receive(self, data):
@@ -144,20 +148,20 @@ class EmulatedBoard(VirtualBoard):
 
     def advance(self, now_us):
         """Advance to a time."""
-        self._core.advance(now_us)
+        self.core.advance(now_us)
         self._receive(now_us)
 
     def next_step(self):
         """Carry out the next step of the script."""
-        if self._steps[0].get("do") in self._core.FAULTS:
-            self._core.inject_fault(self._steps.pop(0)["do"])
+        if self._steps[0].get("do") in self.core.FAULTS:
+            self.core.inject_fault(self._steps.pop(0)["do"])
         else:
             super().next_step()
 
     def end(self):
         """Close the port and end the emulator."""
         super().end()
-        self._core.close()
+        self.core.close()
 
 
 class VirtualLine:

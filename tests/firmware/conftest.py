@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-for folder in ("simulator", "protocol"):  # bench, checks and vectors of the Python tests
-    sys.path.append(str(Path(__file__).parents[1] / "unit" / "link" / folder))
-
-from c_board import CBench  # noqa: E402 - it stands on the bench
+TESTS = Path(__file__).parents[1]
+sys.path.insert(0, str(TESTS / "conformance"))  # the bench of its scenarios
+sys.path.append(str(TESTS / "unit" / "link" / "protocol"))  # the vectors of the Python messages
 
 from c_core import build_library  # noqa: E402
 from firmware_ports import build_emulated_chip  # noqa: E402
@@ -28,8 +27,3 @@ def library(libraries):
 def chips(tmp_path_factory):
     """Return a function for the emulated chip of a mutant, 0 for the unmodified core; each is built once."""
     return cache(partial(build_emulated_chip, tmp_path_factory.mktemp("cortex-m3")))
-
-
-@pytest.fixture
-def make(library):
-    return partial(CBench, library)

@@ -70,6 +70,29 @@ class Lockstep:
         for message in messages:
             self.raw(self.frame(message))
 
+    def set_input(self, name, value):
+        """Change an input of both boards; the C core reads it at once."""
+        self.c.set_input(name, value, self.now_us)
+        self.c.tick(self.now_us)
+        self.python.set_input(name, value, self.now_us)
+        self.compare()
+
     def wait(self, duration_us):
         self.now_us += duration_us
         self.both(lambda board: board.advance(self.now_us))
+
+
+def arm(both, limits=None):
+    """Arm both boards from any state, unless limits or a lost lease prevent it."""
+    core = both.python
+    for name, safe in (("interlock", True), ("key", True), ("estop", False)):
+        if core.machine.inputs[name] != safe:
+            both.set_input(name, safe)
+    if both.python._settings.key_edge:
+        both.set_input("key", False)
+        both.set_input("key", True)
+    both.send(m.Hello(1, 0, 5), m.ClearFault(), *([limits] if limits else []), m.ArmReq(6))
+    both.send(m.ArmConfirm(6, core.machine._board_nonce or 0), m.Lease(60_000))
+    for _ in range(30):
+        both.wait(70_000)
+        both.send(m.Lease(60_000))

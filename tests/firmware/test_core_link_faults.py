@@ -1,13 +1,8 @@
 """A real session and the C core over a faulty link in virtual time, with the tests of the simulated board."""
 
-import sys
 from functools import partial
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))  # before a folder with its own bench module
-
 import test_link_faults_virtual as python_board
 from test_link_faults_virtual import *  # noqa: F403
 from virtual_rig import VirtualRig

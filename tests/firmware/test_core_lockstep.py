@@ -2,7 +2,7 @@
 
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
-from lockstep import Lockstep
+from lockstep import Lockstep, arm
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
@@ -103,22 +103,6 @@ def messages(core, what, detail):
     }[what]
 
 
-def arm(both, limits=None):
-    """Arm both boards from any state, unless limits or a lost lease prevent it."""
-    core = both.python
-    for name, safe in (("interlock", True), ("key", True), ("estop", False)):
-        if core.machine.inputs[name] != safe:
-            both.both(lambda board, name=name, safe=safe: board.set_input(name, safe, both.now_us))
-    if both.python._settings.key_edge:
-        both.both(lambda board: board.set_input("key", False, both.now_us))
-        both.both(lambda board: board.set_input("key", True, both.now_us))
-    both.send(m.Hello(1, 0, 5), m.ClearFault(), *([limits] if limits else []), m.ArmReq(6))
-    both.send(m.ArmConfirm(6, core.machine._board_nonce or 0), m.Lease(60_000))
-    for _ in range(30):
-        both.wait(70_000)
-        both.send(m.Lease(60_000))
-
-
 def damaged(data, how, where):
     at = int(where * (len(data) - 1))
     return {
@@ -138,8 +122,7 @@ def step(both, what, detail):
     elif what == "arm":
         arm(both)
     elif what == "input":
-        value = not core.machine.inputs[detail]
-        both.both(lambda board: board.set_input(detail, value, both.now_us))
+        both.set_input(detail, not core.machine.inputs[detail])
     elif what == "link lost":
         both.both(lambda board: board.on_link_lost(both.now_us))
     elif what == "reset":

@@ -1,0 +1,123 @@
+"""What ports rely on and the wire does not show: the core's calls of its HAL, and the tolerances of B14 and B15."""
+
+from functools import partial
+from itertools import pairwise
+
+import pytest
+from bench import BRIGHT, CENTRE, PATIENT, Bench, here
+from virtual_board import VirtualKind
+
+from c_core import CBoard, SeededCBoard
+
+
+@pytest.fixture
+def bench(library, tmp_path):
+    return Bench(VirtualKind("c", partial(SeededCBoard, library)), tmp_path)
+
+
+def emit(bench, dark_us=0):
+    """Return a core that emits a pulse or waits for one, its board's log and the time of its last tick."""
+    host = bench.ready(**BRIGHT)
+    host.play(here(60_000, dark_us=dark_us), end=False)
+    host.pause(0.01)
+    assert host.board.is_gate_on() == (dark_us == 0)
+    return host.board.core, host.board, host.clock.now_us()
+
+
+# --- B14 ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("late_us", "fault"), [(600, ""), (601, "TICK")])
+def test_a_tick_may_be_half_a_millisecond_late(bench, late_us, fault):
+    core, board, now_us = emit(bench)
+    core.tick(now_us + late_us)
+    assert (core.fault, core.gate_output) == (fault, not fault)
+    pulses = [(pulse["index"], pulse["off_us"]) for pulse in board.of("pulse")]
+    assert pulses == ([(0, now_us + late_us)] if fault else []), "the record tells how long it really was lit"
+
+
+def test_ticks_are_late_only_after_the_first(library):
+    core = CBoard(library)
+    core.tick(20_000)  # board_init took a chip that long
+    assert core.state == "DISARMED"
+    core.tick(20_601)
+    assert core.fault == "TICK"
+
+
+@pytest.mark.parametrize("dark_us", [0, 60_000], ids=["on", "off"])
+def test_a_gate_may_differ_from_its_command_for_a_tick(bench, dark_us):
+    core, board, now_us = emit(bench, dark_us)
+    core.stick(True, not core.gate_output)
+    core.advance(now_us + 200)
+    assert core.fault == "", "it may differ for 100 µs, seen from the first tick that notices"
+    core.advance(now_us + 300)
+    assert (core.state, core.fault, core.relay) == ("FAULT", "READBACK", False)
+    assert board.of("fault")[-1]["t_us"] == now_us + 300
+
+
+def test_each_difference_of_the_gate_counts_by_itself(bench):
+    core, _, now_us = emit(bench, dark_us=60_000)
+    core.stick(True, True)
+    core.advance(now_us + 200)
+    core.stick(False)
+    core.advance(now_us + 1200)
+    core.stick(True, True)
+    core.advance(now_us + 1400)
+    assert core.fault == ""
+
+
+# --- B15 ------------------------------------------------------------------------------------------------------------
+
+
+def check_watchdog(bench):
+    core, _, now_us = emit(bench)
+    core.advance(now_us)
+    assert now_us - core.fed_us <= 100, "fed while loop and tick run"
+    for _ in range(5):
+        core.run_loop()
+    assert core.fed_us == now_us, "fed by the loop alone"
+    core.advance(now_us + 60_000, loop=False)
+    assert core.fed_us <= now_us + 100, "fed by the tick alone"
+
+
+def test_loop_and_tick_feed_the_watchdog_together(bench):
+    check_watchdog(bench)
+
+
+def test_a_watchdog_fed_by_the_tick_alone_is_detected(libraries, tmp_path):
+    bench = Bench(VirtualKind("c", partial(SeededCBoard, libraries(15))), tmp_path)
+    with pytest.raises(AssertionError, match="fed by the tick alone"):
+        check_watchdog(bench)
+
+
+# --- outputs and entropy --------------------------------------------------------------------------------------------
+
+
+def test_indicator_relay_and_mirrors(bench):
+    host = bench.greeted(**PATIENT)
+    core = host.board.core
+    assert not core.indicator
+    host.challenge()
+    assert core.indicator
+    host.order(host.frame("DISARM"))
+    assert not core.indicator
+    host.arm()
+    assert (core.indicator, core.relay) == (True, True)
+    host.play(here(1000, x=CENTRE + 700, y=CENTRE - 900))
+    host.pause(0.01)
+    assert core.mirrors == (CENTRE + 700, CENTRE - 900)
+    core.set_input("interlock", False, host.clock.now_us())
+    host.pause(0.01)
+    assert (core.indicator, core.relay) == (False, False)
+    core.reset(host.clock.now_us())
+    assert core.mirrors == (CENTRE, CENTRE), "where the core takes them to be"
+
+
+def test_an_entropy_that_repeats_itself_does_not_stop_the_board(library, tmp_path):
+    def make_core(settings, sink, seed):
+        return CBoard(library, settings, sink, entropy=[7])
+
+    host = Bench(VirtualKind("c", make_core), tmp_path).greeted()
+    sessions = [host.hello().session for _ in range(3)]
+    assert 0 not in sessions
+    assert all(one != other for one, other in pairwise(sessions))
