@@ -6,7 +6,7 @@
 #include "board.h"
 
 /* make MUTANT=n disables guard Bn at the one place that enforces it, to prove that the tests detect it; 101 and 102
-   remove the bounds checks of the receiver. */
+   remove the bounds checks of the receiver, 103 both what enforces B12: sequence numbers and indices. */
 #ifndef MUTANT
 #define MUTANT 0
 #endif

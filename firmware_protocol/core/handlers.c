@@ -140,7 +140,7 @@ static uint8_t on_data(struct board *b, const uint8_t *body, size_t length) {
     if (!is_armed(b)) {
         return NAK_STATE;
     }
-#if MUTANT != 12
+#if MUTANT != 12 && MUTANT != 103
     if (first < b->next_index || (first > b->next_index && !idle)) {
         return NAK_INDEX;
     }

@@ -99,6 +99,10 @@ size_t frame_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, 
 
 bool link_accept(struct link *link, uint8_t seq, uint8_t *refusal) {
     uint8_t ahead = (uint8_t)(seq - link->expected);
+#if MUTANT == 103
+    link->expected = seq;
+    return true;
+#endif
     if (ahead == 0) {
         return true;
     }

@@ -43,9 +43,9 @@ def test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(seed, loss):
     python_board.test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(seed, loss)
 
 
-@pytest.mark.parametrize("guard", [1, 12, 13])
-def test_a_core_without_a_guard_is_detected(libraries, guard):
-    make_core = partial(SeededCBoard, libraries(guard))
+@pytest.mark.parametrize("mutant", [1, 103, 13], ids=["B1", "B12", "B13"])
+def test_a_core_without_a_guard_is_detected(libraries, mutant):
+    make_core = partial(SeededCBoard, libraries(mutant))
 
     def run_all():
         for seed in SEEDS:  # which frames are lost when a seed decides, and not each loss meets the guard
