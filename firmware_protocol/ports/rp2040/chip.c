@@ -73,10 +73,12 @@ void chip_set_alarm(uint64_t at_us) {
     }
 }
 
+static void (*alarm_callback)(void);
+
 void timer_isr(void) {
     CLEAR(TIMER_INTF) = 1;
     REGISTER(TIMER_INTR) = 1;
-    on_alarm();
+    alarm_callback();
 }
 
 static void fence(void) { __asm volatile("dsb\n\tisb" ::: "memory"); }
@@ -222,10 +224,11 @@ int16_t chip_temperature_dc(void) {
 
 /* --- startup --- */
 
-void chip_start(void) {
+void chip_start(void (*on_alarm)(void)) {
     static const uint32_t USED_BLOCKS = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 |
                                         RESET_TIMER | RESET_UART0;
     CLEAR(WATCHDOG_CTRL) = BIT(30); /* it may still run */
+    alarm_callback = on_alarm;
     start_clocks();
     SET(RESETS) = USED_BLOCKS; /* including the pins, which pull-downs then hold */
     CLEAR(RESETS) = USED_BLOCKS;

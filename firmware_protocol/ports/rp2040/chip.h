@@ -11,8 +11,8 @@
 
 #define CLOCK_HZ 125000000u
 
-/* Initialises clocks, peripherals and the UART, but not the outputs. */
-void chip_start(void);
+/* Initialises clocks, peripherals and the UART, but not the outputs. on_alarm: called from the alarm's interrupt. */
+void chip_start(void (*on_alarm)(void));
 /* Returns the cause of the last reset. */
 enum reset_cause chip_reset_cause(void);
 
@@ -20,9 +20,8 @@ enum reset_cause chip_reset_cause(void);
 uint64_t chip_now_us(void);
 void chip_wait_us(uint32_t us);
 
-/* Calls on_alarm from an interrupt at at_us, at once if that is past. A new alarm replaces the last one. */
+/* Interrupts at at_us, at once if that is past. A new alarm replaces the last one. */
 void chip_set_alarm(uint64_t at_us);
-void on_alarm(void);
 /* No alarm interrupts between hold and release; one that is due in between follows the release. */
 void chip_hold_alarm(void);
 void chip_release_alarm(void);

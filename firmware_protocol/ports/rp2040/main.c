@@ -81,7 +81,7 @@ static void set_alarm(void) {
     chip_set_alarm(due_us < next_us ? due_us : next_us);
 }
 
-void on_alarm(void) {
+static void on_alarm(void) {
     outputs_set(PIN_TICK, true);
     last_tick_us = chip_now_us();
     board_tick(&board, last_tick_us);
@@ -116,7 +116,7 @@ static void run_loop_once(void) {
 
 int main(void) {
     enum reset_cause cause = chip_reset_cause();
-    chip_start();
+    chip_start(on_alarm);
     outputs_start();
     last_tick_us = chip_now_us();
     board_init(&board, &HAL, &SETTINGS, cause, last_tick_us);
