@@ -29,6 +29,7 @@ import httpx
 import numpy as np
 import pytest
 from bench_boards import Bench as SeveralBoards
+from bench_latency import RATES_HZ, WAYS, measure_errors, run_daemon
 from bench_stop import run_flood
 from bench_stream import start_bare_server, stream_under_load
 from measuring import Sleeper, compute_percentile, realtime_priority, time_limit
@@ -258,6 +259,17 @@ def measure_stream(load_hz, bench):
 
 measurement("stream-rest")(partial(measure_stream, None))
 measurement("stream-load")(partial(measure_stream, 300.0))
+
+
+@measurement("latency")
+def measure_latency(bench):
+    """Reported latencies at 5 to 60 frames/s against the instants of caller and board."""
+    rows = []
+    with run_daemon(bench.make_folder()) as (board, daemon):
+        for way in WAYS:
+            errors_s = [error_s for rate_hz in RATES_HZ for error_s in measure_errors(board, daemon, way, rate_hz, 6)]
+            rows.append(Row(f"error of a reported latency, {way}, 5 to 60 frames/s", 1.0, to_ms(errors_s)))
+    return rows
 
 
 @measurement("onset")
