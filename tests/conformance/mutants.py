@@ -272,14 +272,23 @@ def b12_index_is_not_checked():
 
 
 def b13_no_crc():
-    def frame(self, encoded):
-        raw = cobs_decode(encoded)
-        if raw is None or len(raw) < HEADER.size + CRC.size:
-            self.counters.format_errors += 1
-            return None
-        return Frame(*HEADER.unpack(raw[: HEADER.size]), raw[HEADER.size : -CRC.size])
+    """Only the board's decoder: a host without CRC would end its sessions by itself."""
 
-    return FrameDecoder, "_decode_frame", frame
+    class UncheckedDecoder(FrameDecoder):
+        def _decode_frame(self, encoded):
+            raw = cobs_decode(encoded)
+            if raw is None or len(raw) < HEADER.size + CRC.size:
+                self.counters.format_errors += 1
+                return None
+            return Frame(*HEADER.unpack(raw[: HEADER.size]), raw[HEADER.size : -CRC.size])
+
+    build = BoardLink.__init__
+
+    def build_unchecked(self):
+        build(self)
+        self.decoder = UncheckedDecoder()
+
+    return BoardLink, "__init__", build_unchecked
 
 
 def b13_lengths_are_not_checked():

@@ -43,6 +43,7 @@ class HostConnection:
     Sequenced messages pass through the window and are retransmitted until acknowledged. Other messages are sent at once
     and may be lost.
     peer: the board's HELLO_REPLY, None before it arrives
+    futile_transmissions: retransmissions in succession after which nothing was acknowledged
     """
 
     window = WINDOW
@@ -62,6 +63,7 @@ class HostConnection:
         self._nak_count = 0
         self._retransmit_count = 0
         self._aborted_session = 0
+        self.futile_transmissions = 0
         self.peer: HelloReply | None = None
 
     @property
@@ -112,7 +114,7 @@ class HostConnection:
     def _reset(self) -> None:
         self._queued.clear()
         self._unacked.clear()
-        self._next_seq = self._base_seq = 0
+        self._next_seq = self._base_seq = self.futile_transmissions = 0
         self._retransmit_pending = self._retransmit_done = False
 
     def send(self, message: Message, at_front: bool = False) -> None:
@@ -140,6 +142,7 @@ class HostConnection:
         if self._unacked and (self._retransmit_pending or now_s - self._timer_start_s > self._rto_s):
             out += b"".join(self._unacked)
             self._retransmit_count += len(self._unacked)
+            self.futile_transmissions += 1
             self._retransmit_pending, self._retransmit_done = False, True
             self._timer_start_s = now_s
         in_flight = sum(len(frame) for frame in self._unacked)
@@ -158,7 +161,10 @@ class HostConnection:
         return out
 
     def receive_bytes(self, data: bytes, now_s: float) -> list[Message]:
-        """Return the board's messages of this session in received bytes. Invalid frames only increase the counters."""
+        """Return the board's messages of this session in received bytes. Invalid frames only increase the counters.
+
+        Acknowledgements older than one that was received before are left out: the board sends them in order.
+        """
         messages = []
         for frame in self._decoder.feed(data):
             try:
@@ -183,26 +189,31 @@ class HostConnection:
             elif frame.session != self.session:
                 continue
             if isinstance(message, Ack):
-                self._advance_window(message.next_seq, now_s)
+                if not self._advance_window(message.next_seq, now_s):
+                    continue
             elif isinstance(message, Nak):
                 self._nak_count += 1
-                self._advance_window(message.next_seq, now_s)
+                if not self._advance_window(message.next_seq, now_s):
+                    continue
                 # Every frame behind a gap is refused. Only the first NAK triggers a retransmission.
                 if message.reason == NAK_REASONS.index("SEQUENCE") and not self._retransmit_done:
                     self._retransmit_pending = True
             messages.append(message)
         return messages
 
-    def _advance_window(self, next_seq: int, now_s: float) -> None:
+    def _advance_window(self, next_seq: int, now_s: float) -> bool:
+        """Forget what was acknowledged. Return False for an acknowledgement that is older than one before."""
         count = (next_seq - self._base_seq) % SEQ_MODULUS
         if count > len(self._unacked):
-            return  # an outdated acknowledgement
+            return False
         for _ in range(count):
             self._unacked.popleft()
         if count:
             self._base_seq = next_seq
             self._timer_start_s = now_s
             self._retransmit_pending = self._retransmit_done = False
+            self.futile_transmissions = 0
+        return True
 
 
 class BoardLink:

@@ -15,6 +15,8 @@ PENDING_MAX = 64
 WIDTH_MIN_S = 1e-6
 WANDER_MAX = 2e-6
 """Largest change of a crystal's relative rate over the recent exchanges."""
+RATE_ERROR_MAX = 5e-3
+"""Relative error of its rate beyond which a clock is broken, not slow."""
 DRIFT_MAX = 2e-4
 """Maximum relative drift of two crystals. A bracket widens at this rate with age."""
 
@@ -87,6 +89,16 @@ class ClockSync:
             self._samples = (*samples[:-1], sample)
         # All brackets widen alike, so that the narrowest is the same at all times.
         self._best = min(self._samples, key=lambda each: each[0] - DRIFT_MAX * each[1])[1:]
+
+    def compute_contradiction_s(self, stamp: int, reply_s: float, board_s: float) -> float:
+        """Return by how much a reply lies outside of what the latest exchange permits, s; 0 for an unknown stamp."""
+        request_s = self._request_s.get(stamp)
+        if request_s is None or not self._samples:
+            return 0.0
+        width_s, midpoint_s, last_board_s = self._samples[-1]
+        elapsed_s = (request_s + reply_s) / 2 - midpoint_s
+        permitted_s = 0.5 * (width_s + reply_s - request_s) + RATE_ERROR_MAX * abs(elapsed_s)
+        return max(0.0, abs(board_s - last_board_s - elapsed_s) - permitted_s)
 
     def _number_interval(self, sample: tuple[float, float, float]) -> int:
         return floor(sample[1] / self._interval_s)

@@ -15,6 +15,10 @@ RETIMING_RATE_MAX = 2e-4
 """Largest relative shift of points by which a job follows the host's clock, that of two crystals."""
 RETIMING_MAX_TICKS = 5
 """Largest shift of one point: that much of its settling time may be missing."""
+EARLY_MAX_TICKS = 10
+"""By how much a point may seem to begin early, because the start after a late job is rounded."""
+LATE_OFF_MAX_TICKS = 100
+"""Longest time for which the gate may stay on after a pulse (guard B2)."""
 
 
 class ReportedPulses(NamedTuple):
@@ -66,6 +70,7 @@ class PlanJob:
         self._timing = timing
         self._planned_end_tick = points.compute_end_ticks()
         self._end_tick = start_tick + self._planned_end_tick
+        self._delayed_ticks = 0
         self._row = points.row
         self._pulse_points = np.flatnonzero(points.row >= 0)
         self._on_tick = np.full(len(points), -1, dtype=np.int64)
@@ -91,6 +96,7 @@ class PlanJob:
         """Shift the plan's zero because an earlier job was late."""
         self.start_tick += ticks
         self._end_tick += ticks
+        self._delayed_ticks += ticks
 
     @property
     def is_fully_sent(self) -> bool:
@@ -153,6 +159,26 @@ class PlanJob:
             return False
         self._count = min(kept_points, self._count)
         return True
+
+    def find_contradiction(self, message: Executed) -> str:
+        """Return the first report that cannot be of the point that was sent, '' if all can or are of other jobs."""
+        first = message.first_index - self.first_index
+        begin, end = max(0, -first), min(len(message.records), self._count - first)
+        if begin >= end:
+            return ""
+        on_tick, on_ticks, duty = np.array(message.records[begin:end], dtype=np.int64).T
+        sent = slice(first + begin, first + end)
+        sent_on_ticks, sent_duty = self._table[sent, 3].astype(np.int64), self._table[sent, 4]
+        earliest_tick = self._end_tick[sent] - self._delayed_ticks - sent_on_ticks - EARLY_MAX_TICKS
+        is_early = on_tick < earliest_tick
+        is_long = on_ticks > sent_on_ticks + LATE_OFF_MAX_TICKS
+        is_other = (duty != sent_duty) & (on_ticks > 0)
+        if not np.any(is_early | is_long | is_other):
+            return ""
+        k = int(np.argmax(is_early | is_long | is_other))
+        was_sent = f"{sent_on_ticks[k]} ticks with duty {sent_duty[k]} from {earliest_tick[k]} on"
+        reported = f"{on_ticks[k]} ticks with duty {duty[k]} from {on_tick[k]} on"
+        return f"point {self.first_index + first + begin + k} {reported}, expected at most {was_sent}"
 
     def record_executed(self, message: Executed) -> None:
         """Record the board's report. Reports of other jobs and repeated reports have no effect."""

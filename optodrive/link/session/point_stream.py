@@ -52,6 +52,15 @@ class PointStream:
         return self._append(points, start_tick, send_ahead_ticks, timing)
 
     @property
+    def sent_index(self) -> int:
+        """Index after the last point that was sent in this session."""
+        return self._sent_index
+
+    def find_contradiction(self, message: m.Executed) -> str:
+        """Return what a report contradicts of the points that were sent, '' if nothing."""
+        return next((text for job in self._jobs if (text := job.find_contradiction(message))), "")
+
+    @property
     def last(self) -> PlanJob | None:
         """The last job, None without any."""
         return self._jobs[-1] if self._jobs else None

@@ -54,6 +54,7 @@ from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWa
 from optodrive.link.session.plan_job import PlanJob, PointTiming
 from optodrive.link.session.point_drain import PointDrain
 from optodrive.link.session.point_stream import PointStream
+from optodrive.link.session.report_check import FalseReportError, ReportCheck
 from optodrive.link.transport.base import Transport
 
 HELLO_RETRY_S = 0.25
@@ -66,6 +67,11 @@ CLOCK_SEEK_INTERVAL_S = 0.02
 CLOCK_INITIAL_SAMPLES = 8
 SILENCE_TIMEOUT_S = 2.0
 """The link counts as lost after this time without a message from the board."""
+FUTILE_TRANSMISSIONS_MAX = 40
+"""The link counts as lost after this number of retransmissions in succession without an acknowledgement.
+
+On a line that loses a third of all frames in either direction, that happens once in 10^10 times.
+"""
 WAIT_MIN_S, WAIT_MAX_S = 0.001, 0.01
 RETRANSMISSION_WAIT_S = BATCH_WAIT_S = 0.002
 """Shortest wait for a retransmission, and for further points to become due, so that frames hold several."""
@@ -101,6 +107,7 @@ class BoardSession:
         self._status_interval_s = RENEWAL_FRACTION * requirements.lease_s if is_one_of_several else STATUS_INTERVAL_S
         self._clock_sync = self._build_clock_sync()
         self._points = PointStream()
+        self._report_check = self._build_report_check()
         self._arming = Arming()
         self._drain: PointDrain | None = None
         self.on_executed: Callable[[m.Executed], None] = lambda message: None
@@ -129,6 +136,9 @@ class BoardSession:
 
     def _build_clock_sync(self) -> ClockSync:
         return ClockSync(self._clock_interval_s)
+
+    def _build_report_check(self) -> ReportCheck:
+        return ReportCheck(self._clock_sync, self._points, self.scale.tick_s)
 
     @property
     def clock_sync(self) -> ClockSync:
@@ -245,6 +255,7 @@ class BoardSession:
     def _reset(self) -> None:
         self._connection = HostConnection(self._requirements.rto_s)
         self._clock_sync = self._build_clock_sync()
+        self._report_check = self._build_report_check()
         self._refusal = None
         self.board = BoardView()
         self._last_received_s = self._clock.now_s()
@@ -257,15 +268,18 @@ class BoardSession:
         self._transport.close()
 
     def on_lost(self, error: Exception) -> str:
-        """Close the link after an error and return its message, with the likely cause of a link failure."""
+        """Send ABORT if possible, close the link after an error, and return its message, with the likely cause.
+
+        A report that cannot be says itself what is wrong.
+        """
         message = str(error)
-        if isinstance(error, LinkError):
+        if isinstance(error, LinkError) and not isinstance(error, FalseReportError):
             now_s = self._clock.now_s()
             cause = self._watch.on_lost(
                 now_s, self._last_received_s, silent=now_s - self._last_received_s > self._silence_max_s
             )
             message = f"{message}; likely cause: {cause.message}"
-        self.disconnect()
+        self.leave()
         return message
 
     def close(self) -> None:
@@ -310,6 +324,8 @@ class BoardSession:
         self._exchange(wait_s)
         if self._arming.is_lost or self._is_armed_by_itself:
             self.abort()
+        if self._connection.futile_transmissions > FUTILE_TRANSMISSIONS_MAX:
+            raise LinkError(f"{self.port}: the board acknowledges nothing; {self._describe_errors()}")
         silence_max_s = self._silence_max_s
         if now_s - self._last_received_s > silence_max_s:
             raise LinkError(f"{self.port}: the board sent nothing for {silence_max_s:g} s; {self._describe_errors()}")
@@ -342,7 +358,8 @@ class BoardSession:
             now_s = self._clock.now_s()
             for message in self._connection.receive_bytes(data, now_s):
                 self._last_received_s = now_s
-                self._on_message(message, now_s)
+                if self._report_check.accept(message, now_s):
+                    self._on_message(message, now_s)
 
     def _request_status(self) -> None:
         self._status_requested_s = self._clock.now_s()

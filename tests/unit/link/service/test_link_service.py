@@ -523,7 +523,7 @@ def test_without_that_rule_neither_would_arm(rig, monkeypatch):
 
 def test_an_arming_that_takes_too_long_ends_dark(rig):
     """A caller who is told that the board did not arm never finds it armed."""
-    lost, rig.link.read = rig.link.read, lambda timeout_s: drop_frames(lost(timeout_s), m.Ack)
+    lost, rig.link.read = rig.link.read, lambda timeout_s: drop_frames(lost(timeout_s), m.ArmChallenge)
     result = rig.await_result(WEB, rig.request(WEB, "arm", caller="ann"))
     assert "did not arm within" in result["error"]["message"]
     rig.run(0.1)
@@ -531,6 +531,19 @@ def test_an_arming_that_takes_too_long_ends_dark(rig):
     assert find_control(rig) is None
     rig.link.read = lost
     rig.await_result(WEB, rig.request(WEB, "disarm"))
+    rig.arm()
+
+
+def test_a_board_that_acknowledges_nothing_is_a_lost_link(rig):
+    rig.arm()
+    rig.begin(build_points(1500, DUTY))
+    lost = rig.link.read
+    rig.link.read = lambda timeout_s: drop_frames(lost(timeout_s), m.Ack, m.Nak)
+    rig.until(lambda: rig.service.link_error is not None)
+    assert "acknowledges nothing" in str(rig.service.link_error)
+    assert rig.core.state == BoardState.DISARMED
+    rig.link.read = lost
+    rig.until(lambda: rig.boards.connected)
     rig.arm()
 
 
