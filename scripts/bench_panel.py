@@ -62,9 +62,10 @@ def main():
     parser = argparse.ArgumentParser(prog="scripts/bench panel", description=__doc__)
     parser.add_argument("--hours", type=float, default=1.0, help="time that is simulated")
     parser.add_argument("--display", help="only cases of this display")
+    parser.add_argument("--rooms", type=float, nargs="+", default=ROOMS_C, help="temperatures of the room, °C")
     options = parser.parse_args()
     for name, what, pixels, height_um in CASES:
-        for room_c in ROOMS_C if options.display in (None, name) else ():
+        for room_c in options.rooms if options.display in (None, name) else ():
             without, _ = measure(build_display(name, room_c, False), pixels, height_um, 3600.0 * options.hours)
             rate, panel_k = measure(build_display(name, room_c, True), pixels, height_um, 3600.0 * options.hours)
             case = f"{name}, {what} to {height_um:g} µm, room at {room_c:g} °C"

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.device.config_sections import (
@@ -108,12 +108,12 @@ class Config(Section):
             for key, ours in (("name", stage.name), ("board", stage.board.address)):
                 for other, earlier in enumerate(self.stages[:number]):
                     if ours and ours == (earlier.name if key == "name" else earlier.board.address):
-                        value = stage.name if key == "name" else " ".join(map(str, ours))
+                        value = stage.name if key == "name" else Unquoted(" ".join(map(str, ours)))
                         expected = f"another {key} than that of stages[{other}]"
                         raise ConflictError(f"stages[{number}].{key}", value, expected)
         unreached = np.flatnonzero(~np.any([stage.reach for stage in self.list_stage_configs()], axis=0))
         if len(unreached):
-            raise ConflictError("stages", f"none that reaches pixel {unreached[0]}", "rows and columns that hold all")
+            raise ConflictError("stages", Unquoted(f"none that reaches pixel {unreached[0]}"), "one")
         return self
 
     def check_optics(self) -> None:
@@ -133,7 +133,7 @@ class Config(Section):
                 if span is not None and not 0 <= span[0] <= span[1] < count:
                     raise ConflictError(key, list(span), f"the first and the last of 0 to {count - 1}")
         if not self.reach.any():
-            raise ConflictError("rows", "no pixel within rows and columns", "at least one")
+            raise ConflictError("rows", Unquoted("no pixel within rows and columns"), "at least one")
 
     def _check_scan_range(self) -> None:
         layout, reach = build_pixel_layout(self.display), self.reach
@@ -141,7 +141,7 @@ class Config(Section):
         farthest_m = float(max(np.abs(layout.x_m[reach]).max(), np.abs(layout.y_m[reach]).max()))
         if farthest_m > half_field_m:
             value, expected = f"±{half_field_m:.4f} m by focal_length_m", f"±{farthest_m:.4f} m, where a pixel lies"
-            raise ConflictError("scanner.range_rad", f"a reach of {value}", f"at least {expected}")
+            raise ConflictError("scanner.range_rad", Unquoted(f"a reach of {value}"), f"at least {expected}")
 
     def _check_focus(self) -> None:
         display, laser = self.display, self.laser

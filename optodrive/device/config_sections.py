@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from optodrive.core.errors import Unquoted
 from optodrive.core.toml_model import ConflictError, Name, Section
 
 WIRE_ON_MAX_S = 65_535e-6
@@ -43,9 +44,9 @@ class DisplaySection(Section):
     bridge_width_m: Positive
     """Width of the bridges that hold the absorbers, m."""
     absorber_width_m: Positive = 2.0e-3
-    """Width of an absorber in x, m."""
+    """Width of an absorber in x, m; less than the pitch of several columns."""
     absorber_height_m: Positive = 1.5e-3
-    """Height of an absorber in y, m."""
+    """Height of an absorber in y, m; less than the pitch of several rows."""
     pixel_map: Annotated[str, Field(min_length=1)] | None = None
     """File with the measured gain, offset and state of every pixel, relative to the configuration's folder."""
 
@@ -59,7 +60,7 @@ class DisplaySection(Section):
             if (row, column) in self.missing[:number]:
                 raise ConflictError(place, [row, column], "each place once")
         if len(self.missing) >= self.rows * self.columns:
-            raise ConflictError("missing", f"all {len(self.missing)} places", "a place with a pixel")
+            raise ConflictError("missing", Unquoted(f"all {len(self.missing)} places"), "a place with a pixel")
         return self
 
     @model_validator(mode="after")

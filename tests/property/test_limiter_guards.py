@@ -16,6 +16,7 @@ from optodrive.planning.limiter.nominal_model import NominalPanel, Uncertainty
 from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import (
     NO_CAPS,
+    TOUCHED,
     build_plan,
     build_true_display,
     galvo_peak,
@@ -207,6 +208,25 @@ PANEL_MUTANTS = {
 @pytest.mark.parametrize("mutant", PANEL_MUTANTS)
 def test_a_mutant_of_the_panel_is_caught(mutant):
     assert cap_fraction("panel", worst_factors("panel"), **PANEL_MUTANTS[mutant]) > 1.02
+
+
+WITHOUT = {"touch surface": dict(touch=None), "walls": dict(walls=None, touch=None)}
+
+
+@pytest.mark.parametrize("node", WITHOUT)
+def test_walls_and_panel_have_the_touch_cap_without_a_touch_surface(node):
+    """A finger touches them all the same; a limiter whose touch cap is that of touch surfaces only is caught."""
+    model = replace(build_model("display-16", SMALL), **WITHOUT[node])
+    display, fractions = DISPLAYS["display-16"], []
+    for touch_k in (15.0, 1e3):
+        caps = NO_CAPS._replace(touch_k=touch_k)
+        heat = build_heat_bound(model, get_uncertainty("display-16"), caps, 2.45)
+        plan = build_plan(visit_all_pixels(60.0), 2.45, display.config.display)
+        limited, _ = limit(plan, build_cold_budget_state(16), Budget(caps, heat, display.budget.galvos))
+        peaks = build_true_display(model, worst_factors("panel")).peaks(limited)
+        fractions.append(max(peaks[row] for row in TOUCHED) / 15.0)
+    assert 0.9 <= fractions[0] <= 1 + 1e-9
+    assert fractions[1] > 1.02
 
 
 def credit_transit_twice(heat):

@@ -61,9 +61,9 @@ def test_a_single_stage_is_the_configuration(tmp_path):
         ),
         (
             TWO_STAGES.replace("ttyACM1", "ttyACM0").replace("laser =", "#"),
-            r"stages\[1\].board: got 'serial /dev/ttyACM0', expected another board",
+            r"stages\[1\].board: got serial /dev/ttyACM0, expected another board",
         ),
-        (TWO_STAGES.replace("[1, 3]", "[2, 2]"), "stages: got 'none that reaches pixel 3'"),
+        (TWO_STAGES.replace("[1, 3]", "[2, 2]"), "stages: got none that reaches pixel 3, expected one"),
         (TWO_STAGES.replace("1e-5", "9e-4"), r"stages\[0\].laser.focus_width_m: got 0.001, expected to fit"),
         (TWO_STAGES.replace("1.5", "-1.5"), r"stages.1.laser.max_power_w: got -1.5"),
         (TWO_STAGES.replace("max_power_w", "max_power"), r"stages.1.laser.max_power: got 'max_power', expected"),
@@ -75,7 +75,7 @@ def test_a_single_stage_is_the_configuration(tmp_path):
         (TWO_STAGES.replace("/dev/ttyACM1", "/dev/./ttyACM0").replace("laser =", "#"), r"stages\[1\].board: got"),
         (
             TWO_STAGES.replace('port = "/dev/ttyACM1"', 'port = "/dev/ttyACM0", baud = 9600'),
-            r"stages\[1\].board: got 'serial /dev/ttyACM0', expected another board",
+            r"stages\[1\].board: got serial /dev/ttyACM0, expected another board",
         ),
     ],
 )
