@@ -1,4 +1,4 @@
-"""`optodrive status | arm | disarm | dim | pause | resume | stop`: control a running daemon."""
+"""`optodrive status | arm | disarm | dim | pause | resume | reload | stop`: control a running daemon."""
 
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +21,7 @@ STATE_TIMEOUT_S = 2.0
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (status, arm, disarm, dim, pause, resume, stop):
+    for command in (status, arm, disarm, dim, pause, resume, reload, stop):
         app.command()(command)
 
 
@@ -103,6 +103,18 @@ def resume(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     from optodrive.client.requests import RESUME
 
     _print_state(DaemonClient(url).call(RESUME), json)
+
+
+def reload(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
+    """Let the daemon read its configuration and tokens again; some keys apply at once, the others after a restart."""
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import RELOAD
+
+    report = DaemonClient(url).call(RELOAD)
+    if json:
+        print_json(report)
+    else:
+        print(report.message)
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:

@@ -12,6 +12,7 @@ from optodrive.client.plan import Plan
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.patterns import PatternList
+from optodrive.daemon.responses.reload import ReloadReport
 from optodrive.daemon.responses.state import StateReport
 from optodrive.planning.effective_config import EffectiveConfig
 from optodrive.planning.feasibility.report import FitMode
@@ -41,6 +42,7 @@ ARM = ApiRequest("POST", "/v1/arm", StateReport)
 DISARM = ApiRequest("POST", "/v1/disarm", StateReport)
 PAUSE = ApiRequest("POST", "/v1/pause", StateReport)
 RESUME = ApiRequest("POST", "/v1/resume", StateReport)
+RELOAD = ApiRequest("POST", "/v1/reload", ReloadReport)
 STOP = ApiRequest("POST", "/v1/stop", StateReport)
 
 

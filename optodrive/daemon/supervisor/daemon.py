@@ -87,9 +87,10 @@ def run(
         reloader = ConfigReloader(config, tokens, config.model_copy if read_config is None else read_config)
         starts = _build_starts(_load_display(config), folder, listeners, reloader, session_path)
         _prepare_memory()
+        handler = ReloadHandler(reloader, supervisor, notifier, log)
+        supervisor.on_web_message = handler.on_web_message
         if notifier.is_enabled and read_config is not None:
-            handler = ReloadHandler(reloader, supervisor, notifier, log)
-            supervisor.on_reload, supervisor.on_web_message = handler.request, handler.on_web_message
+            supervisor.on_reload = handler.request
         *others, web = (Child(name, start, clock) for name, start in starts.items())
         if supervisor.start_others(others, web):
             address = build_local_url(config.daemon.host, port)

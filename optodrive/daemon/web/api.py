@@ -20,7 +20,8 @@ from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.responses.problem import MEDIA_TYPE
+from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
+from optodrive.daemon.responses.reload import ReloadReport
 from optodrive.daemon.responses.state import StateReport
 from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware, read_request
 from optodrive.daemon.web.access_policy import AccessPolicy
@@ -154,6 +155,14 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Play what was left at the pause, limited again from the heat that is left, and what waits."""
         await daemon.link.command("resume")
         return _send_state(daemon)
+
+    @routes.post("/v1/reload", "armer", response_model=ReloadReport)
+    async def reload() -> Response:
+        """Read configuration and tokens again, and apply what can be applied at once, as SIGHUP does for a service."""
+        result = await daemon.reloads.request()
+        if isinstance(result, Problem):
+            return Response(result.to_json(), result.status, media_type=MEDIA_TYPE)
+        return Response(result.model_dump_json(), media_type="application/json")
 
     @routes.post("/v1/stop", "viewer", response_model=StateReport)
     async def stop() -> Response:

@@ -17,6 +17,7 @@ from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.peer import Peer
+from optodrive.daemon.web.reload_requests import ReloadRequests
 from optodrive.daemon.web.state_merge import merge_state
 from optodrive.daemon.web.telemetry_hub import TelemetryHub
 from optodrive.link.service.results import build_error
@@ -197,13 +198,14 @@ class PlannerClient:
 
 
 class DaemonClient:
-    """The three processes, and the state of the daemon."""
+    """The three processes, the state of the daemon, and the reloads that its supervisor carries out."""
 
     def __init__(self, display: DisplayModel, folder: RuntimeFolder) -> None:
         self.display = display
         self.link = LinkClient(Peer("link", folder.link_socket, drops=False))
         self.planner = PlannerClient(Peer("planner", folder.planner_socket))
         self.preview = Peer("preview", folder.preview_socket)
+        self.reloads = ReloadRequests()
         self.hub = TelemetryHub()
         self._state: StateReport | None = None
         self._state_json = b""

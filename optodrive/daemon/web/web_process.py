@@ -21,6 +21,7 @@ from optodrive.daemon.web.audit import AuditLog
 from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.listeners import describe_exposure
 from optodrive.daemon.web.reload_message import apply_reload
+from optodrive.daemon.web.reload_requests import RESULT
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config_sections import DaemonSection
@@ -74,6 +75,7 @@ class WebProcess:
         daemon: DaemonSection,
     ) -> None:
         self._client = client
+        client.reloads.send = beat.send
         self._acceptor = acceptor
         acceptor.on_connected = self._beat_link  # the first caller may arm at once
         acceptor.on_lost = self._go_dark
@@ -162,6 +164,8 @@ class WebProcess:
                 self._revoke(revoked)
             self._record(fields["fields"])
             self._beat.send({"kind": "reloaded", "id": fields["id"]})
+        elif fields["kind"] == RESULT:
+            self._client.reloads.on_result(fields)
         elif fields["kind"] == "end":
             self.end()
 

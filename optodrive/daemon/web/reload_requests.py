@@ -1,0 +1,46 @@
+"""Reloads that callers request: the web process passes them to the supervisor, which reads the files, as for SIGHUP."""
+
+import asyncio
+import secrets
+from collections.abc import Callable
+from typing import Any
+
+from optodrive.core.errors import NotReadyError
+from optodrive.daemon.responses.problem import Problem
+from optodrive.daemon.responses.reload import ReloadReport
+
+TIMEOUT_S = 30.0
+REQUEST, RESULT = "reload_request", "reload_result"
+"""Kinds of the messages to and from the supervisor."""
+
+
+class ReloadRequests:
+    """The requests that the supervisor has not answered. send: sends it a message, once there is a channel."""
+
+    def __init__(self) -> None:
+        self.send: Callable[[dict[str, Any]], None] = lambda fields: None
+        self._waiting: dict[str, asyncio.Future[ReloadReport | Problem]] = {}
+
+    async def request(self) -> ReloadReport | Problem:
+        """Request a reload and return its effect, or why nothing was changed. Raise NotReadyError without an answer."""
+        request_id = secrets.token_hex(8)
+        future: asyncio.Future[ReloadReport | Problem] = asyncio.get_running_loop().create_future()
+        self._waiting[request_id] = future
+        self.send({"kind": REQUEST, "id": request_id})
+        try:
+            async with asyncio.timeout(TIMEOUT_S):
+                return await future
+        except TimeoutError:
+            raise NotReadyError(f"the supervisor has not answered within {TIMEOUT_S:g} s") from None
+        finally:
+            del self._waiting[request_id]
+
+    def on_result(self, fields: dict[str, Any]) -> None:
+        """Take the supervisor's answer to a request."""
+        future = self._waiting.get(fields["id"])
+        if future is None or future.done():
+            return
+        if "problem" in fields:
+            future.set_result(Problem.model_validate(fields["problem"]))
+        else:
+            future.set_result(ReloadReport.model_validate(fields["report"]))
