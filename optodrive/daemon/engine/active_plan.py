@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses, concatenate_executed
 from optodrive.daemon.engine.plan_record import Execution, PlanRecord
-from optodrive.daemon.responses.plan import PlanStatus
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.planned_sequence import PlannedSequence
@@ -79,7 +79,7 @@ class ActivePlan:
         self._fold_delay()
         self.is_interrupted = True
         self.origin_s = max(self.zero_s, off_s - self.record.start_s)
-        self.record.status = "paused"
+        self.record.change_status(PlanStatus.PAUSED)
         self.record.sent = self.executed_before
 
     def _fold_delay(self) -> None:
@@ -99,5 +99,6 @@ class ActivePlan:
 
     def end(self, status: PlanStatus, error: str | None) -> None:
         """End the plan with a final status."""
-        self.record.status, self.record.error = status, error
+        self.record.change_status(status)
+        self.record.error = error
         self.on_end(self)

@@ -7,6 +7,7 @@ from typing import Any
 from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.responses.plan_status import ENDS
 from optodrive.daemon.responses.state import StateReport
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.remote_session import RemoteSession
@@ -21,7 +22,7 @@ class PlanCounters:
     """Counters of ended plans: number by status, and latency from request to first emission."""
 
     def __init__(self) -> None:
-        self.ended: Counter[str] = Counter(dict.fromkeys(("done", "superseded", "failed", "cancelled"), 0))
+        self.ended: Counter[str] = Counter(dict.fromkeys(ENDS, 0))
         self.first_light = Histogram(LATENCY_BUCKETS_S)
         self.min_headroom_k: float | None = None
 

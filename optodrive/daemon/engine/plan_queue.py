@@ -56,7 +56,7 @@ from optodrive.daemon.engine.queue_thermal import QueueThermal
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
-from optodrive.daemon.responses.plan import PlanStatus
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.protocol.point_cut import PointCut
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
@@ -179,7 +179,7 @@ class PlanQueue:
                 return False
             self._thermal.append(plan)
             self.accounts.totals["planned"] += record.pulse_count
-            record.status = "queued" if snapshot.predecessor is None else "running"
+            record.change_status(PlanStatus.QUEUED if snapshot.predecessor is None else PlanStatus.RUNNING)
             record.planned_after_s = self._session.board_s() - record.arrived_s
             self._plan_store.add(plan)
             return True
@@ -217,7 +217,7 @@ class PlanQueue:
                 plan, job = self.running[0]
                 plan.record.dropped = plan.record.pulse_count - job.sent_count
                 self._session.flush()
-                self.end_running("superseded", "replaced by a newer plan")
+                self.end_running(PlanStatus.SUPERSEDED, "replaced by a newer plan")
 
     def truncate_stream(self) -> None:
         """Truncate the running streamed plan at the first pulse not yet due to be sent.
@@ -238,7 +238,7 @@ class PlanQueue:
 
     def _supersede(self, plan: ActivePlan) -> None:
         plan.record.dropped = plan.rest_count
-        self._end_waiting(plan, "superseded", "replaced by a newer plan")
+        self._end_waiting(plan, PlanStatus.SUPERSEDED, "replaced by a newer plan")
 
     def _end_waiting(self, plan: ActivePlan, status: PlanStatus, error: str | None) -> None:
         plan.update_execution()
@@ -257,10 +257,10 @@ class PlanQueue:
                     first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
                 elif plan.is_interrupted:
                     self._thermal.rewind([plan])
-            self._end_waiting(plan, "cancelled", reason or "removed from the queue")
+            self._end_waiting(plan, PlanStatus.CANCELLED, reason or "removed from the queue")
         elif any(run.plan.record is record for run in self.running):
             self._session.flush()
-            self.end_running("cancelled", reason or "cancelled while running")
+            self.end_running(PlanStatus.CANCELLED, reason or "cancelled while running")
 
     def revoke(self, caller: str) -> None:
         """End all plans of a caller whose token was revoked, and accept none that was requested before now."""
@@ -285,9 +285,9 @@ class PlanQueue:
             plan = self.waiting.popleft()
             record = plan.record
             if not plan.rest_count:
-                self._end_waiting(plan, "done", None)
+                self._end_waiting(plan, PlanStatus.DONE, None)
                 return
-            record.status = "running"
+            record.change_status(PlanStatus.RUNNING)
             ahead_s = self._stream_lead_s if record.streamed else inf
             job = self._session.begin(plan.points, self._find_start_s(plan), plan.epoch, ahead_s, plan.crc)
             self.running.append(PlanRun(plan, job))
@@ -311,7 +311,7 @@ class PlanQueue:
             self._finish_first()
         if self.running and refusal is not None:
             self._session.flush()
-            self.end_running("failed", f"the board refused a part of the plan ({refusal})")
+            self.end_running(PlanStatus.FAILED, f"the board refused a part of the plan ({refusal})")
 
     def _describe_unarmed(self) -> str:
         """Return why the board no longer executes plans, in one sentence."""
@@ -326,7 +326,7 @@ class PlanQueue:
         with self.lock:
             run = self.running.popleft()
             record = run.plan.record
-            self._conclude(run, "superseded" if record.dropped else "done", None)
+            self._conclude(run, PlanStatus.SUPERSEDED if record.dropped else PlanStatus.DONE, None)
             if record.delay_s > MIN_DELAY_S:
                 self._delay_all(record.delay_s)
 
@@ -346,7 +346,7 @@ class PlanQueue:
                 if record.streamed or not left:
                     record.dropped = left
                     error = "the light was paused, and a stream shows the present" if left else None
-                    self._conclude(run, "superseded" if left else "done", error)
+                    self._conclude(run, PlanStatus.SUPERSEDED if left else PlanStatus.DONE, error)
                     continue
                 self.accounts.collect_executed(run)
                 delay_s = record.delay_s
@@ -363,7 +363,7 @@ class PlanQueue:
         plan.update_execution()
         if record.timing_error is not None:
             self.accounts.timing.add(record.timing_error)
-        if status in ("failed", "cancelled"):
+        if status in (PlanStatus.FAILED, PlanStatus.CANCELLED):
             plan.end(status, error)
         self._executor.submit(simulate_plan, plan, status, error)
 
@@ -397,11 +397,11 @@ class PlanQueue:
             waiting = list(self.waiting)
             self.waiting.clear()
             if self.running:
-                self.end_running("failed", reason, clock_shift_s)
+                self.end_running(PlanStatus.FAILED, reason, clock_shift_s)
             elif waiting:
                 self._thermal.rewind(waiting[:1], clock_shift_s)
         for plan in waiting:
-            self._end_waiting(plan, "failed", reason)
+            self._end_waiting(plan, PlanStatus.FAILED, reason)
 
     def on_board_restarted(self, delay_s: float) -> None:
         """Shift heat and budget to the restarted clock of the board."""

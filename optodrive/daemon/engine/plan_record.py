@@ -9,7 +9,8 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.core.units import m_to_um
-from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport, PlanStatus
+from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.timing_error import TimingError
 from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses, UInt8Array
@@ -133,7 +134,7 @@ class PlanRecord:
     labels: dict[str, str | int | float | bool] = field(default_factory=dict)
     parameters: dict[str, str | float | bool | None] = field(default_factory=dict)
     streamed: bool = False
-    status: PlanStatus = "planned"
+    status: PlanStatus = PlanStatus.PLANNED
     error: str | None = None
     sent: int = 0
     execution: Execution | None = None
@@ -148,10 +149,16 @@ class PlanRecord:
     first_pulse_s: float | None = None
     onset: ClockReading | None = None
 
+    def change_status(self, status: PlanStatus) -> None:
+        """Give the plan another status. Raise ValueError if that cannot follow the present one."""
+        if not self.status.may_become(status):
+            raise ValueError(f"plan {self.plan_id} is {self.status}, and cannot become {status}")
+        self.status = status
+
     @property
     def has_ended(self) -> bool:
         """Whether the plan has ended."""
-        return self.status in ("done", "superseded", "failed", "cancelled")
+        return self.status.has_ended
 
     @property
     def nbytes(self) -> int:

@@ -2,6 +2,7 @@
 
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.daemon.responses.state import QueuedPlan, QueueReport, RecentPlan
 
 
@@ -9,7 +10,7 @@ def build_queue_report(plan_queue: PlanQueue, recent: list[PlanRecord], board_no
     """Report the running and waiting plans with their progress at a board time, s, and the recent ones."""
     running = [run.plan.record for run in plan_queue.running.copy()]
     waiting = [plan.record for plan in plan_queue.waiting.copy()]
-    if waiting and waiting[0].status == "paused":
+    if waiting and waiting[0].status == PlanStatus.PAUSED:
         running.append(waiting.pop(0))
     pause = plan_queue.pause
     times_at_s = board_now_s if pause.off_s is None else pause.off_s  # as if the queue went on now
@@ -41,5 +42,5 @@ def _build_queued(record: PlanRecord, board_now_s: float) -> QueuedPlan:
         **dict(_build_recent(record)),
         duration_s=record.duration_s,
         starts_in_s=starts_in_s,
-        ends_in_s=None if record.status == "paused" else max(0.0, starts_in_s + record.duration_s),
+        ends_in_s=None if record.status == PlanStatus.PAUSED else max(0.0, starts_in_s + record.duration_s),
     )

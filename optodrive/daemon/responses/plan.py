@@ -1,12 +1,9 @@
 """The response of the routes that submit, read or cancel a plan."""
 
-from typing import Literal
-
 from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.session.timing_error import TimingError
 from optodrive.planning.summary_schema import PlanSummary, PulseColumns
-
-PlanStatus = Literal["planned", "queued", "running", "paused", "done", "superseded", "failed", "cancelled"]
 
 
 class PlanLatency(JsonModel):
@@ -88,7 +85,7 @@ class PlanReport(JsonModel):
     @property
     def has_ended(self) -> bool:
         """Whether the plan's status is final."""
-        return self.status not in ("queued", "running", "paused")
+        return self.status.has_ended or self.status == PlanStatus.PLANNED  # a dry run
 
     @property
     def fits(self) -> bool | None:

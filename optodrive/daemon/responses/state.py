@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from optodrive.core.json_model import JsonModel
-from optodrive.daemon.responses.plan import PlanStatus
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.protocol.states import ARMED_STATES, BoardState
 from optodrive.link.session.timing_error import TimingError
 

@@ -5,7 +5,8 @@ from typing import Literal
 from pydantic import ConfigDict
 
 from optodrive.core.json_model import JsonModel
-from optodrive.daemon.responses.plan import PlanLatency, PlanStatus
+from optodrive.daemon.responses.plan import PlanLatency
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.daemon.responses.problem import Problem
 
 FrameStatus = PlanStatus | Literal["refused"]

@@ -10,6 +10,7 @@ from optodrive.core.ipc import Message
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.web.daemon_client import DaemonClient, PushFields
@@ -78,7 +79,9 @@ class LiveStream:
                 self._publish(FrameResult(frame=None, status="refused", problem=build_error_problem(error)))
                 continue
             if self._pending is not None:
-                self._publish(FrameResult(frame=self._pending.number, status="superseded", superseded_by=number))
+                self._publish(
+                    FrameResult(frame=self._pending.number, status=PlanStatus.SUPERSEDED, superseded_by=number)
+                )
             self._pending, self._next_number = frame, number + 1
             self._arrived.set()
 
@@ -124,7 +127,7 @@ class LiveStream:
         try:
             report = await self._daemon.planner.wait_for_end(plan)
         except OptodriveError as error:
-            self._publish(FrameResult(frame=number, status="failed", plan=plan, error=str(error)))
+            self._publish(FrameResult(frame=number, status=PlanStatus.FAILED, plan=plan, error=str(error)))
             return
         self._publish(_report_ended(number, report))
 
@@ -143,7 +146,7 @@ class LiveStream:
 def _report_planned(number: int, report: PlanReport) -> FrameResult:
     return FrameResult(
         frame=number,
-        status="planned",
+        status=PlanStatus.PLANNED,
         plan=report.plan,
         pulses=report.planned,
         skipped=len(report.summary.skipped),

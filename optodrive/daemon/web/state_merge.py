@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.daemon.responses.state import (
     BoardReport,
     LimitsReport,
@@ -92,7 +93,7 @@ def _merge_queue(queue: QueueReport, pause_ends_in_s: float | None) -> QueueRepo
     """Merge a pause, as the link process states it, into the planner's queue, which may not know of it yet."""
     active = queue.active
     if pause_ends_in_s is not None:
-        paused = {"status": "paused", "ends_in_s": None}
-        active = [plan.model_copy(update=paused) if plan.status == "running" else plan for plan in active]
+        paused = {"status": PlanStatus.PAUSED, "ends_in_s": None}
+        active = [plan.model_copy(update=paused) if plan.status == PlanStatus.RUNNING else plan for plan in active]
     update = {"paused": pause_ends_in_s is not None, "pause_ends_in_s": pause_ends_in_s, "active": active}
     return queue.model_copy(update=update)
