@@ -1,4 +1,4 @@
-"""Write the reference pages that follow from the code: configuration, terms, REST."""
+"""Write the reference pages that follow from the code: configuration, terms, REST, streams."""
 
 import json
 import sys
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
+from async_reference import build_async_document, build_async_reference
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -124,6 +125,8 @@ PAGES = {
     "configuration.md": build_configuration_reference,
     "terms.md": build_terms_reference,
     "rest.md": build_rest_reference,
+    "streams.md": build_async_reference,
+    "asyncapi.json": build_async_document,
 }
 
 

@@ -7,6 +7,7 @@ from optodrive.planning.stimuli.json_values import PRIORITY_MAX, TIME_MAX_S
 from optodrive.planning.stimuli.labels import KEY_MAX, LABELS_MAX, NUMBER_MAX, TEXT_MAX
 from optodrive.planning.stimuli.pattern_registry import describe_patterns
 from optodrive.planning.stimuli.sequence_file import FRAMES_MAX, TRAINS_MAX
+from optodrive.planning.stimuli.streamed_frame import FRAME_NUMBER_MAX
 
 Schema = dict[str, Any]
 
@@ -25,22 +26,23 @@ _DURATION_SCHEMA: Schema = {"type": "number", "exclusiveMinimum": 0, "maximum": 
 _START_SCHEMA: Schema = {"type": "number", "minimum": 0, "maximum": TIME_MAX_S, "description": "s"}
 _POSITIVE_SCHEMA: Schema = {"type": "number", "exclusiveMinimum": 0}
 _PRIORITY_SCHEMA: Schema = {"type": "integer", "minimum": -PRIORITY_MAX, "maximum": PRIORITY_MAX}
-_FRAME_SCHEMA = _object_schema(
-    {
-        "show_at_s": _START_SCHEMA,
-        "duration_s": _DURATION_SCHEMA,
-        "target_um": {
-            "oneOf": [
-                {
-                    "type": "object",
-                    "additionalProperties": _HEIGHT_SCHEMA,
-                    "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"},
-                },
-                {"type": "array", "items": _HEIGHT_SCHEMA},
-            ],
-            "description": "heights by pixel, or one height per pixel",
+_TARGETS_SCHEMA: Schema = {
+    "oneOf": [
+        {
+            "type": "object",
+            "additionalProperties": _HEIGHT_SCHEMA,
+            "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"},
         },
-    },
+        {"type": "array", "items": _HEIGHT_SCHEMA},
+    ],
+    "description": "heights by pixel, or one height per pixel",
+}
+LIVE_FRAME_SCHEMA = _object_schema(
+    {"target_um": _TARGETS_SCHEMA}, {"frame": {"type": "integer", "minimum": 0, "maximum": FRAME_NUMBER_MAX}}
+)
+"""The schema of a streamed frame as text."""
+_FRAME_SCHEMA = _object_schema(
+    {"show_at_s": _START_SCHEMA, "duration_s": _DURATION_SCHEMA, "target_um": _TARGETS_SCHEMA},
     {
         "id": {"type": "string", "minLength": 1, "maxLength": ID_MAX},
         "simultaneous": {"type": "boolean"},
