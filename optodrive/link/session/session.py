@@ -279,7 +279,9 @@ class BoardSession:
                 now_s, self._last_received_s, silent=now_s - self._last_received_s > self._silence_max_s
             )
             message = f"{message}; likely cause: {cause.message}"
-        self.leave()
+        if self.connected:
+            self._send_abort()
+        self.disconnect()
         return message
 
     def close(self) -> None:
