@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from optodrive.core.errors import OptodriveError
+from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.core.ipc import Message
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.error_problem import build_error_problem
@@ -22,6 +22,8 @@ from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 OUTBOX_MAX = 1000
 """A client with this number of unread results is disconnected."""
 CLOSE_SLOW_READER = 1013
+FRAME_AGE_MAX_S = 2.0
+"""Longest time for which a frame may have waited in the socket: a backlog would light after its client has stopped."""
 
 
 class _Frame(NamedTuple):
@@ -72,6 +74,7 @@ class LiveStream:
                 return
             data: str | bytes = message.get("text") or message.get("bytes") or b""
             try:
+                self._require_recent(message[EARLIEST_S])
                 epoch = self._daemon.link.require_epoch_at(message[EARLIEST_S])
                 number, sequence = parse_live_frame(data, self._next_number, self._pixels)
                 frame = _Frame(number, encode_sequence(sequence), message[ARRIVED_S], epoch)
@@ -84,6 +87,12 @@ class LiveStream:
                 )
             self._pending, self._next_number = frame, number + 1
             self._arrived.set()
+
+    def _require_recent(self, earliest_s: float) -> None:
+        """Raise BusyError for a frame that may have arrived earlier than permitted."""
+        age_s = asyncio.get_running_loop().time() - earliest_s
+        if age_s > FRAME_AGE_MAX_S:
+            raise BusyError(f"the frame may have waited for {age_s:.3g} s, expected at most {FRAME_AGE_MAX_S:g} s")
 
     async def _plan(self) -> None:
         while True:

@@ -19,13 +19,22 @@ EVIDENCE_WINDOW_S = 5.0
 SAMPLE_INTERVAL_S = 0.5
 
 
+BOARD_COUNTER_MODULUS = 2**16
+"""The board's counters begin again at 0 here."""
+
+
 class LinkErrorCounts(NamedTuple):
-    """Error counts of a link since it was opened."""
+    """Error counts of a link since it was opened; board_bad_frames: of the board, modulo BOARD_COUNTER_MODULUS."""
 
     host_bad_frames: int = 0
     board_bad_frames: int = 0
     retransmitted: int = 0
     naks: int = 0
+
+    def count_since(self, then: "LinkErrorCounts") -> "LinkErrorCounts":
+        """Return what was counted since an earlier time."""
+        counts = LinkErrorCounts(*(now - before for now, before in zip(self, then, strict=True)))
+        return counts._replace(board_bad_frames=counts.board_bad_frames % BOARD_COUNTER_MODULUS)
 
 
 class LinkCause(NamedTuple):
@@ -51,7 +60,7 @@ class LinkWatch:
         self._counts = LinkErrorCounts()
         self._fault = ""
         self._last_received_s: float | None = None
-        self._board_bad_frames: int | None = None
+        self._counts_at_loss: LinkErrorCounts | None = None
         self._port_missing = False
 
     def on_opened(self) -> None:
@@ -97,7 +106,7 @@ class LinkWatch:
         silent: whether the link was closed because the board did not answer
         """
         self._last_received_s = last_received_s
-        self._board_bad_frames = self._counts.board_bad_frames if silent else None
+        self._counts_at_loss = self._counts if silent else None
         state = read_port_state(self._port)
         self._port_missing = state.status == "missing"
         self.cause = LinkCause(diagnose_link_loss(self._collect_evidence(now_s, state, silent)), now_s)
@@ -116,18 +125,19 @@ class LinkWatch:
 
         The board has restarted if its uptime is shorter than the time since its last message.
         """
+        since = None if self._counts_at_loss is None else counts.count_since(self._counts_at_loss)
         if self._last_received_s is not None and uptime_s < now_s - self._last_received_s:
             self.cause = LinkCause(describe_restart(reset_code, uptime_s), now_s)
-        elif self._board_bad_frames is not None and counts.board_bad_frames > self._board_bad_frames:
-            self.cause = LinkCause(describe_receive_errors(counts.board_bad_frames - self._board_bad_frames), now_s)
+        elif since is not None and since.board_bad_frames:
+            self.cause = LinkCause(describe_receive_errors(since.board_bad_frames), now_s)
         elif self._port_missing:
             self.cause = LinkCause(describe_replug(self._port), now_s)
-        self._last_received_s = self._board_bad_frames = None
+        self._last_received_s = self._counts_at_loss = None
         self._port_missing = False
 
     def _collect_evidence(self, now_s: float, state: PortState, silent: bool) -> LinkEvidence:
         oldest = self._samples[0][1] if self._samples else LinkErrorCounts()
-        recent = LinkErrorCounts(*(now - then for now, then in zip(self._counts, oldest, strict=True)))
+        recent = self._counts.count_since(oldest)
         withheld = (
             self._lease_withheld_s is not None and now_s - self._lease_withheld_s < self._lease_s + SAMPLE_INTERVAL_S
         )

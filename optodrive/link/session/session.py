@@ -50,7 +50,7 @@ from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import CLOCK_INTERVAL_S, ClockSync
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.lease_renewal import RENEWAL_FRACTION, LeaseRenewal
-from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
+from optodrive.link.session.link_watch import BOARD_COUNTER_MODULUS, LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.plan_job import PlanJob, PointTiming
 from optodrive.link.session.point_drain import PointDrain
 from optodrive.link.session.point_stream import PointStream
@@ -615,7 +615,8 @@ class BoardSession:
 
     def _count_errors(self) -> LinkErrorCounts:
         host, board = self._connection.counters, self.board
-        bad_frames = host.crc_errors + host.format_errors, board.crc_errors + board.format_errors
+        board_bad_frames = (board.crc_errors + board.format_errors) % BOARD_COUNTER_MODULUS
+        bad_frames = host.crc_errors + host.format_errors, board_bad_frames
         return LinkErrorCounts(*bad_frames, host.retransmitted, host.naks)
 
     def _describe_errors(self) -> str:

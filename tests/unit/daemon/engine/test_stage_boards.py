@@ -238,7 +238,7 @@ def test_arming_is_of_all_boards_or_of_none(monkeypatch):
     rig.cores[1].set_input("interlock", False, rig.links[1]._now_us())
     rig.run(0.5)
     result = rig.await_result(WEB, rig.request(WEB, "arm"))
-    assert "stage 's1': the board is FAULT INTERLOCK" in str(result["error"])
+    assert "stage 's1': the board is in FAULT INTERLOCK" in str(result["error"])
     rig.run(3.0)
     assert not list_states(rig) & set(ARMED_STATES)
 

@@ -539,8 +539,9 @@ def test_a_board_that_acknowledges_nothing_is_a_lost_link(rig):
     rig.begin(build_points(1500, DUTY))
     lost = rig.link.read
     rig.link.read = lambda timeout_s: drop_frames(lost(timeout_s), m.Ack, m.Nak)
-    rig.until(lambda: rig.service.link_error is not None)
-    assert "acknowledges nothing" in str(rig.service.link_error)
+    rig.until(lambda: not rig.boards.connected)
+    rig.run(0.2)
+    assert "acknowledges nothing" in rig.of_kind(WEB, "status")[-1].fields["link_error"]
     assert rig.core.state == BoardState.DISARMED
     rig.link.read = lost
     rig.until(lambda: rig.boards.connected)

@@ -240,3 +240,23 @@ def test_a_port_in_use_names_the_program(tmp_path):
         process.stdin.close()
     os.close(master)
     assert f"process {process.pid}: end that program" in watch.cause.message
+
+
+@pytest.mark.parametrize(("then", "now", "counted"), [(3, 5, 2), (65_530, 4, 10), (65_535, 0, 1), (7, 7, 0)])
+def test_counters_of_the_board_begin_again_after_65535(then, now, counted):
+    counts = LinkErrorCounts(host_bad_frames=9, board_bad_frames=now, retransmitted=8, naks=7)
+    since = counts.count_since(LinkErrorCounts(host_bad_frames=2, board_bad_frames=then, retransmitted=2, naks=2))
+    assert since == LinkErrorCounts(host_bad_frames=7, board_bad_frames=counted, retransmitted=6, naks=5)
+
+
+def test_a_board_that_counted_past_65535_while_it_was_silent_has_received_damaged_frames():
+    rig = NoisyRig().connect()
+    rig.core._link.decoder.counters.crc_errors = 65_533
+    rig.run(1.0)
+    rig.faults.inject_fault("flip_bits", 0.2)
+    run_until_lost(rig)
+    rig.faults.repair()
+    rig.connect()
+    assert rig.core._link.decoder.counters.crc_errors > 65_535
+    assert "damaged (" in get_cause(rig)
+    assert "-" not in get_cause(rig)
