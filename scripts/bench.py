@@ -14,6 +14,7 @@ import numpy as np
 from bench_field import bench_field
 from bench_memory import bench_memory
 from bench_stream import bench_stream
+from measuring import measure_median_cpu_s
 from rich.console import Console
 from rich.table import Table
 from scipy.integrate import solve_ivp
@@ -36,16 +37,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 from reference_models.coupled_display import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
 
 RUNS = 7
-
-
-def measure_median_s(work) -> float:
-    """Return the median CPU time of a call, s."""
-    times = []
-    for _ in range(RUNS):
-        begin_s = time.process_time()
-        work()
-        times.append(time.process_time() - begin_s)
-    return statistics.median(times)
 
 
 def build_full_frame(name="display-1511", height_m=50e-6):
@@ -80,9 +71,9 @@ def measure_plan_rows(height_um):
     planned_sequence = plan_sequence(display, sequence, heat, budget)
     batch = next(schedule_batches(display, sequence, heat))
     count = len(planned_sequence.plan)
-    schedule_s = measure_median_s(lambda: list(schedule_batches(display, sequence, heat)))
-    limit_s = measure_median_s(lambda: limit(batch, budget, display.budget))
-    total_s = measure_median_s(lambda: plan_sequence(display, sequence, heat, budget))
+    schedule_s = measure_median_cpu_s(lambda: list(schedule_batches(display, sequence, heat)))
+    limit_s = measure_median_cpu_s(lambda: limit(batch, budget, display.budget))
+    total_s = measure_median_cpu_s(lambda: plan_sequence(display, sequence, heat, budget))
     return [
         (f"{height_um} µm: pulses planned per second", count / schedule_s, "1/s"),
         (f"{height_um} µm: pulses limited per second", count / limit_s, "1/s"),
@@ -121,8 +112,8 @@ def bench_wire():
         verify(plan, points.row[decoded.index], decoded, budget, display.budget)
 
     return [
-        ("pulses quantised per second", len(plan) / measure_median_s(lambda: quantise(plan, scale)), "1/s"),
-        ("pulses decoded and verified per second", len(plan) / measure_median_s(run_verification), "1/s"),
+        ("pulses quantised per second", len(plan) / measure_median_cpu_s(lambda: quantise(plan, scale)), "1/s"),
+        ("pulses decoded and verified per second", len(plan) / measure_median_cpu_s(run_verification), "1/s"),
         ("bytes per pulse", len(payload) / len(plan), "B"),
     ]
 
@@ -131,7 +122,7 @@ def bench_board():
     """Benchmark the board session with the simulated board in virtual time."""
     display, sequence = build_full_frame()
     planned_sequence = plan_sequence(display, sequence, *display.build_cold_state())
-    seconds = measure_median_s(lambda: execute(display, planned_sequence))
+    seconds = measure_median_cpu_s(lambda: execute(display, planned_sequence))
     return [
         ("pulses through session and simulated board per second", len(planned_sequence.plan) / seconds, "1/s"),
         ("times real time", planned_sequence.duration_s / seconds, "×"),
@@ -273,7 +264,9 @@ def bench_limit():
         display, sequence = build_full_frame(height_m=height_um * 1e-6)
         heat, state = display.build_cold_state()
         batch = next(schedule_batches(display, sequence, heat))
-        limit_s = measure_median_s(lambda batch=batch, state=state, budget=display.budget: limit(batch, state, budget))
+        limit_s = measure_median_cpu_s(
+            lambda batch=batch, state=state, budget=display.budget: limit(batch, state, budget)
+        )
         rows.append((f"{height_um} µm: full frame of 1,511 pulses", 1e3 * limit_s, "ms"))
     display, sequence = build_full_frame()
     heat, state = display.build_cold_state()

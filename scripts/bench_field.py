@@ -1,12 +1,12 @@
 """Benchmark of the calibrated field: error on hidden geometries, and duration of conversions."""
 
-import statistics
 import subprocess
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+from measuring import measure_median_cpu_s
 
 from optodrive.core.numeric_tables import write_columns
 from optodrive.device.config import build_pixel_layout
@@ -17,7 +17,7 @@ from optodrive.lab.calibration.field_writer import write_field
 from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.link.simulator.true_geometry import CENTRE_CODE, GroundTruthGeometry
 
-GEOMETRIES, POINTS, RUNS = 10, 1_000_000, 7
+GEOMETRIES, POINTS = 10, 1_000_000
 NOISE_M, OUTLIER_SHARE = 10e-6, 0.02
 
 
@@ -55,16 +55,6 @@ class HiddenGeometryLab:
             length_um = 1e6 * np.hypot(*error_m)
             out.append((float(np.sqrt((length_um**2).mean())), float(length_um.max()), covered))
         return np.array(out)
-
-
-def measure_median_cpu_s(work):
-    """Return the median CPU time of a call, s."""
-    times = []
-    for _ in range(RUNS):
-        begin_s = time.process_time()
-        work()
-        times.append(time.process_time() - begin_s)
-    return statistics.median(times)
 
 
 def measure_command_s(*arguments):

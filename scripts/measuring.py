@@ -1,8 +1,9 @@
-"""What benchmarks share: an end to waiting, the lateness of the computer, and percentiles."""
+"""What benchmarks share: an end to waiting, times of calls, the lateness of the computer, and percentiles."""
 
 import json
 import os
 import signal
+import statistics
 import subprocess
 import sys
 import time
@@ -73,6 +74,16 @@ def realtime_priority():
         yield
     finally:
         os.sched_setscheduler(0, *scheduling)
+
+
+def measure_median_cpu_s(work, runs=7):
+    """Return the median CPU time of a call, s."""
+    times_s = []
+    for _ in range(runs):
+        begin_s = time.process_time()
+        work()
+        times_s.append(time.process_time() - begin_s)
+    return statistics.median(times_s)
 
 
 def compute_percentile(values, share):

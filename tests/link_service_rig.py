@@ -19,6 +19,20 @@ PLANNER, WEB, OPERATOR, SUPERVISOR = 1, 2, 3, 4
 STEP_S = 0.002
 
 
+class CuttableLink(MemoryLink):
+    """In-memory link through which nothing passes while it is cut."""
+
+    is_cut = False
+
+    def write(self, data):
+        if not self.is_cut:
+            super().write(data)
+
+    def read(self, timeout_s):
+        data = super().read(timeout_s)
+        return b"" if self.is_cut else data
+
+
 class ServiceRig:
     """A link service with its board. log: events of the board; received: messages by client, oldest first."""
 

@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 
 from displays import DISPLAYS
+from link_service_rig import CuttableLink
 from optodrive.core.errors import LinkError
 from optodrive.device.config_sections import StageSection
 from optodrive.link.service.link_settings_builder import build_board_settings
@@ -12,7 +13,6 @@ from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_clock import BoardClock
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.memory_link import MemoryLink
 from optodrive.planning.display_model import DisplayModel
 from planner_rig import PlannerRig
 
@@ -24,25 +24,16 @@ CLOCKS = (
 )
 
 
-class DriftingLink(MemoryLink):
-    """Link to a board with a clock of its own. is_cut: whether nothing passes."""
+class DriftingLink(CuttableLink):
+    """Link to a board with a clock of its own."""
 
     def __init__(self, core, clock, board_clock, name):
         super().__init__(core, clock)
         self.name = name
         self.board_clock = board_clock
-        self.is_cut = False
 
     def _now_us(self):
         return round(self.board_clock.read_s(self._clock.now_s()) * 1e6)
-
-    def write(self, data):
-        if not self.is_cut:
-            super().write(data)
-
-    def read(self, timeout_s):
-        data = super().read(timeout_s)
-        return b"" if self.is_cut else data
 
 
 class BreakingLink(DriftingLink):

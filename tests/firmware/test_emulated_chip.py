@@ -10,16 +10,15 @@ import threading
 
 import numpy as np
 import pytest
+from session_rig import configured
 
-from displays import DISPLAYS
+from link_service_rig import CuttableLink
 from optodrive.core.clock import ManualClock
-from optodrive.device.config import Config
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.session import session as session_module
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
-from optodrive.link.simulator.memory_link import MemoryLink
 
 TICK_US = 100
 WATCHDOG_US = 50_000
@@ -31,30 +30,10 @@ LATE_MAX_US = 2 * TICK_US
 """From an edge's time to the pin: what the main loop and the guards compute before."""
 
 
-def build_config():
-    table = DISPLAYS["display-16"].config.model_dump()
-    table["board"] |= {"lease_s": LEASE_S}
-    return Config.model_validate(table)
-
-
 def build_points(count):
     rows = np.arange(count)
     columns = [np.full(count, value) for value in (DARK_US, ON_US, DUTY)]
     return WirePoints(np.column_stack([PLACES[rows % len(PLACES)], *columns]).astype(np.uint16), rows)
-
-
-class CuttableLink(MemoryLink):
-    """Link of which no bytes pass if it is cut."""
-
-    is_cut = False
-
-    def write(self, data):
-        if not self.is_cut:
-            super().write(data)
-
-    def read(self, timeout_s):
-        data = super().read(timeout_s)
-        return b"" if self.is_cut else data
 
 
 class Rig:
@@ -64,7 +43,7 @@ class Rig:
         self.clock, self.log = ManualClock(), []
         self.chip = make_chip(BoardSettings(), self.log.append, seed=1)
         self.link = CuttableLink(self.chip, self.clock)
-        self.session = BoardSession(self.link, self.clock, build_board_requirements(build_config()))
+        self.session = BoardSession(self.link, self.clock, build_board_requirements(configured(LEASE_S)))
 
     def of(self, kind):
         return [event for event in self.log if event["event"] == kind]

@@ -14,14 +14,13 @@ from dataclasses import replace
 
 import pytest
 
-from link_service_rig import OPERATOR, PLANNER, REQUIREMENTS, SUPERVISOR, WEB, ServiceRig
+from link_service_rig import OPERATOR, PLANNER, REQUIREMENTS, SUPERVISOR, WEB, CuttableLink, ServiceRig
 from optodrive.core.ipc import IpcError
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.epoch import Epoch
 from optodrive.link.service.pauses import Pauses
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
-from optodrive.link.simulator.memory_link import MemoryLink
 from wire_points import build_points
 
 LEASE_S = 0.5
@@ -35,20 +34,6 @@ INPUTS = {"interlock": (False, True), "key": (False, True), "estop": (True, Fals
 """Unsafe and safe value of each input."""
 
 
-class BreakableLink(MemoryLink):
-    """In-memory link that may lose all bytes."""
-
-    is_cut = False
-
-    def write(self, data):
-        if not self.is_cut:
-            super().write(data)
-
-    def read(self, timeout_s):
-        data = super().read(timeout_s)
-        return b"" if self.is_cut else data
-
-
 class Interleaving:
     """One random interleaving. accepted: epoch of each push by its duty; waiting: pushes not yet handed over.
 
@@ -58,7 +43,7 @@ class Interleaving:
 
     def __init__(self, seed):
         self.random = random.Random(seed)
-        self.rig = ServiceRig(link_type=BreakableLink, settings=SETTINGS, requirements=PATIENT).hello_all()
+        self.rig = ServiceRig(link_type=CuttableLink, settings=SETTINGS, requirements=PATIENT).hello_all()
         self.accepted, self.waiting, self.last_count = {}, [], 0
         self.epochs = [(0.0, self.rig.epoch)]
         self.built, self.pauses = {}, [(0.0, 0, False)]

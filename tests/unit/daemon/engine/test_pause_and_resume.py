@@ -9,19 +9,11 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.pauses import PAUSE_MAX_S
-from planner_rig import PlannerRig, build_frame, build_train
+from planner_rig import build_frame, build_train
 
 KEPT_INTERRUPT = ActivePlan.interrupt
 DARK_WITHIN_S = 0.004
 """Time from a request to the end of the light: one exchange with the board."""
-
-
-@pytest.fixture
-def rig(monkeypatch):
-    rig = PlannerRig(monkeypatch).ready()
-    rig.arm()
-    rig.run(0.01)
-    return rig
 
 
 def submit(rig, sequence, streamed=False, caller=""):
