@@ -112,6 +112,10 @@ class LinkWatch:
         self.cause = LinkCause(diagnose_link_loss(self._collect_evidence(now_s, state, silent)), now_s)
         return self.cause
 
+    def on_false_report(self, message: str, now_s: float) -> None:
+        """Record a report of the board that cannot be, because of which the link was closed."""
+        self.cause = LinkCause(message, now_s)
+
     def on_reconnect_failed(self, now_s: float) -> None:
         """Update the cause from the port's state after a failed attempt to reconnect."""
         state = read_port_state(self._port)

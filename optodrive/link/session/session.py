@@ -270,11 +270,12 @@ class BoardSession:
     def on_lost(self, error: Exception) -> str:
         """Send ABORT if possible, close the link after an error, and return its message, with the likely cause.
 
-        A report that cannot be says itself what is wrong.
+        A report that cannot be is itself the cause.
         """
-        message = str(error)
-        if isinstance(error, LinkError) and not isinstance(error, FalseReportError):
-            now_s = self._clock.now_s()
+        message, now_s = str(error), self._clock.now_s()
+        if isinstance(error, FalseReportError):
+            self._watch.on_false_report(message, now_s)
+        elif isinstance(error, LinkError):
             cause = self._watch.on_lost(
                 now_s, self._last_received_s, silent=now_s - self._last_received_s > self._silence_max_s
             )

@@ -6,7 +6,7 @@ import pytest
 from link_service_rig import OPERATOR, PLANNER, SUPERVISOR, WEB, ServiceRig
 from optodrive.core.ipc import IpcError, Message
 from optodrive.link.protocol import messages as m
-from optodrive.link.protocol.framing import FrameDecoder, encode_frame
+from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service import control
 from optodrive.link.service.control import HOLD_MAX_S
@@ -544,6 +544,30 @@ def test_a_board_that_acknowledges_nothing_is_a_lost_link(rig):
     assert "acknowledges nothing" in rig.of_kind(WEB, "status")[-1].fields["link_error"]
     assert rig.core.state == BoardState.DISARMED
     rig.link.read = lost
+    rig.until(lambda: rig.boards.connected)
+    rig.arm()
+
+
+def test_a_report_that_cannot_be_is_the_cause_of_the_loss_and_sends_abort(rig):
+    rig.arm()
+    rig.begin(build_points(1500, DUTY))
+    rig.run(0.3)
+    honest = rig.link.read
+    board = rig.core._link
+
+    def read_with_a_false_report(timeout_s):
+        data, report = honest(timeout_s), m.Ack(board.expected_seq, 65_535, 0, m.STATES.index("RUNNING"))
+        return data + encode_frame(Frame(m.Ack.TYPE, 0, board.session, report.encode_body()))
+
+    rig.link.read = read_with_a_false_report
+    rig.run(0.004)
+    rig.link.read = honest
+    assert rig.core.state == BoardState.DISARMED
+    assert [entry["reason"] for entry in rig.log if entry["event"] == "state"][-1] == "abort"
+    rig.run(0.05)
+    status = rig.of_kind(WEB, "status")[-1].fields
+    says = "the board reports free_points 65535 in ACK, expected at most 4096, the queue's room"
+    assert status["cause"][0] == status["link_error"] == says
     rig.until(lambda: rig.boards.connected)
     rig.arm()
 
