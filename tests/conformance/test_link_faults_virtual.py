@@ -1,7 +1,8 @@
-"""A real session and a board over a faulty link in virtual time: 50,000 faults, 200,000 with --slow."""
+"""A real session and each board core over a faulty link in virtual time: 100,000 faults, 400,000 with --slow."""
 
 import random
 from dataclasses import replace
+from functools import partial
 from math import inf
 
 import pytest
@@ -23,13 +24,20 @@ FAULT_RATES += [
     if (seed, loss) not in FAULT_RATES
 ]
 FAULTS_EACH = 25_000
+CHIP_FAULTS = 5_000
 ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 
 
-def run_fault_sessions(rig):
+@pytest.fixture(params=["python", "c"])
+def make_rig(request, virtual):
+    """Return a function that builds a rig with a board core."""
+    return partial(VirtualRig, make_core=virtual(request.param).make_core)
+
+
+def run_fault_sessions(rig, faults=FAULTS_EACH):
     """Run sessions until enough faults are injected; return the number of sessions and pulses."""
     sessions = pulses = 0
-    while rig.faults < FAULTS_EACH:
+    while rig.faults < faults:
         rig.live(3000, patience_s=4.0)
         pulses += rig.check()
         sessions += 1
@@ -37,8 +45,8 @@ def run_fault_sessions(rig):
 
 
 @pytest.mark.parametrize(("seed", "loss"), FAULT_RATES)
-def test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(seed, loss):
-    rig = VirtualRig(seed, loss, extra=0.6, pauses=0.001)
+def test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(make_rig, seed, loss):
+    rig = make_rig(seed, loss, extra=0.6, pauses=0.001)
     rig.up.never_again = ENDING if seed == 2 else ()
     sessions, pulses = run_fault_sessions(rig)
     kinds = rig.up.counts + rig.down.counts
@@ -47,26 +55,45 @@ def test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(seed, loss):
     assert len(kinds) == 11, "a kind of fault that never came"
 
 
-BROKEN = [
-    ["b1_gate_stays_on_after_running"],
-    ["b12_duplicates_are_accepted", "b12_index_is_not_checked"],
-    ["b13_no_crc"],
-]
+@pytest.mark.slow
+def test_the_emulated_chip_emits_each_pulse_as_sent_once_and_in_order(virtual):
+    rig = VirtualRig(6, 0.05, extra=0.6, pauses=0.001, make_core=virtual("qemu").make_core)
+    _, pulses = run_fault_sessions(rig, CHIP_FAULTS)
+    assert pulses > 0
+    rig.core.close()
 
 
-@pytest.mark.parametrize("names", BROKEN, ids=lambda names: names[0])
-def test_a_board_that_violates_a_guard_is_detected(monkeypatch, names):
-    for name in names:
+BROKEN = {
+    "B1": (["b1_gate_stays_on_after_running"], 1),
+    "B12": (["b12_duplicates_are_accepted", "b12_index_is_not_checked"], 103),
+    "B13": (["b13_no_crc"], 13),
+}
+"""Mutants of the simulated board, and MUTANT of the C core."""
+SEEDS = range(5, 13)
+"""Which frames are lost when a seed decides, and not each loss meets the guard."""
+
+
+@pytest.mark.parametrize("guard", BROKEN)
+@pytest.mark.parametrize("core", ["python", "c"])
+def test_a_board_that_violates_a_guard_is_detected(monkeypatch, virtual, core, guard):
+    names, number = BROKEN[guard]
+    for name in names if core == "python" else ():
         monkeypatch.setattr(*MUTANTS[name]())
+    make_core = virtual(core, *[number] * (core == "c")).make_core
+
+    def run_all():
+        for seed in SEEDS:
+            run_fault_sessions(VirtualRig(seed, 0.15, extra=0.6, pauses=0.001, make_core=make_core))
+
     with pytest.raises(AssertionError):
-        run_fault_sessions(VirtualRig(5, 0.15, extra=0.6, pauses=0.001))
+        run_all()
 
 
-def test_a_run_can_be_played_again(monkeypatch):
+def test_a_run_can_be_played_again(make_rig, monkeypatch):
     reported = []
     for _ in range(2):
         monkeypatch.setattr(session_module.secrets, "randbits", random.Random(4).getrandbits)
-        rig = VirtualRig(4, 0.1, extra=0.5, pauses=0.002)
+        rig = make_rig(4, 0.1, extra=0.5, pauses=0.002)
         for _ in range(6):
             rig.live(1000, patience_s=4.0)
         reported.append((rig.log, rig.up.log, rig.down.log))
@@ -86,8 +113,8 @@ def test_equal_seeds_give_equal_faults():
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
-def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(seed):
-    rig = VirtualRig(seed, paced=True)
+def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(make_rig, seed):
+    rig = make_rig(seed, paced=True)
     rig.session.connect()
     assert rig.armed()
     rig.up.loss = rig.down.loss = 0.05
@@ -164,14 +191,14 @@ MOMENTS = [(3, 19), pytest.param(range(7, 35, 4), marks=pytest.mark.slow)]
 """Numbers of executed points at an abort."""
 
 
-def off_after_abort_s(baud, moments):
+def off_after_abort_s(make_rig, baud, moments):
     """Return the maximum time from an abort on a saturated line to gate off, s."""
-    return max(off_after_abort_at_s(baud, executed) for executed in moments)
+    return max(off_after_abort_at_s(make_rig, baud, executed) for executed in moments)
 
 
-def off_after_abort_at_s(baud, executed):
+def off_after_abort_at_s(make_rig, baud, executed):
     config, limits = configured(0.5, baud), replace(DEFAULT_LIMITS, lease_ms=500)
-    rig = VirtualRig(1, paced=True, config=config, limits=limits)
+    rig = make_rig(1, paced=True, config=config, limits=limits)
     rig.session.connect()
     assert rig.armed()
     job = rig.begin(
@@ -193,23 +220,23 @@ def abort_bound_s(baud):
 
 @pytest.mark.parametrize("moments", MOMENTS)
 @pytest.mark.parametrize("baud", LINES)
-def test_an_abort_takes_effect_5_ms_after_the_data_in_flight(baud, moments):
-    dark_s = off_after_abort_s(baud, moments)
+def test_an_abort_takes_effect_5_ms_after_the_data_in_flight(make_rig, baud, moments):
+    dark_s = off_after_abort_s(make_rig, baud, moments)
     print(f"{baud} baud: dark {dark_s * 1e3:.1f} ms after an abort, of {abort_bound_s(baud) * 1e3:.1f}")
     assert dark_s <= abort_bound_s(baud)
 
 
 def test_a_host_that_keeps_more_in_flight_is_detected(monkeypatch):
     monkeypatch.setattr(board_requirements, "MAX_IN_FLIGHT_S", 0.1)
-    assert off_after_abort_s(115_200, (3, 19)) > abort_bound_s(115_200)
+    assert off_after_abort_s(VirtualRig, 115_200, (3, 19)) > abort_bound_s(115_200)
 
 
 # --- a host that stalls ---------------------------------------------------------------------------------------------
 
 
-def stalled(for_s, ahead_s):
+def stalled(make_rig, for_s, ahead_s):
     """Stall a host with a lease of half a second during a job; return the rig and the job."""
-    rig = VirtualRig(1, config=configured(lease_s=0.5), limits=replace(DEFAULT_LIMITS, lease_ms=500))
+    rig = make_rig(1, config=configured(lease_s=0.5), limits=replace(DEFAULT_LIMITS, lease_ms=500))
     rig.session.connect()
     assert rig.armed()
     job = rig.begin(2000, dark_us=900, ahead_s=ahead_s)
@@ -219,8 +246,8 @@ def stalled(for_s, ahead_s):
     return rig, job
 
 
-def test_a_stall_of_a_quarter_second_has_no_effect():
-    rig, job = stalled(0.25, ahead_s=0.5)
+def test_a_stall_of_a_quarter_second_has_no_effect(make_rig):
+    rig, job = stalled(make_rig, 0.25, ahead_s=0.5)
     assert rig.core.state == "RUNNING"
     assert rig.until(lambda: job.is_finished, 10.0)
     assert "HOLD" not in [entry["state"] for entry in rig.log if entry["event"] == "state"]
@@ -228,8 +255,8 @@ def test_a_stall_of_a_quarter_second_has_no_effect():
     assert rig.check() == 2000
 
 
-def test_a_stall_longer_than_the_queue_is_a_hold_that_resumes():
-    rig, job = stalled(0.4, ahead_s=0.25)
+def test_a_stall_longer_than_the_queue_is_a_hold_that_resumes(make_rig):
+    rig, job = stalled(make_rig, 0.4, ahead_s=0.25)
     assert rig.core.state == "HOLD"
     assert not rig.core.gate
     assert rig.until(lambda: job.is_finished, 10.0)
@@ -237,8 +264,8 @@ def test_a_stall_longer_than_the_queue_is_a_hold_that_resumes():
     assert rig.check() == 2000
 
 
-def test_a_stall_longer_than_the_lease_is_a_fault_that_does_not_resume():
-    rig, job = stalled(0.7, ahead_s=inf)
+def test_a_stall_longer_than_the_lease_is_a_fault_that_does_not_resume(make_rig):
+    rig, job = stalled(make_rig, 0.7, ahead_s=inf)
     assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
     assert not rig.core.gate
     assert not rig.until(lambda: job.is_finished or rig.core.state != "FAULT", 3.0)
