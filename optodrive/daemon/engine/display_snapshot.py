@@ -63,7 +63,7 @@ class LiveThermalState:
     def __init__(self, display: DisplayModel) -> None:
         self._display = display
         self._heat, self._budget = display.build_cold_state()
-        self._peak_m = np.zeros(len(display.layout))
+        self._peaks = self._build_no_peaks()
         self.out_of_order = 0
 
     def apply(self, executed: ExecutedBatch) -> None:
@@ -71,7 +71,8 @@ class LiveThermalState:
         columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
         try:
             peaks = self._heat.apply_pulses(*columns)
-            np.maximum.at(self._peak_m, executed.pixel, peaks.displacement_m)
+            for held, values in zip(self._peaks, peaks, strict=True):
+                np.maximum.at(held, executed.pixel, values)
         except ValueError:
             self.out_of_order += len(executed.row)
         self._budget = commit_executed(executed.pixel, executed.stage, executed, self._budget, self._display.budget)
@@ -84,10 +85,14 @@ class LiveThermalState:
         """Return the state of all pixels at a board time, s."""
         return self._heat.state_at(board_s)
 
-    def take_peaks_m(self) -> FloatArray:
-        """Return the peak displacement of the pulses applied since the last call, m, [p]; 0 on pixels without any."""
-        peak_m, self._peak_m = self._peak_m, np.zeros(len(self._peak_m))
-        return peak_m
+    def take_peaks(self) -> DisplayState:
+        """Return the peaks of the pulses applied since the last call; 0 on pixels without any."""
+        peaks, self._peaks = self._peaks, self._build_no_peaks()
+        return peaks
+
+    def _build_no_peaks(self) -> DisplayState:
+        pixels = len(self._display.layout)
+        return DisplayState(np.zeros(pixels), np.zeros(pixels))
 
     def compute_usage(self, board_s: float) -> tuple[Usage, ...]:
         """Compute the usage of every cap at a board time, s."""

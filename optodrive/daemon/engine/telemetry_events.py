@@ -19,15 +19,16 @@ TEMPERATURE_UNIT_K = 0.1
 
 
 def build_display_event(
-    board_s: float, warm: bool, state: DisplayState, peak_m: FloatArray, ambient_c: float
+    board_s: float, warm: bool, state: DisplayState, peaks: DisplayState, ambient_c: float
 ) -> DisplayEvent:
-    """Encode displacement, its peak [p] since the last event, and absorber temperature of every pixel at a time."""
+    """Encode every pixel at a board time, and its peaks since the last event."""
     return DisplayEvent(
         board_s=round(board_s, 6),
         warm=warm,
         height=_encode_base64(state.displacement_m / HEIGHT_UNIT_M),
-        peak=_encode_base64(peak_m / HEIGHT_UNIT_M),
+        height_peak=_encode_base64(peaks.displacement_m / HEIGHT_UNIT_M),
         absorber=_encode_base64((ambient_c + state.absorber_k) / TEMPERATURE_UNIT_K),
+        absorber_peak=_encode_base64((ambient_c + peaks.absorber_k) / TEMPERATURE_UNIT_K),
     )
 
 

@@ -19,6 +19,7 @@ from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.progress import ClockShift, merge_events
 from optodrive.daemon.engine.telemetry_events import build_display_event, build_pulse_batch, describe_caps
 from optodrive.daemon.responses.telemetry import BudgetEvent
+from optodrive.physics.nominal_display import DisplayState
 
 IDLE_RATE_HZ = 20.0
 BUDGET_PERIOD_S, COLD_DISPLAY_PERIOD_S = 0.25, 1.0
@@ -113,7 +114,7 @@ class TelemetryProducer:
         self._collect_executed()
         self._announce_planned(board_s)
         if not self._readers:
-            self._executed_state.take_peaks_m()  # they are older than what the next reader has seen
+            self._executed_state.take_peaks()  # they are older than what the next reader has seen
             return
         self._publish_display(now_s, board_s)
         if self._is_due("budget", now_s, BUDGET_PERIOD_S):
@@ -139,10 +140,13 @@ class TelemetryProducer:
 
     def _publish_display(self, now_s: float, board_s: float) -> None:
         pixel_state = self._executed_state.state_at(board_s)
-        was_warm, peak_m = self._is_warm, np.maximum(self._executed_state.take_peaks_m(), pixel_state.displacement_m)
-        self._is_warm = bool(peak_m.max() > WARM_DISPLACEMENT_M or np.abs(pixel_state.absorber_k).max() > WARM_RISE_K)
+        was_warm = self._is_warm
+        peaks = DisplayState(*map(np.maximum, self._executed_state.take_peaks(), pixel_state))
+        self._is_warm = bool(
+            peaks.displacement_m.max() > WARM_DISPLACEMENT_M or np.abs(pixel_state.absorber_k).max() > WARM_RISE_K
+        )
         if self._is_warm or was_warm or self._is_due("display", now_s, COLD_DISPLAY_PERIOD_S):
-            event = build_display_event(board_s, self._is_warm, pixel_state, peak_m, self._config.ambient_c)
+            event = build_display_event(board_s, self._is_warm, pixel_state, peaks, self._config.ambient_c)
             self._publish("display", event)
 
     def _collect_executed(self) -> None:

@@ -320,10 +320,11 @@ telemetry.addEventListener("display", ({ detail }) => {
   find("stale").hidden = true;
   freshness.see("display");
   const fromTenths = (values) => Float32Array.from(values, (value) => value / 10);
-  const [height, peak, absorber] = [detail.height, detail.peak, detail.absorber].map((column) => fromTenths(decodeUint16(column)));
+  const read = (column) => fromTenths(decodeUint16(column));
+  const [height, absorber] = [read(detail.height), read(detail.absorber)];
   view.beamPath = find("beam").checked ? timeline.beamPath() : [];
   view.setValues(height, absorber);
-  trace.add(detail.board_s, peak[view.cursor], absorber[view.cursor]);
+  trace.add(detail.board_s, read(detail.height_peak)[view.cursor], read(detail.absorber_peak)[view.cursor]);
 });
 telemetry.run();
 

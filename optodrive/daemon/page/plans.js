@@ -68,6 +68,7 @@ export class PlanControl extends EventTarget {
       this.previewed = stimulus;
       this.playButton.disabled = false;
       this.#showSummary(plan);
+      this.result.scrollIntoView({ block: "nearest" }); // in a low window it is below the fold
       this.dispatchEvent(new CustomEvent("previewed", { detail: plan.pulses }));
     } catch (error) {
       this.#showError(error);

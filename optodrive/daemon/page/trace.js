@@ -1,4 +1,4 @@
-// Height and temperature of the selected pixel over the last ten seconds; of the height, the peak between two messages.
+// Height and temperature of the selected pixel over the last ten seconds: the peaks between two messages.
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 import { readThemeColour } from "./colours.js";
@@ -54,13 +54,13 @@ export class Trace {
     return Math.max(0, ...this.height);
   }
 
-  // peakUm: the highest since the last call
-  add(boardS, peakUm, absorberC) {
+  // heightUm, absorberC: the highest since the last call
+  add(boardS, heightUm, absorberC) {
     if (this.t.length && boardS < this.t.at(-1)) {
       this.clear();
     }
     this.t.push(boardS);
-    this.height.push(peakUm);
+    this.height.push(heightUm);
     this.absorber.push(absorberC);
     const first = this.t.findIndex((s) => s > boardS - HISTORY_S);
     for (const column of [this.t, this.height, this.absorber]) {

@@ -19,16 +19,17 @@ class FaultEvent(JsonModel):
 class DisplayEvent(JsonModel):
     """Every pixel at a board time: base64 of little-endian u16, heights in 0.1 µm, temperatures in 0.1 °C.
 
-    height: at the board time
-    peak: the largest height since the previous event that the reader received, also that to which a pulse that was
-    executed since then still raises the pixel
+    height, absorber: at the board time
+    height_peak, absorber_peak: the largest since the previous event that the reader received, also the height to which
+    a pulse that was executed since then still raises the pixel
     """
 
     board_s: float
     warm: bool
     height: str
-    peak: str
+    height_peak: str
     absorber: str
+    absorber_peak: str
 
 
 class PulseBatch(JsonModel):

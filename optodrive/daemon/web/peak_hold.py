@@ -7,20 +7,22 @@ import numpy as np
 from optodrive.core.types.arrays import IntArray
 from optodrive.daemon.responses.telemetry import DisplayEvent
 
+COLUMNS = ("height_peak", "absorber_peak")
+
 
 def decode_peaks(event: DisplayEvent) -> IntArray:
-    """Return the peaks [p] of a display event, in its unit."""
-    return np.frombuffer(b64decode(event.peak), dtype="<u2").astype(np.int64)
+    """Return the peaks [2, p] of a display event, of COLUMNS in their units."""
+    return np.stack([np.frombuffer(b64decode(getattr(event, name)), dtype="<u2") for name in COLUMNS]).astype(np.int64)
 
 
 class PeakHold:
-    """Highest peak of every pixel over the display events since the one that a reader received last."""
+    """Highest peaks of every pixel over the display events since the one that a reader received last."""
 
     def __init__(self) -> None:
         self._peaks: IntArray | None = None
 
     def add(self, peaks: IntArray) -> None:
-        """Add the peaks [p] of a new event."""
+        """Add the peaks [2, p] of a new event."""
         self._peaks = peaks if self._peaks is None else np.maximum(self._peaks, peaks)
 
     def release(self, newest: DisplayEvent) -> DisplayEvent:
@@ -28,4 +30,5 @@ class PeakHold:
         peaks, self._peaks = self._peaks, None
         if peaks is None:
             return newest
-        return newest.model_copy(update={"peak": b64encode(peaks.astype("<u2").tobytes()).decode()})
+        columns = zip(COLUMNS, peaks.astype("<u2"), strict=True)
+        return newest.model_copy(update={name: b64encode(column.tobytes()).decode() for name, column in columns})

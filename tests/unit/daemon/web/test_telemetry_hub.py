@@ -12,7 +12,7 @@ from optodrive.daemon.engine.telemetry_events import build_display_event
 from optodrive.daemon.responses.state import StateReport
 from optodrive.daemon.responses.telemetry import DisplayEvent, PulsesEvent
 from optodrive.daemon.web import telemetry_hub
-from optodrive.daemon.web.peak_hold import decode_peaks
+from optodrive.daemon.web.peak_hold import COLUMNS, decode_peaks
 from optodrive.daemon.web.telemetry_hub import TelemetryHub
 from optodrive.physics.nominal_display import DisplayState
 
@@ -48,12 +48,15 @@ def build_event(kind, text, warm=True):
 def build_display(peaks_um, height_um=0.0):
     """Build the display event of a few pixels with these peaks."""
     heights, peaks = (np.array(each) * 1e-6 for each in (np.full(len(peaks_um), height_um), peaks_um))
-    display = build_display_event(1.5, True, DisplayState(heights, np.zeros(len(peaks_um))), peaks, 20.0)
+    state, peaks = DisplayState(heights, 0.0 * heights), DisplayState(peaks, 1e6 * peaks)
+    display = build_display_event(1.5, True, state, peaks, 0.0)
     return build_event("display", display.model_dump_json())
 
 
 def read_peaks_um(data):
-    return decode_peaks(DisplayEvent.model_validate_json(data)).tolist()
+    heights, temperatures = decode_peaks(DisplayEvent.model_validate_json(data)).tolist()
+    assert temperatures == heights  # as built above, 1 °C per µm
+    return heights
 
 
 def build_batch(plan, rows, kind="executed"):
@@ -122,7 +125,8 @@ def test_a_reader_gets_the_peaks_of_the_displays_that_it_has_missed():
         assert [read_peaks_um(data) for _, data in fast.events] == [[300, 0], [1500, 40], [50, 60]]
         ((_, data),) = await slow.until(1)
         assert read_peaks_um(data) == [1500, 60]
-        assert json.loads(data) | {"peak": None} == json.loads(fast.events[-1][1]) | {"peak": None}
+        others = dict.fromkeys(COLUMNS)
+        assert json.loads(data) | others == json.loads(fast.events[-1][1]) | others
         hub.receive(build_display([7.0, 8.0]))
         assert read_peaks_um((await slow.until(2))[1][1]) == [70, 80]
         await fast.leave()
