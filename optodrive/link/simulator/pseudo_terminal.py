@@ -26,3 +26,9 @@ def open_pty(link: Path) -> int:
     temporary.replace(link)
     os.close(slave)  # from now on a hang-up means that no host has the port open
     return master
+
+
+def remove_link(link: Path, terminal: Path) -> None:
+    """Remove a link that open_pty() has created, unless another instrument has its name by now."""
+    if link.is_symlink() and link.readlink() == terminal:
+        link.unlink()

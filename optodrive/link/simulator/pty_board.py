@@ -15,7 +15,7 @@ from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.faulty_link import FaultyLink
 from optodrive.link.simulator.line_rate import READ_MAX, LineRate
-from optodrive.link.simulator.pseudo_terminal import open_pty
+from optodrive.link.simulator.pseudo_terminal import open_pty, remove_link
 from optodrive.link.simulator.script import SENSOR_ACTIONS, ScriptStep
 
 if TYPE_CHECKING:
@@ -107,6 +107,7 @@ class PtyBoard:
 
     def _open_pty(self) -> None:
         self._master = open_pty(self._link_path)
+        self._terminal = self._link_path.readlink()
 
     def _log(self, event: dict[str, Any]) -> None:
         if self._optics is not None:
@@ -140,7 +141,7 @@ class PtyBoard:
                 self._run_once()
         finally:
             self._core.on_link_lost(self._now_us())
-            self._link_path.unlink(missing_ok=True)
+            remove_link(self._link_path, self._terminal)
             if self._optics is not None:
                 self._optics.close()
 

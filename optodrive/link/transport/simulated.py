@@ -52,6 +52,8 @@ class SimulatedBoard(SerialPort):
         self._folder.cleanup()
 
     def _start(self) -> None:
+        if Path(self.name).is_symlink():  # of an earlier board, whose terminal another program may have by now
+            Path(self.name).unlink()
         arguments = ["--pty", self.name, "--log", str(self.log), "--baud", str(self._baud)]
         arguments += ["--limits", str(self._limits)]
         if self._display is not None:
