@@ -1,6 +1,7 @@
 """Execution of a plan on simulated boards in virtual time, through the real sessions and protocol."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import BoardFaultError
@@ -28,6 +29,7 @@ def execute(
 ) -> ExecutedPulses:
     """Arm new simulated boards, stream the plan, and return the pulses that they report.
 
+    Their times count from the plan's zero, or from the first pulse of a board whose clock let it begin earlier.
     Raise BoardFaultError if a board disarms or enters FAULT.
     """
     boards = _build_boards(display.config)
@@ -43,7 +45,9 @@ def execute(
         if on_progress is not None:
             on_progress(job.executed_count / len(prepared.plan))
     boards.close()
-    return job.build_executed(prepared.plan, scales)
+    executed = job.build_executed(prepared.plan, scales)
+    early_s = -min(0.0, float(executed.start_s.min(initial=0.0)))
+    return replace(executed, start_s=executed.start_s + early_s)
 
 
 def _build_boards(config: Config) -> BoardGroup:
