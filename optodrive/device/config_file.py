@@ -18,6 +18,7 @@ from optodrive.device.plausible_config import check_units
 
 RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
 """Keys that version 4 renamed, with their new names."""
+OLD_VERSIONS = (1, 2, 3)
 MIRRORS_FORMAT = "optodrive-mirrors"
 MIRRORS_VERSION = 1
 DEFAULT_CONFIG = "display-437"
@@ -46,10 +47,16 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
         if str(source) not in list_shipped_configs():
             raise InputError("--config", str(source), "a file, or " + ", ".join(list_shipped_configs()))
         path = locate_shipped(f"{source}.toml")
-    table = read_toml(path)
-    if table.get("format") == FORMAT and table.get("version") == 3:
+    config = build_config(path, read_toml(path))
+    return _apply_measured_servos(config) if measured_servo else config
+
+
+def build_config(path: Path, table: dict[str, Any]) -> Config:
+    """Build the configuration of a file's table, with the servo that it states. Raise InputError with one line."""
+    if table.get("format") == FORMAT and table.get("version") in OLD_VERSIONS:
         renamed = ", ".join(f"{old} is now {new}" for old, new in RENAMED_KEYS.items())
-        raise InputError(f"{path}: version", 3, f"{VERSION}: {renamed}")
+        expected = f"{VERSION}: {renamed}; `optodrive config migrate` renames them, or lists the lines to change"
+        raise InputError(f"{path}: version", table["version"], expected)
     check_format(path, table, FORMAT, VERSION)
     check_units(path, table)
     stages = table.get("stages")
@@ -61,9 +68,7 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
         config = Config.model_validate(table)
     except ValidationError as error:
         raise build_input_error(error, str(path), Config) from None
-    if len(config.stages) == 1:
-        config = config.list_stage_configs()[0]
-    return _apply_measured_servos(config) if measured_servo else config
+    return config.list_stage_configs()[0] if len(config.stages) == 1 else config
 
 
 def _apply_measured_servos(config: Config) -> Config:
