@@ -3,7 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
@@ -11,14 +11,68 @@ from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_json
 from optodrive.core.errors import InputError
 
+Answer = TypeVar("Answer", int, float, str)
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = typer.Typer(help="Write, show, check or migrate a configuration.", no_args_is_help=True)
+    group.command("new")(new)
     group.command("show")(show)
     group.command("check")(check)
     group.command("migrate")(migrate)
     app.add_typer(group, name="config")
+
+
+def new(
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="Configuration to write; no file is overwritten.")],
+    rows: Annotated[int | None, typer.Option("--rows", min=1, max=200, help="Rows of pixels.")] = None,
+    columns: Annotated[int | None, typer.Option("--columns", min=1, max=200, help="Columns of pixels.")] = None,
+    pitch_mm: Annotated[
+        float | None, typer.Option("--pitch-mm", metavar="MM", help="Distance of neighbouring pixels.")
+    ] = None,
+    power_w: Annotated[
+        float | None, typer.Option("--power-w", metavar="W", help="Power of the laser on the pixels at full duty.")
+    ] = None,
+    lens_mm: Annotated[
+        float | None, typer.Option("--lens-mm", metavar="MM", help="Focal length of the f-theta lens.")
+    ] = None,
+    port: Annotated[
+        str | None, typer.Option("--port", metavar="DEVICE", help="Serial device of the board, or: simulated.")
+    ] = None,
+) -> None:
+    """Write a configuration; ask on the terminal for what no option states."""
+    from optodrive.core.files import atomic_write, check_output
+    from optodrive.device.config_template import NewDisplay, write_template
+    from optodrive.planning.display_model import DisplayModel
+
+    check_output("FILE", file, ".toml")
+    check_new("FILE", file)
+    display = NewDisplay(
+        name=file.stem,
+        rows=_ask("--rows", rows, "Rows of pixels", 4),
+        columns=_ask("--columns", columns, "Columns of pixels", 4),
+        pitch_m=1e-3 * _ask("--pitch-mm", pitch_mm, "Distance of neighbouring pixels, mm", 4.0),
+        power_w=_ask("--power-w", power_w, "Power of the laser on the pixels at full duty, W", 2.45),
+        focal_length_m=1e-3 * _ask("--lens-mm", lens_mm, "Focal length of the f-theta lens, mm", 220.0),
+        port=_ask("--port", port, "Serial device of the board, or: simulated", "simulated"),
+    )
+    text, config = write_template(display, file)
+    DisplayModel.from_config(config)
+    with atomic_write(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"written          {file}: check servo, caps and sizes in it against your own parts")
+    print(f"next             optodrive serve --config {file}")
+
+
+def _ask(option: str, value: Answer | None, question: str, default: Answer) -> Answer:
+    """Return the option's value, or the answer on the terminal. Raise InputError without a terminal."""
+    if value is not None:
+        return value
+    if not sys.stdin.isatty():
+        raise InputError(option, None, f"{option}, because without a terminal nobody can answer: {question}")
+    answer: Answer = typer.prompt(question, default=default, type=type(default), err=True)
+    return answer
 
 
 def show(config: ConfigOption = None, json: JsonOption = False) -> None:
@@ -72,7 +126,7 @@ def migrate(
     from optodrive.device.config_migration import migrate_config
 
     check_output("--out", out, ".toml")
-    check_new(out)
+    check_new("--out", out)
     migration = migrate_config(file)
     if json:
         print_json(migration._asdict() | {"out": None if migration.by_hand or out is None else str(out)})
@@ -91,7 +145,7 @@ def migrate(
         print(f"optodrive: version {migration.version}: {done}", file=sys.stderr)
 
 
-def check_new(out: Path | None) -> None:
+def check_new(where: str, path: Path | None) -> None:
     """Raise InputError for a file that exists: no configuration is overwritten."""
-    if out is not None and out.exists():
-        raise InputError("--out", str(out), "a new file; this one exists")
+    if path is not None and path.exists():
+        raise InputError(where, str(path), "a new file; this one exists")

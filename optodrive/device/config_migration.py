@@ -1,12 +1,11 @@
 """Migration of older configurations: keys are renamed in the text, and what only a person can state is listed."""
 
 import re
-import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from optodrive.core.errors import InputError
-from optodrive.core.toml_file import read_toml
+from optodrive.core.toml_file import parse_toml, read_toml
 from optodrive.core.toml_model import Section
 from optodrive.device.config import FORMAT, VERSION, Config
 from optodrive.device.config_file import RENAMED_KEYS, build_config
@@ -48,7 +47,7 @@ def migrate_config(path: Path) -> Migration:
     renamed = _rename_keys(table)
     table["version"] = VERSION
     text, changes = _rename_in_text(text), _list_changes(table)
-    if changes or tomllib.loads(text) != table:
+    if changes or parse_toml(text.encode(), str(path)) != table:
         return Migration(version, "", (), (f"version = {VERSION}", *(f"rename {each}" for each in renamed), *changes))
     build_config(path, table)
     return Migration(version, text, renamed, ())

@@ -1,0 +1,95 @@
+"""Text of a new configuration: a shipped one, with its comments, and with the values of another display."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from optodrive.core.errors import InputError
+from optodrive.core.toml_file import parse_toml
+from optodrive.device.config import Config
+from optodrive.device.config_file import build_config, locate_shipped
+
+TEMPLATE = "display-16"
+SIMULATED = "simulated"
+FULL_SIZE_PITCH_M = 3e-3
+"""Smallest pitch at which absorbers and focus keep the size that they have in the template."""
+HEAD_LINES = 2
+"""Lines of the template that describe its display."""
+
+
+@dataclass(frozen=True)
+class NewDisplay:
+    """What tells a new display from the template, in SI units. port: a serial device, or `simulated`."""
+
+    name: str
+    rows: int
+    columns: int
+    pitch_m: float
+    power_w: float
+    focal_length_m: float
+    port: str
+
+
+def write_template(display: NewDisplay, path: Path) -> tuple[str, Config]:
+    """Return the text of a valid configuration of a display, and the configuration.
+
+    path: of the file that the text is for. Raises InputError for a display that no configuration describes.
+    """
+    template = locate_shipped(f"{TEMPLATE}.toml").read_text(encoding="utf-8")
+    config = build_config(path, parse_toml(template.encode(), TEMPLATE))
+    half_field_m = 2.0 * config.scanner.range_rad * display.focal_length_m
+    farthest_m = 0.5 * (max(display.rows, display.columns) - 1) * display.pitch_m
+    if farthest_m > half_field_m:
+        needed_mm = 1e3 * display.focal_length_m * farthest_m / half_field_m
+        expected = f"at least {needed_mm:.4g} mm: mirrors of ±{config.scanner.range_rad:g} rad must reach every pixel"
+        raise InputError("--lens-mm", 1e3 * display.focal_length_m, expected)
+    lines, section = template.splitlines()[HEAD_LINES:], ""
+    values = _list_values(display, config)
+    head = f"{display.rows * display.columns} pixels, {display.rows} x {display.columns}"
+    written = [
+        f"# {head}, pitch {display.pitch_m * 1e3:g} mm",
+        "# Written by `optodrive config new` from the display of the paper: check every number against your own parts.",
+    ]
+    for line in lines:
+        if line.startswith("["):
+            section = line.strip("[]")
+        key = line.partition(" ")[0]
+        written.append(values.pop((section, key), line))
+        if (section, key) == ("board", "transport") and display.port != SIMULATED:
+            written.append(f"port = {json.dumps(display.port)}")
+    text = "\n".join(written) + "\n"
+    return text, build_config(path, parse_toml(text.encode(), str(path)))
+
+
+def _list_values(display: NewDisplay, template: Config) -> dict[tuple[str, str], str]:
+    """Return the lines that differ from the template's, by section and key."""
+    old, limits, power_w = template.display, template.limits, display.power_w
+    share = min(1.0, display.pitch_m / FULL_SIZE_PITCH_M)
+    energy_j = min(limits.pulse_energy_max_j, power_w * limits.pulse_width_max_s)
+    pixel_w = min(limits.pixel_mean_power_max_w, power_w)
+    numbers: dict[str, tuple[float, str]] = {
+        "display.rows": (display.rows, ""),
+        "display.columns": (display.columns, ""),
+        "display.pitch_m": (display.pitch_m, ""),
+        "display.absorber_width_m": (old.absorber_width_m * share, "along x"),
+        "display.absorber_height_m": (old.absorber_height_m * share, "along y"),
+        "laser.max_power_w": (power_w, "incident on the pixels at full duty: measure it"),
+        "laser.focus_width_m": (template.laser.focus_width_m * share, "along x, on the absorber"),
+        "laser.focus_height_m": (template.laser.focus_height_m * share, "along y"),
+        "scanner.focal_length_m": (display.focal_length_m, "f-theta lens"),
+        "scanner.aim_error_m": (
+            template.scanner.aim_error_m * share,
+            "largest distance of a settled beam from its target",
+        ),
+        "limits.pulse_energy_max_j": (energy_j, "largest pulse, at most the longest one at full power"),
+        "limits.pixel_mean_power_max_w": (pixel_w, "continuous power on one pixel"),
+        "limits.display_mean_power_max_w": (power_w, "continuous power of the diode; lower it for a diode that droops"),
+    }
+    texts = {".name": display.name, "board.transport": "simulated" if display.port == SIMULATED else "serial"}
+    lines = {place: (json.dumps(value), "") for place, value in texts.items()}
+    lines |= {place: (f"{value:.6g}", comment) for place, (value, comment) in numbers.items()}
+    found = {}
+    for place, (value, comment) in lines.items():
+        section, _, key = place.partition(".")
+        found[section, key] = f"{key} = {value}" if not comment else f"{key} = {value}".ljust(34) + f"# {comment}"
+    return found

@@ -1,0 +1,128 @@
+"""`optodrive config new`: what it writes is valid for what was asked, and nothing is overwritten."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from optodrive.cli.main import run
+from optodrive.device.config_file import load_config, locate_shipped
+from optodrive.link.board_setup import build_board_requirements
+from optodrive.planning.display_model import DisplayModel
+
+OPTIONS = {"rows": 6, "columns": 6, "pitch-mm": 4, "power-w": 1.2, "lens-mm": 160, "port": "simulated"}
+
+
+def write(path, **changes):
+    """Run the command; return its exit status. A change to None leaves an option out."""
+    options = OPTIONS | {key.replace("_", "-"): value for key, value in changes.items()}
+    words = [f"--{key}={value}" for key, value in options.items() if value is not None]
+    return run(["config", "new", str(path), *words])
+
+
+def test_the_file_is_that_of_the_display(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    assert write(path) == 0
+    assert f"optodrive serve --config {path}" in capsys.readouterr().out
+    config = load_config(path)
+    assert (config.name, config.display.rows, config.display.columns) == ("mine", 6, 6)
+    assert (config.display.pitch_m, config.laser.max_power_w, config.scanner.focal_length_m) == (4e-3, 1.2, 0.16)
+    assert (config.board.transport, config.limits.display_mean_power_max_w) == ("simulated", 1.2)
+    assert run(["config", "check", "--config", str(path)]) == 0
+    named = [line for line in path.read_text().splitlines() if "=" in line]
+    assert sum("#" in line for line in named) > len(named) / 2, "most keys have a comment"
+
+
+def test_without_changes_it_is_the_template(tmp_path):
+    path = tmp_path / "display-16.toml"
+    assert write(path, rows=4, columns=4, power_w=2.45, lens_mm=220) == 0
+    limits = {"pulse_energy_max_j": pytest.approx(0.1225)}  # 2.45 W for 50 ms
+    written, shipped = load_config(path).model_dump(), load_config(locate_shipped("display-16.toml")).model_dump()
+    assert written == shipped | {"limits": shipped["limits"] | limits}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rows": 1, "columns": 1},
+        {"rows": 30, "columns": 2, "lens_mm": 300},
+        {"pitch_mm": 2.1, "rows": 3, "columns": 3},
+        {"pitch_mm": 12},
+        {"power_w": 0.02},
+        {"power_w": 40},
+        {"lens_mm": 60},
+        {"lens_mm": 800},
+        {"port": "/dev/ttyACM0"},
+    ],
+    ids=str,
+)
+def test_the_file_is_valid_for_every_display(changes, tmp_path):
+    path = tmp_path / "mine.toml"
+    assert write(path, **changes) == 0
+    config = load_config(path)
+    DisplayModel.from_config(config)
+    build_board_requirements(config)
+    assert config.board.port == ("/dev/ttyACM0" if "port" in changes else "")
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"lens_mm": 10}, "--lens-mm: got 10.0, expected at least 28.65 mm"),
+        ({"rows": None}, "--rows: got None, expected --rows, because without a terminal nobody can answer"),
+        ({"rows": 0}, "'--rows'"),
+        ({"power_w": 1200}, "laser.max_power_w: got 1200"),
+        ({"pitch_mm": 0.004}, "display.pitch_m: got 4e-06"),
+        ({"port": ""}, "board.port: got ''"),
+    ],
+    ids=str,
+)
+def test_what_no_display_has_is_refused_in_one_line(changes, says, tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    assert write(path, **changes) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_file_is_overwritten(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text("mine")
+    assert write(path) == 2
+    assert "expected a new file; this one exists" in capsys.readouterr().err
+    assert path.read_text() == "mine"
+
+
+def test_a_terminal_is_asked_for_what_no_option_states(tmp_path):
+    path, (terminal, theirs) = tmp_path / "mine.toml", os.openpty()
+    command = [
+        sys.executable,
+        "-m",
+        "optodrive.cli.main",
+        "config",
+        "new",
+        str(path),
+        "--rows",
+        "5",
+        "--lens-mm",
+        "160",
+    ]
+    with subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as asking:
+        os.close(theirs)
+        os.write(terminal, b"3\n\n1.2\n\n")
+        _, asked = asking.communicate()
+    os.close(terminal)
+    assert asking.returncode == 0, asked
+    assert [asked.count(word) for word in ("Rows", "Columns", "Distance", "Power", "Focal", "Serial")] == [
+        0,
+        1,
+        1,
+        1,
+        0,
+        1,
+    ]
+    config = load_config(path)
+    assert (config.display.rows, config.display.columns, config.laser.max_power_w) == (5, 3, 1.2)
+    assert config.board.transport == "simulated"
