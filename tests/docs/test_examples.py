@@ -32,6 +32,7 @@ ELSEWHERE = {
     "optodrive helios": "tests/helios plays on a DAC's USB protocol; no device is here",
     "optodrive home": "a synopsis; tests/system/test_home.py",
     "optodrive doctor --config display.toml": "tests/system/test_stages.py",
+    "optodrive config migrate": "tests/unit/device/test_config_migration.py",
     "optodrive first-light --stage": "tests/unit/device/test_stage_config.py",
     "optodrive calibrate board": "a synopsis; tests/system/test_calibrate_loop.py",
     "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
@@ -55,6 +56,7 @@ SCENARIOS = {
     "fits": (write_checkout, ["docs/how-to/show-stimuli.md:Whether it fits"]),
     "refusals": (write_recordings, ["docs/reference/recordings.md:Refusals"]),
     "quickstart": (write_checkout, ["docs/tutorials/quickstart.md:Quickstart"]),
+    "configuration": (write_checkout, ["docs/how-to/write-a-configuration.md:A new one"]),
     "client": (write_checkout, ["docs/how-to/use-the-python-client.md:Python client"]),
     "diagnosis": (
         write_recordings,
