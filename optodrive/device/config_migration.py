@@ -1,4 +1,4 @@
-"""Migration of older configurations: keys are renamed in the text, and what only a person can state is listed."""
+"""Migration of older configurations."""
 
 import re
 from pathlib import Path

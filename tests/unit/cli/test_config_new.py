@@ -112,10 +112,10 @@ def test_a_terminal_is_asked_for_what_no_option_states(tmp_path):
     with subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as asking:
         os.close(theirs)
         os.write(terminal, b"3\n\n1.2\n\n")
-        _, asked = asking.communicate()
+        _, questions = asking.communicate()
     os.close(terminal)
-    assert asking.returncode == 0, asked
-    assert [asked.count(word) for word in ("Rows", "Columns", "Distance", "Power", "Focal", "Serial")] == [
+    assert asking.returncode == 0, questions
+    assert [questions.count(word) for word in ("Rows", "Columns", "Distance", "Power", "Focal", "Serial")] == [
         0,
         1,
         1,
