@@ -1,6 +1,6 @@
 """Planner and link process with a board whose reports are falsified: nothing raises, and the next plan is executed.
 
-The clock that the planner is told stays the board's, whatever a proxy writes into CLOCK_REPLY and EXECUTED.
+The clock that the planner is told stays that of the board while a proxy falsifies CLOCK_REPLY and EXECUTED.
 """
 
 import pytest

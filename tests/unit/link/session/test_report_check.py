@@ -150,7 +150,7 @@ def test_older_reports_change_nothing():
     assert not bench.accept(STATUS)
     assert bench.accept(replace(STATUS, tick=TICK + 1))
     bench.accept(HELLO)
-    assert bench.accept(STATUS), "a session begins with whatever its board reports"
+    assert bench.accept(STATUS), "a session begins with the first report of its board"
 
 
 def test_a_tick_to_come_is_noticed_once_the_clock_is_known():
