@@ -6,6 +6,7 @@ that stays at the room's temperature.
 
 import argparse
 import sys
+from dataclasses import replace
 
 import numpy as np
 
@@ -41,12 +42,18 @@ def build_display(name, room_c, has_panel):
     return DisplayModel.from_config(config)
 
 
-def measure(display, pixels, height_um, duration_s):
-    """Show one frame after the other; return the raised pixels per second, and the panel's bound at the end, K."""
+def measure(display, pixels, height_um, duration_s, is_warm):
+    """Show one frame after the other; return the raised pixels per second, and the panel's bound at the end, K.
+
+    is_warm: begin with the panel as warm as permanent light of full power makes its bound
+    """
     target_m = np.zeros(len(display.pixels))
     target_m[slice(None) if pixels is None else pixels] = height_um * 1e-6
     sequence = FrameSequence((TactileFrame("f", 0.0, duration_s, target_m),))
     heat, budget = display.build_cold_state()
+    if is_warm:
+        bound = display.budget.heat
+        budget = replace(budget, panel_k=bound.panel_k_per_j * bound.panel_tau_s * bound.power_max_w.sum())
     now_s, raised = 0.0, 0
     while now_s < duration_s:
         planned = plan_sequence(display, sequence, heat, budget)
@@ -63,11 +70,13 @@ def main():
     parser.add_argument("--hours", type=float, default=1.0, help="time that is simulated")
     parser.add_argument("--display", help="only cases of this display")
     parser.add_argument("--rooms", type=float, nargs="+", default=ROOMS_C, help="temperatures of the room, °C")
+    parser.add_argument("--warm", action="store_true", help="begin with the panel as warm as full power makes it")
     options = parser.parse_args()
     for name, what, pixels, height_um in CASES:
         for room_c in options.rooms if options.display in (None, name) else ():
-            without, _ = measure(build_display(name, room_c, False), pixels, height_um, 3600.0 * options.hours)
-            rate, panel_k = measure(build_display(name, room_c, True), pixels, height_um, 3600.0 * options.hours)
+            frames = pixels, height_um, 3600.0 * options.hours
+            without, _ = measure(build_display(name, room_c, False), *frames, False)
+            rate, panel_k = measure(build_display(name, room_c, True), *frames, options.warm)
             case = f"{name}, {what} to {height_um:g} µm, room at {room_c:g} °C"
             print(f"{case}: {without:.1f} → {rate:.1f} pixels/s, panel up to {panel_k:.1f} K", flush=True)
     return 0

@@ -1,6 +1,7 @@
 """The configuration of one display as a model that is checked as a whole."""
 
 from dataclasses import dataclass
+from os.path import realpath
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -111,6 +112,10 @@ class Config(Section):
                         value = stage.name if key == "name" else Unquoted(" ".join(map(str, ours)))
                         expected = f"another {key} than that of stages[{other}]"
                         raise ConflictError(f"stages[{number}].{key}", value, expected)
+        if self.sensor is not None:
+            boards = [config.board.address for config in self.list_stage_configs()]
+            if ("serial", realpath(self.sensor.port)) in boards:
+                raise ConflictError("sensor.port", self.sensor.port, "another port than that of a board")
         unreached = np.flatnonzero(~np.any([stage.reach for stage in self.list_stage_configs()], axis=0))
         if len(unreached):
             raise ConflictError("stages", Unquoted(f"none that reaches pixel {unreached[0]}"), "one")

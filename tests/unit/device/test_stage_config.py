@@ -72,6 +72,10 @@ def test_a_single_stage_is_the_configuration(tmp_path):
         (TWO_STAGES.replace("[0, 1]", "[1, 0]"), r"stages\[0\].columns: got \[1, 0\], expected .* last of 0 to 3"),
         (TWO_STAGES.replace("[1, 3]", "[0, 99]"), r"stages\[1\].columns: got \[0, 99\]"),
         (TWO_STAGES.replace("[1, 3]", "[-5, 3]"), r"stages\[1\].columns: got \[-5, 3\]"),
+        (
+            TWO_STAGES + '[sensor]\nport = "/dev/../dev/ttyACM1"\n',
+            r"sensor.port: got '/dev/../dev/ttyACM1', expected another",
+        ),
         (TWO_STAGES.replace("/dev/ttyACM1", "/dev/./ttyACM0").replace("laser =", "#"), r"stages\[1\].board: got"),
         (
             TWO_STAGES.replace('port = "/dev/ttyACM1"', 'port = "/dev/ttyACM0", baud = 9600'),
