@@ -113,6 +113,19 @@ def b4_pulse_elsewhere_is_rest():
     return EmissionGuards, "record_pulse", forget
 
 
+def b4_interrupted_pulse_counts_as_it_was():
+    close = BoardMachine._close_gate
+
+    def refund(self, reason):
+        point, was_on = self._current_point, self.gate
+        close(self, reason)
+        for cell in self._guards.find_cells(point.x, point.y) if was_on else ():
+            on_us, _ = self._guards._on_time[cell]
+            self._guards._on_time[cell] = on_us - point.on_us + self.now_us - self._gate_on_us, self.now_us
+
+    return BoardMachine, "_close_gate", refund
+
+
 def b5_any_duty():
     static = BoardMachine._check_point
     return BoardMachine, "_check_point", lambda self, point: static(self, point._replace(duty=0))
@@ -194,6 +207,18 @@ def b9_cleared_without_a_check():
     return BoardMachine, "clear_fault", clear
 
 
+def b9_arms_with_an_unsafe_input():
+    arm = BoardMachine.request_arming
+
+    def ignore(self, host_nonce):
+        inputs, self.inputs = self.inputs, machine_module.SAFE_INPUTS
+        refusal = arm(self, host_nonce)
+        self.inputs = inputs
+        return refusal
+
+    return BoardMachine, "request_arming", ignore
+
+
 def b10_applies_any_limits():
     return machine_module, "tighten", lambda own, requested: requested
 
@@ -209,6 +234,17 @@ def b10_compares_only_with_the_own_limits():
         return ""
 
     return BoardMachine, "tighten_limits", tighten_limits
+
+
+def b10_limits_end_with_a_fault():
+    clear = BoardMachine.clear_fault
+
+    def restore(self):
+        refusal = clear(self)
+        self.limits = self.limits if refusal else self._settings.limits
+        return refusal
+
+    return BoardMachine, "clear_fault", restore
 
 
 def b11_any_confirmation():

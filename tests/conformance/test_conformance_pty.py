@@ -23,6 +23,7 @@ IN_EVERY_RUN = (
     "external_event_turns_the_gate_off_at_once-a reset",
     "refused_frames_count_as_specified",
     "internal_fault_is_immediate_and_latched-a late tick",
+    "internal_fault_is_immediate_and_latched-a gate that sticks",
     "stopped_main_loop_ends_in_a_reset_that_hello_reports",
 )
 

@@ -102,17 +102,6 @@ def test_the_watchdog_resets_a_stopped_main_loop(make_board, open_host):
     assert host.hello().of(simulated.m.HelloReply)[-1].reset_cause == 3
 
 
-@pytest.mark.parametrize(("do", "fault"), [("late_tick", "TICK"), ("stick_gate", "READBACK")])
-def test_a_board_reports_its_own_failures(make_board, open_host, do, fault):
-    board = make_board(script=f'[[step]]\nat_s = 3.5\ndo = "{do}"\n', limits="lease_ms = 2000\n")
-    host = open_host(board).hello().arm()
-    host.play(simulated.points(600, on_us=8000))
-    host.wait(lambda: board.of("fault"), "the fault")
-    assert board.of("fault")[0]["fault"] == fault
-    assert 3_500_000 <= board.of("fault")[0]["t_us"] <= 3_520_000
-    assert not board.of("gate")[-1]["on"]
-
-
 # --- with a daemon --------------------------------------------------------------------------------------------------
 
 
