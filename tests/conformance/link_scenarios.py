@@ -119,11 +119,15 @@ def reopened_port_is_not_armed(bench):
     host.shine()
     host.close()
     host.board.wait(lambda: host.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
+    count = len(host.board.pulse_numbers())
     again = bench.host(host.board)
-    again.hello()
+    assert again.hello().session != host.session
     assert again.status().state == "DISARMED"
     again.arm()
     assert again.status().queued == 0
+    assert again.play(here(1000), here(0), here(1000)) == []
+    again.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
+    assert host.board.pulse_numbers()[count:] == [0, 2], "nothing of the old job is left"
     assert [entry["open"] for entry in host.board.of("port")] == [True, False, True]
 
 

@@ -18,6 +18,7 @@ IN_EVERY_RUN = (
     "gate_turns_off_in_time_with_and_without_more_points",
     "only_a_lease_of_this_session_prevents_fault_link-RUNNING",
     "abort_is_accepted_in_any_session",
+    "reopened_port_is_not_armed",
     "unsafe_input_is_latched_until_cleared-interlock",
     "leaving_running_turns_the_gate_off_first-closed port",
     "external_event_turns_the_gate_off_at_once-a reset",

@@ -156,27 +156,6 @@ def test_the_log_of_fifty_points(board, open_host):
     ]
 
 
-def test_closing_the_port_during_a_job_disarms_the_board(board, open_host):
-    host = open_host(board).hello().arm()
-    host.play(points(200, on_us=8000))
-    host.wait(lambda: len(board.of("pulse")) > 5, "pulses")
-    host.close()
-    wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
-    state, gate = board.of("state")[-1], board.of("gate")[-1]
-    assert state["reason"] == "link lost"
-    assert gate["on"] is False
-    assert gate["t_us"] <= state["t_us"]
-    count = len(board.of("pulse"))
-
-    again = open_host(board).hello()
-    assert again.session != host.session
-    again.arm()
-    assert len(board.of("pulse")) == count, "nothing of the old job is left"
-    again.play(points(5))
-    again.wait(lambda: sum(len(x.records) for x in again.of(m.Executed)) == 5, "the new job")
-    assert [entry["open"] for entry in board.of("port")] == [True, False, True]
-
-
 def test_bytes_of_a_closed_host_do_not_reach_the_next(board, open_host):
     host = open_host(board).hello()
     host.say(*[m.Get()] * 400, m.ArmReq(1))
