@@ -20,26 +20,32 @@ FORMAT = "optodrive-field"
 VERSION = 2
 
 
+Code = Annotated[float, Item(ge=-1e5, le=1e5)]
+HalfRange = Annotated[float, Item(ge=1, le=1e5)]
+Coefficient = Annotated[float, Item(ge=-1e3, le=1e3)]
+Displacement = Annotated[float, Item(ge=-1, le=1)]
+
+
 class _Scanner(Section):
     rad_per_code: Annotated[float, Item(gt=0)]
     focal_length_m: Annotated[float, Item(gt=0)]
 
 
 class _Extent(Section):
-    x_code: float
-    y_code: float
-    x_half: Annotated[float, Item(gt=0)]
-    y_half: Annotated[float, Item(gt=0)]
+    x_code: Code
+    y_code: Code
+    x_half: HalfRange
+    y_half: HalfRange
 
 
 class _Surface(Section):
     order: Literal[6]
-    x_m: Annotated[tuple[float, ...], Item(min_length=TERM_COUNT, max_length=TERM_COUNT)]
-    y_m: Annotated[tuple[float, ...], Item(min_length=TERM_COUNT, max_length=TERM_COUNT)]
+    x_m: Annotated[tuple[Displacement, ...], Item(min_length=TERM_COUNT, max_length=TERM_COUNT)]
+    y_m: Annotated[tuple[Displacement, ...], Item(min_length=TERM_COUNT, max_length=TERM_COUNT)]
 
 
 class _Uncertainty(Section):
-    sigma_m: Annotated[tuple[tuple[Annotated[float, Item(gt=0)], ...], ...], Item(min_length=2)]
+    sigma_m: Annotated[tuple[tuple[Annotated[float, Item(gt=0, le=1)], ...], ...], Item(min_length=2)]
 
 
 class _FieldFile(Section):
@@ -48,7 +54,7 @@ class _FieldFile(Section):
     about: dict[str, str | float | int] = Item(default_factory=dict)
     scanner: _Scanner
     extent: _Extent
-    geometry: dict[str, float]
+    geometry: dict[str, Coefficient]
     surface: _Surface
     uncertainty: _Uncertainty
 
