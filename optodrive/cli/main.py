@@ -27,6 +27,7 @@ from optodrive.cli import (
     serve,
     service,
     simulate,
+    support,
     terms,
     token,
     validate,
@@ -83,6 +84,7 @@ for module in (
     token,
     wire,
     doctor,
+    support,
     docs,
 ):
     module.register(app)

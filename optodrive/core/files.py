@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from optodrive.core.errors import InputError, Unquoted
 
@@ -71,6 +72,24 @@ def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> b
 
     private: require that only the file's owner can read it. Raise InputError for any other file.
     """
+    with _open_regular_file(path, private) as file:
+        content = file.read(bytes_max + 1)
+    if len(content) > bytes_max:
+        raise InputError(str(path), Unquoted("a larger file"), f"at most {bytes_max} bytes")
+    return content
+
+
+def read_last_lines(path: Path, bytes_max: int) -> bytes:
+    """Return the whole lines at the end of a regular file, at most so many bytes. Raise InputError for another file."""
+    with _open_regular_file(path) as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - bytes_max))
+        content = file.read(bytes_max)
+    return content if size <= bytes_max else content.partition(b"\n")[2]
+
+
+@contextmanager
+def _open_regular_file(path: Path, private: bool = False) -> Iterator[BinaryIO]:
     try:
         _require_regular(path, path.stat().st_mode)  # to open a serial port may reset a board
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -81,16 +100,13 @@ def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> b
                 expected = f"0600, for it holds secrets: chmod 600 {path}"
                 raise InputError(str(path), f"mode {stat.S_IMODE(mode):04o}", expected)
             with os.fdopen(descriptor, "rb", closefd=False) as file:
-                content = file.read(bytes_max + 1)
+                yield file
         finally:
             os.close(descriptor)
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable file") from None
     except ValueError as error:  # a null character in the path
         raise InputError(str(path), Unquoted(str(error)), "the path of a file") from None
-    if len(content) > bytes_max:
-        raise InputError(str(path), Unquoted("a larger file"), f"at most {bytes_max} bytes")
-    return content
 
 
 def _require_regular(path: Path, mode: int) -> None:

@@ -137,3 +137,12 @@ def test_damaged_files_are_refused_in_one_line(count, tmp_path):
     print(f"{outcomes['read']} read, {outcomes['refused']} refused, {len(wrong)} wrong")
     assert not wrong, "\n".join(f"{name} {seed}: {message[:300]}" for name, seed, message in wrong)
     assert min(outcomes["read"], outcomes["refused"]) > count, outcomes
+
+
+@pytest.mark.parametrize(("key", "value"), [("focal_length_m", -0.0), ("focal_length_m", 1e-200)])
+def test_a_field_whose_codes_have_no_position_is_refused(key, value, tmp_path):
+    content = FieldFile().draw(np.random.default_rng(1))
+    content["geometry"][key] = value
+    path = write_toml(tmp_path / "field.toml", content)
+    with pytest.raises(InputError, match="field.toml: geometry"):
+        read_with("field")(path)
