@@ -20,15 +20,18 @@ class PeakHold:
 
     def __init__(self) -> None:
         self._peaks: IntArray | None = None
+        self._count = 0
 
     def add(self, peaks: IntArray) -> None:
         """Add the peaks [2, p] of a new event."""
         self._peaks = peaks if self._peaks is None else np.maximum(self._peaks, peaks)
+        self._count += 1
 
     def release(self, newest: DisplayEvent) -> DisplayEvent:
-        """Return the newest event with the peaks of all that were added, and begin anew."""
-        peaks, self._peaks = self._peaks, None
-        if peaks is None:
+        """Return the newest event with the peaks of all that were added, unchanged if it is the only one; begin anew."""
+        peaks, count = self._peaks, self._count
+        self._peaks, self._count = None, 0
+        if peaks is None or count == 1:
             return newest
         columns = zip(COLUMNS, peaks.astype("<u2"), strict=True)
         return newest.model_copy(update={name: b64encode(column.tobytes()).decode() for name, column in columns})

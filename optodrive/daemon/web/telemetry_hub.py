@@ -156,7 +156,9 @@ class TelemetryHub:
         """Format the events after a number; that of the display has the peaks since the reader's last one."""
         texts = {kind: text for kind, (number, text) in self._latest.items() if number > event_number}
         if "display" in texts and self._display is not None:
-            texts["display"] = _format_event("display", hold.release(self._display).model_dump_json())
+            display = hold.release(self._display)
+            if display is not self._display:
+                texts["display"] = _format_event("display", display.model_dump_json())
         return "".join(texts.values())
 
     @property
