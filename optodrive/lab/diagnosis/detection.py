@@ -201,6 +201,8 @@ def _compute_scores(
     max_surprisal = np.zeros(DRAWS)
     for degrees, ratio_drawn in max_ratio.items():  # once per number of degrees, because it takes long
         max_surprisal = np.maximum(max_surprisal, -chi_squared.logsf(ratio_drawn, degrees))
+    if not (np.isfinite(max_surprisal).all() and np.isfinite(observed)):
+        return [], np.nan  # nothing is concluded from it
     level = float(np.quantile(max_surprisal, 0.99))
     # Beyond the draws, extrapolate as for the maximum of 1 % × e^level independent scores.
     exceedance = float((max_surprisal >= observed).mean())

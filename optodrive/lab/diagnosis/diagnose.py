@@ -38,6 +38,7 @@ from optodrive.lab.diagnosis.model_selection import (
 )
 from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
+from optodrive.lab.diagnosis.numeric_limits import check_numeric_limits
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint
@@ -90,6 +91,7 @@ def diagnose(
     copy in place of a repeat.
     """
     began_s = perf_counter()
+    check_numeric_limits(measurement)
     check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel(epsilon))
     check_copied_runs(measurement)
     subsystems: list[_SubsystemFit] = []

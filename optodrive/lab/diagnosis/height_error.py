@@ -19,9 +19,7 @@ DISPLACEMENT = SIGNALS.index("displacement_m")
 NEAR_PEAK = 0.9
 """Samples of a push above this share of its predicted height give the measured one."""
 MAX_NOISE = 0.1
-"""Pushes whose height is known less well than to this share are not judged."""
-MODELS = ("nominal_m", "extended_m")
-"""Predicted heights of a push."""
+"""Pushes whose measured height is uncertain by more than this share of the predicted one are not judged."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +48,12 @@ def compute_height_error(
                 repeats.setdefault((data.runs[block.run].group, block.pixel, number), []).append(push)
     errors, experiments = [], set()
     for (group, pixel, _), pushes in repeats.items():
-        measured_m = float(np.mean([push.measured_m for push in pushes]))
-        noise = float(np.sqrt(np.mean([push.noise_m**2 for push in pushes]) / len(pushes))) / measured_m
-        if 0.0 < noise <= MAX_NOISE:
-            predicted_m = [float(np.mean([getattr(push, name) for push in pushes])) for name in MODELS]
-            errors.append([*(measured_m / height_m - 1.0 for height_m in predicted_m), noise])
+        measured_m, nominal_m, extended_m, noise2 = np.mean(
+            [(push.measured_m, push.nominal_m, push.extended_m, push.noise_m**2) for push in pushes], axis=0
+        ).tolist()
+        noise = float(np.sqrt(noise2 / len(pushes))) / extended_m
+        if noise <= MAX_NOISE:
+            errors.append((measured_m / nominal_m - 1.0, measured_m / extended_m - 1.0, noise))
             experiments.add((group, pixel))
     if not errors:
         return None

@@ -5,6 +5,7 @@ and resembles slow noise, but it appears with the pulse and decays as the absorb
 """
 
 from dataclasses import replace
+from math import ceil
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_s
 
 SLICE_S = 0.012
 """Length of a pulse slice, about the thermal time constant: faster fluctuations are smoothed, slower span slices."""
+MAX_SLICES = 2000
+"""Maximum number of slices that are examined; of more, evenly spaced ones are."""
 
 RUN_POWER_SIGMA = 1.0
 """Prior σ of a run's relative power here: ageing and drift between repeats are no fluctuation within pulses."""
@@ -54,12 +57,13 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
 
 
 def _slice_pulses(pulses: FloatArray) -> FloatArray:
-    """Return pulses [k, 4] cut into equal slices."""
+    """Return pulses [k, 4] cut into equal slices, MAX_SLICES at most."""
     rows = []
     for start_s, width_s, power_w, pixel in pulses.tolist():
         count = max(1, round(width_s / SLICE_S))
         rows += [[start_s + k * width_s / count, width_s / count, power_w, pixel] for k in range(count)]
-    return np.array(rows, dtype=np.float64).reshape(-1, 4)
+    slices = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    return slices[:: max(1, ceil(len(slices) / MAX_SLICES))]
 
 
 def _compute_slice_responses(

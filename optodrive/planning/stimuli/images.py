@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 FORMATS = ("PNG", "JPEG", "GIF")
 SOURCE_PIXELS_MAX = 16_000_000
 """Largest number of pixels of an image file."""
+SIDE_MAX = 20_000
+"""Largest width and height of an image: the weights of a lattice place cover a whole side."""
 ANIMATION_PIXELS_MAX = 200_000_000
 """Largest number of pixels of all images of an animation."""
 
@@ -58,12 +60,16 @@ def build_animation(
     An image lasts 1 / rate_hz. If rate_hz is None it lasts as long as the file states, at least 20 ms and its beam
     time. Raises InputError (bad_picture, too_many).
     """
-    beam, start_s = BeamTimeEstimator(config), 0.0
+    beam, start_s, pixels = BeamTimeEstimator(config), 0.0, 0
     frames: list[TactileFrame] = []
     is_transparent: list[bool] = []
     with _open_image(file, f"{where}: file") as image:
         for position in _select_positions(image, f"{where}: file"):
             image.seek(position)
+            _check_size(image, f"{where}: file")  # a later image of a GIF may be larger than the first
+            pixels += image.width * image.height
+            if pixels > ANIMATION_PIXELS_MAX:
+                raise _too_many_pixels_error(f"{where}: file", f"{len(frames) + 1} pictures of {pixels} pixels")
             is_transparent.append(_is_transparent(image))
             target_m = height_m * compute_lattice_brightness(image, beam.lattice, invert)
             duration_s = 1.0 / rate_hz if rate_hz else max(_duration_s(image), beam.beam_time_s(target_m))
@@ -141,7 +147,7 @@ def _select_positions(image: "Image", where: str) -> range:
         raise InputError(where, f"{count} pictures", f"at most {ANIMATION_FRAMES_MAX}", code="too_many")
     if count * image.width * image.height > ANIMATION_PIXELS_MAX:
         size = f"{count} pictures of {image.width} × {image.height}"
-        raise InputError(where, size, f"at most {ANIMATION_PIXELS_MAX} pixels in all", code="too_many")
+        raise _too_many_pixels_error(where, size)
     first = 1 if image.info.get("default_image") and count > 1 else 0
     return range(first, count)
 
@@ -156,8 +162,7 @@ def _open_image(file: bytes, where: str) -> Iterator["Image"]:
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
             with Image.open(BytesIO(file), formats=FORMATS) as image:
-                if image.width * image.height > SOURCE_PIXELS_MAX:
-                    raise _too_large_error(where, f"{image.width} × {image.height}")
+                _check_size(image, where)
                 yield image
         except (Image.DecompressionBombError, Image.DecompressionBombWarning):
             raise _too_large_error(where, "a far larger picture") from None
@@ -167,5 +172,17 @@ def _open_image(file: bytes, where: str) -> Iterator["Image"]:
             raise InputError(where, str(error), "a picture without damage", code="bad_picture") from None
 
 
+def _check_size(image: "Image", where: str) -> None:
+    """Raise InputError (too_many) for an image with too many pixels or too long a side."""
+    if image.width * image.height > SOURCE_PIXELS_MAX or max(image.size) > SIDE_MAX:
+        raise _too_large_error(where, f"{image.width} × {image.height}")
+
+
+def _too_many_pixels_error(where: str, found: str) -> InputError:
+    return InputError(where, found, f"at most {ANIMATION_PIXELS_MAX} pixels in all", code="too_many")
+
+
 def _too_large_error(where: str, size: str) -> InputError:
-    return InputError(where, size, f"a picture of at most {SOURCE_PIXELS_MAX} pixels", code="too_many")
+    return InputError(
+        where, size, f"a picture of at most {SOURCE_PIXELS_MAX} pixels, {SIDE_MAX} a side", code="too_many"
+    )

@@ -1,5 +1,6 @@
 """Fit, brightness, durations and refusal of images and animations."""
 
+import struct
 import subprocess
 import sys
 from io import BytesIO
@@ -220,10 +221,35 @@ def test_a_truncated_animation_is_refused():
 def test_large_images_are_refused_before_decoding(monkeypatch):
     code, message = refusal(encoded(Image.new("1", (5000, 4000))))
     assert code == "too_many"
-    assert message == "image: file: got '5000 × 4000', expected a picture of at most 16000000 pixels"
+    assert message == "image: file: got '5000 × 4000', expected a picture of at most 16000000 pixels, 20000 a side"
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
     for side in (40, 100):  # Pillow only warns up to twice its bound
         assert refusal(encoded(Image.new("1", (side, side))))[0] == "too_many"
+
+
+@pytest.mark.parametrize("size", [(20_001, 1), (1, 20_001)])
+def test_images_with_a_very_long_side_are_refused(size):
+    """The weights of the lattice's places took a gigabyte and most of a minute."""
+    assert refusal(encoded(Image.new("1", size)))[0] == "too_many"
+    assert refusal(encoded(Image.new("1", size)), build_animation)[0] == "too_many"
+
+
+def join_gif(*sizes):
+    """Return a GIF whose images have these sizes, the screen that of the first."""
+    images_of = []
+    for size in sizes:
+        one = encoded(Image.new("P", size, 0), kind="GIF")
+        images_of.append(one[one.index(b"\x2c" + struct.pack("<HHHH", 0, 0, *size)) : -1])
+    return b"GIF89a" + struct.pack("<HHBBB", *sizes[0], 0xF0, 0, 0) + bytes(6) + b"".join(images_of) + b";"
+
+
+def test_an_animation_that_grows_is_refused_at_the_image_that_is_too_large(monkeypatch):
+    """Of 60 kB became two gigabytes, because the size was checked once, at the first image."""
+    assert len(build_animation(CONFIG, "t", join_gif((8, 8), (9, 9)), 50e-6, None, False).frames) == 2
+    code, message = refusal(join_gif((8, 8), (9, 9), (5000, 4000)), build_animation)
+    assert (code, message[:33]) == ("too_many", "image: file: got '5000 × 4000', e")
+    monkeypatch.setattr(images, "ANIMATION_PIXELS_MAX", 3 * 64 + 100)
+    assert "got '3 pictures of 20264 pixels'" in refusal(join_gif((8, 8), (10, 10), (10, 2010)), build_animation)[1]
 
 
 def test_long_animations_are_refused(monkeypatch):
