@@ -36,7 +36,7 @@ class ChipRig(PlannerRig):
         self.chip = self._make_chip(settings, self.log.append, seed=3)
         self.link = MemoryLink(self.chip, self.clock)
         self.session = BoardSession(self.link, self.clock, requirements)
-        return BoardGroup([self.session], self.clock)
+        return BoardGroup([self.session], self.clock, [self.open_port])
 
 
 @pytest.mark.parametrize(("name", "given", "count"), EXPERIMENTS)
