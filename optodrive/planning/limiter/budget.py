@@ -26,7 +26,7 @@ class HeatBound(NamedTuple):
 
     Wall:
     wall_w_per_k: [p] conductance to the surroundings; wall_j_per_k: [2] smallest and largest capacity
-    wall_k_per_j: [2] rise per incident joule, delivered at once; wall_specht_ratio: see `worst_case.specht_ratio`
+    wall_k_per_j: [2] rise per incident joule, delivered at once; wall_specht_ratio: see `specht.specht_ratio`
     neighbours: [p, 4] neighbouring pixels, −1 for none
     lateral_w_per_k: conductance to a neighbour, as counted for the colder of two walls
     exchange_step_s: interval at which walls exchange heat

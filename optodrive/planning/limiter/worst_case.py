@@ -10,7 +10,7 @@ Which end. Temperatures rise monotonically with absorbed power, resistances, cou
 taken at one end. Capacities and lags are not monotone: a smaller one warms faster, a larger one cools more slowly. Each
 such node is bounded with both ends, and `specht_ratio` is the proven price of the values in between.
 
-Concave loss. A bridge conducts better when hot: its loss is concave, and chords from 0 to the cap lie below it. Less
+Concave loss. A bridge conducts less when hot: its loss is concave, and chords from 0 to the cap lie below it. Less
 loss is the worse case. Where the exponent is uncertain, chords are laid even for a nominally constant bridge.
 
 Delays. The bound lets heat arrive at once. Where a node in between delays it, it arrives later, when the counted heat
@@ -28,7 +28,7 @@ uncertainties and requires each to be counted. Judged by an integrator that shar
 """
 
 from dataclasses import dataclass
-from math import e, exp, inf, log
+from math import exp, inf
 
 import numpy as np
 
@@ -38,25 +38,12 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.planning.limiter.budget import HeatBound
 from optodrive.planning.limiter.caps import CapValues
 from optodrive.planning.limiter.nominal_model import NominalThermalModel, Uncertainty
+from optodrive.planning.limiter.panel_bound import build_panel_bound
+from optodrive.planning.limiter.specht import specht_ratio
 
 CHORDS = 8
-PANEL_LAG_RATIO = 4.0
 STEP_FRACTION = 0.07
 """Step of the heat exchange between walls, as a fraction of the fastest wall's time constant."""
-
-
-def specht_ratio(ratio: float) -> float:
-    """Return the factor by which a sum of responses (1/c) e^(−t/rc) can exceed its larger value at the ends of c.
-
-    ratio: larger over smaller end of c.
-
-    With s = 1/c each response is s e^(−xs). For s between its ends, with weights linear in s, e^(−xs) is the weighted
-    geometric mean of its end values, and no mean of two values exceeds the larger one. s itself exceeds the weighted
-    geometric mean of its ends by at most Specht's ratio.
-    """
-    if ratio == 1.0:
-        return 1.0
-    return float((ratio - 1) * ratio ** (1 / (ratio - 1)) / (e * log(ratio)))
 
 
 def build_heat_bound(
@@ -82,7 +69,8 @@ def build_heat_bound(
     touch = _build_touch_bound(
         model, uncertainty, epsilon_max, float(r_high.max()) * resistance_factor, tau_max_s, wall
     )
-    panel = _build_panel_bound(model, uncertainty, epsilon_max, lag_max_s, sum(power_max_w), wall, touch)
+    lags_s = lag_max_s, float(wall.j_per_k[1]), float(touch.lag_s[1])
+    panel = build_panel_bound(model, uncertainty, epsilon_max, sum(power_max_w), *lags_s)
     lower = _build_lower_bound(model, uncertainty, caps, c_low, c_high, wall, touch, panel.k_per_s)
     bound = HeatBound(
         epsilon=epsilon,
@@ -261,87 +249,6 @@ def _build_touch_bound(
         per_wall_k=gas_share + wall_share + (absorber_s + gas_s) * wall.rate_per_s,
         specht_ratio=specht_ratio(lags_s[1] / lags_s[0]),
         gas_s=gas_s,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _PanelBound:
-    """Worst-case coefficients of the panel; k_per_s: its fastest rise."""
-
-    k_per_j: FloatArray
-    tau_s: FloatArray
-    specht_ratio: float
-    per_absorber: float
-    per_wall: float
-    per_touch: float
-    k_per_s: float
-    floor_k: float
-
-
-def _build_panel_bound(
-    model: NominalThermalModel,
-    uncertainty: Uncertainty,
-    epsilon: float,
-    lag_max_s: float,
-    all_power_w: float,
-    wall: _WallBound,
-    touch: _TouchBound,
-) -> _PanelBound:
-    """Bound the panel as if all heat of a pulse arrived at once, and warmed the walls with it.
-
-    all_power_w: power of all stages together.
-
-    The walls are warmer than the panel on average, because all heat enters through them.
-
-    A node with a time constant τ that follows one that falls no faster than exp(−t / T) exceeds it at most by the
-    factor 1 / (1 − τ / T). The same factor covers heat that arrives at the panel later than it is counted.
-
-    The panel also rises by pulses on other pixels, at most at one rate. A wall at its cap over the panel, warmed by
-    neighbours that are no hotter, falls meanwhile at least at the rate cap / (R C), which is faster if the cap is above
-    a floor.
-
-    A touch surface follows the panel and its share of what gas and wall are above it: the panel as a whole, and more if
-    the shares exceed 1.
-    """
-    panel, walls = model.panel, model.walls
-    if panel is None:
-        return _PanelBound(np.zeros(2), np.ones(2), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    signs, count = np.array([-1.0, 1.0]), len(model.epsilon)
-    capacities = panel.c_j_per_k * (1 + signs * uncertainty.panel_capacity)
-    wall_lag_s = 0.0
-    if walls is not None:
-        capacities += count * walls.c_j_per_k * (1 + signs * uncertainty.wall_capacity)
-        wall_lag_s = walls.r_k_per_w * (1 + uncertainty.wall_resistance) * float(wall.j_per_k[1])
-    tau_s = panel.r_k_per_w * (1 + uncertainty.panel_resistance) * capacities
-    gas_lag_s = model.tau_g_s * (1 + uncertainty.gas_lag)
-    touch_lag_s = 0.0 if model.touch is None else float(touch.lag_s[1])
-    slowest_s = max(lag_max_s, wall_lag_s, touch_lag_s)
-    if tau_s[0] < PANEL_LAG_RATIO * slowest_s:
-        raise InputError(
-            "panel",
-            f"a time constant of {format_quantity(float(tau_s[0]), 's')}",
-            f"at least {PANEL_LAG_RATIO:g} times that of absorbers, walls and touch surface, "
-            f"{format_quantity(slowest_s, 's')}",
-        )
-
-    def follow(*lags_s: float) -> float:
-        return float(np.prod([1.0 / (1.0 - lag_s / tau_s[0]) for lag_s in lags_s]))
-
-    per_wall, per_absorber = follow(wall_lag_s), follow(wall_lag_s, lag_max_s)
-    ratio = specht_ratio(capacities[1] / capacities[0])
-    k_per_j = epsilon * per_absorber / capacities
-    k_per_s = ratio * float(k_per_j[0]) * all_power_w
-    shares = 0.0 if model.touch is None else model.touch.gas_share + model.touch.wall_share
-    per_panel = max(1.0, shares * (1 + uncertainty.touch_share))
-    return _PanelBound(
-        k_per_j=k_per_j,
-        tau_s=tau_s,
-        specht_ratio=ratio,
-        per_absorber=per_absorber,
-        per_wall=per_wall,
-        per_touch=per_panel * follow(wall_lag_s, lag_max_s, gas_lag_s, touch_lag_s),
-        k_per_s=k_per_s,
-        floor_k=per_wall * k_per_s * wall_lag_s,
     )
 
 

@@ -21,7 +21,8 @@ from optodrive.planning.limiter.limiter import (
     verify,
 )
 from optodrive.planning.limiter.nominal_model import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
-from optodrive.planning.limiter.worst_case import build_heat_bound, specht_ratio
+from optodrive.planning.limiter.specht import specht_ratio
+from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import NO_CAPS
 
 CERTAIN = Uncertainty(*[0.0] * len(Uncertainty.__dataclass_fields__))

@@ -1,0 +1,95 @@
+"""Worst-case coefficients of the panel, on which all walls and touch surfaces stand."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
+from optodrive.core.types.arrays import FloatArray
+from optodrive.planning.limiter.nominal_model import NominalThermalModel, Uncertainty
+from optodrive.planning.limiter.specht import specht_ratio
+
+PANEL_LAG_RATIO = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class PanelBound:
+    """Worst-case coefficients of the panel; k_per_s: its fastest rise."""
+
+    k_per_j: FloatArray
+    tau_s: FloatArray
+    specht_ratio: float
+    per_absorber: float
+    per_wall: float
+    per_touch: float
+    k_per_s: float
+    floor_k: float
+
+
+def build_panel_bound(
+    model: NominalThermalModel,
+    uncertainty: Uncertainty,
+    epsilon: float,
+    all_power_w: float,
+    lag_max_s: float,
+    wall_max_j_per_k: float,
+    touch_lag_max_s: float,
+) -> PanelBound:
+    """Bound the panel as if all heat of a pulse arrived at once, and warmed the walls with it.
+
+    all_power_w: power of all stages together; lag_max_s, touch_lag_max_s: largest lags of absorber and touch surface;
+    wall_max_j_per_k: largest capacity of a wall with its absorber. Raises InputError if the panel is too fast for them.
+
+    The walls are warmer than the panel on average, because all heat enters through them.
+
+    A node with a time constant τ that follows one that falls no faster than exp(−t / T) exceeds it at most by the
+    factor 1 / (1 − τ / T). The same factor covers heat that arrives at the panel later than it is counted.
+
+    The panel also rises by pulses on other pixels, at most at one rate. A wall at its cap over the panel, warmed by
+    neighbours that are no hotter, falls meanwhile at least at the rate cap / (R C), which is faster if the cap is above
+    a floor.
+
+    A touch surface follows the panel and its share of what gas and wall are above it: the panel as a whole, and more if
+    the shares exceed 1.
+    """
+    panel, walls = model.panel, model.walls
+    if panel is None:
+        return PanelBound(np.zeros(2), np.ones(2), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    signs, count = np.array([-1.0, 1.0]), len(model.epsilon)
+    capacities = panel.c_j_per_k * (1 + signs * uncertainty.panel_capacity)
+    wall_lag_s = 0.0
+    if walls is not None:
+        capacities += count * walls.c_j_per_k * (1 + signs * uncertainty.wall_capacity)
+        wall_lag_s = walls.r_k_per_w * (1 + uncertainty.wall_resistance) * wall_max_j_per_k
+    tau_s = panel.r_k_per_w * (1 + uncertainty.panel_resistance) * capacities
+    gas_lag_s = model.tau_g_s * (1 + uncertainty.gas_lag)
+    touch_lag_s = 0.0 if model.touch is None else touch_lag_max_s
+    slowest_s = max(lag_max_s, wall_lag_s, touch_lag_s)
+    if tau_s[0] < PANEL_LAG_RATIO * slowest_s:
+        raise InputError(
+            "panel",
+            f"a time constant of {format_quantity(float(tau_s[0]), 's')}",
+            f"at least {PANEL_LAG_RATIO:g} times that of absorbers, walls and touch surface, "
+            f"{format_quantity(slowest_s, 's')}",
+        )
+
+    def follow(*lags_s: float) -> float:
+        return float(np.prod([1.0 / (1.0 - lag_s / tau_s[0]) for lag_s in lags_s]))
+
+    per_wall, per_absorber = follow(wall_lag_s), follow(wall_lag_s, lag_max_s)
+    ratio = specht_ratio(capacities[1] / capacities[0])
+    k_per_j = epsilon * per_absorber / capacities
+    k_per_s = ratio * float(k_per_j[0]) * all_power_w
+    shares = 0.0 if model.touch is None else model.touch.gas_share + model.touch.wall_share
+    per_panel = max(1.0, shares * (1 + uncertainty.touch_share))
+    return PanelBound(
+        k_per_j=k_per_j,
+        tau_s=tau_s,
+        specht_ratio=ratio,
+        per_absorber=per_absorber,
+        per_wall=per_wall,
+        per_touch=per_panel * follow(wall_lag_s, lag_max_s, gas_lag_s, touch_lag_s),
+        k_per_s=k_per_s,
+        floor_k=per_wall * k_per_s * wall_lag_s,
+    )
