@@ -1,7 +1,8 @@
 """Benchmark of several stages over one display: the time of a plan against light ÷ stages + moves, and planning time.
 
-Moves are the settling times of the plan, per stage; light is the beam-on time of its pulses. The caps are those of the
-shipped configurations, and the temperatures are those of an integrator that shares no code with the limiter.
+Beside it the bound that no plan can undercut in which each pixel keeps its stage: its pulses are not divided. Moves are
+the settling times of the plan, per stage; light is the beam-on time of its pulses. The caps are those of the shipped
+configurations, and the temperatures are those of an integrator that shares no code with the limiter.
 """
 
 import argparse
@@ -29,6 +30,7 @@ from reference_models.thermal_display import build_true_display
 RUNS = 5
 STAGE_COUNTS = (1, 2, 3, 4)
 TEXT = "optodrive draws"
+PAGES = "the quick brown fox jumps over the lazy dog and reads a page of braille with two fingers on a display of light"
 
 
 def build_display(name, count):
@@ -49,11 +51,31 @@ def build_cases(display):
     heights_m[half] = rng.uniform(20e-6, 150e-6, len(half))
     yield "full, 50 µm", [np.full(count, 50e-6)]
     yield "half at random, 20 to 150 µm", [heights_m]
+    yield "braille, ten pages of four words", list(build_pages(display, 4, 100.0))
+    yield "braille, a page per word", list(build_pages(display, 1, 150.0))
+    x_m, y_m = display.layout.x_m, display.layout.y_m
+    offset_m = np.abs(np.hypot(x_m, y_m)[None, :] - np.linspace(0.2, 0.9, 8)[:, None] * np.hypot(x_m, y_m).max())
+    yield "rings, twice", [*np.where(offset_m < 0.7 * display.config.display.pitch_m, 100e-6, 0.0)] * 2
     for name, pattern, given in (
-        ("braille", "text", {"text": TEXT, "height_um": 150}),
+        ("braille, one page", "text", {"text": TEXT, "height_um": 150}),
         ("moving edge", "edge", {"height_um": 100}),
     ):
         yield name, [frame.target_m for frame in build_pattern(pattern, given, display.config).frames]
+
+
+def build_pages(display, count, height_um):
+    """Yield the targets of pages of a number of words each, of which every second begins one."""
+    words = PAGES.split()
+    for first in range(0, len(words) - count, 2 if count > 1 else 1):
+        given = {"text": " ".join(words[first : first + count]), "height_um": height_um}
+        yield build_pattern("text", given, display.config).frames[0].target_m
+
+
+def compute_bound(plan, stages):
+    """Return the bound that pixels set which keep their stage, over light ÷ stages + moves."""
+    pixel_s = np.sort(np.bincount(plan.pixel, plan.width_s + plan.settling_s))[::-1]
+    largest_s = pixel_s[::stages]  # of the largest j k + 1, one stage has j + 1
+    return max(1.0, ((np.arange(len(largest_s)) + 1) * largest_s).max() * stages / pixel_s.sum())
 
 
 def build_sequence(targets_m):
@@ -91,7 +113,8 @@ def main():
     parser = argparse.ArgumentParser(prog="scripts/bench stages", description=__doc__)
     parser.add_argument("--display", choices=("display-1511", "display-437"), help="only this one")
     options = parser.parse_args()
-    print(f"{'display':<13}{'case':<30}{'k':>2}{'pulses':>8}{'time s':>9}{'over floor':>12}{'planning':>10}{'caps':>7}")
+    columns = f"{'k':>2}{'pulses':>8}{'time s':>9}{'over floor':>12}{'bound':>8}{'planning':>10}{'caps':>7}"
+    print(f"{'display':<13}{'case':<44}{columns}")
     for name in (options.display,) if options.display else ("display-1511", "display-437"):
         displays = [build_display(name, count) for count in STAGE_COUNTS]
         for case, targets_m in build_cases(displays[0]):
@@ -99,9 +122,9 @@ def main():
             for display in displays:
                 plan, over, span_s, planning_s = measure_plan(display, sequence)
                 single_s = planning_s if single_s is None else single_s
-                used = compute_cap_use(display, plan)
-                row = f"{len(display.scan_heads):>2}{len(plan):>8}{span_s:>9.3f}{over:>12.4f}"
-                print(f"{name:<13}{case:<30}{row}{planning_s / single_s:>10.2f}{used:>7.2f}", flush=True)
+                stages, used = len(display.scan_heads), compute_cap_use(display, plan)
+                row = f"{stages:>2}{len(plan):>8}{span_s:>9.3f}{over:>12.4f}{compute_bound(plan, stages):>8.4f}"
+                print(f"{name:<13}{case:<44}{row}{planning_s / single_s:>10.2f}{used:>7.2f}", flush=True)
     return 0
 
 

@@ -53,7 +53,7 @@ def warm_up(display: DisplayModel) -> None:
         PulseTrain(pixel, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w),
         HeightTrain(pixel, 2.0, 1e-3, 0.1, 1e-6),
     )
-    frames = (TactileFrame("", 0.0, 1.0, target_m),)
+    frames = tuple(TactileFrame("", at_s, 1.0, target_m) for at_s in (0.0, 1.0))
     for each in (FrameSequence(frames), FrameSequence(frames, trains)):  # a frame alone takes a kernel of its own
         plan_sequence(display, each, *display.build_cold_state())
     if not display.parameters.planner_terms:

@@ -1,7 +1,7 @@
 """Which stage draws which pixel within a plan: all beams are to end each frame together, each on a short path.
 
-The pixels that a frame adds are cut into stretches of one path over them, one per stage: the stage that is ahead gets
-the longest.
+Pixels that recur in a plan are shared before it begins, so that the whole of it ends early. The others that a frame
+adds are cut into stretches of one path over them, one per stage: the stage that is ahead gets the longest.
 """
 
 from heapq import heapify, heapreplace
@@ -14,30 +14,57 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.scheduler.scan_head import ScanHead
+from optodrive.planning.scheduler.stage_balance import FrameLight, balance
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 
 NOBODY = -1
 SHARES = np.linspace(0.0, 1.0, 41)
 """Shares of a pixel's largest displacement at which widths are tabulated."""
+BALANCED_MAX = 2_000_000
+"""Frames times recurring pixels that are shared before a plan begins; later frames keep what the first ones decide."""
+COOLING_S = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 60)])
+"""Times after a pulse at which the displacement that is left is tabulated, s."""
 TRAIN_SHARE = 0.5
 """Share of the beam time that a train takes, as half duty does."""
 
 
 class LightEstimate(NamedTuple):
-    """Width of a pulse on a cold pixel by its target: max_m [p], and widths at SHARES of it, s."""
+    """Width of a pulse by its target: max_m [p], and widths on a cold pixel at SHARES of it, s.
+
+    saved: share of the width that the same target does not need COOLING_S after a pulse for it
+    """
 
     max_m: FloatArray
     widths_s: FloatArray
+    saved: FloatArray
 
     @classmethod
     def from_cold(cls, cold: ThermalState, max_m: FloatArray, drive: DriveRange) -> "LightEstimate":
-        """Tabulate the widths of the tallest pixel; those of others are alike at equal shares of their largest."""
+        """Tabulate the tallest pixel; others are alike at equal shares of their largest displacement."""
         pixel = int(np.argmax(max_m))
         widths_s = [0.0]
         for share in SHARES[1:]:
             pulse = cold.solve_pulse(pixel, 0.0, float(share * max_m[pixel]), drive)
             widths_s.append(0.0 if pulse is None else (pulse[0] - 1 + pulse[1]) * drive.period_s)
-        return cls(max_m, np.array(widths_s))
+        return cls(max_m, np.array(widths_s), _tabulate_saved(cold, pixel, 0.5 * float(max_m[pixel]), drive))
+
+    def compute_frames_s(self, target_m: FloatArray, show_at_s: FloatArray, stages: int, step_s: float) -> FloatArray:
+        """Return the estimated beam time of frames [f, p], 0 where one lights nothing: what is warm needs less.
+
+        show_at_s: begin of each frame; step_s: time of a move
+        """
+        beam_s = np.zeros_like(target_m)
+        before_m, drawn_at_s, at_s = np.zeros(target_m.shape[1]), np.full(target_m.shape[1], -np.inf), 0.0
+        for frame, heights_m in enumerate(target_m):
+            at_s = max(at_s, float(show_at_s[frame]))
+            is_drawn = heights_m > 0
+            cold_s = self.compute_s(np.where(is_drawn, heights_m, 0.0))
+            saved = np.interp(at_s - drawn_at_s, COOLING_S, self.saved)
+            saved_s = saved * self.compute_s(np.minimum(before_m, np.where(is_drawn, heights_m, 0.0)))
+            beam_s[frame] = np.where(is_drawn, cold_s - saved_s + step_s, 0.0)
+            before_m, drawn_at_s = np.where(is_drawn, heights_m, before_m), np.where(is_drawn, at_s, drawn_at_s)
+            at_s += beam_s[frame].sum() / stages
+        return beam_s
 
     def compute_s(self, target_m: FloatArray) -> FloatArray:
         """Return the estimated width for targets [p], s."""
@@ -45,8 +72,21 @@ class LightEstimate(NamedTuple):
         return np.interp(shares, SHARES, self.widths_s)
 
 
+def _tabulate_saved(cold: ThermalState, pixel: int, target_m: float, drive: DriveRange) -> FloatArray:
+    """Return the share of a pulse's width that the next one for the same target saves by the heat that is left."""
+    periods, duty = cold.solve_pulse(pixel, 0.0, target_m, drive) or (0, 0.0)
+    end_s, power_w = periods * drive.period_s, duty * drive.max_power_w
+    warm = cold.copy()
+    warm.apply_pulses(np.array([pixel]), np.zeros(1), np.array([end_s]), np.array([power_w]))
+    saved = []
+    for wait_s in COOLING_S:
+        pulse = warm.solve_pulse(pixel, end_s + float(wait_s), target_m, drive)
+        saved.append(1.0 if pulse is None else 1.0 - (pulse[0] - 1 + pulse[1]) / (periods - 1 + duty))
+    return np.array(saved)
+
+
 class StageAssignment:
-    """The stage of each pixel, decided frame by frame as the plan reaches them, and for its trains before.
+    """The stage of each pixel, decided frame by frame as the plan reaches them, and for trains and what recurs before.
 
     stage_of: [p] stage of each pixel, NOBODY while it has none
     """
@@ -54,11 +94,46 @@ class StageAssignment:
     def __init__(
         self, sequence: FrameSequence, scan_heads: tuple[ScanHead, ...], reach: BoolArray, light: LightEstimate | None
     ) -> None:
-        """Assign the trains; reach: [k, p] whether a stage's beam reaches a pixel; light: None with one stage."""
+        """Assign trains and recurring pixels; reach: [k, p] whether a stage reaches a pixel; light: None with one."""
         self._sequence, self._first, self._reach, self._light = sequence, scan_heads[0], reach, light
-        first = scan_heads[0]
+        first = self._first
         self._step_s = first.settling.settling_us(first.settling.pitch_rad, 0.0) * 1e-6 if light else 0.0
         self.stage_of = _assign_trains(sequence.trains, reach) if light else np.zeros(reach.shape[1], dtype=np.int64)
+        if light:
+            self._assign_recurring(light)
+
+    def _assign_recurring(self, light: LightEstimate) -> None:
+        """Assign the pixels that several frames light: stretches of a path per frame, balanced over the whole plan."""
+        frames = self._sequence.frames[: max(2, BALANCED_MAX // len(self.stage_of))]
+        target_m = np.array([frame.target_m for frame in frames]).reshape(len(frames), len(self.stage_of))
+        is_drawn = target_m > 0
+        recurring = np.flatnonzero((np.count_nonzero(is_drawn, axis=0) > 1) & (self.stage_of == NOBODY))
+        if not len(recurring):
+            return
+        show_at_s = np.array([frame.show_at_s for frame in frames])
+        cost_s = light.compute_frames_s(target_m, show_at_s, len(self._reach), self._step_s)
+        is_shared = self.stage_of == NOBODY
+        is_shared[recurring] = False
+        stages = len(self._reach)
+        loads_s = np.zeros((len(frames), stages))
+        for frame, each in enumerate(frames):
+            pixels = recurring[is_drawn[frame, recurring]]
+            path = self._order_path(pixels[self.stage_of[pixels] == NOBODY])
+            known = np.setdiff1d(pixels, path, assume_unique=True)
+            loads_s[frame] = _compute_train_light_s(self._sequence.trains, each, self.stage_of, stages)
+            loads_s[frame] += np.bincount(self.stage_of[known], cost_s[frame, known], stages)
+            stage = self.stage_of[path] = _cut(cost_s[frame, path], loads_s[frame], self._reach[:, path])
+            loads_s[frame] += np.bincount(stage, cost_s[frame, path], stages)
+        overlap_s = np.append(0.0, cost_s.sum(axis=1) / np.maximum(np.count_nonzero(is_drawn, axis=1), 1))[:-1]
+        frame_light = FrameLight(loads_s, cost_s[:, is_shared].sum(axis=1), show_at_s, overlap_s)
+        stage = self.stage_of[recurring]
+        balance(frame_light, cost_s[:, recurring], stage, self._reach[:, recurring])
+        self.stage_of[recurring] = stage
+
+    def _order_path(self, pixels: IntArray) -> IntArray:
+        """Return pixels in the order of a short path over them."""
+        layout, moves = self._first.layout, self._first.moves
+        return compute_visiting_order(pixels, layout.row, layout.column, moves.x_rad, moves.y_rad)
 
     def assign(self, source: int, free_s: FloatArray) -> tuple[IntArray, ...] | None:
         """Assign the pixels of a frame that have no stage: all stages, free from free_s [k] on, are to end together.
@@ -67,13 +142,13 @@ class StageAssignment:
         """
         if self._light is None:
             return None
-        frame, layout, moves = self._sequence.frames[source], self._first.layout, self._first.moves
+        frame = self._sequence.frames[source]
         active = np.flatnonzero(frame.target_m > 0)
         cost_s = self._light.compute_s(frame.target_m)[active] + self._step_s
         known = self.stage_of[active] != NOBODY
         busy_s = free_s + _compute_train_light_s(self._sequence.trains, frame, self.stage_of, len(free_s))
         busy_s += np.bincount(self.stage_of[active[known]], cost_s[known], len(free_s))
-        path = compute_visiting_order(active[~known], layout.row, layout.column, moves.x_rad, moves.y_rad)
+        path = self._order_path(active[~known])
         stages = self.stage_of[path] = _cut(cost_s[np.searchsorted(active, path)], busy_s, self._reach[:, path])
         return None if known.any() else tuple(path[stages == stage] for stage in range(len(free_s)))
 

@@ -14,7 +14,9 @@ from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
 from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.scheduler.stage_assignment import StageAssignment
 from optodrive.planning.stimuli.experiments import build_two_fingers
+from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 
 def build_display(name, count, **spans):
@@ -63,8 +65,7 @@ def test_stages_share_the_light_of_a_frame(display, heights):
     planned = plan(display, frame)
     check_beams(display, planned)
     lead_in_s, result = planned.lead_in_s, planned.plan
-    floor_s = (result.width_s.sum() + result.settling_s.sum() - stages * lead_in_s) / stages
-    assert result.end_s - lead_in_s <= 1.02 * floor_s
+    assert compute_excess(display, planned) <= 1.02
     single = plan(DISPLAYS["display-437"], frame)
     assert sorted(result.pixel) == sorted(single.plan.pixel)
     order, single_order = np.argsort(result.pixel), np.argsort(single.plan.pixel)
@@ -77,6 +78,49 @@ def test_a_frame_begins_once_every_pulse_of_the_one_before_has_begun(display):
     planned = plan(display, *frames)
     check_beams(display, planned)
     assert (np.diff(planned.plan.source) >= 0).all()
+
+
+def build_pages(display):
+    """Build pages of braille whose dots recur unevenly."""
+    text = (
+        "the quick brown fox jumps over the lazy dog and reads a page of braille with two fingers on a display of light"
+    )
+    words = text.split()
+    texts = [" ".join(words[first : first + 4]) for first in range(0, 20, 2)]
+    targets_m = [
+        build_pattern("text", {"text": text, "height_um": 100}, display.config).frames[0].target_m for text in texts
+    ]
+    return [TactileFrame(f"f{k}", 1e-3 * k, 10.0, target_m) for k, target_m in enumerate(targets_m)]
+
+
+def compute_excess(display, planned):
+    """Return the time of a plan over light ÷ stages + moves."""
+    stages, result = len(display.scan_heads), planned.plan
+    floor_s = (result.width_s.sum() + result.settling_s.sum() - stages * planned.lead_in_s) / stages
+    return (result.end_s - planned.lead_in_s) / floor_s
+
+
+def test_dots_that_recur_are_shared_over_the_whole_plan(display):
+    planned = plan(display, *build_pages(display))
+    check_beams(display, planned)
+    assert compute_excess(display, planned) <= 1.035
+
+
+def test_decided_frame_by_frame_recurring_dots_would_be_uneven(display, monkeypatch):
+    """Mutant: what later pages light is not looked at."""
+    monkeypatch.setattr(StageAssignment, "_assign_recurring", lambda *_: None)
+    planned = plan(display, *build_pages(display))
+    check_beams(display, planned)
+    assert compute_excess(display, planned) > 1.06
+
+
+def test_each_stage_keeps_to_its_reach_where_dots_recur():
+    display = build_display("display-437", 2, columns=((0, 14), (8, 22)))
+    planned = plan(display, *build_pages(display))
+    check_beams(display, planned)
+    column = display.layout.column[planned.plan.pixel]
+    assert (column[planned.plan.stage == 0] <= 14).all()
+    assert (column[planned.plan.stage == 1] >= 8).all()
 
 
 def test_two_fingers_feel_trains_at_once():
