@@ -1,5 +1,7 @@
 """A diagnosis says in its first sentence what is uncertain, and how far heights planned with its model are off."""
 
+import json
+import shlex
 from dataclasses import replace
 from itertools import pairwise
 
@@ -8,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from labs import AMBIENT_K, GROUPS, PIXEL, lab
+from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
@@ -17,6 +20,7 @@ from optodrive.lab.diagnosis.display_narrative import build_display_answer, buil
 from optodrive.lab.diagnosis.estimates import describe_doubts
 from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+from optodrive.lab.diagnosis.next_steps import list_next_steps
 from optodrive.lab.diagnosis.report import build_report
 from optodrive.physics.hypothesis import RecordingScope
 from optodrive.physics.terms import discover_terms
@@ -210,3 +214,51 @@ def test_no_pixel_without_an_answer_counts_as_one_without_an_error(late):
     assert build_headline(DisplayAnswer((lost,), None, 1.0)) == (
         "Of 1 pixel, each diagnosed separately, none has an answer."
     )
+
+
+def list_commands(found, *recordings):
+    return [shlex.split(step.command) for step in list_next_steps(found, recordings or ("recording.h5",))]
+
+
+def test_the_report_says_what_to_run_next_and_the_commands_run(leak, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "model.toml").write_text(build_model_toml(leak, "orifice", WIDTH_M))
+    frames = {"frames": [{"show_at_s": 0.0, "duration_s": 0.3, "target_um": {"3": 100}}]}
+    (tmp_path / "frames.json").write_text(json.dumps(frames))
+    commands = list_commands(leak)
+    assert [command[1] for command in commands] == ["plan", "simulate", "serve"]
+    report = build_report(leak, "leak.h5")
+    for program, *arguments in commands:
+        assert program == "optodrive"
+        assert f"<code>{shlex.join([program, *arguments])}</code>" in report
+        if arguments[0] != "serve":
+            assert run(arguments) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"verdict": "none", "causes": (), "terms": {}}, ["plan frames.json", "serve --model"]),
+        ({"verdict": "unexplained", "causes": ()}, ["recording show 'my rec.h5' --out signals.png"]),
+        ({"verdict": "ambiguous"}, ["diagnose 'my rec.h5' more.h5", "plan", "simulate", "serve"]),
+        ({"doubts": {"gas_leak": "the interval contains zero"}}, ["diagnose", "plan", "simulate", "serve"]),
+        ({"causes": ("sensor_lag",)}, []),
+        ({"causes": ("mirror_lag",)}, ["calibrate steps --out steps", "calibrate servo steps --out mirrors.toml"]),
+        ({"verdict": "incomplete", "causes": (), "failures": {"gas_leak": "too fast"}}, ["terms gas_leak"]),
+    ],
+)
+def test_every_finding_has_its_next_command_whose_options_exist(leak, capsys, change, expected):
+    found = replace(leak, **change)
+    commands = list_commands(found, "my rec.h5")
+    for command, begin in zip(commands, expected, strict=True):
+        assert shlex.join(command).startswith(f"optodrive {begin}")
+        capsys.readouterr()
+        assert run([*command[1:], "--help"]) == 0  # refuses an option that does not exist
+    assert ("Run next" in build_report(found, "my rec.h5")) == bool(expected)
+
+
+def test_a_late_clock_is_corrected_in_the_merge(late):
+    (merge,) = list_commands(late)
+    assert merge[1:] == [
+        *("recording", "merge", "session.h5", "measured", "--time-offset=2.4e-05", "--out", "recording.h5"),
+    ]

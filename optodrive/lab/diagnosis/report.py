@@ -10,6 +10,7 @@ from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.types.discrepancy import Discrepancy, ResidualTrace
 from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
 from optodrive.lab.diagnosis.narrative import build_narrative
+from optodrive.lab.diagnosis.next_steps import NextStep, list_next_steps
 from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_residuals
 
 MAX_TRACES = 12
@@ -22,7 +23,9 @@ def build_report(discrepancy: Discrepancy, title: str, provenance: Provenance | 
     """Return the report as HTML."""
     has_extension = bool(discrepancy.terms)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
+    recordings = ("recording.h5",) if provenance is None or not provenance.recordings else provenance.recordings
     parts = [
+        *_build_next_steps(list_next_steps(discrepancy, recordings)),
         "<h2>Measured against model</h2>",
         f"<p>{MEASURED}, {models}. Of each signal the run in which the nominal model is worst, and the median one; "
         "below, measured minus model. The band is the noise of one sample, ± σ.</p>",
@@ -45,6 +48,16 @@ def build_report(discrepancy: Discrepancy, title: str, provenance: Provenance | 
         "</div>",
     ]
     return render_page(title, discrepancy.verdict, build_narrative(discrepancy), parts, provenance)
+
+
+def _build_next_steps(steps: list[NextStep]) -> Iterator[str]:
+    """Return the section with the commands to run next."""
+    if not steps:
+        return
+    yield "<h2>Run next</h2>"
+    yield "<p>From the folder with this report, model.toml, the recordings and your frames.json.</p>"
+    rows = ((escape(step.reason), f"<code>{escape(step.command)}</code>") for step in steps)
+    yield render_table(("why", "command"), rows, label="Run next")
 
 
 def _select_traces(traces: tuple[ResidualTrace, ...]) -> list[ResidualTrace]:

@@ -1,0 +1,72 @@
+"""Next steps after a diagnosis: the commands that follow from what was found."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from shlex import join
+
+from optodrive.core.types.discrepancy import Discrepancy
+from optodrive.physics.terms import discover_terms
+
+MODEL, FRAMES = "model.toml", "frames.json"
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """A reason, and the command to run for it, from the folder that holds report and recordings."""
+
+    reason: str
+    command: str
+
+
+def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str]) -> list[NextStep]:
+    """Return the steps in their order; recordings: names of those that were diagnosed."""
+    steps = [_inspect_term(label) for label in discrepancy.failures]
+    if discrepancy.verdict == "unexplained":
+        show = ("recording", "show", recordings[0], "--out", "signals.png")
+        steps.append(_step("Look at the signals in which the residuals are largest.", *show))
+    if discrepancy.verdict == "ambiguous" or discrepancy.doubts:
+        again = (
+            "Record the proposed experiment" if discrepancy.next_experiment else "Record each experiment three times"
+        )
+        more = ("diagnose", *recordings, "more.h5", "--out", "answer")
+        steps.append(_step(f"{again}, and diagnose it together with these runs.", *more))
+    if "mirror_lag" in discrepancy.causes:
+        steps.append(_step("Identify the mirrors' servos from steps.", "calibrate", "steps", "--out", "steps"))
+        servo = ("calibrate", "servo", "steps", "--out", "mirrors.toml")
+        steps.append(_step("Complete the steps by the measured angles; plan with the result (--mirrors).", *servo))
+    if "clock_offset" in discrepancy.causes:
+        offset = discrepancy.parameters["clock_offset.displacement"].value
+        merge = (
+            "recording",
+            "merge",
+            "session.h5",
+            "measured",
+            f"--time-offset={-offset:.3g}",
+            "--out",
+            "recording.h5",
+        )
+        steps.append(_step("Correct the instrument's times when session and measurement are merged.", *merge))
+    changes_plans = any(_changes_plans(key) for key in discrepancy.causes)
+    if discrepancy.base and discrepancy.verdict != "unexplained" and (changes_plans or discrepancy.verdict == "none"):
+        steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", MODEL))
+        if changes_plans:
+            steps.append(
+                _step("See what the effect does to heights planned without it.", "simulate", FRAMES, "--truth", MODEL)
+            )
+        steps.append(_step("Serve the display with it.", "serve", "--model", MODEL))
+    return steps
+
+
+def _changes_plans(key: str) -> bool:
+    """Return whether a term acts in the pixel, rather than in an instrument or in the mirrors."""
+    kernels = discover_terms()[key].kernels._replace(sensor_reading=None, sensor_lag=None, force=None)
+    return any(hook is not None for hook in kernels)
+
+
+def _inspect_term(label: str) -> NextStep:
+    key = label.partition(" ")[0].rstrip(":")
+    return _step(f"Correct the term, which could not be computed: {key}.", "terms", key)
+
+
+def _step(reason: str, *arguments: str) -> NextStep:
+    return NextStep(reason, join(["optodrive", *arguments]))
