@@ -1,4 +1,4 @@
-"""Next steps after a diagnosis: the commands that follow from what was found."""
+"""Commands that a user runs next for what a diagnosis has found."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
