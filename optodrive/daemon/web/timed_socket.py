@@ -35,7 +35,7 @@ class TimedSocket(socket.socket):
         for level, kind, value in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
                 seconds, nanoseconds = _TIMESPEC.unpack(value)
+                now_s = time.monotonic()  # first: a stall before the next line makes the time too early, never too late
                 # The kernel states it in Unix time, which somebody may set in between.
-                age_s = max(0, time.time_ns() - seconds * 1_000_000_000 - nanoseconds) * 1e-9
-                self.received_s = time.monotonic() - age_s
+                self.received_s = now_s - max(0, time.time_ns() - seconds * 1_000_000_000 - nanoseconds) * 1e-9
         return data
