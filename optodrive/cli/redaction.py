@@ -1,4 +1,4 @@
-"""Removal of secrets from text that leaves the computer: known ones in every form, and what is named as a secret."""
+"""Removal of secrets from text: known ones in every form, and values that are named as a secret."""
 
 import json
 import re

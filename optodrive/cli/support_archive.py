@@ -1,4 +1,4 @@
-"""The entries of a support archive. What cannot be read is an entry that says why."""
+"""The entries of a support archive."""
 
 import gzip
 import io

@@ -80,7 +80,7 @@ def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> b
 
 
 def read_last_lines(path: Path, bytes_max: int) -> bytes:
-    """Return the whole lines at the end of a regular file, at most so many bytes. Raise InputError for another file."""
+    """Return whole lines from the end of a regular file, at most `bytes_max` bytes. Raise InputError for another."""
     with _open_regular_file(path) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - bytes_max))

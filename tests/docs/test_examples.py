@@ -29,6 +29,7 @@ ELSEWHERE = {
     "make ": "tests/firmware builds the ports",
     "python3 -m venv": "tests/system/test_wheel.py checks the wheel",
     "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",
+    "openssl req -x509": "tests/system/test_tls_proxy.py makes its certificate so",
     "optodrive helios": "tests/helios plays on a DAC's USB protocol; no device is here",
     "optodrive home": "a synopsis; tests/system/test_home.py",
     "optodrive doctor --config display.toml": "tests/system/test_stages.py",
@@ -37,6 +38,7 @@ ELSEWHERE = {
     "optodrive calibrate board": "a synopsis; tests/system/test_calibrate_loop.py",
     "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
     "optodrive calibrate pixels": "tests/accuracy/test_calibrate_pixels.py records its sweep, which takes minutes",
+    "optodrive calibrate servo recording.h5 --stage": "tests/accuracy/test_calibrate_servo.py",
     "optodrive calibrate sweep": "tests/system/test_calibrate_sweep.py",
     "optodrive recording merge sweep/": "tests/unit/lab/commissioning/test_sweep_player.py",
     "optodrive token": "tests/unit/cli/test_token_command.py",
@@ -73,10 +75,11 @@ SCENARIOS = {
 }
 DRAWINGS = {
     "docs/explanation/architecture.md": ("FrameSequence →", "core < device"),
+    "docs/how-to/reach-it-from-the-network.md": ("lab.example {", "server {"),
     "docs/how-to/wire-a-board.md": ("PC ── USB",),
     "docs/reference/recordings.md": ("/        ", "recording.toml   "),
 }
-"""Beginnings of indented blocks that are drawings or layouts of files."""
+"""Beginnings of indented blocks that are drawings, layouts of files or configurations of other programs."""
 CSV_HEADER = re.compile(r"[a-z]\w*(,[a-z]\w*)+")
 EVERY_TIME = ("readme", "readme-rest")
 INLINE = re.compile(r"`(optodrive [^`]+)`")

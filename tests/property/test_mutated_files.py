@@ -144,5 +144,5 @@ def test_a_field_whose_codes_have_no_position_is_refused(key, value, tmp_path):
     content = FieldFile().draw(np.random.default_rng(1))
     content["geometry"][key] = value
     path = write_toml(tmp_path / "field.toml", content)
-    with pytest.raises(InputError, match="field.toml: geometry"):
+    with pytest.raises(InputError, match=r"field\.toml: geometry"):
         read_with("field")(path)

@@ -1,0 +1,138 @@
+"""The daemon behind a TLS proxy, for other computers and phones: names, origins, cookie, WebSockets, client."""
+
+import asyncio
+import os
+import socket
+import ssl
+import subprocess
+import threading
+from contextlib import suppress
+
+import httpx
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from forked_process import run_process
+from optodrive.client import Display
+from optodrive.core.errors import NotReadyError
+from rig import OPTODRIVE, TOKEN
+
+NAME = "lab.example"
+AUTHORIZATION = {"Authorization": f"Bearer {TOKEN}"}
+
+
+class TlsProxy:
+    """Ends TLS and passes all bytes on, so that the Host is that of the client, as a proxy has to be configured."""
+
+    def __init__(self, folder, target_port):
+        self.certificate = folder / "certificate.pem"
+        key = folder / "key.pem"
+        names = ("-subj", f"/CN={NAME}", "-addext", f"subjectAltName=DNS:{NAME},DNS:localhost")
+        options = ("-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *names, "-keyout", key)
+        subprocess.run(["openssl", "req", *options, "-out", self.certificate], check=True, capture_output=True)
+        self._context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        self._context.load_cert_chain(self.certificate, key)
+        self._target_port = target_port
+        self._loop, listening = asyncio.new_event_loop(), threading.Event()
+        self._thread = threading.Thread(target=lambda: self._loop.run_until_complete(self._serve(listening)))
+        self._thread.start()
+        listening.wait()
+
+    async def _serve(self, listening):
+        self._ending = asyncio.Event()
+        async with asyncio.TaskGroup() as group:
+            server = await asyncio.start_server(
+                lambda *client: group.create_task(self._pass_on(*client)), "127.0.0.1", 0, ssl=self._context
+            )
+            self.port = server.sockets[0].getsockname()[1]
+            listening.set()
+            await self._ending.wait()
+            server.close()
+
+    async def _pass_on(self, from_client, to_client):
+        from_daemon, to_daemon = await asyncio.open_connection("127.0.0.1", self._target_port)
+        await asyncio.gather(copy(from_client, to_daemon), copy(from_daemon, to_client))
+
+    def close(self):
+        self._loop.call_soon_threadsafe(self._ending.set)
+        self._thread.join()
+        self._loop.close()
+
+
+async def copy(source, sink):
+    with suppress(OSError):
+        while data := await source.read(65536):
+            sink.write(data)
+            await sink.drain()
+    with suppress(OSError):
+        sink.close()
+        await sink.wait_closed()
+
+
+@pytest.fixture
+def behind_proxy(board, make_daemon, tmp_path):
+    """Return a daemon that knows its name on the network, and the proxy before it."""
+    daemon = make_daemon(board, replace=[("lease_s = 1.0", f'lease_s = 1.0\n[daemon]\nhosts = ["{NAME}"]\n#')])
+    proxy = TlsProxy(tmp_path, int(daemon.url.rpartition(":")[2]))
+    yield daemon, proxy
+    proxy.close()
+
+
+def request(proxy, path, host=NAME, **headers):
+    """Send a request as a browser does that found the proxy under a name."""
+    context = ssl.create_default_context(cafile=proxy.certificate)
+    with httpx.Client(base_url=f"https://127.0.0.1:{proxy.port}", verify=context, timeout=None) as client:
+        return client.get(path, headers={"Host": host, **headers}, extensions={"sni_hostname": NAME})
+
+
+def test_names_and_origins_are_checked_behind_a_proxy(behind_proxy):
+    _, proxy = behind_proxy
+    assert request(proxy, "/v1/state", **AUTHORIZATION).status_code == 200
+    for origin, status in ((f"https://{NAME}", 200), (f"https://{NAME}.evil", 403), ("https://evil.example", 403)):
+        assert request(proxy, "/v1/state", Origin=origin, **AUTHORIZATION).status_code == status, origin
+    with_port = f"{NAME}:{proxy.port}"
+    assert request(proxy, "/v1/me", with_port, Origin=f"https://{with_port}", **AUTHORIZATION).status_code == 200
+    assert request(proxy, "/v1/me", with_port, Origin=f"https://{NAME}", **AUTHORIZATION).status_code == 403
+    assert request(proxy, "/v1/me", "localhost", Origin="https://localhost", **AUTHORIZATION).status_code == 403
+    refused = request(proxy, "/v1/state", "phone.example", **AUTHORIZATION)
+    assert (refused.status_code, refused.json()["code"]) == (421, "host_not_allowed")
+    assert "daemon.hosts" in refused.json()["detail"]
+
+
+def test_the_page_opens_with_the_cookie_of_its_name(behind_proxy):
+    _, proxy = behind_proxy
+    assert request(proxy, "/").status_code == 401
+    assert request(proxy, "/", Cookie=f"optodrive-80={TOKEN}").status_code == 200
+    assert request(proxy, "/", f"{NAME}:8443", Cookie=f"optodrive-8443={TOKEN}").status_code == 200
+
+
+def test_websockets_pass_a_proxy_for_their_own_origin_only(behind_proxy):
+    _, proxy = behind_proxy
+    context = ssl.create_default_context(cafile=proxy.certificate)
+
+    options = {"ssl": context, "additional_headers": AUTHORIZATION, "proxy": None}
+    address, url = ("127.0.0.1", proxy.port), f"wss://{NAME}/v1/stream"
+    with (
+        socket.create_connection(address) as link,
+        connect(url, sock=link, origin=f"https://{NAME}", **options) as stream,
+    ):
+        stream.send("no frame")
+        assert "refused" in stream.recv()
+    with socket.create_connection(address) as link, pytest.raises(InvalidStatus, match="HTTP 403"):
+        connect(url, sock=link, origin="https://evil.example", **options)
+
+
+def test_client_and_commands_reach_the_daemon_over_tls(behind_proxy, monkeypatch):
+    daemon, proxy = behind_proxy
+    monkeypatch.setenv("SSL_CERT_FILE", str(proxy.certificate))
+    url = f"https://localhost:{proxy.port}"
+    with Display(url, TOKEN) as display:
+        assert display.state().board.state == "DISARMED"
+        with display.stream() as stream, pytest.raises(NotReadyError):
+            stream.wait(stream.send({5: 60.0}))
+        display.arm(hold=True)
+        assert daemon.state()["control"]["hold"] is True
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
+    done = run_process([OPTODRIVE, "stop", "--url", url], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
