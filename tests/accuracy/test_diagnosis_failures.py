@@ -16,6 +16,7 @@ from optodrive.lab.diagnosis.display_narrative import build_display_answer, buil
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.report import build_report
+from optodrive.physics.hypothesis import RecordingScope
 from optodrive.physics.terms import discover_terms
 
 FAST_PER_S = 5000.0
@@ -75,6 +76,20 @@ def test_a_test_without_a_number_ends_the_diagnosis(monkeypatch):
     monkeypatch.setattr(detection, "_compute_scores", compute_nothing)
     with pytest.raises(OptodriveError, match="the test of the residuals gave no number"):
         diagnose(lab(11, {}, groups=("middle", "strong"), repeats=2))
+
+
+@pytest.mark.parametrize(("effect", "p"), [(1e4, 0.0), (np.inf, 0.0), (np.nan, np.nan), (0.1, None)])
+def test_an_effect_whose_p_underflows_is_found_and_one_without_a_number_is_not_judged(effect, p):
+    """A mirror's lag has χ² of 10⁸ against noise that counts as known."""
+    leak = discover_terms()["gas_leak"]
+    (hypothesis,) = leak.build_hypotheses(RecordingScope(("displacement",), (0,), frozenset({0}), False, 1))
+    projected = np.array([[1.0, effect], [effect, 1.0]])
+    independent = np.ones(1)
+    with np.errstate(all="ignore"):
+        _, found = detection._compute_scores(
+            ((hypothesis, hypothesis.starts[0]),), projected, np.ones(1), independent, 0, detection.NOISE_KNOWN_DEGREES
+        )
+    assert found > 0.1 if p is None else np.array_equal(found, p, equal_nan=True)
 
 
 def test_a_nominal_model_that_diverges_is_refused():

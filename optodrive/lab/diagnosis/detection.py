@@ -183,7 +183,8 @@ def _compute_scores(
         score = Score(item, start, ratio, amplitudes, indices, start_ratio, float(independent[last]))
         if item.label not in best or ratio > best[item.label].ratio:
             best[item.label] = score
-    observed = max(_compute_surprisal(score.ratio, len(score.columns), noise_degrees) for score in best.values())
+    surprisals = [_compute_surprisal(score.ratio, len(score.columns), noise_degrees) for score in best.values()]
+    observed = float(np.max(surprisals))  # no number if one is none
     generator = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(gram)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -201,8 +202,8 @@ def _compute_scores(
     max_surprisal = np.zeros(DRAWS)
     for degrees, ratio_drawn in max_ratio.items():  # once per number of degrees, because it takes long
         max_surprisal = np.maximum(max_surprisal, -chi_squared.logsf(ratio_drawn, degrees))
-    if not (np.isfinite(max_surprisal).all() and np.isfinite(observed)):
-        return [], np.nan  # nothing is concluded from it
+    if not np.isfinite(max_surprisal).all() or np.isnan(observed):  # an infinite one rejects: its p underflows to zero
+        return [], np.nan
     level = float(np.quantile(max_surprisal, 0.99))
     # Beyond the draws, extrapolate as for the maximum of 1 % × e^level independent scores.
     exceedance = float((max_surprisal >= observed).mean())
