@@ -1,8 +1,31 @@
 """The boards of all stages as one: they are armed, stopped and lost together, and keep the host's time.
 
-One board keeps its own time: `board_s` is its clock, and its points follow it. Several keep the host's: `board_s` is
-the host's clock, and the points of each board are shifted by what its clock drifts. Light that would come late is not
-emitted: all boards drop their points, and stay armed.
+Theory of operation
+
+Problem. Several lasers draw one display, each with its scan head and its board. The thermal bound is proven for the
+pulses of all in one order; a board that drifts, waits or is lost breaks the proof for the pixels of the others.
+Everything above this module knows one board.
+
+As one. State is that of the board nearest to light (`STATE_ORDER`): armed only when all are, dark only when all are. So
+STOP is confirmed by the last one, and a plan begins when the last one is ready. Commands go to all; arming is refused
+without effect if one cannot be armed. A fault, a lost link, or the silence of one for a lease ends the light of all;
+the links of the others are kept, and the status lists each stage with its state and cause.
+
+Time. One board keeps its own: `board_s` is its clock, its points follow each other by durations, and what is late is
+executed late and reported. Several keep the host's: `board_s` is the host's clock, a line is fitted to the exchanges
+with each board (`clock_sync.py`), and each point is shifted by as much as its board has drifted since the one before.
+Points leave at most `SEND_AHEAD_MAX_S` ahead, because the drift until then is a guess. A plan starts only if the error
+of every clock is below `stage_skew_max_s`, which the limiter has counted; until then exchanges repeat (`_seek_clocks`),
+for `CLOCK_PATIENCE_S`, then the start is refused by name.
+
+Late light is not emitted. If one board would execute its next point late, all drop their points and stay armed
+(`_drop_late_points`), and the plan has failed: light out of order is not covered by any proof.
+
+Streams are cut at one time on all boards, behind every point that may have left; a splice is made on all or, if it is
+too late on one, on none.
+
+Why one process. STOP, epochs and leases would otherwise have to agree across processes. Why no going on without a lost
+stage: its last lease of light is unknown, see decision 42. Decisions: 41, 42.
 """
 
 from collections import Counter
