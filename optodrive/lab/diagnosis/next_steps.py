@@ -1,4 +1,4 @@
-"""Commands that a user runs next for what a diagnosis has found."""
+"""Commands that a user runs next after the findings of a diagnosis."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
