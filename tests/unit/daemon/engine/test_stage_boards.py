@@ -7,6 +7,7 @@ import pytest
 
 from displays import DISPLAYS
 from link_service_rig import OPERATOR, WEB
+from optodrive.core.errors import LinkError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.link.protocol.states import ARMED_STATES, BoardState
 from optodrive.link.session import plan_job
@@ -231,6 +232,22 @@ def test_every_stage_is_listed_with_its_state_after_one_was_lost(monkeypatch, lo
     rig.links[1].is_broken = False
     rig.until(lambda: rig.remote.connected)
     assert [stage["error"] for stage in rig.remote.stages] == [None, None, None]
+
+
+def test_abort_goes_to_the_other_boards_in_the_step_that_finds_one_lost(monkeypatch):
+    """They would also be aborted later, as boards without an arming, once they have acknowledged all that was sent."""
+    rig = StageRig(monkeypatch, build_stages("display-16", 3), link_type=BreakingLink).ready()
+    rig.run(2.0)
+    rig.arm()
+    submit(rig, build_trains(3, 9.0))
+    rig.run(0.5)
+    rig.links[2].is_broken = True
+    assert [core.state for core in rig.cores[:2]] == [BoardState.RUNNING] * 2
+    with pytest.raises(LinkError, match="unplugged"):
+        rig.boards.step(0.0, renew_lease=True)
+    for session in rig.boards.sessions[:2]:
+        session.step(0.0, renew_lease=True)
+    assert [core.state for core in rig.cores[:2]] == [BoardState.DISARMED] * 2
 
 
 def test_arming_is_of_all_boards_or_of_none(monkeypatch):
