@@ -239,8 +239,8 @@ def test_abort_goes_to_the_other_boards_in_the_step_that_finds_one_lost(monkeypa
     rig = StageRig(monkeypatch, build_stages("display-16", 3), link_type=BreakingLink).ready()
     rig.run(2.0)
     rig.arm()
-    submit(rig, build_trains(3, 9.0))
-    rig.run(0.5)
+    record = submit(rig, build_trains(3, 9.0))
+    rig.until(lambda: record.executed_count > 20)
     rig.links[2].is_broken = True
     assert [core.state for core in rig.cores[:2]] == [BoardState.RUNNING] * 2
     with pytest.raises(LinkError, match="unplugged"):
