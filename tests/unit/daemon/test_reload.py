@@ -1,12 +1,19 @@
+from contextlib import closing
+from types import SimpleNamespace
+
 import pytest
 
+from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, NotReadyError
+from optodrive.daemon.log import DaemonLog
+from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import (
     ConfigReloader,
     describe_reload,
     merge_reloadable,
     split_changed_keys,
 )
+from optodrive.daemon.supervisor.reload_handler import ReloadHandler
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config_file import load_config
 from optodrive.link.protocol.states import LEASED_STATES
@@ -114,3 +121,24 @@ def test_a_refused_reload_changes_nothing(config, tmp_path):
     with pytest.raises(InputError, match=r"missing\.toml"):
         reloader.reload("DISARMED")
     assert (reloader.config, reloader.tokens) == (unreadable, TOKENS)
+
+
+def test_an_error_that_no_reader_foresees_is_a_refusal_in_one_line(config, capsys):
+    """The supervisor, which watches the other processes, goes on with what it had."""
+
+    def read_config():
+        raise ZeroDivisionError("a\nb")
+
+    audit, answers = [], []
+    supervisor = SimpleNamespace(
+        link_view=SimpleNamespace(board_state="DISARMED"), record_audit=audit.append, send_to_web=answers.append
+    )
+    reloader = ConfigReloader(config, TOKENS, read_config)
+    with closing(DaemonLog()) as log, closing(Notifier(ManualClock())) as notifier:
+        handler = ReloadHandler(reloader, supervisor, notifier, log)
+        handler.on_web_message({"kind": "reload_request", "id": "x"})
+    assert (reloader.config, reloader.tokens) == (config, TOKENS)
+    assert capsys.readouterr().err == "optodrive: not reloaded, nothing changed: ZeroDivisionError: a\\nb\n"
+    assert [entry["event"] for entry in audit] == ["reload_refused"]
+    ((kind, problem),) = [(answer["kind"], answer["problem"]) for answer in answers]
+    assert (kind, problem["status"], problem["detail"]) == ("reload_result", 500, "ZeroDivisionError: a\\nb")

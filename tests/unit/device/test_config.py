@@ -125,3 +125,14 @@ def test_an_unknown_parameter_set_is_refused(tmp_path):
     path.write_text('format = "optodrive-parameters"\nversion = 7\n')
     with pytest.raises(InputError, match="version"):
         load_parameters(path)
+
+
+@pytest.mark.parametrize("name", ["a\\u001b[2Jb", "a\\nb", 'a\\"b', "a\\\\b", "", "x" * 101])
+def test_a_name_that_fits_no_line_is_refused(name, tmp_path):
+    """It is printed by commands, and written into files of TOML."""
+    path = tmp_path / "config.toml"
+    text = locate_shipped("display-16.toml").read_text()
+    path.write_text(text.replace('name = "display-16"', f'name = "{name}"'))
+    with pytest.raises(InputError, match=r"config\.toml: name: got") as refused:
+        load_config(path)
+    assert str(refused.value).isprintable()
