@@ -31,7 +31,13 @@ class SensorLocator:
 
     def __init__(self, board: ExclusiveBoard, spot_reader: SpotReader, power_w: float, readings: int) -> None:
         self._spot_reader, self._power_w, self._readings = spot_reader, power_w, readings
-        self._codes = np.rint(board.clip_codes(build_code_grid(board.config, GRID_MARGIN_M, GRID_SIDE)))
+        # The whole grid shrinks to the board's range: places that are clipped one by one may get the same codes, and
+        # one that cannot be told from another would never count as measured.
+        grid = build_code_grid(board.config, GRID_MARGIN_M, GRID_SIDE)
+        low, high = grid.min(axis=0), grid.max(axis=0)
+        self._codes = np.rint(
+            board.clip_codes(low) + (grid - low) / (high - low) * (board.clip_codes(high) - board.clip_codes(low))
+        )
         self.name = f"sensor at {spot_reader.port}"
         self.not_found_message = (
             f"{self.name} sees no spot, expected one: is it covered, or is {format_quantity(power_w, 'W')} too dim?"

@@ -3,14 +3,21 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from displays import DISPLAYS
+from exclusive_rig import ExclusiveRig
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
+from optodrive.device.config import Config
+from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.lab.commissioning.calibration_session import CalibrationSession, SpotRow, save_text, session_path_for
-from optodrive.lab.commissioning.spot_reader import robust_mean
-from optodrive.lab.commissioning.spot_sensor_client import SpotReading
+from optodrive.lab.commissioning.spot_locator import SensorLocator
+from optodrive.lab.commissioning.spot_reader import SpotReader, robust_mean
+from optodrive.lab.commissioning.spot_sensor_client import SpotReading, SpotSensorClient
 from optodrive.lab.commissioning.worker_process import WorkerProcess
+from optodrive.link.transport.serial_port import SerialPort
+from optodrive.planning.display_model import DisplayModel
 
 CONFIG = DISPLAYS["display-437"].config
 
@@ -70,3 +77,18 @@ def test_work_aside_comes_back_or_says_why():
         worker._process.terminate()
         with pytest.raises(OptodriveError, match="has ended"):
             worker.result()
+
+
+@pytest.mark.parametrize("empty_columns", [0, 3])
+def test_every_place_of_a_sensor_s_grid_is_told_from_the_others(empty_columns):
+    """Also where all pixels lie on one side: a place that looks like another would be measured without end."""
+    table = DISPLAYS["display-16"].config.model_dump()
+    table["display"] |= {"missing": [[row, column] for row in range(4) for column in range(empty_columns)]}
+    rig = ExclusiveRig(DisplayModel.from_config(Config.model_validate(table)), lambda x_code, y_code, at_us: None)
+    sensor = SpotReader(rig.held, SpotSensorClient(SerialPort("/dev/null", 115_200)), rig.clock)
+    locator = SensorLocator(rig.held, sensor, 5e-3, 3)
+    codes = locator.candidate_codes(None)
+    spots = MeasuredSpots.from_table(np.column_stack([codes, np.zeros_like(codes)]))
+    assert locator.match_places(spots).tolist() == list(range(len(codes)))
+    for x_code, y_code in codes:
+        rig.held.check_range(int(x_code), int(y_code))
