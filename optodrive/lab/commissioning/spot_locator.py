@@ -35,7 +35,7 @@ class SensorLocator:
         # one that cannot be told from another would never count as measured.
         grid = build_code_grid(board.config, GRID_MARGIN_M, GRID_SIDE)
         low, high = grid.min(axis=0), grid.max(axis=0)
-        self._codes = np.rint(
+        self._codes: FloatArray = np.rint(
             board.clip_codes(low) + (grid - low) / (high - low) * (board.clip_codes(high) - board.clip_codes(low))
         )
         self.name = f"sensor at {spot_reader.port}"
