@@ -72,7 +72,10 @@ class Edge(ctypes.Structure):
 
 
 def build_library(folder, mutant=0, *defines):
-    """Build the core and the shim as a shared library outside the source tree; defines: non-default sizes."""
+    """Build the core and the shim as a shared library outside the source tree.
+
+    defines: non-default sizes
+    """
     require("gcc")
     library = folder / f"core-{mutant}{''.join(defines)}.so"
     sources = [*sorted((FIRMWARE / "core").glob("*.c")), SHIM]
@@ -131,7 +134,10 @@ def load(path):
 
 
 class CBoard:
-    """A C core with punctual ticks; sink: receives each log event, as from the simulated board."""
+    """A C core with punctual ticks.
+
+    sink: receives each log event, as from the simulated board
+    """
 
     def __init__(self, library, settings=None, sink=None, entropy=None):
         settings = settings or BoardSettings()
@@ -189,7 +195,10 @@ class CBoard:
         return [(edges[k].at_us, bool(edges[k].on)) for k in range(count.value)]
 
     def advance(self, now_us, loop=True):
-        """Run ticks every 100 µs up to now_us; loop: whether the main loop runs then."""
+        """Run ticks every 100 µs up to now_us.
+
+        loop: whether the main loop runs then
+        """
         self._library.shim_run(self._handle, now_us)
         if loop:
             self.run_loop()

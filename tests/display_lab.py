@@ -7,7 +7,11 @@ from optodrive.core.types.measurements import Measurement
 
 
 def display_lab(hidden, seed=0, **design):
-    """Record a display; hidden: pixel → terms; design: as lab takes it."""
+    """Record a display.
+
+    hidden: pixel → terms
+    design: as lab takes it
+    """
     runs = []
     for pixel, terms in hidden.items():
         for run in lab(seed + pixel, terms, **design).runs:

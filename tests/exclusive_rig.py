@@ -10,7 +10,10 @@ from optodrive.planning.display_model import DisplayModel
 
 
 class ExclusiveRig:
-    """A board in the same process, and exclusive access to it. mirror_sink: receives each move of the mirrors"""
+    """A board in the same process, and exclusive access to it.
+
+    mirror_sink: receives each move of the mirrors
+    """
 
     def __init__(self, display, mirror_sink):
         self.log, self.clock = [], ManualClock(3.0)

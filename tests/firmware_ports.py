@@ -27,7 +27,10 @@ def require(*tools):
 
 
 def _build(folder, mutant, port):
-    """Build a port; return its file without suffix. mutant: number of the disabled guard."""
+    """Build a port. Return its file without suffix.
+
+    mutant: number of the disabled guard
+    """
     require(*NEEDS[port])
     build = ["make", "-s", "-C", PORTS / port, f"BUILD={folder}", f"MUTANT={mutant}"]
     built = subprocess.run(build, capture_output=True, text=True)
@@ -44,5 +47,5 @@ def build_board(folder, mutant=0, port="host"):
 
 
 def build_emulated_chip(folder, mutant=0):
-    """Build the image of the emulated Cortex-M3; return a function of settings, sink and seed for a chip."""
+    """Build the image of the emulated Cortex-M3. Return a function of settings, sink and seed for a chip."""
     return partial(EmulatedChip, _build(folder, mutant, "mps2-an385").with_suffix(".elf"))

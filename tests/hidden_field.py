@@ -46,7 +46,7 @@ def field_errors_m(truth: GroundTruthGeometry, field, count=1500):
 
 
 def calibrate_hidden_field(path, seed=0, side=17):
-    """Calibrate a hidden geometry as a user would and write its field; return the geometry and the configuration."""
+    """Calibrate a hidden geometry as a user would and write its field. Return the geometry and the configuration."""
     truth = GroundTruthGeometry.sample(seed, CONFIG)
     spots, _ = measure_spots(truth, grid_codes(side), np.random.default_rng([seed, side]))
     write_field(path, fit_field(spots, PRIOR))

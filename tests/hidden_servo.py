@@ -88,7 +88,11 @@ def commands(random, size_rad, count=16):
 
 
 def recording(servos, random, rate_hz=5e4, noise=0.003, sizes_rad=SIZES_RAD):
-    """Build a recording with one run per step size. noise: relative to the step; servos: of x and y."""
+    """Build a recording with one run per step size.
+
+    noise: relative to the step
+    servos: of x and y
+    """
     runs = []
     for number, size_rad in enumerate(sizes_rad):
         table = commands(random, size_rad)

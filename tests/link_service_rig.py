@@ -34,7 +34,11 @@ class CuttableLink(MemoryLink):
 
 
 class ServiceRig:
-    """A link service with its board. log: events of the board; received: messages by client, oldest first."""
+    """A link service with its board.
+
+    log: events of the board
+    received: messages by client, oldest first
+    """
 
     def __init__(self, on_web_loss="dark", link_type=MemoryLink, settings=None, requirements=REQUIREMENTS):
         self.log = []
@@ -139,7 +143,7 @@ class ServiceRig:
         return self.service.pauses.number
 
     def begin(self, points, epoch=None, start_in_s=0.05, ahead_s=None, crc=None, pause=None):
-        """Hand points over as the planner does; return the number of the job."""
+        """Hand points over as the planner does. Return the number of the job."""
         number, payload = next(self.job_numbers), points.encode_payload()
         fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "ahead_s": ahead_s}
         fields |= {"pause": self.pause_number if pause is None else pause, "counts": [len(points)]}

@@ -20,7 +20,7 @@ ONE = st.just(1)
 
 @st.composite
 def tables(draw, stages=ONE):
-    """Draw the table of a configuration; a few of them are not valid, and then one line must say so.
+    """Draw the table of a configuration. A few of them are not valid, and then one line must say so.
 
     stages: strategy of the number of stages
     """

@@ -22,7 +22,7 @@ def run_json(capsys, *arguments, status=0):
 
 
 def record_sweep(capsys, folder, display, seed, noise=1.0, aims=None):
-    """Record a sweep over hidden pixels with the given aims or all; return the files."""
+    """Record a sweep over hidden pixels with the given aims or all. Return the files."""
     sweep = run_json(capsys, "calibrate", "pixels", "--sweep", folder / "sweep", "--config", display, "--json")
     recordings = []
     for k, aim in enumerate(sweep["aims"]):
@@ -41,7 +41,7 @@ def record_sweep(capsys, folder, display, seed, noise=1.0, aims=None):
 
 
 def calibrate_map(capsys, folder, display, recordings):
-    """Fit pixels.toml to recordings; return its path and the statistics."""
+    """Fit pixels.toml to recordings. Return its path and the statistics."""
     out = folder / "pixels.toml"
     answer = run_json(capsys, "calibrate", "pixels", "--config", display, "--out", out, "--json", *recordings)
     return out, answer

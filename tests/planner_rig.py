@@ -119,7 +119,7 @@ class PlannerRig(ServiceRig):
         self.queue.start_next()
 
     def submit(self, sequence, epoch, streamed=False, caller=""):
-        """Plan a sequence; return its future."""
+        """Plan a sequence. Return its future."""
         arrived_s = self.remote.board_s()
         return self.planner.submit(
             PlanningRequest(lambda: BuiltRequest(sequence), "push", "trim", "as_is", streamed, arrived_s, epoch, caller)

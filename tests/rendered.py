@@ -19,7 +19,10 @@ TURN_RAD = 0.006
 
 @dataclass(frozen=True)
 class Camera:
-    """Camera aimed at the display's centre from lateral offset off_m and height away_m; k1, k2: lens distortion."""
+    """Camera aimed at the display's centre from lateral offset off_m and height away_m.
+
+    k1, k2: lens distortion
+    """
 
     off_m: tuple = (0.06, -0.09)
     away_m: float = 0.42
@@ -30,7 +33,7 @@ class Camera:
     k2: float = 0.8
 
     def pose(self):
-        """Return the axes of the camera as rows and its position; display: x right, y up, z to the front."""
+        """Return the axes of the camera as rows and its position. The display has x right, y up, z to the front."""
         at = np.array([*self.off_m, self.away_m])
         ahead = -at / np.linalg.norm(at)
         right = np.cross(ahead, [0.0, 1.0, 0.0])
@@ -114,7 +117,10 @@ def grid_light(camera=CAMERA, grid=GRID):
 
 
 def spot_light(place_m, camera=CAMERA, width_m=(0.25e-3, 0.15e-3)):
-    """Return the brightness of a Gaussian beam spot, 1 at its centre; width_m: sigma in x and y."""
+    """Return the brightness of a Gaussian beam spot, 1 at its centre.
+
+    width_m: sigma in x and y
+    """
     x, y = camera.places_m()
     return np.exp(-0.5 * (((x - place_m[0]) / width_m[0]) ** 2 + ((y - place_m[1]) / width_m[1]) ** 2))
 

@@ -58,7 +58,10 @@ def to_unit(value, unit, other):
 
 
 def change(table, path, convert):
-    """Return a copy of nested tables with the numbers at a path converted; a path leads through every item of lists."""
+    """Return a copy of nested tables with the numbers at a path converted.
+
+    A path leads through every item of lists.
+    """
     if not path:
         return [convert(item) for item in table] if isinstance(table, list) else convert(table)
     if isinstance(table, list):
@@ -132,7 +135,7 @@ class Format:
 
 
 class Parameters(Format):
-    """A parameter set with one or two terms, typed by a person; sigmas too."""
+    """A parameter set with one or two terms, typed by a person, with its sigmas."""
 
     name = "parameters"
 

@@ -164,7 +164,7 @@ WRONG_UNITS = {
 
 
 def mistake_units(rng, measurement):
-    """Return the recording with one quantity of one run, or of all, in a wrong unit; the quantity; the unit.
+    """Return the recording with a quantity of one run, or of all, in a wrong unit, then the quantity and the unit.
 
     None where no quantity of the recording shows it, as without a pulse on the measured pixel.
     """

@@ -58,7 +58,7 @@ class BreakingLink(DriftingLink):
 
 
 class BusyLink(DriftingLink):
-    """Link over a computer that wakes its programs late: what the board sends arrives after delay_s."""
+    """Link over a computer that wakes its programs late: the board's bytes arrive after delay_s."""
 
     delay_s = 0.0
 
@@ -85,7 +85,12 @@ def build_stages(name, count, **changes):
 
 
 class StageRig(PlannerRig):
-    """Boards of several stages. logs: events of each board; links: its link; cores: the board."""
+    """Boards of several stages.
+
+    logs: events of each board
+    links: its link
+    cores: the board
+    """
 
     def __init__(self, monkeypatch, display, clocks=CLOCKS, link_type=DriftingLink, **options):
         self.display, self.clocks, self.link_type = display, clocks, link_type

@@ -51,7 +51,7 @@ FIELDS = list_fields()
 
 
 class TamperedLink(MemoryLink):
-    """In-memory link on which falsify(value, maximum) replaces fields in what the board sends, until until_s."""
+    """In-memory link on which falsify(value, maximum) replaces fields in the board's messages until until_s."""
 
     def __init__(self, core, clock):
         super().__init__(core, clock)

@@ -6,7 +6,7 @@ from sound_files import write_toml
 
 
 def write_truth(path, terms):
-    """Write a truth with term → parameter → SI value; return its path."""
+    """Write a truth with term → parameter → SI value. Return its path."""
     stated = {
         key: {
             item.name: {"value": float(values[item.name]), "unit": item.unit, "source": "hidden"}

@@ -127,7 +127,10 @@ def round_temperature(terms, quantum_k):
     [(34.05544665820724, 0.3), pytest.param(14.817305218450562, 0.9462824584018701, marks=pytest.mark.slow)],
 )
 def test_a_fit_that_still_improves_is_not_abandoned(resistance, capacity):
-    """From far away a linear prediction is pessimistic; the true cause was abandoned for one that had come close."""
+    """The true cause is not abandoned for one that has come close.
+
+    From far away a linear prediction is pessimistic.
+    """
     measurement = round_temperature(WALL, 0.1)
     prior, epsilon, _ = build_prior(measurement, None)
     (data,) = build_dataset(measurement).split_subsystems()

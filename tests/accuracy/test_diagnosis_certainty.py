@@ -1,4 +1,4 @@
-"""A diagnosis says in its first sentence what is uncertain, and how far heights planned with its model are off."""
+"""A diagnosis states in its first sentence its uncertain results and the error of heights planned with its model."""
 
 import json
 import shlex
@@ -87,7 +87,7 @@ def late(leak):
 
 
 def measure_planned_errors(found, folder):
-    """Plan a ladder of heights with the diagnosed model; return (true − target) / target of each push."""
+    """Plan a ladder of heights with the diagnosed model. Return (true − target) / target of each push."""
     path = folder / "model.toml"
     path.write_text(build_model_toml(found, "orifice", WIDTH_M))
     config = load_config("display-16")

@@ -58,7 +58,7 @@ def find_workers(pid):
 
 
 def has_reached(stage, process):
-    """Return whether both workers exist and, in the second stage, have imported what a task needs."""
+    """Return whether both workers exist and, in the second stage, have imported the modules that a task needs."""
     workers = find_workers(process.pid)
     return len(workers) == 2 and (stage == "starting" or all("h5py" in read_proc(pid, "maps") for pid in workers))
 

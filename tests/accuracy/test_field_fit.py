@@ -50,7 +50,7 @@ def test_from_289_spots_5_um_rms_and_25_um_at_most(geometries):
 
 
 def test_from_25_spots_10_um_rms(geometries):
-    """Per axis, as noise is given, for each geometry; in length for all of them together."""
+    """The limit holds per axis, as noise is given, for each geometry, and in length for all of them together."""
     results = fit_geometries(geometries, 5)
     for miss_m, *_ in results:
         assert axis_rms_m(miss_m) <= 10e-6

@@ -80,7 +80,7 @@ def hide(key):
 
 
 def simulate(folder, key, noise, seed):
-    """Record one simulation; return the exit status and the file."""
+    """Record one simulation. Return the exit status and the file."""
     (folder / "frames.json").write_text(json.dumps(FRAMES))
     truth, out = write_truth(folder / "truth.toml", hide(key)), folder / f"recording{seed}.h5"
     options = (
@@ -131,7 +131,7 @@ def test_a_truth_that_the_plan_does_not_show_gives_no_false_name(key, noise, tmp
     ],
 )
 def test_a_laser_that_pulses_of_two_pixels_share_is_named(key, values, tmp_path, capsys):
-    """README's frames light two pixels: what the light on one does to the laser shows on the other."""
+    """README's frames light two pixels: the effect of the light of one on the laser shows on the other."""
     (tmp_path / "frames.json").write_text(json.dumps(README_FRAMES))
     truth, out = write_truth(tmp_path / "truth.toml", {key: values}), tmp_path / "recording.h5"
     arguments = ("simulate", tmp_path / "frames.json", "--truth", truth, "--out", out, "--repeats", 3, "--noise", 0)
@@ -146,7 +146,7 @@ def test_a_laser_that_pulses_of_two_pixels_share_is_named(key, values, tmp_path,
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0, 1])
 def test_a_small_panel_that_one_pixel_heats_for_seconds_is_named(noise, tmp_path, capsys):
-    """The other pixel's light begins when the panel is warm; its wall is not."""
+    """The other pixel's light begins when the panel is warm. Its wall is not."""
     trains = [train(MEASURED, 0.0, 10.0, 2.0, gap_s=0.02), train(15, 10.5, 0.5, 2.0, gap_s=0.02)]
     (tmp_path / "frames.json").write_text(json.dumps({"trains": trains}))
     truth = write_truth(

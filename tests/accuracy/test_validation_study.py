@@ -43,7 +43,7 @@ def changed(**factors):
 
 
 def generate_facts(parameters, seed):
-    """Generate facts from a set, each with its error; for rates, the error is that of the height."""
+    """Generate facts from a set, each with its error. For rates, the error is that of the height."""
     rng = np.random.default_rng(seed)
     facts = dict(load_paper_facts())
     for datum in build_data(facts, LITERAL):
@@ -60,7 +60,7 @@ def generate_facts(parameters, seed):
 
 
 def rate(parameters, height_m):
-    """Return the rate of a height; for an unreachable height, the rate of the longest pulse."""
+    """Return the rate of a height. For an unreachable height, return the rate of the longest pulse."""
     return 1.0 / min(width_to_reach_s(parameters.build_pixel(0.55e-3), FULL_POWER_W, height_m), MAX_PULSE_S)
 
 

@@ -40,7 +40,7 @@ GATE_OFF, GATE_ON, AFTER_FLAT, AFTER_FADING = 0.0, 1.0, 2.0, 3.0
 
 @dataclass(frozen=True)
 class Physics:
-    """All parameters of the hidden display; the defaults are the nominal model."""
+    """All parameters of the hidden display. The defaults are the nominal model."""
 
     R: float = 200.0
     C: float = 1.0e-4
@@ -333,7 +333,7 @@ def _integrate(v, segments, longest, shortest):
 
 @njit(cache=True)
 def _interpolate(times, values, slopes, column, query_s):
-    """Return one output at the query times; zero before the start."""
+    """Return one output at the query times. It is zero before the start."""
     result = np.zeros(len(query_s))
     last = len(times) - 2
     for i in range(len(query_s)):

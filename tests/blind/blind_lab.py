@@ -77,7 +77,7 @@ class Case:
         commands: np.ndarray | None = None,
         repeats: int = 3,
     ) -> Path:
-        """Repeat one more experiment on the same display; return a recording with the old and the new runs.
+        """Repeat one more experiment on the same display. Return a recording with the old and the new runs.
 
         Every call starts from the recording as drawn. `pixel` is the measured one: by default 0 if pixel 0 or its
         neighbour 1 is pulsed, else the first pulsed pixel.
@@ -147,7 +147,7 @@ def _is_too_hot(session: _Session, truth: Physics) -> bool:
 def _draw_detectable_effects(
     rng: Rng, session: _Session, draws: list[Draw], seeds: list[int], *, hidden: bool, silent: bool
 ):
-    """Draw effects until all are detectable; the power is reduced first where the absorber would burn."""
+    """Draw effects until all are detectable. The power is reduced first where the absorber would burn."""
     min_sigma = 0.0 if silent else MIN_EFFECT_SIGMA
     for _ in range(25):
         effects = tuple(d(rng, session.scene) for d in draws)

@@ -32,7 +32,10 @@ STEP_S = 5e-5
 
 @dataclass(frozen=True)
 class LoopResult:
-    """RMS of (true − target) / target over all pulses, and the diagnosis; trimmed: pulses trimmed by a cap."""
+    """RMS of (true − target) / target over all pulses, and the diagnosis.
+
+    trimmed: pulses trimmed by a cap
+    """
 
     verdict: str
     causes: tuple[str, ...]
@@ -43,7 +46,7 @@ class LoopResult:
 
     @property
     def error_reduction(self) -> float:
-        """Share of the error that the diagnosed model removes; the true model removes all of it."""
+        """Share of the error that the diagnosed model removes. The true model removes all of it."""
         return 1.0 - self.extended / self.nominal
 
 

@@ -227,7 +227,7 @@ class Bench:
         return float(max(total[0, 0] - total[1:, 0] @ steps, 0.0)), steps
 
     def sigma(self, shown: list[dict[str, np.ndarray]], refits: int = 4, extras=()) -> float:
-        """Return the norm of the signals beyond the nominal model; rises and mirror errors as in `differences`."""
+        """Return the norm of the signals beyond the nominal model. Rises and mirror errors are as in `differences`."""
         base, sensitivities = self.base, self._start
         chi2 = 0.0
         for nth in range(max(refits, 1)):
@@ -239,7 +239,7 @@ class Bench:
         return math.sqrt(chi2)
 
     def differences(self, base: Physics, shown: list[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
-        """Return signals minus nominal per run; temperatures relative to ambient, mirrors to their commands."""
+        """Return signals minus nominal per run. Temperatures are relative to ambient, mirrors to their commands."""
         known: dict[str, dict[str, np.ndarray]] = {}
         done: dict[tuple[str, int], dict[str, np.ndarray]] = {}
         result = []
@@ -256,7 +256,7 @@ class Bench:
 def subtract_signals(
     some: list[dict[str, np.ndarray]], others: list[dict[str, np.ndarray]]
 ) -> list[dict[str, np.ndarray]]:
-    """Subtract signals run by run; runs that are one object stay one."""
+    """Subtract signals run by run. Runs that are one object stay one."""
     done: dict[tuple[int, int], dict[str, np.ndarray]] = {}
     result = []
     for a, b in zip(some, others, strict=True):

@@ -47,7 +47,7 @@ UNITS = {"heat_capacity.slope": 0.01}
 
 @dataclass(frozen=True)
 class Score:
-    """Score of one case; None where a question does not apply."""
+    """Score of one case. A mark is None where a question does not apply."""
 
     block: str
     seed: int
@@ -105,7 +105,7 @@ def _covered(case: Any, answer: Mapping[str, Any]) -> tuple[dict[str, bool], dic
 def score_answer(
     case: Any, answer: Mapping[str, Any], *, after: Mapping[str, Any] | None = None, known: float | None = None
 ) -> Score:
-    """Score one answer; `known` is the gain of a fit with the known cause, default 1 (down to the noise)."""
+    """Score one answer. `known` is the gain of a fit with the known cause, default 1 (down to the noise)."""
     verdict = str(answer.get("verdict"))
     named = tuple(answer.get("causes") or ())
     truth = set(case.causes)

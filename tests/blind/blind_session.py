@@ -80,7 +80,7 @@ def draw_sample_times(rng: Rng, span: float, rate: float) -> np.ndarray:
 
 
 def draw_mirror_steps(rng: Rng) -> np.ndarray:
-    """Draw steps of three sizes of both mirrors, forth and back; each falls between two samples at 5 kHz."""
+    """Draw steps of three sizes of both mirrors, forth and back. Each falls between two samples at 5 kHz."""
     sizes = [0.004, 0.03, 0.16] * np.exp(0.3 * rng.standard_normal(3))
     rows = [(0.0, 0.0, 0.0)]
     t, x, y = 0.01, 0.0, 0.0

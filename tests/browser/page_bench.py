@@ -1,4 +1,4 @@
-"""A board and a daemon that the tests of a module share, and what they do to both."""
+"""A board and a daemon that the tests of a module share, and the actions of the tests on both."""
 
 from rig import Board, Daemon, wait_for
 

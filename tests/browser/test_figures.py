@@ -1,4 +1,4 @@
-"""What the page shows of heights, pulses and quantities: it is what was executed."""
+"""The heights, pulses and quantities that the page shows are those that were executed."""
 
 import re
 
@@ -9,7 +9,10 @@ from rig import wait_for
 
 
 def test_every_peak_of_the_executed_pulses_is_in_the_trace(page, daemon):
-    """The page, whose motion is reduced, reads five displays per second; a bump is over in a tenth of a second."""
+    """The trace has each bump, which is over in a tenth of a second, at five displays per second.
+
+    The motion of the page is reduced.
+    """
     page.evaluate("""async () => {
         const { Trace } = await import("/page/trace.js");
         const add = Trace.prototype.add;
@@ -79,7 +82,11 @@ def test_planned_pulses_are_dropped_executed_ones_stay(page):
 
 
 def test_planned_pulses_are_outlines_however_dense(page):
-    """Shares of the picture that are filled, at half the height of the pulses, before and after now; and the edge."""
+    """Planned pulses are outlines and executed ones are filled, whichever their density.
+
+    The shares of the picture that are filled are measured at half the height of the pulses, before and after now, and
+    at the edge.
+    """
     shares = page.evaluate("""async () => {
         const { Timeline } = await import("/page/timeline.js");
         const canvas = document.createElement("canvas");

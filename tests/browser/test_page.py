@@ -188,9 +188,9 @@ def is_in_view(page, *items):
 
 
 def list_out_of_view(page):
-    """Return what covers panels of PANELS (scrolling, header, alert), and their top, bottom and heading; else nothing.
+    """Return the scrolling, the header, the alert and the panels of PANELS that are out of view, else nothing.
 
-    All at one moment, because the page changes with what plays.
+    The panels are given by top, bottom and heading. All is read at one moment, because the page changes with the plan.
     """
     return page.evaluate(
         """titles => {

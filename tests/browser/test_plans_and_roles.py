@@ -1,4 +1,4 @@
-"""Whose plans play and wait, who armed the board, and what the role may use."""
+"""Owners of the plans that play and wait, the caller who armed the board, and the rights of the role."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def test_what_plays_and_waits_is_named_and_can_be_cancelled(page, daemon):
 
 
 def check_state(daemon, *plans):
-    """Compare the state with three plans, which last for 8, 3 and 4 s; the first runs."""
+    """Compare the state with three plans, which last for 8, 3 and 4 s. The first one runs."""
     wait_for(lambda: daemon.state()["queue"]["active"][0]["executed"] > 10, "light")
     queue = daemon.state()["queue"]
     first, second, _ = queue["active"]

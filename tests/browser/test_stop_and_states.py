@@ -1,4 +1,4 @@
-"""STOP by any key and over everything, and what the page says about the laser, faults and lost connections."""
+"""STOP by any key and over everything, and the page's words on the laser, faults and lost connections."""
 
 import os
 import re
@@ -102,7 +102,7 @@ def test_what_the_browser_opens_itself_takes_no_escape_while_the_laser_may_emit(
 
 
 def press_escape_once(page):
-    """Press Escape; STOP must be answered at the first attempt, and the telemetry come back without a fault."""
+    """Press Escape. STOP must be answered at the first attempt, and the telemetry come back without a fault."""
     stops, failed = [], []
     page.on("request", lambda request: request.url.endswith("/v1/stop") and stops.append(request))
     page.on("requestfailed", lambda request: request.url.endswith("/v1/stop") and failed.append(request))
@@ -173,7 +173,7 @@ def test_a_token_that_the_daemon_does_not_know_is_told_from_a_daemon_that_is_gon
 
 
 def read_look(page):
-    """Return what distinguishes a state in the header: word, outline of the sign, pattern of the border, ground."""
+    """Return the features that distinguish a state in the header: word, outline of the sign, border pattern, ground."""
     return page.evaluate("""() => {
         const bar = document.getElementById("bar");
         const style = getComputedStyle(bar);

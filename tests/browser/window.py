@@ -50,7 +50,7 @@ class PageVisit:
         self.url = url
 
     def open(self, token=TOKEN):
-        """Log in with the address that a terminal shows; return the page once it is live."""
+        """Log in with the address that a terminal shows. Return the page once it is live."""
         self.page.goto(f"{self.url}/#token={token}")
         try:
             self.page.get_by_text("live", exact=True).wait_for()
@@ -61,7 +61,7 @@ class PageVisit:
         return self.page
 
     def reset(self, token=TOKEN):
-        """Load the page anew with a token, as if this browser had never been here; its motion is reduced."""
+        """Load the page anew with a token, as if this browser had never been here. Its motion is reduced."""
         self.page.unroute_all()
         self.page.set_viewport_size(WIDE)
         self.page.emulate_media(color_scheme="light", reduced_motion="reduce")
@@ -79,7 +79,7 @@ class PageVisit:
         self.page.get_by_text("live", exact=True).wait_for()
 
     def unexpected_errors(self, *expected):
-        """Return the console errors except the expected ones; the 401 of the login is always expected."""
+        """Return the console errors except the expected ones. The 401 of the login is always expected."""
         expected = ("401", *expected)
         return [line for line in self.console_errors if not any(part in line for part in expected)]
 
@@ -99,7 +99,7 @@ def press_escape(page):
 
 
 def list_violations(page, axe, within="html"):
-    """Return what axe-core finds in a part of the page."""
+    """Return the violations that axe-core finds in a part of the page."""
     if not page.evaluate("'axe' in window"):
         page.evaluate(axe)
     return page.evaluate(

@@ -36,7 +36,7 @@ class Host:
         self.port.write(data)
 
     def frame(self, name, seq=None, session=None, **fields):
-        """Encode a message; a sequenced one gets the next sequence number."""
+        """Encode a message. A sequenced one gets the next sequence number."""
         if seq is None:
             seq = self.seq if name in SEQUENCED else 0
             self.seq = (self.seq + (name in SEQUENCED)) % 256
@@ -76,12 +76,12 @@ class Host:
         self.wait(lambda: self.clock.now_s() >= until_s, "the time", lease)
 
     def wait_for_change(self, reason, count=1, lease=True):
-        """Wait for the count-th change of state for a reason; return its log entry."""
+        """Wait for the count-th change of state for a reason. Return its log entry."""
         self.wait(lambda: len(self.board.changes(reason)) >= count, f"{count} changes by {reason}", lease)
         return self.board.changes(reason)[count - 1]
 
     def request(self, data=b""):
-        """Send bytes; return the board's answers and its status after them."""
+        """Send bytes. Return the board's answers and its status after them."""
         before = len(self.received)
         self.raw(data)
         for _ in range(2):  # an ACK may follow its batch, so the answers are complete only at the second status
@@ -92,7 +92,7 @@ class Host:
         return [m for m in self.received[before:] if m.name != "STATUS"], status
 
     def order(self, *frames):
-        """Send frames in batches of the window size; return the reasons of all NAKs."""
+        """Send frames in batches of the window size. Return the reasons of all NAKs."""
         answers = []
         for at in range(0, len(frames), WINDOW):
             self.lease()  # hundreds of frames may take longer than one lease
@@ -100,7 +100,7 @@ class Host:
         return [message.reason for messages in answers for message in messages if message.name == "NAK"]
 
     def send_checked(self, name, **fields):
-        """Send one message; return the reasons of its NAKs."""
+        """Send one message. Return the reasons of its NAKs."""
         return self.order(self.frame(name, **fields))
 
     def status(self):
@@ -110,7 +110,7 @@ class Host:
     # --- session, arming, jobs ---
 
     def hello(self, major=1):
-        """Begin a session and return the board's reply; repeat HELLO, as a board may detect the open port late."""
+        """Begin a session and return the board's reply. Repeat HELLO, as a board may detect the open port late."""
         nonce = 0
         until_s = self.clock.now_s() + self.board.patience_s
         while self.clock.now_s() < until_s:
@@ -147,7 +147,7 @@ class Host:
         return self.frame("DATA", first_index=first, points=points)
 
     def play(self, *points, end=True, start_tick=0, watermark=1):
-        """Send points, START and END at once; return the reasons of the NAKs."""
+        """Send points, START and END at once. Return the reasons of the NAKs."""
         first = self.index
         pieces = [points[at : at + DATA_POINTS_MAX] for at in range(0, len(points), DATA_POINTS_MAX)]
         frames = [self.data(*piece) for piece in pieces]
@@ -157,7 +157,7 @@ class Host:
         return self.order(*frames)
 
     def shine(self, duty=2000, seconds=SHINE_S):
-        """Run a job with the gate on nearly continuously, without END; return its number of points."""
+        """Run a job with the gate on nearly continuously, without END. Return its number of points."""
         points = [here(60_000, duty=duty)] * int(seconds / 0.06)
         assert self.play(*points, end=False) == []
         self.wait(self.board.is_gate_on, "light")
@@ -197,7 +197,7 @@ class Bench:
         return self.greeted(*steps, **limits).arm()
 
     def finish(self, audit):
-        """Close all hosts and boards; pass each board to audit."""
+        """Close all hosts and boards. Pass each board to audit."""
         try:
             for host in self._hosts:
                 host.close()

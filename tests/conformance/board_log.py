@@ -1,4 +1,4 @@
-"""The log of a board under test, which is the witness of what it did."""
+"""The log of a board under test, which is the witness of its actions."""
 
 
 class BoardLog:

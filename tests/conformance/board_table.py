@@ -28,7 +28,10 @@ ENFORCED = {
 
 
 def scenarios_of(guard):
-    """Return the names of a guard's scenarios with the number of cases; †: some of them in every run on a pty."""
+    """Return the names of a guard's scenarios with the number of cases.
+
+    †: some of them are in every run on a pty
+    """
     counts = Counter(case.name.partition("-")[0] for case in SCENARIOS if case.subject == guard)
     played = {name.partition("-")[0] for name in IN_EVERY_RUN}
     return ", ".join(

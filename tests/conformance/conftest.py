@@ -16,7 +16,7 @@ from optodrive.link.simulator.board_core import BoardCore  # noqa: E402
 
 @pytest.fixture(scope="session")
 def virtual(tmp_path_factory):
-    """Return a function for a virtual kind by name, or a mutant of the core in C; each is built once."""
+    """Return a function for a virtual kind by name, or a mutant of the core in C. Each is built once."""
     folder = tmp_path_factory.mktemp("core")
 
     @cache

@@ -9,7 +9,7 @@ INSTANT = dict(settle_us=0, settle_ns_per_code=0)
 
 
 def wait_for_log(host, condition, what):
-    """Wait for the board's log; send only leases."""
+    """Wait for the board's log. Send only leases."""
     host.wait(lambda: condition(host.board), what)
 
 

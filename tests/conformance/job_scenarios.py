@@ -7,7 +7,7 @@ DIM = dict(duty=999)
 
 
 def start(host, first=0, watermark=1, job=1, start_tick=0):
-    """Send START; return the reasons of its NAKs."""
+    """Send START. Return the reasons of its NAKs."""
     return host.send_checked("START", job=job, first_index=first, start_tick=start_tick, watermark=watermark)
 
 

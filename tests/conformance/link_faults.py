@@ -121,7 +121,7 @@ class Witness:
                         self._sent[first + k, x, y, duty] = on_us
 
     def check(self, events):
-        """Check that each pulse of the log was sent, is unchanged, once and in order; return the number of pulses."""
+        """Check that each pulse of the log was sent, is unchanged, once and in order. Return the number of pulses."""
         last_index, count = -1, 0
         ended = {(entry["t_us"], entry["reason"]) for entry in events if entry["event"] == "gate" and not entry["on"]}
         for entry in events:

@@ -1,4 +1,4 @@
-"""Scenarios of B12 and B13: each point once and in order; invalid frames change only counters."""
+"""Scenarios of B12 and B13: each point once and in order, and invalid frames change only counters."""
 
 import tomllib
 from itertools import pairwise

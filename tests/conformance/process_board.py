@@ -54,7 +54,11 @@ PROCESS_KINDS = [
 
 
 class BoardProcess(BoardLog):
-    """A running board process. limits: keys of its limits file; steps: of its script, carried out by `next_step`."""
+    """A running board process.
+
+    limits: keys of its limits file
+    steps: of its script, carried out by `next_step`
+    """
 
     def __init__(self, kind, folder, limits, steps=()):
         self.port, self.clock = folder / "tty", MonotonicClock()
@@ -88,7 +92,7 @@ class BoardProcess(BoardLog):
         return list(self._events)
 
     def next_step(self):
-        """Carry out the next step of the script; the log shows when."""
+        """Carry out the next step of the script. The log shows when."""
         self.process.send_signal(signal.SIGUSR1)
 
     def open(self):
@@ -112,7 +116,7 @@ class SerialLine:
         self._port.write(data)
 
     def read(self):
-        """Return the bytes that have arrived; wait for READ_WAIT_S if there are none."""
+        """Return the bytes that have arrived. Wait for READ_WAIT_S if there are none."""
         return self._port.read(max(1, self._port.in_waiting))
 
     def close(self):

@@ -117,7 +117,7 @@ class PtyRig(SessionRig):
         super().__init__(session, clock, up, down)
 
     def finish(self):
-        """Stop host, proxy and board; check the log and return the number of pulses."""
+        """Stop host, proxy and board. Check the log and return the number of pulses."""
         self.session.close()
         self.proxy.end()
         self._bench.finish(lambda board: None)

@@ -32,7 +32,7 @@ SCENARIOS: list[Scenario] = []
 
 
 def scenario(subject, cases=None):
-    """Register a function of a bench; with cases (a dict by name), once per case as its second argument."""
+    """Register a function of a bench. With cases (a dict by name), it runs once per case as its second argument."""
 
     def register(function):
         name, module = function.__name__, function.__module__
@@ -47,7 +47,7 @@ def scenario(subject, cases=None):
 
 
 def judge(kind, case: Scenario):
-    """Run a scenario once against a board of a kind; raise AssertionError if the board does not conform."""
+    """Run a scenario once against a board of a kind. Raise AssertionError if the board does not conform."""
     with tempfile.TemporaryDirectory(prefix="conform-") as folder:
         bench = Bench(kind, folder)
         try:
@@ -101,7 +101,7 @@ def audit_output(logged, edges):
 
 
 def run_all(kind, cases: list[Scenario]):
-    """Start all scenarios with limited concurrency; return their futures by name."""
+    """Start all scenarios with limited concurrency. Return their futures by name."""
     pool = ThreadPoolExecutor(AT_ONCE)
     futures = {case.name: pool.submit(judge, kind, case) for case in cases}
     pool.shutdown(wait=False)

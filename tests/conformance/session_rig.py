@@ -25,7 +25,7 @@ class Points:
         self._serial = 0
 
     def make(self, count, dark_us=200):
-        """Return [count] points with pulses at four positions in turn, eight at each; about half a millisecond each."""
+        """Return [count] points of about half a millisecond, with pulses at four positions in turn, eight at each."""
         serial = self._serial + np.arange(count)
         self._serial += count
         places = np.array(PLACES)[serial // 8 % 4]
@@ -47,7 +47,7 @@ class SessionRig:
         return sum(self.up.counts.values()) + sum(self.down.counts.values())
 
     def until(self, condition, patience_s):
-        """Step until condition() is true or patience_s has passed; return whether it is true."""
+        """Step until condition() is true or patience_s has passed. Return whether it is true."""
         give_up_s = self.clock.now_s() + patience_s
         while not condition():
             if self.clock.now_s() > give_up_s:
@@ -56,7 +56,7 @@ class SessionRig:
         return True
 
     def armed(self, patience_s=4.0):
-        """Arm once, as a user does; return whether the board is armed."""
+        """Arm once, as a user does. Return whether the board is armed."""
         if self.session.board.state == "FAULT":
             self.session.disarm()
             self.until(lambda: self.session.board.state == "DISARMED", 1.0)

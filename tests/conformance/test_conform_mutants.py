@@ -13,7 +13,10 @@ from scenario import AT_ONCE, GUARDS, judge
 
 
 class Mutant(NamedTuple):
-    """A board that violates a guard; name: of the simulated board's mutant, or the C core's MUTANT."""
+    """A board that violates a guard.
+
+    name: of the simulated board's mutant, or the C core's MUTANT
+    """
 
     board: str
     guard: str

@@ -54,7 +54,7 @@ def name_case(case):
 
 
 def list_cases(name, without=None):
-    """Return the scenarios of a kind of board, those of another one left out; only some are played in every run."""
+    """Return the scenarios of a kind of board without those of another one. Only some are played in every run."""
     return [
         case if in_every_run(case) else pytest.param(case, marks=pytest.mark.slow)
         for case in SCENARIOS

@@ -26,7 +26,10 @@ ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 
 
 class Owner(RuleBasedStateMachine):
-    """An application that owns a session; `allowed`: how often the board may have become ARMED."""
+    """An application that owns a session.
+
+    allowed: how often the board may have become ARMED
+    """
 
     @initialize(seed=st.integers(0, 2**16), endings_come_again=st.booleans())
     def power_up(self, seed, endings_come_again):

@@ -35,7 +35,7 @@ def make_rig(request, virtual):
 
 
 def run_fault_sessions(rig, faults=FAULTS_EACH):
-    """Run sessions until enough faults are injected; return the number of sessions and pulses."""
+    """Run sessions until enough faults are injected. Return the number of sessions and pulses."""
     sessions = pulses = 0
     while rig.faults < faults:
         rig.live(3000, patience_s=4.0)
@@ -175,7 +175,7 @@ def filled_in_s(baud, loss, seed):
 @pytest.mark.parametrize("runs", [2, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("baud", LINES)
 def test_goodput_of_a_full_line_at_one_percent_loss(baud, runs):
-    """The throughput relative to a line without loss; each lost frame costs those behind it."""
+    """The throughput is relative to a line without loss. Each lost frame costs those behind it."""
     clean_s = filled_in_s(baud, 0.0, 0)
     assert clean_s < 1.1 * LINES[baud] * (FRAME_BYTES / 24) * BITS_PER_BYTE / baud, "the line was not full"
     lossy_s = [filled_in_s(baud, 0.01, seed) for seed in range(1, runs + 1)]
@@ -235,7 +235,7 @@ def test_a_host_that_keeps_more_in_flight_is_detected(monkeypatch):
 
 
 def stalled(make_rig, for_s, ahead_s):
-    """Stall a host with a lease of half a second during a job; return the rig and the job."""
+    """Stall a host with a lease of half a second during a job. Return the rig and the job."""
     rig = make_rig(1, config=configured(lease_s=0.5), limits=replace(DEFAULT_LIMITS, lease_ms=500))
     rig.session.connect()
     assert rig.armed()

@@ -63,7 +63,7 @@ class VirtualBoard(BoardLog):
         return list(self._log)
 
     def output_edges(self):
-        """Return the edges of the core's calls; the simulated board's are those that it logs."""
+        """Return the edges of the core's calls. The simulated board's are those that it logs."""
         return self.core.gate_edges if hasattr(self.core, "gate_edges") else super().output_edges()
 
     # --- time ---
@@ -171,12 +171,12 @@ class VirtualLine:
         self._board = board
 
     def write(self, data):
-        """Send bytes; they take their time on the line."""
+        """Send bytes. They take their time on the line."""
         self._board.clock.sleep(len(data) * BYTE_S)
         self._board.receive(data)
 
     def read(self):
-        """Return the bytes that have arrived; wait for READ_WAIT_S if there are none."""
+        """Return the bytes that have arrived. Wait for READ_WAIT_S if there are none."""
         data = self._board.take_output()
         if not data:
             self._board.clock.sleep(READ_WAIT_S)
@@ -189,7 +189,11 @@ class VirtualLine:
 
 
 class VirtualKind(NamedTuple):
-    """A board core. make_core: (settings, sink, seed) → core; make_board: of its port."""
+    """A board core.
+
+    make_core: (settings, sink, seed) → core
+    make_board: of its port
+    """
 
     name: str
     make_core: Callable[..., Any]
@@ -200,7 +204,10 @@ class VirtualKind(NamedTuple):
         return VirtualClock()
 
     def start(self, folder, clock, number, steps, limits):
-        """Return a new board; number: its seed."""
+        """Return a new board.
+
+        number: its seed
+        """
         guarded = {name: value for name, value in limits.items() if hasattr(DEFAULT_LIMITS, name)}
         others = {name: value for name, value in limits.items() if name not in guarded}
         settings = BoardSettings(replace(DEFAULT_LIMITS, **guarded), **others)

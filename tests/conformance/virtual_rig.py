@@ -15,7 +15,7 @@ from optodrive.link.simulator.memory_link import EXCHANGE_MIN_S, MemoryLink
 
 
 class Line:
-    """One direction of a serial line with a byte rate; 0 for no limit."""
+    """One direction of a serial line with a byte rate, 0 for no limit."""
 
     def __init__(self, bytes_per_s):
         self._bytes_per_s = bytes_per_s
@@ -36,7 +36,10 @@ class Line:
 
 
 class FaultyMemoryLink(MemoryLink):
-    """A memory link with fault injection; up: direction to the board."""
+    """A memory link with fault injection.
+
+    up: direction to the board
+    """
 
     def __init__(self, core, clock, up, down, bytes_per_s=0):
         super().__init__(core, clock)
@@ -64,7 +67,7 @@ class FaultyMemoryLink(MemoryLink):
             super().write(arrived)
 
     def read(self, timeout_s):
-        """Return received bytes as soon as there are any; advance the clock."""
+        """Return received bytes as soon as there are any. Advance the clock."""
         until_s, wait_s = self._clock.now_s() + timeout_s, EXCHANGE_MIN_S
         while not self._broken:
             sent = super().read(wait_s)
@@ -77,7 +80,7 @@ class FaultyMemoryLink(MemoryLink):
         raise LinkError("the link is broken")
 
     def break_down(self):
-        """Remove the port; both ends detect it."""
+        """Remove the port. Both ends detect it."""
         self._broken = True
         self.close()
 
@@ -102,7 +105,7 @@ class VirtualRig(SessionRig):
         super().__init__(BoardSession(self.link, clock, build_board_requirements(config)), clock, up, down)
 
     def check(self):
-        """Check and clear the log; return the number of pulses."""
+        """Check and clear the log. Return the number of pulses."""
         assert not self.core.gate
         audit_log(self.log, self._state)
         self._state = self.core.state

@@ -83,14 +83,14 @@ def frame(kind, seq=0, session=0, body=b""):
 
 
 def body_of(name, **fields):
-    """Encode the body of a host's message; DATA takes points as tuples of five."""
+    """Encode the body of a host's message. DATA takes points as tuples of five."""
     _, codes, names = HOST[name]
     points = b"".join(POINT.pack(*point) for point in fields.pop("points", ()))
     return struct.pack("<" + codes, *(fields.pop(field) for field in names)) + points
 
 
 def understood(raw):
-    """Decode a board's frame as a namespace: name, session and fields; enumerations by name."""
+    """Decode a board's frame as a namespace: name, session and fields. Enumerations are decoded by name."""
     *_, session = struct.unpack_from("<BBH", raw)
     content, body = raw[:-4], raw[4:-4]
     assert struct.unpack("<I", raw[-4:])[0] == zlib.crc32(content), "a board's frame with a wrong CRC"

@@ -11,8 +11,10 @@ COMMENT = re.compile(r"\s{2,}#.*$|^#.*$")
 
 
 class Example(NamedTuple):
-    """A command of a shell, or the code of a Python block; heading: the one above it; line: its number.
+    """A command of a shell, or the code of a Python block.
 
+    heading: the one above it
+    line: its number
     output: what the page shows that the command prints, None where it shows nothing
     """
 

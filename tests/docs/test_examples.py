@@ -192,7 +192,10 @@ def find_refusal(words):
 
 
 def read_words(text):
-    """Return the arguments of a command; of a synopsis, with all that is optional, and numbers for the values."""
+    """Return the arguments of a command.
+
+    Of a synopsis, return those with all that is optional, and numbers for the values.
+    """
     bare = re.sub(r"\b(POWER_MW|N)\b", "5", text.replace("[--", "--").replace("]", ""))
     return shlex.split(bare)[1:]
 

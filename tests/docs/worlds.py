@@ -100,7 +100,7 @@ def serve(command):
 
 
 def write_patient_configs(folder):
-    """Write the shipped configurations with a lease that a stalled computer outlasts; return the folder."""
+    """Write the shipped configurations with a lease that a stalled computer outlasts. Return the folder."""
     shutil.copytree(locate_shipped(), folder)
     for name in list_shipped_configs():
         (folder / f"{name}.toml").write_text(config_text(name=name))
@@ -108,7 +108,7 @@ def write_patient_configs(folder):
 
 
 def run_script(script, folder):
-    """Run a script in a folder with a network, a home and a runtime folder of its own; return what it printed."""
+    """Run a script in a folder with a network, a home and a runtime folder of its own. Return its output."""
     (folder / "script.sh").write_text(script)
     configs = write_patient_configs(folder / "configs")
     (folder / "runtime").mkdir(mode=0o700)

@@ -14,7 +14,7 @@ from firmware_ports import build_emulated_chip  # noqa: E402
 
 @pytest.fixture(scope="session")
 def libraries(tmp_path_factory):
-    """Return a function for the library of a mutant, 0 for the unmodified core; each is built once."""
+    """Return a function for the library of a mutant, 0 for the unmodified core. Each is built once."""
     return cache(partial(build_library, tmp_path_factory.mktemp("core")))
 
 
@@ -25,5 +25,5 @@ def library(libraries):
 
 @pytest.fixture(scope="session")
 def chips(tmp_path_factory):
-    """Return a function for the emulated chip of a mutant, 0 for the unmodified core; each is built once."""
+    """Return a function for the emulated chip of a mutant, 0 for the unmodified core. Each is built once."""
     return cache(partial(build_emulated_chip, tmp_path_factory.mktemp("cortex-m3")))

@@ -26,7 +26,7 @@ class PythonEntropy:
 
 
 class Lockstep:
-    """Both boards; bytes, log and state are compared after each action."""
+    """Both boards. Bytes, log and state are compared after each action."""
 
     def __init__(self, library, settings=None, entropy=None, seed=1):
         source = random.Random(seed)
@@ -71,7 +71,7 @@ class Lockstep:
             self.raw(self.frame(message))
 
     def set_input(self, name, value):
-        """Change an input of both boards; the C core reads it at once."""
+        """Change an input of both boards. The C core reads it at once."""
         self.c.set_input(name, value, self.now_us)
         self.c.tick(self.now_us)
         self.python.set_input(name, value, self.now_us)

@@ -1,4 +1,4 @@
-"""What ports rely on and the wire does not show: the core's calls of its HAL, and the tolerances of B14 and B15."""
+"""The C core's calls of its HAL and the tolerances of B14 and B15, which ports rely on and the wire does not show."""
 
 from functools import partial
 from itertools import pairwise

@@ -1,4 +1,7 @@
-"""The wire format of the C core: vectors encode and decode; refused frames and random bytes change only counters."""
+"""The wire format of the C core: vectors encode and decode, and invalid frames change only counters.
+
+Invalid are refused frames and random bytes.
+"""
 
 import ctypes
 
@@ -38,7 +41,7 @@ def test_vector_is_answered_as_the_python_board_answers(library, stem, portion):
 
 
 def condition(both):
-    """Return what invalid frames must not change: all state of the C core, and the simulated board's."""
+    """Return the state that invalid frames must not change: all of the C core, and the simulated board's."""
     machine = both.python.machine
     queue = machine.queue
     counts = len(queue), queue.first_index, queue.next_index, machine.lease_until_us

@@ -100,7 +100,7 @@ def close_port(rig):
 
 
 def cut_cable(rig):
-    """Nothing passes any more; the host runs on and renews the lease."""
+    """Let nothing pass any more. The host runs on and renews the lease."""
     rig.link.is_cut = True
     rig.run(2 * LEASE_S)
     rig.link.is_cut = False
@@ -115,7 +115,7 @@ WAYS = {
 
 
 def check_host_loss(rig, way):
-    """Lose the host of an emitting chip; return the time of the last edge after the end of the lease, µs."""
+    """Lose the host of an emitting chip. Return the time of the last edge after the end of the lease, µs."""
     lose, ended = WAYS[way]
     lost_us = rig.clock.now_s() * 1e6
     assert rig.chip.state == "RUNNING"

@@ -34,7 +34,7 @@ class MixedRig(StageRig):
         return self.store.find(self.submit(sequence, self.remote.epoch).result().plan)
 
     def play_trains(self):
-        """Play trains on both stages until some pulses have been emitted; return the plan's record."""
+        """Play trains on both stages until some pulses have been emitted. Return the plan's record."""
         trains = tuple(PulseTrain(pixel, 0.0, 5.0, 0.01, 0.01, 1.0) for pixel in (100, 300))
         before = self.count_pulses()
         record = self.play(FrameSequence((), trains))

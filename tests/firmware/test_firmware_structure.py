@@ -20,7 +20,7 @@ PORTS = {
 
 
 def list_needs(port, firmware, folder):
-    """Compile a port in a folder; return the object files whose symbols each object file needs."""
+    """Compile a port in a folder. Return the object files whose symbols each object file needs."""
     compiler, flags, folders = PORTS[port]
     require(compiler)
     paths = [firmware / name for name in ("core", *folders)]

@@ -1,4 +1,4 @@
-"""Exhaustive search of the SPIN models of link and gate, and of epochs; each removed rule is detected."""
+"""Exhaustive search of the SPIN models of link and gate, and of epochs. Each removed rule is detected."""
 
 import re
 import subprocess
@@ -11,7 +11,7 @@ MODELS = locate_shipped().parent / "firmware_protocol" / "model"
 
 
 def explored(folder, mutant, name="board.pml"):
-    """Run pan; return the numbers of errors and of states, and its output.
+    """Run pan. Return the numbers of errors and of states, and its output.
 
     The error of a mutant is found so soon that pan is not worth optimising.
     """

@@ -39,7 +39,7 @@ class Output:
 
 
 class Device:
-    """The DAC without USB. It receives data by method calls; time is in ticks of its clock."""
+    """The DAC without USB. It receives data by method calls. Time is in ticks of its clock."""
 
     def __init__(self, name="Helios 1163021877", version=6):
         self.name, self.version = name, version
@@ -197,7 +197,7 @@ class Device:
     # --- emission ---
 
     def light(self):
-        """Return (from_s, to_s, x, y, level) of each emission, regardless of the shutter; the last may end now."""
+        """Return (from_s, to_s, x, y, level) of each emission, regardless of the shutter. The last may end now."""
         stretches = []
         for output, after in zip(self.log, [*self.log[1:], None], strict=True):
             if any(output.colour):

@@ -111,7 +111,7 @@ def test_a_plan_at_the_galvo_cap_passes_verification():
 
 
 def test_without_the_interval_shrink_of_points_that_plan_is_rejected():
-    """Mutant: a budget that ignores the shift of the mirror moves; verification finds the galvo cap exceeded."""
+    """Mutant: a budget that ignores the shift of the mirror moves. Verification finds the galvo cap exceeded."""
     display = build_display()
     exact = display.budget._replace(galvos=display.budget.galvos._replace(timing_slack_s=np.zeros(1)))
     with pytest.raises(LocalProtocolError, match="galvo_acceleration"):

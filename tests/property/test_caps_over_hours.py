@@ -79,14 +79,14 @@ def compute_fractions(name, plan, factors):
 
 
 def judge(name, hours, capacity_sign, mutate=lambda name, budget: budget):
-    """Limit the sequence by a budget, and return what of each cap the worst true display reaches."""
+    """Limit the sequence by a budget. Return the fraction of each cap that the worst true display reaches."""
     plan = limit_all(name, warm_and_hammer(name, hours), mutate(name, DISPLAYS[name].budget))
     return compute_fractions(name, plan, build_worst_factors(name, capacity_sign))
 
 
 @pytest.mark.parametrize("name", ["display-1", "display-16"])
 def test_no_cap_is_exceeded_while_a_small_panel_warms(name):
-    """Within eight minutes both come to a cap: display-1 to its absorber's, display-16 to that of what is touched."""
+    """Within eight minutes both come to a cap: display-1 to its absorber's, display-16 to that of touched surfaces."""
     fractions = judge(name, MINUTES, -1)
     assert 0.95 <= max(fractions.values()) <= 1 + 1e-9, fractions
 

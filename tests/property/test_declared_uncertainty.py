@@ -62,7 +62,7 @@ def limit_scenario(scenario, **half_widths):
 
 
 def compute_fraction(scenario, plan, name, sign):
-    """Return what of the caps the display reaches whose parameter lies at one end of its half-width."""
+    """Return the fraction of the caps that a display with its parameter at one end of its half-width reaches."""
     factor = sign * HALF_WIDTHS[name] + (0.0 if name == "exponent" else 1.0)
     peaks, caps = build_true_display(MODEL, {name: factor}).peaks(plan), NO_CAPS._replace(**SCENARIOS[scenario][0])
     touched_k = max(peaks[row] for row in TOUCHED)

@@ -34,7 +34,7 @@ STATE_FIELDS = [field for field in FIELDS if field.name in ("state", "fault", "r
 
 
 class Falsification(NamedTuple):
-    """What becomes of a field: its value is set, or added to, or random."""
+    """The change of a field: its value is set, or added to, or random."""
 
     how: str
     value: int = 0
@@ -57,7 +57,11 @@ DURATIONS_S = st.sampled_from([0.002, 0.02, 0.06, 0.15, 0.45, 1.5])
 
 
 class Scene:
-    """One plan under false reports. epochs: time at which each began; armed: epochs in which the board was armed."""
+    """One plan under false reports.
+
+    epochs: time at which each began
+    armed: epochs in which the board was armed
+    """
 
     def __init__(self, fields, falsification, phase, for_s):
         self.tampering = fields, falsification.build(), for_s
@@ -148,7 +152,7 @@ def test_light_needs_an_arming_of_its_epoch_whatever_a_board_reports(scene):
 
 
 def build_hidden_state(for_s):
-    """Return the scene in which STATUS and ACK say DISARMED while the board runs; EVENT is honest."""
+    """Return the scene in which STATUS and ACK say DISARMED while the board runs. EVENT is honest."""
     fields = [field for field in STATE_FIELDS if field.name == "state" and field.message != "EVENT"]
     return Scene(fields, Falsification("set", 1), "running", for_s)
 
@@ -176,7 +180,7 @@ def test_without_both_the_light_goes_on(monkeypatch):
 
 
 def arm_from_elsewhere(rig):
-    """Let the board go to ARMING without a request of the host; return the reason for which it leaves that."""
+    """Let the board go to ARMING without a request of the host. Return the reason for which it leaves that state."""
     assert rig.core.machine.request_arming(1) == ""
     rig.until(lambda: rig.core.state not in LEASED_STATES)
     return [entry["reason"] for entry in rig.log if entry["event"] == "state"][-1]

@@ -18,7 +18,7 @@ REPORTED = [field for field in FIELDS if field.message in ("EXECUTED", "CLOCK_RE
 
 
 def play(rig, seconds):
-    """Arm and play a train; return its record."""
+    """Arm and play a train. Return its record."""
     rig.arm()
     rig.run(0.01)
     record = rig.store.find(rig.submit(build_train(seconds), rig.remote.epoch).result().plan)

@@ -30,7 +30,10 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def settling_us(position, free, pixel):
-    """Return the settling time to a pixel, µs; position: a pixel, and since when the gate was first on there."""
+    """Return the settling time to a pixel, µs.
+
+    position: a pixel, and since when the gate was first on there
+    """
     if position is None:
         return LEAD_IN_US
     origin, since = position
@@ -63,7 +66,7 @@ class ExhaustiveSearch:
         return self.frame(0, 0, None, 0, self.heat)
 
     def train(self, free, position, done, heat):
-        """Place the next train pulse; None if it is late by more than the settling time."""
+        """Place the next train pulse. Return None if it is late by more than the settling time."""
         requested, _, pixel, width, power_w = self.pulses[done]
         move = settling_us(position, free, pixel)
         start = max(requested, free + move)
@@ -163,7 +166,7 @@ def random_heat(seed):
 
 
 def find_misses(sequence, planned):
-    """Return what a plan misses of a sequence, computed from the plan's columns, and verify it with the limiter."""
+    """Return the misses of a plan, computed from its columns and the sequence, and verify it with the limiter."""
     plan, found = planned.plan, []
     end_us = (plan.start_s + plan.width_s) * 1e6
     for source, frame in enumerate(sequence.frames):

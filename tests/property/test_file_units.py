@@ -1,4 +1,4 @@
-"""Files of every format with one quantity in a wrong unit are refused in one line; sound ones are not."""
+"""Files of every format with one quantity in a wrong unit are refused in one line, sound ones are not."""
 
 from collections import Counter
 

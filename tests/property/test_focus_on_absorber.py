@@ -28,7 +28,7 @@ ROUNDING_M = 1e-9
 
 @dataclass(frozen=True)
 class ExactServo:
-    """Servo by its matrix exponential; the state [angle, speed] is relative to the target, at rest or slewing."""
+    """Servo by its matrix exponential. The state [angle, speed] is relative to the target, at rest or slewing."""
 
     scanner: object
 

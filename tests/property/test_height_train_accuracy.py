@@ -36,7 +36,7 @@ def build_trains(count, period_s, target_m, peak_to_peak_m):
 
 
 def parse_bounds_um(display, trains, phrase):
-    """Return the bound that the refusal of each train names, µm; the slots of the trains differ a little."""
+    """Return the bound that the refusal of each train names, µm. The slots of the trains differ a little."""
     return [parse_bound_um(display, (*trains[k:], *trains[:k]), phrase) for k in range(len(trains))]
 
 
@@ -88,7 +88,7 @@ def test_steady_cycles_reach_the_target_height_and_peak_to_peak(count, data):
 
 
 def test_pulse_widths_do_not_alternate_near_full_power():
-    """The steady pulse has 13 periods at 99 % of the laser's power; a slightly larger demand would need 14."""
+    """The steady pulse has 13 periods at 99 % of the laser's power. A slightly larger demand would need 14."""
     display = build_display(0.2e-3)
     train = HeightTrain(PIXELS[0], 0.0, 0.37, 0.005859, 551.5e-6, 13.63635e-6)
     plan = plan_sequence(display, FrameSequence(trains=(train,)), *display.build_cold_state()).plan

@@ -34,7 +34,7 @@ LONG = "long"
 
 
 def random_caps(rng):
-    """Sample heat caps that bind within seconds; the other caps bind occasionally."""
+    """Sample heat caps that bind within seconds. The other caps bind occasionally."""
     return NO_CAPS._replace(
         absorber_k=rng.uniform(60.0, 380.0),
         wall_k=rng.choice([rng.uniform(1.0, 15.0), 60.0]),
@@ -46,7 +46,7 @@ def random_caps(rng):
 
 
 def random_mirrors(rng):
-    """Sample underdamped and slow servos; every ramp ends while the gate of `build_sequence` is off."""
+    """Sample underdamped and slow servos. Every ramp ends while the gate of `build_sequence` is off."""
     return GalvoModel(
         omega_rad_per_s=2 * np.pi * 10 ** rng.uniform(2.3, 3.6),
         damping=rng.uniform(0.3, 0.9),
@@ -66,7 +66,7 @@ def build_budget(model, unsure, caps, mirrors, skew_s=0.0):
 
 
 def limit_in_batches(rng, plan, budget, pixels):
-    """Limit the plan batch by batch; some batches are cancelled half-way, and their executed pulses are committed."""
+    """Limit the plan batch by batch. Some batches are cancelled half-way, and their executed pulses are committed."""
     state, committed, at = build_cold_budget_state(pixels, stage_count=len(budget.galvos.damping)), [], 0
     while at < len(plan):
         until = at + int(rng.integers(1, 120))

@@ -215,7 +215,7 @@ WITHOUT = {"touch surface": dict(touch=None), "walls": dict(walls=None, touch=No
 
 @pytest.mark.parametrize("node", WITHOUT)
 def test_walls_and_panel_have_the_touch_cap_without_a_touch_surface(node):
-    """A finger touches them all the same; a limiter whose touch cap is that of touch surfaces only is caught."""
+    """A finger touches them all the same. A limiter whose touch cap is that of touch surfaces only is caught."""
     model = replace(build_model("display-16", SMALL), **WITHOUT[node])
     display, fractions = DISPLAYS["display-16"], []
     for touch_k in (15.0, 1e3):

@@ -1,4 +1,4 @@
-"""A configuration of one's own works at the first try: what `config check` accepts, all other commands accept.
+"""A configuration of one's own that `config check` accepts is accepted by all other commands at the first try.
 
 The chain of README: check, plan, simulate, diagnose. A simulation of the planned model has no error to be found.
 """
@@ -25,7 +25,7 @@ SETTINGS = settings(
 
 
 def call(capsys, *arguments):
-    """Run a command with --json; return its exit status, its document and its line of error."""
+    """Run a command with --json. Return its exit status, its document and its line of error."""
     capsys.readouterr()
     status = run([str(item) for item in arguments])
     written = capsys.readouterr()
@@ -33,7 +33,7 @@ def call(capsys, *arguments):
 
 
 def check(capsys, path):
-    """Return the display of a configuration; None after one line that refuses it."""
+    """Return the display of a configuration. Return None after one line that refuses it."""
     status, _, error = call(capsys, "config", "check", "--config", path, "--json")
     if status == 0:
         return DisplayModel.from_config(load_config(path))
@@ -44,7 +44,7 @@ def check(capsys, path):
 
 
 def record(capsys, folder, path, shown, seed):
-    """Plan and simulate; return the recording, and how many pulses it has."""
+    """Plan and simulate. Return the recording and its number of pulses."""
     (folder / "frames.json").write_text(json.dumps(shown))
     out = folder / "recording.h5"
     status, planned, error = call(capsys, "plan", folder / "frames.json", "--config", path, "--json")
@@ -58,7 +58,7 @@ def record(capsys, folder, path, shown, seed):
 
 
 def check_chain(tmp_path, capsys, data, table, seed):
-    """Fail where a command refuses what `config check` accepts."""
+    """Fail where a command refuses a configuration that `config check` accepts."""
     path = write_config(tmp_path / "own.toml", table)
     if (display := check(capsys, path)) is None:
         return

@@ -110,7 +110,7 @@ def test_none_of_three_thousand_paused_sequences_exceeds_a_cap(kind, seed):
 
 
 def forget_heat(plan, until_s, state, budget):
-    """Mutant: what was executed before the pause is forgotten."""
+    """Mutant: the pulses that were executed before the pause are forgotten."""
     return state
 
 

@@ -14,7 +14,7 @@ STEP_S = 2e-5
 
 
 def integrate(pixel, pulses, until_s):
-    """Integrate the pixel's two equations by fourth-order Runge–Kutta; return times, absorber rise, displacement."""
+    """Integrate the pixel's two equations by fourth-order Runge–Kutta. Return times, absorber rise, displacement."""
     steps = int(np.ceil(until_s / STEP_S))
     power = np.zeros(steps)
     time = np.arange(steps) * STEP_S

@@ -82,7 +82,7 @@ def read_or_refuse(read, path):
 
 
 def reads_or_refuses(path):
-    """Check that reading refuses what the index refuses."""
+    """Check that reading refuses every file that the index refuses."""
     index, measurement = read_or_refuse(RecordingIndex.open, path), read_or_refuse(read_recording, path)
     if measurement is None:
         return

@@ -29,7 +29,7 @@ TRAIN = {"pixel": 3, "start_s": 0.0, "duration_s": 0.3, "pulse_width_s": 0.02, "
 
 
 def is_accepted(value):
-    """Return whether a sequence was parsed; any error but a one-line refusal fails."""
+    """Return whether a sequence was parsed. Any error but a one-line refusal fails."""
     try:
         parse_sequence(value, CONFIG, "frames.json")
     except InputError as error:

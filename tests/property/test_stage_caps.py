@@ -1,4 +1,4 @@
-"""Beams of several stages over one display: what the limiter must not forget about the others. Mutants.
+"""Beams of several stages over one display, of which the limiter must forget none, and mutants that do.
 
 The general property, with one to four stages and clocks that differ, is in test_limiter_caps.py.
 """

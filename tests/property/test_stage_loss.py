@@ -55,7 +55,7 @@ def list_planned(rig, record, plan):
 
 
 def play_trains_through(monkeypatch, kind):
-    """Break the first of two boards during trains; return until when the other one's light lasts after that, s."""
+    """Break the first of two boards during trains. Return until when the other one's light lasts after that, s."""
     rig = StageRig(monkeypatch, build_stages("display-437", 2), link_type=BreakingLink).ready()
     rig.run(1.0)
     rig.arm()

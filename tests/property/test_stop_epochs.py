@@ -1,4 +1,4 @@
-"""Nothing accepted before a STOP is emitted after the next arming, for any interleaving of what may happen.
+"""Nothing accepted before a STOP is emitted after the next arming, for any interleaving of possible actions.
 
 Pushes are accepted at any moment, in the epoch that the web process sees then, and handed over at any later one. Each
 has its own duty, so the board's log tells whose points it emits. Two gates each keep the property alone only in part:
@@ -35,10 +35,12 @@ INPUTS = {"interlock": (False, True), "key": (False, True), "estop": (True, Fals
 
 
 class Interleaving:
-    """One random interleaving. accepted: epoch of each push by its duty; waiting: pushes not yet handed over.
+    """One random interleaving.
 
-    built: number of the latest pause that the planner knew when it built a push's points; pauses: time of each answered
-    pause, and of its end, with the number of the pause and whether it lasts
+    accepted: epoch of each push by its duty
+    waiting: pushes not yet handed over
+    built: number of the latest pause that the planner knew when it built a push's points
+    pauses: time of each answered pause, and of its end, with the number of the pause and whether it lasts
     """
 
     def __init__(self, seed):

@@ -85,7 +85,7 @@ class Interleaving:
     # --- operations
 
     def accept(self):
-        """A request arrives; its caller may have seen an older status of the link process."""
+        """Accept a request. Its caller may have seen an older status of the link process."""
         self.serial += 1
         if self.random.random() < 0.3:
             sequence = build_pattern("vibration", {"height_um": 30 + self.serial, "seconds": 0.2}, DISPLAY.config)
@@ -125,7 +125,7 @@ class Interleaving:
         self.command(WEB, "arm")
 
     def pause(self):
-        """Pause; mostly, wait for the answer. A board that is not armed refuses."""
+        """Pause, and mostly wait for the answer. A board that is not armed refuses."""
         request = self.rig.request(WEB, "pause")
         if self.random.random() < 0.8:
             result = self.rig.await_result(WEB, request)
@@ -142,7 +142,7 @@ class Interleaving:
             self.pauses.append((self.rig.session.board_s(), False))
 
     def command(self, client, kind):
-        """Send a command; mostly, wait for its result."""
+        """Send a command, and mostly wait for its result."""
         request = self.rig.request(client, kind)
         self.note_epoch()
         if self.random.random() < 0.8 or kind == "arm":
@@ -152,7 +152,7 @@ class Interleaving:
             self.answered_epoch = self.rig.epoch
 
     def dry_run(self):
-        """Plan without executing; the queue stays as it is."""
+        """Plan without executing. The queue stays as it is."""
         snapshot = self.rig.queue.make_snapshot(False, 0.0)
         before = [record.plan_id for record in self.rig.store.list_recent()]
         fields = {"name": "dry", "policy": "trim", "fit": "as_is"}

@@ -1,4 +1,4 @@
-"""Recordings and configurations with one quantity in a wrong unit are refused in one line; sound ones are not."""
+"""Recordings and configurations with one quantity in a wrong unit are refused in one line, sound ones are not."""
 
 import tomllib
 from collections import Counter

@@ -75,7 +75,7 @@ class ModalAmplitudes(NamedTuple):
 
 
 class Modes(NamedTuple):
-    """Modes of the display; the first motion of a mode is mostly absorber, the second mostly wall.
+    """Modes of the display. The first motion of a mode is mostly absorber, the second mostly wall.
 
     share: [p, p] component of each pixel in each mode. For each motion, all [p]: its rate; rise of wall and gas per
     kelvin of the absorber; rise of the absorber per joule of light. gas_k_per_j: [p] rise of the gas's own amplitude
@@ -161,7 +161,7 @@ def _separate_rates(rate_per_s: FloatArray, gas_per_s: float) -> FloatArray:
 
 
 class CoupledDisplay:
-    """Mutable thermal state of a display of equal cells with coupled walls; all pixels share one time."""
+    """Mutable thermal state of a display of equal cells with coupled walls. All pixels share one time."""
 
     def __init__(self, modes: Modes, at_s: float = 0.0) -> None:
         self._modes = modes
@@ -169,7 +169,7 @@ class CoupledDisplay:
         self._now = _zero_amplitudes(len(modes.share))
 
     def apply_pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> WallPeaks:
-        """Apply pulses in order of time, all [n], power_w the mean incident power; return their peaks.
+        """Apply pulses in order of time, all [n], power_w the mean incident power. Return their peaks.
 
         Raises ValueError for a pulse that starts before the last event; the pulses before it remain applied.
         """
@@ -210,7 +210,7 @@ def _apply_pulses(
     peak_k: FloatArray,
     wall_k: FloatArray,
 ) -> int:
-    """Apply the pulses [n] and fill in their peaks [n]; return the number of pulses before one out of order.
+    """Apply the pulses [n] and fill in their peaks [n]. Return the number of pulses before one out of order.
 
     The time of the gas peak assumes a constant wall, the value at that time uses all modes: near a peak, a small error
     of time causes a much smaller one of height. For walls a thousand times slower than the pixel, as in the laminate,
@@ -247,7 +247,7 @@ def _apply_pulses(
 
 @array_kernel
 def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatArray:
-    """Return the start of the next pulse on the pixel of each pulse, [n]; infinite for its last one."""
+    """Return the start of the next pulse on the pixel of each pulse, [n], infinite for its last one."""
     coming_s = np.full(pixels, np.inf)
     next_s = np.empty(len(pixel))
     for row in range(len(pixel) - 1, -1, -1):
@@ -260,7 +260,7 @@ def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatAr
 def _advance(
     modes: Modes, before: ModalAmplitudes, after: ModalAmplitudes, pixel: int, power_w: float, time_s: float
 ) -> None:
-    """Advance the amplitudes by time_s at constant power on one pixel; before and after may be the same."""
+    """Advance the amplitudes by time_s at constant power on one pixel. before and after may be the same."""
     share = modes.share[pixel]
     light_j = power_w * time_s
     mean, left = _decay(modes.first_per_s, modes.first_max_per_s, time_s)
@@ -283,7 +283,7 @@ def _advance_motion(
     k_per_j: FloatArray,
     mean: FloatArray,
 ) -> None:
-    """Advance one motion of all modes; the compiler vectorises this loop only with few arrays."""
+    """Advance one motion of all modes. The compiler vectorises this loop only with few arrays."""
     for k in range(len(share)):
         after_k[k] = before_k[k] * left[k] + light_j * share[k] * k_per_j[k] * mean[k]
 

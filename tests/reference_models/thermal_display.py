@@ -35,7 +35,7 @@ SETTLED_AFTER_S = 1.8
 
 @array_kernel
 def _fill_leaving_w(y, leaving_w, numbers, neighbours, frame_edges):
-    """Fill in the heat flow from each wall [p], W, to the panel and to its neighbours; return that to the panel."""
+    """Fill in the heat flow from each wall [p], W, to the panel and to its neighbours. Return that to the panel."""
     rw, rx, rf, into_panel_w = numbers[6], numbers[8], numbers[9], 0.0
     if numbers[7] == 0.0:  # no walls
         return 0.0
@@ -126,8 +126,9 @@ def _rest(y, peak, time_s, numbers, neighbours, frame_edges):
 
 @array_kernel
 def _integrate(y, peak, at, pixel, watts, until, numbers, neighbours, frame_edges, on_step, off_step):
-    """Integrate by the fourth-order Runge–Kutta method between edges; peak [5] receives the maximum of each kind.
+    """Integrate by the fourth-order Runge–Kutta method between edges.
 
+    peak: [5] receives the maximum of each kind
     at, pixel, watts: [e] light on a pixel from an edge on
     """
     k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)

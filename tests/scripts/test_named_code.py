@@ -1,4 +1,4 @@
-"""The check of named code finds what a page names and the code lacks, and only that."""
+"""The check of named code finds the names on a page that the code lacks, and only those."""
 
 import sys
 from pathlib import Path

@@ -31,7 +31,7 @@ class WebStandIn:
                 self._client.receive()
 
     def command(self, kind):
-        """Send a command, wait for its result and return it; raise its error."""
+        """Send a command, wait for its result and return it. Raise its error."""
         with self._lock:
             self._client.beat()  # as the web process does before it serves; the thread may be late on a busy machine
             request = self._client.request(kind)
@@ -90,7 +90,7 @@ class RiggedEngine(Engine):
         return self._command("stop", lambda result: self._epoch == result["epoch"])
 
     def _command(self, kind, is_seen):
-        """Return a future of the result; done once the engine has seen the effect."""
+        """Return a future of the result. It is done once the engine has seen the effect."""
         future = Future()
         try:
             result = self.web.command(kind)

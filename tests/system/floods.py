@@ -48,7 +48,10 @@ class Target:
     def build_head(
         self, method: str, path: str, role: str | None = "operator", length: int = 0, **headers: str
     ) -> bytes:
-        """Build the head of a request; role None: no token; underscores in the names of headers become hyphens."""
+        """Build the head of a request. Underscores in the names of headers become hyphens.
+
+        role: None for no token
+        """
         fields = {"Host": f"{self.host}:{self.port}", "Content_Length": str(length)} | headers
         if role is not None:
             fields["Authorization"] = f"Bearer {self.tokens[role]}"
@@ -175,7 +178,7 @@ def list_routes() -> list[tuple[str, str]]:
 
 @flood(workers=2)
 async def bodies_of_every_kind(target: Target, number: int) -> None:
-    """Refused bodies of 8 and 9 MB for every route; no role that may arm or disarm."""
+    """Send refused bodies of 8 and 9 MB for every route. No role may arm or disarm."""
     size = BODY_MAX_BYTES - 1000
     kinds = (b"\xff" * size, b'"' + b"x" * (size - 2) + b'"', b"{}" + b" " * (size - 2), b"0" * (size + 1_100_000))
     for method, path in list_routes()[number::2]:
@@ -343,7 +346,10 @@ def write_frame(writer: asyncio.StreamWriter, opcode: int, data: bytes, is_final
 
 
 def build_frame_head(opcode: int, length: int, is_final: bool = True, bits: int = 0) -> bytes:
-    """Build a frame's head; bits: reserved bits, 0x40 for a compressed message."""
+    """Build a frame's head.
+
+    bits: reserved bits, 0x40 for a compressed message
+    """
     first = (0x80 if is_final else 0) | bits | opcode
     if length < 126:
         return struct.pack(">BBI", first, 0x80 | length, 0)
@@ -353,7 +359,7 @@ def build_frame_head(opcode: int, length: int, is_final: bool = True, bits: int 
 
 
 async def read_some(target: Target, reader: asyncio.StreamReader, timeout_s: float = 60.0) -> None:
-    """Read what the daemon sent; ConnectionError at its end."""
+    """Read the bytes that the daemon sent. Raise ConnectionError at their end."""
     if not await asyncio.wait_for(reader.read(1 << 16), timeout_s):
         target.count("closed")
         raise ConnectionError("closed")
@@ -537,7 +543,7 @@ PAGE_FILES = ("main.js", "api.js", "display.js", "draw.js", "gauges.js", "plans.
 
 
 async def attempt(target: Target, item: Flood, number: int) -> bool:
-    """Do one worker's part once; return whether it was not broken off."""
+    """Do one worker's part once. Return whether it was not broken off."""
     try:
         await item.work(target, number)
     except BROKEN as error:

@@ -21,7 +21,7 @@ RLIMITS = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE, resource.RLIMIT_AS, re
 
 
 def load():
-    """Import what a daemon, a command or a board imports, and load the compiled kernels."""
+    """Import the modules that a daemon, a command or a board imports, and load the compiled kernels."""
     import optodrive.cli.main
     import optodrive.daemon.engine.planner_process
     import optodrive.daemon.preview.process
@@ -76,7 +76,7 @@ PROGRAMS = {"optodrive": run_optodrive, "board": run_board, "short_indicator_boa
 
 
 def serve(control):
-    """Fork a process per request until the socket is closed; return the program to run in each fork, None here.
+    """Fork a process per request until the socket is closed. Return the program to run in each fork, None here.
 
     A request is a JSON object (program, arguments, folder, environment, limits) with the descriptors 0, 1 and 2 of the
     new process and a stream socket, which receives the process's id and, at its end, its status of waitpid.

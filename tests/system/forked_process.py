@@ -1,4 +1,7 @@
-"""`optodrive` commands and simulated boards as forks of a server that has loaded them; see fork_server.py."""
+"""`optodrive` commands and simulated boards as forks of a server that has loaded them.
+
+See fork_server.py.
+"""
 
 import json
 import os

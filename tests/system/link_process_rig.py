@@ -62,7 +62,7 @@ class LinkProcess:
         return client
 
     def run(self, duration_s=BEAT_INTERVAL_S):
-        """Beat as planner and web, and process what arrives."""
+        """Beat as planner and web, and process the messages that arrive."""
         until_s = time.monotonic() + duration_s
         while time.monotonic() < until_s:
             self.planner.beat(True)
@@ -92,7 +92,11 @@ class LinkProcess:
 
 
 class Client:
-    """Client with a role. status: latest status; results: by request."""
+    """Client with a role.
+
+    status: latest status
+    results: by request
+    """
 
     def __init__(self, path, role):
         self.role, self.status, self.results = role, None, {}

@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 def list_tree(pid):
-    """Return a process and its descendants; none that has ended."""
+    """Return a process and its descendants without those that have ended."""
     pids = [pid]
     try:
         for task in Path(f"/proc/{pid}/task").iterdir():
@@ -15,7 +15,7 @@ def list_tree(pid):
 
 
 def list_processes(pid):
-    """Return the processes of a daemon by name; a number tells those of one name apart."""
+    """Return the processes of a daemon by name. A number tells those of one name apart."""
     processes = {}
     for process in list_tree(pid):
         try:
@@ -27,7 +27,7 @@ def list_processes(pid):
 
 
 def read_memory_mib(pid):
-    """Return the proportional (PSS) and the resident memory (RSS) of a process, MiB; 0 if it has ended."""
+    """Return the proportional (PSS) and the resident memory (RSS) of a process, MiB, 0 if it has ended."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
@@ -37,7 +37,7 @@ def read_memory_mib(pid):
 
 
 def read_peak_mib(pid):
-    """Return the peak resident memory of a process so far, MiB; 0 if it has ended."""
+    """Return the peak resident memory of a process so far, MiB, 0 if it has ended."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:

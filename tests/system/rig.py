@@ -27,7 +27,7 @@ ENDED = ("done", "superseded", "failed", "cancelled")
 
 
 def wait_for(condition, what, nap_s=0.005):
-    """Poll until condition() is truthy and return its value; less often the longer it takes.
+    """Poll until condition() is truthy and return its value. Poll less often the longer it takes.
 
     Only pytest's timeout ends it, which shows `what`: how long something takes is the computer's affair.
     """
@@ -254,7 +254,7 @@ def is_suspended(pid):
 
 
 def is_alive(pid):
-    """Return whether a process runs, is suspended or waits; a zombie does not."""
+    """Return whether a process runs, is suspended or waits. A zombie does not."""
     return read_proc(pid, "stat").rpartition(")")[2].split()[:1] not in ([], ["Z"])
 
 
@@ -267,7 +267,11 @@ def read_role_tokens(daemon):
 
 @contextmanager
 def running(folder, replace=(), **options):
-    """Run a board and a daemon on it. replace: changes of the configuration; options: of the board."""
+    """Run a board and a daemon on it.
+
+    replace: changes of the configuration
+    options: of the board
+    """
     board = Board(folder, **options)
     try:
         daemon = Daemon(folder, board.port, replace=replace)

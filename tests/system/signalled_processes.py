@@ -40,7 +40,7 @@ def wait_for_end(process):
 
 
 def assert_one_line(errors, progress=()):
-    """Assert that a command's stderr is one line of its own that says what happened, besides lines of progress."""
+    """Assert that a command's stderr is one line of its own that states the event, besides lines of progress."""
     lines = [line for line in errors.splitlines() if not line.startswith(tuple(progress))]
     assert len(lines) == 1, errors
     assert lines[0].startswith("optodrive: "), errors

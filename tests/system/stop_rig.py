@@ -211,7 +211,7 @@ class StopRig:
 
     @contextmanager
     def running_show(self):
-        """Keep a show running, push by push, and yield the index of its first event; STOP at the end."""
+        """Keep a show running, push by push, and yield the index of its first event. STOP at the end."""
         begin, is_over = self.start_show(), threading.Event()
 
         def push():
@@ -230,7 +230,7 @@ class StopRig:
                 self.client.post("/v1/stop")
 
     def watch_show(self, begin, pulses):
-        """Let the show that began at an event emit a number of pulses; return the events that end it."""
+        """Let the show that began at an event emit a number of pulses. Return the events that end it."""
 
         def look():
             self.tail.read()

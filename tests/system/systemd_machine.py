@@ -59,7 +59,7 @@ def machine_files(folder):
 
 
 def run_script(root, script):
-    """Boot the machine, run a shell script as root in it, power it off; return the script's stdout and stderr."""
+    """Boot the machine, run a shell script as root in it, power it off. Return the script's stdout and stderr."""
     place = root / "opt/optodrive"
     for name in ("python", "packages", "checkout"):
         (place / name).mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What the web process tells the link process about the acceptor, over real sockets."""
+"""Messages of the web process to the link process about the acceptor, over real sockets."""
 
 import socket
 import threading
@@ -58,7 +58,7 @@ class WebRig:
         self.kinds = []
 
     def await_message(self, is_expected):
-        """Wait until an expected message reaches the link process; note the kinds of all."""
+        """Wait until an expected message reaches the link process. Note the kinds of all messages."""
         while True:
             for message in self._link.receive():
                 self.kinds.append("not alive" if message.fields.get("alive") is False else message.kind)

@@ -54,7 +54,7 @@ class Host:
             self.heard.append(m.parse_message(frame.type, frame.body))
 
     def wait(self, condition, what, lease=True):
-        """Read messages until condition() is true; pytest's timeout shows `what`."""
+        """Read messages until condition() is true. The timeout of pytest shows the text that names it."""
         while not condition():
             if lease and self.session:
                 self.say(m.Lease(60_000))

@@ -1,4 +1,4 @@
-"""What one caller's hostile requests may cost the others: a running show, a push, memory, the audit log."""
+"""The cost of one caller's hostile requests to the others: a running show, a push, memory, the audit log."""
 
 import asyncio
 import fcntl
@@ -172,7 +172,7 @@ def test_a_body_that_hangs_up_logs_no_traceback(rig):
 
 
 def test_an_audit_path_that_hangs_delays_neither_STOP_nor_the_end(make_board, tmp_path):
-    """A FIFO that nobody reads any more: what waited until it takes a line would never end."""
+    """A FIFO that nobody reads any more: a wait until it takes a line would never end."""
     board, fifo = make_board(), tmp_path / "audit"
     os.mkfifo(fifo)
     reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)

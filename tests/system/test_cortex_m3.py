@@ -1,4 +1,7 @@
-"""The emulated Cortex-M3 as a process under a daemon; tests/firmware judges its times, in its own time."""
+"""The emulated Cortex-M3 as a process under a daemon.
+
+tests/firmware judges its times, in its own time.
+"""
 
 import pytest
 

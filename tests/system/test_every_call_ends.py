@@ -1,4 +1,4 @@
-"""Every call ends, in one line, when a process is killed or suspended; nothing is lit afterwards.
+"""Every call ends, in one line, when a process is killed or suspended, and nothing is lit afterwards.
 
 The cases are the product of call, stage, process and signal. A process that a call does not need does not end it.
 """
@@ -115,7 +115,10 @@ class CommandCall:
 
 
 class StreamCall:
-    """A call of the Python client that streams frames until it fails; in a thread. stage: at which it waits for go."""
+    """A call of the Python client that streams frames until it fails, in a thread.
+
+    stage: at which it waits for go
+    """
 
     def __init__(self, daemon, is_async, stage):
         self.frames, self.error, self._stage = 0, None, stage
@@ -166,7 +169,7 @@ class StreamCall:
                 self._pause("closing")
 
     def wait(self):
-        """Wait until the call ends and return its error, None if it had what it needed."""
+        """Wait until the call ends and return its error, None if it had all that it needed."""
         self._thread.join()
         if self.error is not None:
             assert "\n" not in str(self.error)

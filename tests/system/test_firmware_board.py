@@ -39,7 +39,7 @@ def make_firmware_board(make_board, program):
 
 @pytest.fixture
 def while_playing():
-    """As for the simulated board; this one counts from its start, and its indicator is on for two seconds."""
+    """As for the simulated board. This one counts from its start, and its indicator is on for two seconds."""
     return "at_s = 4.0", lambda board: 4_000_000
 
 

@@ -73,7 +73,7 @@ def test_a_client_that_is_killed_or_stopped_leaves_the_board_dark(running, board
 
 
 def test_a_client_that_does_not_hold_leaves_its_plan_running(running, board, tmp_path):
-    """The counterpart: what is to be prevented happens without --hold."""
+    """The counterpart: without --hold the plan runs on, which --hold prevents."""
     running.arm()
     client = start_push(running, tmp_path)
     client.communicate()  # it is refused, for the board is armed already

@@ -58,7 +58,7 @@ def begin(link, points, **options):
 
 
 def emit(link, board, count=5000):
-    """Arm and start a plan of seconds; return when pulses are emitted."""
+    """Arm and start a plan of seconds. Return when pulses are emitted."""
     arm(link)
     begin(link, build_stage_points(count, DUTY))
     pulses = len(board.of("pulse"))

@@ -53,7 +53,7 @@ def is_dark(board):
 
 
 def check_paused(daemon, board, plan):
-    """Require the state of a pause that has been answered, and no light since; return the number of pulses so far."""
+    """Require the state of an answered pause, and no light since. Return the number of pulses so far."""
     emitted = len(board.of("pulse"))
     state = daemon.state()
     (active,) = state["queue"]["active"]

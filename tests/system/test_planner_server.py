@@ -108,7 +108,7 @@ def rig(tmp_path_factory):
 
 @pytest.fixture
 def web(rig):
-    """A client of an armed display; all plans end with the test."""
+    """A client of an armed display. All plans end with the test."""
     engine, path = rig
     engine.arm().result()
     web = Web(path, engine)

@@ -54,7 +54,10 @@ The link process sends ABORT at the end of a connection (at once), lets the leas
 
 
 def read_realtime_priority(pid, thread):
-    """Return the real-time priority of a thread, 0 for a usual one; the name in parentheses may contain spaces."""
+    """Return the real-time priority of a thread, 0 for a usual one.
+
+    The name in parentheses may contain spaces.
+    """
     return int(read_proc(pid, f"task/{thread}/stat").rpartition(")")[2].split()[37])
 
 
@@ -116,7 +119,10 @@ def await_dark(board, situation, causes):
 
 
 def ask(daemon):
-    """Return the state over a connection of its own; it is accepted at any time, and answered by the next process."""
+    """Return the state over a connection of its own.
+
+    It is accepted at any time, and answered by the next process.
+    """
     return httpx.get(f"{daemon.url}/v1/state", headers={"Authorization": f"Bearer {TOKEN}"}, timeout=None).json()
 
 

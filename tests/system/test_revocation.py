@@ -1,4 +1,4 @@
-"""Tokens that are removed while they are in use: what was begun with them ends at once, and the others stay."""
+"""Tokens that are removed while they are in use: calls begun with them end at once, and the others stay."""
 
 import threading
 

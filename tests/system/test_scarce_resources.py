@@ -175,7 +175,7 @@ def test_a_supervisor_without_memory_keeps_the_board_under_control(tmp_path, sit
 
 @contextmanager
 def full_disk(rig):
-    """Let no process of the daemon write to any file, as on a full disk; what was open before is limited, too."""
+    """Let no process of the daemon write to any file, as on a full disk. Files open before are limited, too."""
     pids = [rig.daemon.find_process(name) for name in PROCESSES]
     for pid in pids:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
@@ -188,7 +188,7 @@ def full_disk(rig):
 
 @pytest.mark.parametrize("process", ["link", *(pytest.param(name, marks=pytest.mark.slow) for name in PROCESSES[1:-1])])
 def test_a_full_disk_behind_everything_costs_lines_and_arming_only(tmp_path, process):
-    """Log, audit file and runtime folder are on it; the killed process starts again all the same."""
+    """Log, audit file and runtime folder are on it. The killed process starts again all the same."""
     rig = Rig(tmp_path)
     daemon, board = rig.daemon, rig.board
     try:

@@ -366,7 +366,7 @@ def test_no_token_is_written(running, folder):
 
 
 def collect_until_refused(call):
-    """Call until the rate limit refuses; return the statuses before that, and the refusal."""
+    """Call until the rate limit refuses. Return the statuses before that, and the refusal."""
     statuses = []
     while (response := call()).status_code != 429:
         statuses.append(response.status_code)

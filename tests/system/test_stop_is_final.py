@@ -30,7 +30,10 @@ def end_and_arm_again(rig, ending):
 
 
 def assert_only_a_later_push_lights(rig, begin):
-    """Push, and judge by the log from index `begin` on: what was accepted before would be in front of that push."""
+    """Push, and check by the log from index `begin` on that only this push lights.
+
+    An earlier accepted push would be in front of it.
+    """
     report = rig.client.post("/v1/plans", content=SMALL).json()
     assert {plan["plan"] for plan in rig.daemon.state()["queue"]["active"]} <= {report["plan"]}
     assert rig.daemon.finished(report["plan"])["status"] == "done"
@@ -42,7 +45,7 @@ def assert_only_a_later_push_lights(rig, begin):
 @pytest.mark.parametrize("ending", ["stop", "disarm"])
 @pytest.mark.parametrize("attempt", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_a_large_push_from_before_never_lights(rig, ending, attempt):
-    """400 full frames take seconds to plan; the end comes while they are read, built or planned."""
+    """400 full frames take seconds to plan. The end comes while they are read, built or planned."""
     rig.arm()
     body = build_full_frames(LARGE_FRAMES, PIXELS)
     with RawPush(rig.daemon, len(body)) as push:

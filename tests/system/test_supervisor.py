@@ -1,4 +1,4 @@
-"""The supervisor over real children of a few lines: tiny_daemon.py states what each of them does."""
+"""The supervisor over real children of a few lines, whose actions tiny_daemon.py states."""
 
 import json
 import os

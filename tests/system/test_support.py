@@ -1,4 +1,4 @@
-"""The archive for the report of a fault: it has what explains a fault, and no byte of a secret."""
+"""The archive for the report of a fault has the facts that explain a fault, and no byte of a secret."""
 
 import gzip
 import io

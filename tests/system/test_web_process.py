@@ -1,4 +1,4 @@
-"""What the web process guarantees about STOP, on a real daemon: no push from before it, no wait for the planner."""
+"""The web process's guarantees of STOP, on a real daemon: no push from before it, no wait for the planner."""
 
 import json
 import os
@@ -23,7 +23,7 @@ def armed(kept):
 
 @contextmanager
 def suspended(daemon, *names):
-    """Suspend processes of a daemon, and yield their ids; with the supervisor, which would end the others."""
+    """Suspend processes of a daemon, and yield their ids. Include the supervisor, which would end the others."""
     pids = [daemon.find_process(name) for name in names]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)

@@ -34,7 +34,7 @@ LONG_S = 1e6
 
 
 class Application:
-    """Answers 200; waits on /wait, blocks the loop on /block, reads bodies on /body, echoes WebSocket messages.
+    """Answers 200, waits on /wait, blocks the loop on /block, reads bodies on /body, echoes WebSocket messages.
 
     arrivals: paths of the requests with the times at which they arrived
     message_arrivals: earliest and actual times of the messages
@@ -84,7 +84,7 @@ class Application:
 
 
 class Clock:
-    """The clock by which acceptor and server close what takes too long: the computer's, and what a test adds."""
+    """The clock by which acceptor and server close slow connections: the computer's, and the time that a test adds."""
 
     def __init__(self):
         self._added_s = 0.0
@@ -121,7 +121,7 @@ class Client:
         self.link.sendall(data)
 
     def receive(self):
-        """Return what arrives next, b'' if the server has closed the connection."""
+        """Return the next bytes that arrive, b'' if the server has closed the connection."""
         try:
             return self.link.recv(4096)
         except ConnectionResetError:
@@ -386,7 +386,7 @@ def open_websocket(port, **options):
 
 
 def send_and_get_close_code(stream, message):
-    """Return the code, None if the close frame was lost because the client was still sending; else the answer."""
+    """Return the close code, None if the close frame was lost because the client was still sending, else the answer."""
     try:
         stream.send(message)
         return stream.recv()

@@ -1,4 +1,4 @@
-"""The wheel, installed into an empty environment: what is in it, and the daemon from it outside the checkout."""
+"""The wheel, installed into an empty environment: its contents, and the daemon from it outside the checkout."""
 
 import json
 import subprocess
@@ -38,7 +38,7 @@ def test_everything_is_inside(tmp_path):
 @pytest.mark.slow  # its kernels are compiled anew, too
 @pytest.mark.timeout(300)
 def test_the_daemon_runs_from_the_wheel(tmp_path):
-    """Libraries are lent by this environment; the next test installs them too."""
+    """Libraries are lent by this environment. The next test installs them too."""
     assert made(tmp_path, "--quick")["display"] == "display-16"
 
 

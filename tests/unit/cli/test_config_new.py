@@ -1,4 +1,4 @@
-"""`optodrive config new`: what it writes is valid for what was asked, and nothing is overwritten."""
+"""`optodrive config new` writes a file that is valid for the display asked for, and overwrites nothing."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ OPTIONS = {"rows": 6, "columns": 6, "pitch-mm": 4, "power-w": 1.2, "lens-mm": 16
 
 
 def write(path, **changes):
-    """Run the command; return its exit status. A change to None leaves an option out."""
+    """Run the command. Return its exit status. A change to None leaves an option out."""
     options = OPTIONS | {key.replace("_", "-"): value for key, value in changes.items()}
     words = [f"--{key}={value}" for key, value in options.items() if value is not None]
     return run(["config", "new", str(path), *words])

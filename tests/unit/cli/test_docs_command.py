@@ -49,7 +49,7 @@ def test_a_copy_has_the_wiring_and_the_sources_of_the_firmware(tmp_path, capsys)
 
 
 def test_the_wheel_is_declared_to_contain_them():
-    """tests/system/test_wheel.py builds it; this states what it must have where no build backend is at hand."""
+    """State the required contents where no build backend is at hand. tests/system/test_wheel.py builds the wheel."""
     build = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     for name in FOLDERS:
         assert build["force-include"][name] == f"optodrive/_shipped/{name}"

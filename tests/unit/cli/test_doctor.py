@@ -24,7 +24,7 @@ from optodrive.device.config_sections import BoardSection
 
 @pytest.fixture
 def tmp_path():
-    """A folder that other users can read; the folders of pytest are private to its user."""
+    """A folder that other users can read. The folders of pytest are private to its user."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         yield Path(folder)

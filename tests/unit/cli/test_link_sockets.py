@@ -23,7 +23,7 @@ def runtime(tmp_path, monkeypatch):
 
 
 def serve_once(path, answer):
-    """Answer one STOP in place of the link process; return the thread and the list of kinds received."""
+    """Answer one STOP in place of the link process. Return the thread and the list of kinds received."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
     listener.listen()

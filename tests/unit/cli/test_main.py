@@ -1,4 +1,4 @@
-"""The command line as a whole: version, addresses, and what its commands list."""
+"""The command line as a whole: version, addresses, and the lists that its commands print."""
 
 import socket
 from importlib.metadata import version

@@ -1,4 +1,4 @@
-"""Programs for the unit: what its sandbox hides is refused, also behind links and virtual environments."""
+"""Programs for the unit: one that its sandbox hides is refused, also behind links and virtual environments."""
 
 import subprocess
 import sys
@@ -30,7 +30,7 @@ def visible(tmp_path):
 
 
 def make_environment(folder, base):
-    """Create a virtual environment on a base interpreter; return its script `optodrive`."""
+    """Create a virtual environment on a base interpreter. Return its script `optodrive`."""
     subprocess.run([base, "-m", "venv", "--without-pip", folder], check=True)
     script = folder / "bin" / "optodrive"
     script.write_text(f"#!{folder}/bin/python\nimport optodrive.cli.main\n")
@@ -75,7 +75,7 @@ def test_an_environment_on_a_hidden_interpreter_is_refused(hidden, visible):
 
 
 def test_a_copied_interpreter_whose_base_is_hidden_is_refused(hidden, visible):
-    """The links show nothing; pyvenv.cfg does."""
+    """The links show nothing, but pyvenv.cfg does."""
     script = make_environment(visible / "venv", REAL_PYTHON)
     python = visible / "venv" / "bin" / "python"
     python.unlink()

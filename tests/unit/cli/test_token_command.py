@@ -1,4 +1,4 @@
-"""`optodrive token`: what changes in the file of tokens, and where the secret goes."""
+"""`optodrive token`: the changes in the file of tokens, and the destination of the secret."""
 
 import json
 import os

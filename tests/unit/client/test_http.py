@@ -211,7 +211,7 @@ def test_a_call_at_a_suspended_daemon_leaves_time_for_its_stop():
 
 @pytest.mark.parametrize(("scheme", "mode"), [("https", ssl.CERT_REQUIRED), ("http", ssl.CERT_NONE)])
 def test_certificates_are_verified_where_there_are_some(scheme, mode):
-    """Loading what verifies them takes tens of milliseconds for each of the clients that stop and probe."""
+    """Loading the certificates takes tens of milliseconds for each of the clients that stop and probe."""
     endpoint = Endpoint(f"{scheme}://localhost", "token")
     for client in (endpoint.open_client(1.0), endpoint.open_async_client(1.0)):
         assert client._transport._pool._ssl_context.verify_mode == mode

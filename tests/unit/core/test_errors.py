@@ -1,4 +1,4 @@
-"""Errors between processes: a pool's parent raises what a worker has raised."""
+"""Errors between processes: a pool's parent raises the error that a worker has raised."""
 
 import pickle
 

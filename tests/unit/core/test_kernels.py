@@ -1,4 +1,4 @@
-"""The cache of machine code: what invalidates it, and what happens if its folder is not writable."""
+"""The cache of machine code: the changes that invalidate it, and the behaviour without a writable folder."""
 
 import os
 import re

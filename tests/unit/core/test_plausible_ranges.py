@@ -164,7 +164,7 @@ def test_what_is_no_finite_number_is_left_to_the_schema(value):
 
 @pytest.mark.parametrize("value", [10**400, 1e308, -1e308, 1e-320])
 def test_a_number_that_no_quantity_can_have_is_refused(value):
-    """What is computed from it would leave the range of floats."""
+    """A value computed from it would leave the range of floats."""
     with pytest.raises(InputError, match=r"^file: grid\.corner_m\[0\]: got .*, expected 1 mm to 500 mm$"):
         check_table("file", {"grid": {"corner_m": [value]}}, {"grid.corner_m": PlausibleRange(1e-3, 0.5, "m")})
 

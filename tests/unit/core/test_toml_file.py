@@ -1,4 +1,4 @@
-"""The bounds of every file that is read: kind, size, depth, digits, keys; refusals name file and line."""
+"""The bounds of every file that is read: kind, size, depth, digits, keys. Refusals name file and line."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Listening Unix sockets: their mode, and what they replace."""
+"""Listening Unix sockets: their mode, and the files that they replace."""
 
 import socket
 import stat

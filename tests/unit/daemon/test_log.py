@@ -120,7 +120,7 @@ def test_a_minute_of_the_log_is_bounded_and_says_what_is_missing(capsys):
 
 
 def test_equal_lines_are_merged_and_counted(capsys):
-    """What a caller without a token can provoke, as often as it likes: a record of a library."""
+    """A caller without a token can provoke records of a library as often as it likes."""
     clock = ManualClock()
     with closing(DaemonLog(None, clock)) as log:
         for number in range(1000):

@@ -75,7 +75,7 @@ def write_tokens(path, *tokens):
 
 
 def test_an_armed_board_permits_only_to_revoke_tokens(config, tmp_path):
-    """A new token, a new secret and a new key wait until the board is disarmed; what they replace ends at once."""
+    """A new token, secret or key waits until the board is disarmed. The replaced ones end at once."""
     path = tmp_path / "tokens.toml"
     running = with_(config, "daemon", tokens=str(path))
     reloader = ConfigReloader(running, Tokens([ANN, BEN]), lambda: with_(running, "daemon", hosts=("lab",)))

@@ -40,7 +40,7 @@ def test_what_no_code_reaches_is_not_a_number():
 
 
 def test_far_places_are_never_taken_for_others():
-    """The initial guess folds over far outside; every code that is returned leads to its position."""
+    """The initial guess folds over far outside. Every code that is returned leads to its position."""
     far_m = np.random.default_rng(3).uniform(-1.0, 1.0, (2, 4000))
     for seed in range(6):
         spots, _ = measure_spots(GroundTruthGeometry.sample(seed, CONFIG), grid_codes(5), np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Estimates of what a configuration does not state of its panel."""
+"""Estimates of the values that a configuration does not state of its panel."""
 
 import pytest
 

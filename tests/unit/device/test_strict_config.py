@@ -17,7 +17,7 @@ NOT_CHECKED = ("version", "stages")
 
 
 def list_keys(model, accepts, place=()):
-    """Yield the place of every key whose type `accepts` it, in all sections; a list stands for its items."""
+    """Yield the place of every key whose type `accepts` it, in all sections. A list stands for its items."""
     for name, field in model.model_fields.items():
         kinds, found = [field.annotation], []
         while kinds:

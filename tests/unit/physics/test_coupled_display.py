@@ -88,7 +88,7 @@ def test_gas_as_slow_as_a_mode(motion, off):
 
 
 def trace(walls, columns):
-    """Sample absorber and gas [m, p] every 20 µs through all pulses and for a while after each; with the times [m]."""
+    """Sample absorber and gas [m, p] every 20 µs through all pulses and for a while after each, with the times [m]."""
     heat, step_s, dark_s = CoupledDisplay(Modes.diagonalise(PIXEL, walls, LATTICE)), 2e-5, 0.03
     t_s, absorber_k, gas_k = [0.0], [np.zeros(len(LATTICE))], [np.zeros(len(LATTICE))]
 

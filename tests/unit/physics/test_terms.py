@@ -118,7 +118,7 @@ def test_the_generated_module_keeps_its_name_whatever_its_terms():
 
 @pytest.mark.parametrize(("rate", "found"), [(500.0, "2 ms"), (1000.0, "1 ms"), (5000.0, "200 µs")])
 def test_a_term_that_is_too_fast_for_the_integrator_is_refused_by_name(rate, found):
-    """Steps grow to 6 ms; between 2 ms and half of that, an error may grow without leaving the range."""
+    """Steps grow to 6 ms. Between 2 ms and half of that, an error may grow without leaving the range."""
     values = {"gas_leak": {"rate": rate}, "wall_heating": {"resistance": 20.0, "capacity": 0.06}}
     message = f"term gas_leak: got a time constant of {found}, expected 2.2 ms or more"
     with pytest.raises(DivergedError, match=message) as caught:

@@ -20,7 +20,10 @@ from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 
 def build_display(name, count, **spans):
-    """Build a display with equal stages; spans: rows or columns of each."""
+    """Build a display with equal stages.
+
+    spans: rows or columns of each
+    """
     config = DISPLAYS[name].config
     sections = {"laser": config.laser, "scanner": config.scanner, "board": config.board}
     stages = tuple(
@@ -44,7 +47,7 @@ def full(display, height_um=50.0, show_at_s=0.0, name="f", duration_s=10.0):
 
 
 def check_beams(display, planned):
-    """Assert what holds of every plan: order of starts, no overlap on a beam or a pixel, one stage per pixel."""
+    """Assert the properties of every plan: order of starts, no overlap on a beam or a pixel, one stage per pixel."""
     result = planned.plan
     assert (np.diff(result.start_s) >= 0).all()
     for column, values in ((result.stage, range(len(display.scan_heads))), (result.pixel, range(len(display.pixels)))):
@@ -107,7 +110,7 @@ def test_dots_that_recur_are_shared_over_the_whole_plan(display):
 
 
 def test_decided_frame_by_frame_recurring_dots_would_be_uneven(display, monkeypatch):
-    """Mutant: what later pages light is not looked at."""
+    """Mutant: the pixels that later pages light are not looked at."""
     monkeypatch.setattr(StageAssignment, "_assign_recurring", lambda *_: None)
     planned = plan(display, *build_pages(display))
     check_beams(display, planned)
@@ -136,7 +139,7 @@ def test_two_fingers_feel_trains_at_once():
 
 @pytest.mark.parametrize("digits", ["2-3", "2-5"])
 def test_experiment_6_takes_the_paper_s_600_ms(digits):
-    """One stage needs time for the moves between the fingers; of two, one moves while the other draws."""
+    """One stage needs time for the moves between the fingers. Of two, one moves while the other draws."""
     display = build_display("display-437", 2)
     planned = plan_sequence(display, build_two_fingers(display.config, "f", digits, None), *display.build_cold_state())
     check_beams(display, planned)

@@ -17,7 +17,7 @@ DUTY_MAX = 65535
 
 
 def play(rig, sequence):
-    """Play a sequence; return its plan and the largest share of full power that the board has emitted for it."""
+    """Play a sequence. Return its plan and the largest share of full power that the board has emitted for it."""
     before = len(rig.list_emitted())
     plan = rig.submit(sequence, rig.remote.epoch).result()
     record = rig.store.find(plan.plan)

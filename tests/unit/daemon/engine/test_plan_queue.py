@@ -63,7 +63,7 @@ def attempts(monkeypatch):
 
 
 def show_after_another(rig, delays_s, streamed):
-    """Show a frame on a warm pixel, with delays between planning and commit; return its record."""
+    """Show a frame on a warm pixel, with delays between planning and commit. Return its record."""
     first = submit(rig, build_frame(300.0, (5,), 0.02), streamed)
     rig.until(lambda: first.executed_count == 1)
     left = list(delays_s)

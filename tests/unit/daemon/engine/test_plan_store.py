@@ -1,4 +1,4 @@
-"""What is kept of ended plans: what their reports state, in bounded memory."""
+"""Ended plans keep the content of their reports, in bounded memory."""
 
 import gc
 import weakref

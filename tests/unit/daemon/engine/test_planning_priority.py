@@ -16,7 +16,7 @@ def read_priority():
 
 
 def is_permitted():
-    """Return whether a thread may have the priority; the other threads of this process keep theirs."""
+    """Return whether a thread may have the priority. The other threads of this process keep theirs."""
     read = []
 
     def try_it():

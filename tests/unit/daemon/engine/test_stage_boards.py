@@ -211,7 +211,7 @@ def test_a_board_that_falls_silent_ends_the_light_of_all(rig):
 
 @pytest.mark.parametrize("lost_for_s", [0.05, 5.0])
 def test_every_stage_is_listed_with_its_state_after_one_was_lost(monkeypatch, lost_for_s):
-    """The links to the others stay open; what the lost board did last would be a claim."""
+    """The links to the others stay open. A last known state of the lost board would be a claim."""
     rig = StageRig(monkeypatch, build_stages("display-16", 3), link_type=BreakingLink).ready()
     rig.run(2.0)
     rig.arm()
@@ -270,7 +270,7 @@ def test_a_board_that_faults_while_it_is_armed_leaves_none_armed(monkeypatch):
 
 
 def test_light_that_would_be_late_is_not_emitted_and_the_boards_stay_armed(wide_rig):
-    """Boards that execute what is late would no longer agree about the order of their pulses."""
+    """Boards that execute points late would no longer agree about the order of their pulses."""
     rig = wide_rig
     record = submit(rig, fill(60.0), streamed=True)
     rig.until(lambda: record.executed_count > 20)
@@ -311,7 +311,10 @@ def test_a_board_whose_clock_is_not_known_well_enough_refuses_the_start(monkeypa
 
 
 def build_busy(monkeypatch, delay_s=0.004):
-    """Build armed boards. delay_s: of all that arrives from the second; by default a start needs narrower exchanges."""
+    """Build armed boards.
+
+    delay_s: of all that arrives from the second. By default a start needs narrower exchanges.
+    """
     rig = StageRig(monkeypatch, build_stages("display-16", 2), link_type=BusyLink)
     rig.links[1].delay_s = delay_s
     rig.ready()
@@ -322,7 +325,7 @@ def build_busy(monkeypatch, delay_s=0.004):
 
 @pytest.mark.parametrize("streamed", [False, True])
 def test_a_start_waits_until_an_exchange_is_narrow_enough(monkeypatch, streamed):
-    """The plan is then proven again for its new time; the error is that of the best exchange, not of the last."""
+    """The plan is then proven again for its new time. The error is that of the best exchange, not of the last."""
     rig = build_busy(monkeypatch)
     record = submit(rig, build_frame(60.0), streamed)
     planned_s = record.start_s

@@ -1,4 +1,4 @@
-"""What a planner process leaves to its successor: heat and budget, never less than what may have been emitted."""
+"""A planner process leaves heat and budget to its successor, never less than may have been emitted."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,10 @@ def submit(rig, sequence):
 
 
 def restart(rig, later_s=0.0):
-    """Restart the queue from what the memory of a dead one holds; later_s: time without a planner."""
+    """Restart the queue from the content of a dead one's memory.
+
+    later_s: time without a planner
+    """
     memory = ThermalMemory()
     memory.save(rig.queue.build_saved_state(rig.clock.now_s()))
     rig.run(later_s)

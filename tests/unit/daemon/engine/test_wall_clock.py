@@ -13,7 +13,7 @@ STEPS_S = (0.0, 86_400.0, -86_400.0, 3600.0, -1e9, 0.5, -0.5)
 
 
 def play(monkeypatch):
-    """Play a train and a frame, pause and stop; return the board's log and the states of the plans."""
+    """Play a train and a frame, pause and stop. Return the board's log and the states of the plans."""
     rig = PlannerRig(monkeypatch).ready()
     rig.arm()
     rig.run(0.01)
@@ -37,7 +37,7 @@ def test_a_clock_that_is_set_at_every_reading_changes_nothing(monkeypatch):
 
 @pytest.mark.parametrize("step_s", STEPS_S)
 def test_an_arrival_is_never_later_than_its_reading(monkeypatch, step_s):
-    """A frame that seems to have come earlier is refused after a STOP; one that seems later would be shown."""
+    """A frame that seems to have come earlier is refused after a STOP. One that seems later would be shown."""
     now_ns = time.time_ns()
     ancillary = [(1, SO_TIMESTAMPNS, _TIMESPEC.pack(*divmod(now_ns, 10**9)))]
     monkeypatch.setattr(TimedSocket, "recvmsg", lambda *_: (b"x", ancillary, 0, None))

@@ -172,7 +172,10 @@ def build_slowly(*_):
 
 @pytest.fixture
 def start(tmp_path, monkeypatch):
-    """Return a function that starts a preview process; act: what building the body b"bad" does."""
+    """Return a function that starts a preview process.
+
+    act: called to build the body b"bad"
+    """
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     warm_up(DISPLAY)
     started, parse = [], request_body.parse_request

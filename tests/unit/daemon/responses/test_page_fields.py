@@ -72,7 +72,7 @@ OTHER_VARIABLES = {
 
 
 def list_members(kind):
-    """The members of a model or dataclass with their types; None for any other type."""
+    """The members of a model or dataclass with their types, None for any other type."""
     for item in get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,):
         if isinstance(item, type) and issubclass(item, BaseModel):
             return {name: field.annotation for name, field in item.model_fields.items()}

@@ -133,7 +133,10 @@ def test_a_stop_that_nobody_answers_is_audited(rig, monkeypatch):
 
 
 def run_client(rig, act):
-    """Run a client of the acceptor in an event loop; act: receives it and the connections handed over."""
+    """Run a client of the acceptor in an event loop.
+
+    act: receives it and the connections handed over
+    """
 
     async def run():
         client, taken = AcceptorClient(rig.path), []
@@ -150,7 +153,10 @@ def run_client(rig, act):
 
 
 async def await_count(client, taken, count):
-    """Return the ranks of what is handed over, once as many have come and the acceptor has had further turns."""
+    """Return the ranks of the connections handed over.
+
+    It waits until as many have come and the acceptor has had further turns.
+    """
     while len(taken) < count:
         await asyncio.sleep(0.01)
     await await_beats(client)
@@ -158,7 +164,7 @@ async def await_count(client, taken, count):
 
 
 async def await_beats(client):
-    """Wait for two beats of the acceptor, between which it has handed over what it may."""
+    """Wait for two beats of the acceptor, between which it has handed over all connections that it may."""
     for _ in range(2):
         beaten_s = client._beaten_s
         while client._beaten_s == beaten_s:
@@ -182,7 +188,7 @@ def test_a_connection_is_handed_over_with_its_request_if_its_rank_is_permitted(r
 
 
 def open_first_of(count):
-    """Return what receives connections, opens the first and returns the ranks of all."""
+    """Return a function that receives connections, opens the first and returns the ranks of all."""
 
     async def act(client, taken):
         ranks = await await_count(client, taken, count)

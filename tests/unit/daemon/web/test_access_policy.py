@@ -105,7 +105,7 @@ def test_a_page_from_elsewhere_is_refused(check, host, origin):
 
 @pytest.fixture
 def audited(app, tmp_path):
-    """Function that sends one request through the middleware; returns the audit's entries after all requests."""
+    """Function that sends one request through the middleware. It returns the audit's entries after all requests."""
     audit = AuditLog(tmp_path / "audit.jsonl", print)
     policy = AccessPolicy(TOKENS, DaemonSection(requests_per_s=1, requests_burst=1), audit)
 

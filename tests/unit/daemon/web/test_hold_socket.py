@@ -1,4 +1,4 @@
-"""What one client that holds an arming makes the web process tell the link process."""
+"""Messages from the web process to the link process that one client that holds an arming causes."""
 
 import asyncio
 from pathlib import Path

@@ -46,7 +46,7 @@ class Client:
 
 
 def stream(ages_s):
-    """Stream frames that may have waited for these times; return the details of refusals, and what was planned."""
+    """Stream frames that may have waited for these times. Return details of refusals, and names of planned frames."""
     client = Client(ages_s)
     asyncio.run(LiveStream(client, client, "trim", "ann").run())
     return [answer["problem"]["detail"] for answer in client.answers], client.planned

@@ -1,4 +1,4 @@
-"""Who may have the page, and by what."""
+"""Callers who may have the page, and the credentials that open it."""
 
 import asyncio
 from functools import partial
@@ -22,7 +22,7 @@ async def serve_inner(scope, receive, send):
 
 
 def request(app, path, method="GET", **headers):
-    """Status, headers and body of what the guard lets through or answers itself."""
+    """Status, headers and body of the response that the guard lets through or gives itself."""
     sent = []
 
     async def send(message):

@@ -67,7 +67,10 @@ def build_batch(plan, rows, kind="executed"):
 
 
 class Reader:
-    """Reader of a hub; events: (kind, data) received so far."""
+    """Reader of a hub.
+
+    events: (kind, data) received so far
+    """
 
     def __init__(self, hub, rate_hz=60.0):
         self.events = []
@@ -114,7 +117,7 @@ def test_a_reader_gets_the_latest_of_each_kind_and_then_only_changes():
 
 
 def test_a_reader_gets_the_peaks_of_the_displays_that_it_has_missed():
-    """The events of the planner follow the fastest reader; the others see every peak as well, and only once."""
+    """The events of the planner follow the fastest reader. The others see every peak as well, and only once."""
 
     async def scenario(hub):
         fast, slow = Reader(hub, 60.0), Reader(hub, 1.0)

@@ -1,4 +1,4 @@
-"""First light in virtual time: where, how weak and how often, and what prevents it."""
+"""First light in virtual time: its place, its weakness and its rate, and the conditions that prevent it."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""Mirror steps in virtual time: gate off by the board's log, exact times, and what a calibration makes of them."""
+"""Mirror steps in virtual time: gate off by the board's log, exact times, and the calibration from them."""
 
 from dataclasses import replace
 

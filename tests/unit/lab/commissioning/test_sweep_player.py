@@ -46,7 +46,7 @@ def open_journal(folder):
 
 
 def play(displays, journal, on_progress=ignore):
-    """Play what the journal lacks; return the rig."""
+    """Play the aims that the journal lacks. Return the rig."""
     rig = ExclusiveRig(DISPLAY, lambda x_code, y_code, at_us: None)
     plans = plan_aims(displays, journal)
     with rig.armed() as board:

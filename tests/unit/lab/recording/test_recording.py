@@ -404,7 +404,7 @@ def test_numbers_of_numpy_are_written_as_numbers(tmp_path):
 
 
 def count_opens(monkeypatch, path):
-    """Read a file as the sandboxed process does; return how many times it opens the file."""
+    """Read a file as the sandboxed process does. Return how many times it opens the file."""
     opened = []
 
     class CountingTree(Hdf5Tree):
@@ -421,7 +421,7 @@ def count_opens(monkeypatch, path):
 @pytest.mark.parametrize(("group", "read"), [("runs", read_recording), ("plans", read_trials)])
 @pytest.mark.parametrize("is_soft", [True, False])
 def test_links_cost_no_work_each_and_are_refused_by_name(path, monkeypatch, group, read, is_soft):
-    """A link takes some bytes; 60,000 of them took minutes, one opened file each."""
+    """A link takes some bytes. Reading 60,000 of them took minutes, one opened file each."""
     with h5py.File(path, "r+") as file:
         first = next(iter(file["runs"].values()))
         links = file.require_group(group)

@@ -1,4 +1,4 @@
-"""Every fact is predicted or excluded with a reason; predictions agree with independent calculations."""
+"""Every fact is predicted or excluded with a reason, and predictions agree with independent calculations."""
 
 import csv
 from math import exp, pi

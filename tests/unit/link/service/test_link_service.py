@@ -492,7 +492,7 @@ def test_a_client_that_leaves_while_the_board_arms_ends_the_arming(rig):
 
 
 def arm_twice(rig, delay_s):
-    """Request two armings, the second after a delay; return both results."""
+    """Request two armings, the second after a delay. Return both results."""
     first = rig.request(WEB, "arm", caller="ann")
     rig.run(delay_s)
     second = rig.request(WEB, "arm", caller="ben")

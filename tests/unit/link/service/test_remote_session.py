@@ -55,7 +55,7 @@ def rig(monkeypatch):
 
 
 def truncate_during_a_stall(rig, stall_s):
-    """Request that the running job ends later than it does; return how long the planner waited, s."""
+    """Request that the running job ends later than it does. Return how long the planner waited, s."""
     began_s = rig.clock.now_s()
     rig.channel.stalled_until_s = began_s + stall_s
     rig.remote.truncate([10_000])

@@ -31,7 +31,7 @@ def test_the_error_is_within_its_bound(clock, count):
 
 
 def test_repeated_exchanges_leave_the_narrowest_of_each_interval():
-    """A hundred wide ones within two seconds neither displace a narrow one nor what is known of the rate."""
+    """A hundred wide ones within two seconds neither displace a narrow one nor the knowledge of the rate."""
     clock = CLOCKS[0]
     sync, last_s = compare(clock, 64)
     before = sync.fit(last_s)

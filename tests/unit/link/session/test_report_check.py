@@ -1,4 +1,4 @@
-"""Reports that cannot be: each is a fault of the link, in one line, and none changes what the host knows."""
+"""Each impossible report is a fault of the link, in one line, and none changes the state that the host knows."""
 
 from dataclasses import replace
 

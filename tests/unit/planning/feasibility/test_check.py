@@ -185,7 +185,7 @@ def test_an_unreachable_target_is_refused_as_is_and_changed_on_request():
 
 
 def test_the_source_of_higher_priority_stays():
-    """A train leaves a frame no beam time; the one of lower priority is omitted."""
+    """A train leaves a frame no beam time. The one of lower priority is omitted."""
     train = PulseTrain(9, 0.0, 0.1, 0.02, 0.005, 0.3)
     _, first = check(build_frame([0, 1], 200, duration_s=0.05, priority=1), trains=[train], fit="priority")
     assert [(item.name, item.pixels) for item in first.omitted] == [("train 0", (9,))]
@@ -294,7 +294,7 @@ def test_height_trains_are_scaled_and_stretched():
 
 
 def test_a_height_train_takes_beam_time_from_a_frame():
-    """Both do not fit at full height; the scaled variant fits, although the train has other cycles then."""
+    """Both do not fit at full height. The scaled variant fits, although the train has other cycles then."""
     train = HeightTrain(9, 0.0, 0.5, 0.025, 250e-6, 60e-6)
     _, alone = check(build_frame(range(30), 60, duration_s=0.14))
     assert alone.fits

@@ -139,7 +139,7 @@ def test_resonant_moves_are_bounded_and_a_mutant_without_ringing_is_caught():
 
 
 def test_a_move_long_before_its_pulse_is_bounded():
-    """The mirrors move when a pulse ends, even if the next one is much later; the bound covers that."""
+    """The mirrors move when a pulse ends, even if the next one is much later. The bound covers that."""
     there_and_back = [(0.002 * k + 0.001, 2e-4, 0.03 * (-1) ** k) for k in range(200)]
     bound = compute_bound(SERVO, there_and_back)
     then = [*there_and_back, (5.0, 2e-4, 0.15)]

@@ -60,7 +60,7 @@ WITHOUT_CAPS = build_budget()
 
 
 def pulses(*rows):
-    """Build a plan from rows of (pixel, start_s, width_s, power_w); a pixel lies at its number times 10 mrad."""
+    """Build a plan from rows of (pixel, start_s, width_s, power_w). A pixel lies at its number times 10 mrad."""
     pixel, start, width, power = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     zero = np.zeros(len(rows))
     return PulsePlan(
@@ -233,7 +233,7 @@ def test_verification_passes_limited_pulses_and_rejects_others():
 
 
 def test_a_dimmed_budget_passes_no_power_above_its_share():
-    """Also the verification of the bytes refuses it; a share of 1 changes nothing."""
+    """Also the verification of the bytes refuses it. A share of 1 changes nothing."""
     plan = run(build_budget(power_share=0.5), (0, 0.0, 0.02, 2.45), (1, 0.06, 0.02, 1.0))
     assert plan.power_w.tolist() == [1.225, 1.0]
     bright = run(build_budget(power_share=1.0), (0, 0.0, 0.02, 2.45), (1, 0.06, 0.02, 1.0))

@@ -23,7 +23,7 @@ class PulseByPulse:
 
 
 def plan_batches(display, frames, heat, initial_pixel, pause_count, stage_count):
-    """Return the batches of a scheduler, the first ones with pauses, and what it skipped."""
+    """Return the batches of a scheduler, the first ones with pauses, and the pulses that it skipped."""
     sequence, scan_heads = FrameSequence(frames), display.scan_heads * stage_count
     reach = np.ones((stage_count, len(display.pixels)), dtype=bool)
     light = LightEstimate.from_cold(display.build_cold_heat(), display.max_displacement_m, display.scan_head.drive)

@@ -59,7 +59,7 @@ def test_every_cycle_has_its_peak_and_its_peak_to_peak_value():
 
 
 def test_the_mean_level_does_not_grow():
-    """With pulses of fixed energy the level grows with 1 − exp(−t/τ); here it is constant from the first cycle on."""
+    """With pulses of fixed energy the level grows with 1 − exp(−t/τ). Here it is constant from the first cycle on."""
     train = HeightTrain(17, 0.0, 0.5, 0.02, 200e-6, 40e-6)
     _, troughs_um = simulate_cycles(plan_trains(train), train)
     assert troughs_um[1] == pytest.approx(160.0, rel=0.03)
@@ -123,7 +123,7 @@ def test_four_interleaved_trains_keep_their_times_and_heights():
 
 
 def test_a_pulse_never_exceeds_its_slot():
-    """Only one slot of many is short, so the train is not refused; the pulse in that slot is short as well."""
+    """Only one slot of many is short, so the train is not refused. The pulse in that slot is short as well."""
     tall = HeightTrain(17, 0.0, 0.4, 0.04, 300e-6)
     other = PulseTrain(300, 0.205, 0.001, 0.002, 0.001, 1.0)
     result = plan_trains(tall, other)

@@ -52,7 +52,7 @@ def test_bad_frames_are_refused_in_one_line(message, says):
 
 @given(st.data())
 def test_every_pixel_is_refreshed_at_any_frame_rate(data):
-    """Of each frame one pixel is drawn and heights change; within a cycle no pixel precedes the stale ones."""
+    """Of each frame one pixel is drawn and heights change. Within a cycle no pixel precedes the stale ones."""
     count = data.draw(st.integers(1, 12))
     refreshed = np.zeros(count, dtype=bool)
     active = np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))

@@ -1,4 +1,7 @@
-"""Gains and offsets from runs of hidden pixels; tuned with seeds from 100, tested on others."""
+"""Gains and offsets from runs of hidden pixels.
+
+They are tuned with seeds from 100 and tested on others.
+"""
 
 from dataclasses import replace
 
@@ -163,7 +166,7 @@ def test_stats_list_dead_and_unmeasured_pixels():
 
 
 def test_light_beside_the_absorber_keeps_a_black_wall_below_its_cap():
-    """A half-space of acrylic absorbs the whole focus; rises of the PWM pulses are superposed."""
+    """A half-space of acrylic absorbs the whole focus. Rises of the PWM pulses are superposed."""
     laser = CONFIG.laser
     faint = [compute_pulse(CONFIG, aim) for aim in list_aims(CONFIG)[1:]]
     assert len(set(faint)) == 1
