@@ -43,7 +43,7 @@ class BeatWriter:
         return self._socket.fileno()
 
     def beat(self) -> None:
-        """Prove that the caller's loop runs. Call it in every iteration; at most one packet per interval is sent."""
+        """Prove that the caller's loop runs. Call it in every iteration. At most one packet per interval is sent."""
         now_s = self._now_s()
         if now_s - self._beaten_s >= BEAT_INTERVAL_S:
             self._beaten_s = now_s

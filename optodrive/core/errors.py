@@ -8,7 +8,7 @@ MESSAGE_MAX = 1000
 
 
 class OptodriveError(Exception):
-    """Base of all errors that this package raises deliberately; `code` is stable and machine-readable."""
+    """Base of all errors that this package raises deliberately. `code` is stable and machine-readable."""
 
     code = "error"
     exit_status = 1
@@ -27,7 +27,7 @@ def _restore_error(kind: type[OptodriveError], args: tuple[object, ...], fields:
 
 
 class InputError(OptodriveError):
-    """Invalid input; the message states place, value and expectation in one line."""
+    """Invalid input. The message states place, value and expectation in one line."""
 
     code = "bad_input"
     exit_status = 2
@@ -85,19 +85,19 @@ class StoppedError(NotReadyError):
 
 
 class BusyError(NotReadyError):
-    """Too many requests wait; the same request may succeed later."""
+    """Too many requests wait. The same request may succeed later."""
 
     code = "busy"
 
 
 class LinkError(OptodriveError):
-    """The link to the board failed; the message states the likely cause."""
+    """The link to the board failed. The message states the likely cause."""
 
     code = "link"
 
 
 class BoardFaultError(OptodriveError):
-    """The board is in FAULT; the message states the fault and its likely cause."""
+    """The board is in FAULT. The message states the fault and its likely cause."""
 
     code = "board_fault"
 
@@ -133,7 +133,7 @@ def suggest_nearest(name: str, known: list[str]) -> str:
 
 
 def suggest_near_name(name: str, known: list[str]) -> str:
-    """Return a phrase with the known name nearest to `name`, one that begins with it first; empty if none is near."""
+    """Return a phrase with the known name nearest to `name`, one that begins with it first, or an empty text."""
     longer = [each for each in known if len(name) > 1 and each.startswith(name)]
     match = get_close_matches(name, longer, n=1, cutoff=0.0) or get_close_matches(name, known, n=1, cutoff=0.5)
     return f"nearest is '{match[0]}'" if match else ""

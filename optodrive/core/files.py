@@ -68,7 +68,7 @@ def create_folder(path: Path) -> None:
 
 
 def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> bytes:
-    """Return the content of a regular file of bounded size; never open a device, never wait for a pipe.
+    """Return the content of a regular file of bounded size. Never open a device, never wait for a pipe.
 
     private: require that only the file's owner can read it. Raise InputError for any other file.
     """

@@ -5,7 +5,7 @@ from itertools import accumulate
 
 
 class Histogram:
-    """Counts of values up to each bound; one thread may add, any thread may read."""
+    """Counts of values up to each bound. One thread may add, any thread may read."""
 
     def __init__(self, bounds: tuple[float, ...]) -> None:
         self.bounds = bounds

@@ -44,7 +44,7 @@ svg .measured { fill: var(--muted); } svg .bar { fill: var(--extended); } svg .o
 def render_page(
     title: str, verdict: str, narrative: list[str], body: Iterable[str], provenance: Provenance | None = None
 ) -> str:
-    """Return an HTML page; the first line of the narrative is its heading, body is HTML that follows the narrative."""
+    """Return an HTML page. The first line of the narrative is its heading, body is HTML that follows the narrative."""
     lines = [line for line in narrative if line]
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
@@ -93,5 +93,5 @@ def _render_provenance(provenance: Provenance) -> str:
 
 
 def _class_attribute(line: str) -> str:
-    """Return the class attribute of a narrative line; list items and continuation lines have less spacing."""
+    """Return the class attribute of a narrative line. List items and continuation lines have less spacing."""
     return " class='item'" if line.startswith(("- ", "  ")) else ""

@@ -31,7 +31,10 @@ class IpcClosed(IpcError):  # noqa: N818 - the usual end of a connection
 
 
 class Message(NamedTuple):
-    """One message. fields: JSON values by name, without `kind`; payload: bytes after the header."""
+    """One message between two processes.
+
+    fields: JSON values by name, without `kind`; payload: bytes after the header
+    """
 
     kind: str
     fields: dict[str, Any]
@@ -136,11 +139,11 @@ class MessageSocket:
         return bool(self._out)
 
     def send(self, message: Message) -> None:
-        """Send a message, or keep what the peer does not accept yet."""
+        """Send a message, or keep the bytes that the peer does not accept yet."""
         self.send_bytes(encode_message(message))
 
     def send_bytes(self, data: bytes) -> None:
-        """Send an encoded message, or keep what the peer does not accept yet."""
+        """Send an encoded message, or keep the bytes that the peer does not accept yet."""
         self._require_open()
         if len(self._out) + len(data) > self._out_max_bytes:
             waiting_bytes = len(self._out)

@@ -57,7 +57,7 @@ CACHED = _is_writable(_FOLDER)
 
 
 def code_folder() -> Path | None:
-    """Return the folder for generated source files and machine code; None where it is not writable."""
+    """Return the folder for generated source files and machine code, or None where it is not writable."""
     return _FOLDER if CACHED else None
 
 
@@ -145,7 +145,7 @@ def _refuse_blas() -> None:
 
 
 class _KernelLocator:
-    """Places the machine code of every kernel in one folder; the stamp in `_KernelCache` tells its versions apart."""
+    """Places the machine code of every kernel in one folder. The stamp in `_KernelCache` tells its versions apart."""
 
     def __init__(self, function: FunctionType) -> None:
         self._module = function.__module__

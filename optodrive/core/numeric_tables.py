@@ -73,7 +73,10 @@ def _is_number(cell: str) -> bool:
 
 
 def write_columns(path: Path, columns: tuple[str, ...], table: FloatArray, formats: tuple[str, ...]) -> None:
-    """Write a table [n, columns] atomically; formats: one printf format per column, such as %.3f."""
+    """Write a table [n, columns] atomically.
+
+    formats: one printf format per column, such as %.3f
+    """
     line = ",".join(formats) + "\n"
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(columns) + "\n")

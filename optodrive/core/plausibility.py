@@ -62,7 +62,7 @@ class PlausibleRange(NamedTuple):
 
 
 def guess_unit(value: float, plausible: PlausibleRange) -> str | None:
-    """Return the other units in which a value lies within the range, likelier first, joined by "or"; None for none."""
+    """Return the other units in which a value lies within the range, likelier first, joined by "or", or None."""
     if abs(value) >= LARGEST:
         return None
     names = [

@@ -28,7 +28,10 @@ class Provenance:
     def capture(
         cls, arguments: Sequence[str], recordings: Sequence[str], configuration: tuple[str, str] | None = None
     ) -> "Provenance":
-        """Return the provenance of a result that this command computes now; configuration: name and canonical JSON."""
+        """Return the provenance of a result that this command computes now.
+
+        configuration: name and canonical JSON
+        """
         name, text = (None, None) if configuration is None else configuration
         return cls(
             version("optodrive"),

@@ -8,7 +8,7 @@ USUAL, PLANNING, LIGHT = 0, 1, 2
 
 
 def set_realtime_priority(priority: int) -> None:
-    """Set the real-time priority of this thread, USUAL for none; the nice value is kept.
+    """Set the real-time priority of this thread, USUAL for none. The nice value is kept.
 
     Threads that it starts later inherit it; otherwise a preempted thread could hold the interpreter lock. Without the
     permission, scheduling stays as it is, and the lease tolerates less load by other programs.

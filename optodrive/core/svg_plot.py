@@ -19,7 +19,10 @@ DOT_RADIUS = 1.8
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Values over the common axis: [n]; css_class: of its line, or of its dots."""
+    """Values [n] over the common axis.
+
+    css_class: of its line, or of its dots
+    """
 
     y: FloatArray
     css_class: str
@@ -28,7 +31,10 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """Axis with its quantity and unit, SI; half_band: half the width of a band about zero, 0 for none."""
+    """Axis with its quantity and unit, SI.
+
+    half_band: half the width of a band about zero, 0 for none
+    """
 
     quantity: str
     unit: str
@@ -57,7 +63,10 @@ class Scale:
 
 
 def draw_plot(title: str, x: FloatArray, x_axis: Axis, y_axis: Axis, series: Sequence[Series], height: int) -> str:
-    """Return a plot of series over x [n]; title: accessible name."""
+    """Return a plot of series over x [n].
+
+    title: accessible name
+    """
     finite = np.concatenate([item.y[np.isfinite(item.y)] for item in series])
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     low, high = min(low, -1.5 * y_axis.half_band), max(high, 1.5 * y_axis.half_band)

@@ -9,7 +9,10 @@ from optodrive.core.errors import InputError, suggest_nearest
 
 
 class ConflictError(ValueError):
-    """A value of a table that does not go with another one; place: its dotted key within the table."""
+    """A value of a table that does not go with another one.
+
+    place: its dotted key within the table
+    """
 
     def __init__(self, place: str, value: object, expected: str) -> None:
         self.place, self.value, self.expected = place, value, expected
@@ -17,7 +20,7 @@ class ConflictError(ValueError):
 
 
 class Section(BaseModel):
-    """Base of all tables of files: immutable, without unknown keys; field docstrings are their descriptions.
+    """Base of all tables of files: immutable, without unknown keys. Field docstrings are their descriptions.
 
     Types are strict: a number is neither a boolean nor a text, and a whole number has no decimal point.
     """
@@ -56,7 +59,7 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
 
 
 def build_input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
-    """Convert pydantic's first complaint to one line; suggest the nearest known key for an unknown one."""
+    """Convert pydantic's first complaint to one line. Suggest the nearest known key for an unknown one."""
     complaints = error.errors(include_url=False)
     first = next((item for item in complaints if item["type"] == "extra_forbidden"), complaints[0])
     place = ".".join(str(part) for part in first["loc"])

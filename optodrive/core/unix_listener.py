@@ -11,7 +11,7 @@ from optodrive.core.errors import InputError
 def open_unix_listener(
     path: Path, mode: int, backlog: int, where: str, kind: socket.SocketKind = socket.SOCK_STREAM
 ) -> socket.socket:
-    """Open a socket that listens at a path, with a mode; replace one on which nobody listens any more.
+    """Open a socket that listens at a path, with a mode. Replace one on which nobody listens any more.
 
     Raise InputError, at `where`, if the path is in use or cannot hold a socket.
     """

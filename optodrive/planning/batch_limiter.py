@@ -21,7 +21,7 @@ COLD_AFTER_AVERAGING_TIMES = 50.0
 
 
 class BatchLimiter:
-    """Limits the batches of a scheduler in order; `grant` is the callback of `Scheduler.run`.
+    """Limits the batches of a scheduler in order. `grant` is the callback of `Scheduler.run`.
 
     state: budget state after the batches granted so far
     delays: under policy "delay", every delay in order; galvo_pause_s: total of all pauses
@@ -42,7 +42,7 @@ class BatchLimiter:
         self._first_trimmed: tuple[PulsePlan, LimitedPlan, BudgetState] | None = None
 
     def grant(self, batch: PulsePlan) -> LimitedPlan | None:
-        """Limit a batch; return None after telling the scheduler to pause or delay it.
+        """Limit a batch. Return None after telling the scheduler to pause or delay it.
 
         Raises OverBudgetError under policy "refuse" for a pulse above a cap, and under "delay" for one that never fits.
         """
@@ -72,7 +72,7 @@ class BatchLimiter:
         self._batch_pause_s, self._paused_row = 0.0, 0
 
     def build_shortfall(self) -> Shortfall | None:
-        """Describe the first trimmed pulse; return None if no pulse was trimmed."""
+        """Describe the first trimmed pulse. Return None if no pulse was trimmed."""
         if self._first_trimmed is None:
             return None
         batch, granted, state = self._first_trimmed
@@ -85,7 +85,7 @@ class BatchLimiter:
         )
 
     def _find_galvo_pause(self, batch: PulsePlan) -> GalvoPause | None:
-        """Return the pause that the mirrors need within a frame's batch; None if none is needed or none helps.
+        """Return the pause that the mirrors need within a frame's batch. Return None if none is needed or none helps.
 
         No reduction of power makes a move feasible that exceeds the galvo cap, so a frame is drawn more slowly instead
         of with missing pulses. Trains keep their times and leave such pulses to the limiter.

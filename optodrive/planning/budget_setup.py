@@ -30,7 +30,7 @@ BOUNDED_TERMS = ("bridge_conductivity", "wall_heating", "lateral_conduction", "t
 
 
 def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -> Budget:
-    """Build the budget; raises InputError if a cap is not above its base temperature or a term has no bound."""
+    """Build the budget. Raise InputError if a cap is not above its base temperature or a term has no bound."""
     limits, ambient_c, stages = config.limits, config.ambient_c, config.list_stage_configs()
     heat_gain = compute_heat_gain_bound(parameters, pixels, config)
     base_c = ambient_c + heat_gain.uniform_rise_k
@@ -85,7 +85,7 @@ def check_galvo_cap(cap_rad_per_s2: float, galvos: list[GalvoModel]) -> None:
 
 
 def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelArray) -> NominalPanel:
-    """Build the panel without the walls; raises InputError for less capacity than theirs.
+    """Build the panel without the walls. Raise InputError for less capacity than theirs.
 
     A parameter set with panel_heating states it, else the configuration does. The bound heats it by what the absorbers
     absorb: where the term has a larger share, resistance and capacity stand for the larger heat.

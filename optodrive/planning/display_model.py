@@ -43,7 +43,7 @@ class DisplayModel:
 
     @classmethod
     def from_config(cls, config: Config) -> "DisplayModel":
-        """Load the files that a configuration names and build the models; raises InputError for unusable values."""
+        """Load the files that a configuration names and build the models. Raise InputError for unusable values."""
         layout, pixel_map = build_pixel_layout(config.display), load_pixel_map(config)
         parameters = load_parameters(config.pixel_model.parameters)
         pixels = build_display_pixels(config, parameters)
@@ -85,7 +85,7 @@ class DisplayModel:
 
     @cached_property
     def light(self) -> LightEstimate | None:
-        """Estimate of the light that a height takes, by which pixels are shared among stages; None with one."""
+        """Estimate of the light that a height takes, by which pixels are shared among stages. None with one stage."""
         if len(self.scan_heads) == 1:
             return None
         return LightEstimate.from_cold(self.build_cold_heat(), self.max_displacement_m, self.scan_head.drive)

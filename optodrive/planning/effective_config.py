@@ -56,7 +56,7 @@ class EffectiveScanner(ScannerSection):
 
 
 class EffectivePanel(PanelSection):
-    """The section [panel], with an estimate for what it does not state."""
+    """The section [panel], with an estimate for each value that it does not state."""
 
     width_m: float
     height_m: float
@@ -65,7 +65,7 @@ class EffectivePanel(PanelSection):
 
 
 class EffectivePixelModel(PixelModelSection):
-    """The section [pixel_model] and the parameters of a pixel; `planner_terms` holds the parameters of each term."""
+    """The section [pixel_model] and the parameters of a pixel. `planner_terms` holds the parameters of each term."""
 
     R: float
     C: float

@@ -37,7 +37,7 @@ Progress = Callable[[float], None]
 
 
 def resolve_policy(policy: Policy, strict: bool) -> Policy:
-    """Return the policy that `strict`, a synonym of "refuse", selects; raises InputError if the two contradict."""
+    """Return the policy that `strict`, a synonym of "refuse", selects. Raise InputError if the two contradict."""
     if strict and policy == "delay":
         raise InputError("strict", True, "either strict or policy 'delay'")
     return "refuse" if strict else policy

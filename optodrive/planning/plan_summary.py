@@ -81,7 +81,7 @@ def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | No
 
 
 def describe_dead_pixels(dead: tuple[int, ...]) -> str | None:
-    """Describe which dead pixels are omitted; None if there are none."""
+    """Describe which dead pixels are omitted. Return None if there are none."""
     if not dead:
         return None
     if len(dead) == 1:
@@ -179,7 +179,7 @@ PLAN_COLUMNS = (
 
 
 def write_plan_csv(path: Path, planned: PlannedSequence, display: DisplayModel) -> None:
-    """Write plan.csv, one row a pulse in order; whole or not at all."""
+    """Write plan.csv atomically, one row a pulse in order."""
     plan = planned.plan
     aims_m = zip(*((head.layout.x_m, head.layout.y_m) for head in display.scan_heads), strict=True)
     rows = zip(

@@ -15,7 +15,10 @@ TIME_TOLERANCE_S = 1e-9
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """Timing of a frame against its deadline; on_time: number of its pulses that end by the deadline."""
+    """Timing of a frame against its deadline.
+
+    on_time: number of its pulses that end by the deadline
+    """
 
     source: int
     frame_id: str
@@ -28,7 +31,7 @@ class FrameTiming:
 
     @property
     def late_s(self) -> float:
-        """Time from the deadline to the end of the last pulse, s; 0 if the frame meets its deadline."""
+        """Time from the deadline to the end of the last pulse, s, or 0 if the frame meets its deadline."""
         late_s = self.end_s - self.deadline_s
         return late_s if late_s > TIME_TOLERANCE_S else 0.0
 
@@ -45,7 +48,10 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Delay:
-    """Total delay of a frame or train for one cap; pixel: the first pixel that caused it."""
+    """Total delay of a frame or train for one cap.
+
+    pixel: the first pixel that caused it
+    """
 
     source: int
     pixel: int
@@ -55,7 +61,7 @@ class Delay:
 
 @dataclass(frozen=True, eq=False)
 class PlannedSequence:
-    """A limited plan with its prediction; heat and budget are those after the plan, on the plan's time line.
+    """A limited plan with its prediction. Heat and budget are those after the plan, on the plan's time line.
 
     predicted_m: [n] largest displacement from each pulse's start to the pixel's next pulse
     simultaneous: frames split into interleaved rounds

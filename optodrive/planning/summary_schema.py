@@ -5,7 +5,7 @@ from optodrive.planning.feasibility.report import FeasibilityReport
 
 
 class TrimmedPulse(JsonModel):
-    """One pulse that the limiter reduced; `target_um` is None for a pulse of a train given by its width."""
+    """One pulse that the limiter reduced. `target_um` is None for a pulse of a train given by its width."""
 
     pixel: int
     start_s: float
@@ -16,7 +16,7 @@ class TrimmedPulse(JsonModel):
 
 
 class TrimmingSummary(JsonModel):
-    """Energy that the limiter removed, by cap; `worst` lists up to 20 pulses, the largest reduction first."""
+    """Energy that the limiter removed, by cap. `worst` lists up to 20 pulses, the largest reduction first."""
 
     pulses: int
     energy_j: float
@@ -25,7 +25,7 @@ class TrimmingSummary(JsonModel):
 
 
 class ShortfallSummary(JsonModel):
-    """The first pulse that a cap reduced; `fits_after_s` is None if no delay makes it fit."""
+    """The first pulse that a cap reduced. `fits_after_s` is None if no delay makes it fit."""
 
     pixel: int
     cap: str
@@ -43,7 +43,7 @@ class DelaySummary(JsonModel):
 
 
 class DeadPixelSummary(JsonModel):
-    """Dead pixels that the frames request and the plan omits; `message` is None if there are none."""
+    """Dead pixels that the frames request and the plan omits. `message` is None if there are none."""
 
     pixels: list[int]
     count: int
@@ -60,7 +60,10 @@ class SkippedTarget(JsonModel):
 
 
 class SimultaneitySummary(JsonModel):
-    """How the pulses of a simultaneous frame were interleaved; without interleaving: `simultaneity_single_pulse`."""
+    """How the pulses of a simultaneous frame were interleaved.
+
+    `simultaneity_single_pulse`: without interleaving
+    """
 
     interleaved_rounds: int
     simultaneity: float
@@ -69,7 +72,7 @@ class SimultaneitySummary(JsonModel):
 
 
 class FrameSummary(JsonModel):
-    """Times of one frame on the plan's time line, s; `on_time` counts its pulses that end before the deadline."""
+    """Times of one frame on the plan's time line, s. `on_time` counts its pulses that end before the deadline."""
 
     frame: str
     show_at_s: float
@@ -83,7 +86,7 @@ class FrameSummary(JsonModel):
 
 
 class PlanSummary(JsonModel):
-    """A limited plan: feasibility, timing, energy, predicted displacement, and what the limiter changed.
+    """A limited plan: feasibility, timing, energy, predicted displacement, and the limiter's changes.
 
     feasibility: None if it was not requested (a stream)
     predicted_max_pixel, predicted_max_um, predicted_max_target_um: the pulse with the largest predicted displacement
@@ -116,7 +119,7 @@ class PlanSummary(JsonModel):
 
 
 class PulseColumns(JsonModel):
-    """The pulses of a plan by column, in order; `target_um` is None for a pulse without a target height.
+    """The pulses of a plan by column, in order. `target_um` is None for a pulse without a target height.
 
     stage: number of the pulse's stage, in the order of the configuration, from 0
     """

@@ -86,7 +86,7 @@ class RivalModel:
 
 @dataclass(frozen=True)
 class HeldOutError:
-    """RMSE of both models in one signal of one held-out group, and the expected noise; SI."""
+    """RMSE of both models in one signal of one held-out group, and the expected noise, in SI units."""
 
     group: str
     signal: str
@@ -136,7 +136,10 @@ class ResidualTrace:
 
 @dataclass(frozen=True, eq=False)
 class ExampleTrace:
-    """The run with the largest or the median error of the nominal model in one signal; role: "worst" or "typical"."""
+    """The run with the largest or the median error of the nominal model in one signal.
+
+    role: "worst" or "typical"
+    """
 
     role: str
     trace: ResidualTrace

@@ -25,7 +25,10 @@ class PixelTrace:
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """Measured signal of one pixel: t_s [m] increasing; value [m], NaN where missing; sigma: stated noise, if any."""
+    """Measured signal of one pixel.
+
+    t_s: [m] increasing; value: [m], NaN where missing; sigma: stated noise, if any
+    """
 
     pixel: int
     t_s: FloatArray

@@ -9,7 +9,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray, StrArray, freeze_a
 
 @dataclass(frozen=True, eq=False)
 class PulsePlan:
-    """Timed pulses of all beams before the limiter: one row per pulse, in order of their starts; all arrays [n].
+    """Timed pulses of all beams before the limiter, one row per pulse, in order of their starts, all arrays [n].
 
     start_s: gate-on time from the plan's start, whole microseconds; width_s: gate-on duration, whole PWM periods
     x_rad, y_rad: mechanical mirror angles (the beam turns by twice the angle)
@@ -42,7 +42,7 @@ class PulsePlan:
 
     @property
     def end_s(self) -> float:
-        """End of the last pulse of all stages, s; 0 without pulses."""
+        """End of the last pulse of all stages, s, or 0 without pulses."""
         return float((self.start_s + self.width_s).max(initial=0.0))
 
 
@@ -68,7 +68,7 @@ EMPTY_PLAN = PulsePlan(
 
 @dataclass(frozen=True, eq=False)
 class LimitedPlan(PulsePlan):
-    """A plan that the limiter has passed; only `optodrive.planning.limiter` creates one.
+    """A plan that the limiter has passed. Only `optodrive.planning.limiter` creates one.
 
     energy_j: [n] incident energy of the pulse as passed; trimmed_j: [n] energy that the limiter removed
     reason: [n] key of the binding cap, '' if no energy was removed
@@ -83,7 +83,7 @@ class LimitedPlan(PulsePlan):
 
 @dataclass(frozen=True, eq=False)
 class BudgetState:
-    """State of the limiter between plans; passed pulses count as executed until the board reports otherwise.
+    """State of the limiter between plans. Passed pulses count as executed until the board reports otherwise.
 
     at_s: end of the last pulse of any stage, on the budget's time line; begun_s: start of the last one
     last_pulse_end_s: [p] end of each pixel's last pulse; the following [p] arrays hold at that time
@@ -130,7 +130,7 @@ class BudgetState:
 
 @dataclass(frozen=True, eq=False)
 class ExecutedPulses:
-    """Pulses that the board reports as executed, one row per pulse in order; all arrays [n].
+    """Pulses that the board reports as executed, one row per pulse in order, all arrays [n].
 
     on_tick: tick of gate on, of the board, or of the host if there are several stages; width_ticks: gate-on duration
     pixel, stage: of the plan's row; start_s: on_tick counted from the tick of the plan's start, s
@@ -154,7 +154,7 @@ class ExecutedPulses:
 
 
 def concatenate_executed(first: ExecutedPulses, second: ExecutedPulses) -> ExecutedPulses:
-    """Concatenate the pulses of two parts of a plan; they are complete if those of both are."""
+    """Concatenate the pulses of two parts of a plan. They are complete if those of both are."""
     columns = {item.name: getattr(first, item.name) for item in fields(ExecutedPulses) if item.name != "complete"}
     joined = {name: np.concatenate([column, getattr(second, name)]) for name, column in columns.items()}
     return ExecutedPulses(**joined, complete=first.complete and second.complete)

@@ -80,7 +80,7 @@ def _compute_cycle_starts_s(start_s: float, duration_s: float, period_s: float) 
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """A request: frames by height and trains by pulse or by height; times count from the sequence's start."""
+    """A request: frames by height and trains by pulse or by height. Times count from the sequence's start."""
 
     frames: tuple[TactileFrame, ...] = ()
     trains: tuple[Train, ...] = ()

@@ -67,7 +67,10 @@ class _FeasibilityQuery:
         return TERMS_PLAN_FRACTION if self.display.parameters.planner_terms else 1.0
 
     def compute_plans_max(self, is_requested: bool) -> int:
-        """Compute the number of plans to try for one kind of variant; is_requested: the caller requested this kind."""
+        """Compute the number of plans to try for one kind of variant.
+
+        is_requested: the caller requested this kind
+        """
         pulses = PULSES_REQUESTED_MAX if is_requested else PULSES_MAX
         frames = sum(int((frame.target_m > 0).sum()) for frame in self.sequence.frames)
         count = frames + sum(len(train.pulse_starts_s()) for train in self.sequence.trains)
@@ -100,7 +103,7 @@ def check_feasibility(
 
 
 def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSequence, FeasibilityReport]:
-    """Plan the query's sequence and report; plan a variant if the plan violates a limit."""
+    """Plan the query's sequence and report. Plan a variant if the plan violates a limit."""
     unreachable = None if query.fit == "as_is" else first_unreachable(query.display, query.sequence)
     if unreachable is not None:
         return _plan_alternative(query, None, Violation("unreachable", unreachable[0], unreachable[1]), policy)
@@ -114,7 +117,7 @@ def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSeque
 def _plan_alternative(
     query: _FeasibilityQuery, plan: PlannedSequence | None, violation: Violation, policy: Policy
 ) -> tuple[PlannedSequence, FeasibilityReport]:
-    """Plan a variant of a sequence whose plan violates a limit; plan is None if a target is unreachable."""
+    """Plan a variant of a sequence whose plan violates a limit. The plan is None if a target is unreachable."""
     search = query.new_search(int(query.plan_fraction() * ORDERS_MAX))
     orders, proof, lower_bound_s = _search_other_orders(search, query.sequence, violation)
     if orders is not None:
@@ -168,7 +171,7 @@ def _search_other_orders(
 def _apply_policy(
     query: _FeasibilityQuery, plan: PlannedSequence | None, report: FeasibilityReport, policy: Policy
 ) -> PlannedSequence:
-    """Return the trimmed or delayed plan; raises under "refuse" and if no delay helps."""
+    """Return the trimmed or delayed plan. Raise RefusedError under "refuse" and if no delay helps."""
     if plan is not None and policy == "trim":
         return plan
     try:

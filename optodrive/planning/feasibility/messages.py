@@ -16,7 +16,7 @@ def name_source(sequence: FrameSequence, source: int) -> str:
 
 
 def describe_violation(sequence: FrameSequence, plan: PlannedSequence | None, violation: Violation) -> str:
-    """Describe the first violation with its numbers; plan is None if a target is unreachable."""
+    """Describe the first violation with its numbers. The plan is None if a target is unreachable."""
     frames, name = sequence.frames, name_source(sequence, violation.source)
     is_frame = violation.source < len(frames)
     subject = f"frame {name}" if is_frame else name
@@ -36,7 +36,10 @@ def describe_violation(sequence: FrameSequence, plan: PlannedSequence | None, vi
 
 
 def describe_nearest(nearest: NearestFeasible, sequence: FrameSequence, source: int) -> str:
-    """Describe the nearest feasible variants; source: the frame or train of the violation."""
+    """Describe the nearest feasible variants.
+
+    source: the frame or train of the violation
+    """
     options = []
     if nearest.pixels is not None:
         options.append(_describe_reduction(nearest.pixels, sequence, source))

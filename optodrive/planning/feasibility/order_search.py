@@ -197,21 +197,27 @@ class OrderSearch:
 
 
 def count_orders(sequence: FrameSequence, stage_count: int) -> int:
-    """Return the number of visiting orders of all frames; ORDERS_MAX + 1 with simultaneous ones or several stages."""
+    """Return the number of visiting orders of all frames.
+
+    ORDERS_MAX + 1 with simultaneous frames or several stages.
+    """
     if stage_count > 1 or any(frame.simultaneous for frame in sequence.frames):
         return ORDERS_MAX + 1
     return prod(factorial(int(np.count_nonzero(frame.target_m > 0))) for frame in sequence.frames)
 
 
 def _locate_violation(violation: Violation, orders: Orders, ranks: list[list[int]]) -> tuple[int, int]:
-    """Return the frame and the place in its order that decide a violation; the last place for a train's pulse."""
+    """Return the frame and the place in its order that decide a violation.
+
+    The last place for a train's pulse.
+    """
     if violation.source < len(ranks):
         return violation.source, orders[violation.source].tolist().index(violation.pixel)
     return len(ranks) - 1, len(ranks[-1]) - 1 if ranks else 0
 
 
 def _advance_orders(ranks: list[list[int]], source: int, place: int) -> bool:
-    """Advance in place to the next orders that differ up to this place of this frame; False if there are none."""
+    """Advance in place to the next orders that differ up to this place of this frame, or return False."""
     for later in ranks[source + 1 :]:
         later.sort()
     while source >= 0:
@@ -224,7 +230,7 @@ def _advance_orders(ranks: list[list[int]], source: int, place: int) -> bool:
 
 
 def _advance_permutation(rank: list[int], place: int) -> bool:
-    """Advance in place to the next permutation that differs up to a place; False if there is none."""
+    """Advance in place to the next permutation that differs up to a place. Return False if there is none."""
     rank[place + 1 :] = sorted(rank[place + 1 :], reverse=True)
     for k in range(len(rank) - 2, -1, -1):
         if rank[k] < rank[k + 1]:

@@ -80,7 +80,7 @@ class _Reducer:
         return low
 
     def _accept_reduced_frame(self, source: int) -> None:
-        """Accept a frame without the fewest pixels; omit all of it if no part fits."""
+        """Accept a frame without the fewest pixels. Omit all of it if no part fits."""
         if source >= len(self._sequence.frames):
             return
         pixels = self._source_pixels[source]

@@ -11,7 +11,10 @@ Proof = Literal["planned", "searched", "bound", "not found"]
 
 @dataclass(frozen=True)
 class Omission:
-    """Omitted pixels of a frame, or an omitted train; source: index as in the sequence."""
+    """Omitted pixels of a frame, or an omitted train.
+
+    source: index as in the sequence
+    """
 
     name: str
     source: int
@@ -32,7 +35,7 @@ class SequenceReduction:
 
 @dataclass(frozen=True)
 class NearestFeasible:
-    """The nearest feasible variants, each confirmed by a plan; None for a kind without one.
+    """The nearest feasible variants, each confirmed by a plan, and None for a kind without one.
 
     pixels: variant with pixels omitted
     height_factor: largest factor on all targets and powers, in hundredths

@@ -44,7 +44,7 @@ def build_infeasible_report(
     lower_bound_s: float | None,
     nearest: NearestFeasible,
 ) -> FeasibilityReport:
-    """Build the report of a sequence that does not fit; plan is None if a target is unreachable."""
+    """Build the report of a sequence that does not fit. The plan is None if a target is unreachable."""
     required_s, available_s = (None, None) if plan is None else _beam_times_s(plan, violation)
     parts = [
         describe_violation(sequence, plan, violation),
@@ -89,7 +89,10 @@ def _beam_times_s(plan: PlannedSequence, violation: Violation) -> tuple[float, f
 
 
 def build_reduction(sequence: FrameSequence, omitted_pixels: OmittedPixels, source: int) -> SequenceReduction:
-    """Describe the omitted pixels by name; source: the frame or train whose pixels are counted."""
+    """Describe the omitted pixels by name.
+
+    source: the frame or train whose pixels are counted
+    """
 
     def count_requested(index: int) -> int:
         frames = sequence.frames

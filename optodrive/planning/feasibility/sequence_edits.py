@@ -24,7 +24,7 @@ def _scale_train(train: Train, factor: float) -> Train:
 
 
 def stretch_sequence(sequence: FrameSequence, time_factor: float) -> FrameSequence:
-    """Return the sequence with all times multiplied by a factor; the pulse widths of pulse trains stay."""
+    """Return the sequence with all times multiplied by a factor. The pulse widths of pulse trains stay."""
     return FrameSequence(
         tuple(
             replace(frame, show_at_s=frame.show_at_s * time_factor, duration_s=frame.duration_s * time_factor)

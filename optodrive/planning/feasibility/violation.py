@@ -39,7 +39,10 @@ def deadlines_s(sequence: FrameSequence, lead_in_s: float) -> FloatArray:
 
 
 def find_first_violation(plan: PulsePlan, deadline_s: FloatArray) -> Violation | None:
-    """Return the first late or trimmed pulse of a plan or batch, or None; deadline_s: [frames]."""
+    """Return the first late or trimmed pulse of a plan or batch, or None.
+
+    deadline_s: [frames]
+    """
     deadline_s = np.append(deadline_s, np.inf)
     is_frame = plan.source < len(deadline_s) - 1
     end_s = plan.start_s + plan.width_s
@@ -65,7 +68,7 @@ def is_order_independent(violation: Violation, sequence: FrameSequence) -> bool:
 def beam_lower_bound_s(
     display: DisplayModel, sequence: FrameSequence, heat: ThermalState, source: int, lead_in_s: float
 ) -> float | None:
-    """Return a lower bound of a frame's beam time between show_at and its deadline, s; None with planner terms.
+    """Return a lower bound of a frame's beam time between show_at and its deadline, s, or None with planner terms.
 
     The bound sums the trains' pulses that lie within that time, the pulses of the frame's pixels that no earlier frame
     and no train drives, and the smallest settling time to all of these pixels but one. The thermal state of these
@@ -108,7 +111,7 @@ def beam_lower_bound_s(
 
 
 def _select_falling_pixels(heat: ThermalState, pixels: IntArray, at_s: float) -> IntArray:
-    """Return the pixels whose displacement does not rise after at_s with the gate off; it then keeps falling."""
+    """Return the pixels whose displacement does not rise after at_s with the gate off. It then keeps falling."""
     if not len(pixels):
         return pixels
     height_m = heat.simulate_traces(
@@ -119,7 +122,10 @@ def _select_falling_pixels(heat: ThermalState, pixels: IntArray, at_s: float) ->
 
 
 def _min_settling_s(scan_head: ScanHead, pixels: IntArray, origins: IntArray) -> float:
-    """Return the sum of the smallest settling times to all pixels but one, s; pixels: [k], origins: [m]."""
+    """Return the sum of the smallest settling times to all pixels but one, s.
+
+    pixels: [k], origins: [m]
+    """
     if not len(pixels):
         return 0.0
     x_rad, y_rad = scan_head.field.angles_rad(scan_head.layout.x_m, scan_head.layout.y_m)

@@ -84,7 +84,7 @@ class PlanState:
 
 @dataclass
 class BatchDraft:
-    """Pulses planned on a copy of the state; the scheduler adopts the copy when the batch is accepted."""
+    """Pulses planned on a copy of the state. The scheduler adopts the copy when the batch is accepted."""
 
     paths: tuple[BeamPath, ...]
     state: PlanState

@@ -50,7 +50,10 @@ PROGRESS_INTERVAL = 16
 
 @dataclass(frozen=True)
 class Round:
-    """One pulse per pixel of every stage's order; periods: fixed widths of sub-pulses, None for the full height."""
+    """One pulse per pixel of every stage's order.
+
+    periods: fixed widths of sub-pulses, None for the full height
+    """
 
     source: int
     orders: tuple[list[int], ...]
@@ -58,7 +61,7 @@ class Round:
 
 
 class StageTools(NamedTuple):
-    """What the pulses of one stage are planned with."""
+    """Path, drive range and trains from which the pulses of one stage are planned."""
 
     path: BeamPath
     drive: DriveRange
@@ -184,7 +187,7 @@ class BatchPlanner:
         draft.sort_rows(first)
 
     def _solve_next_pulse(self, draft: BatchDraft, stage: int, each: Round, heat: ThermalState) -> _FramePulse | None:
-        """Return the next pulse of a stage in a round, None after its last; pixels without need of one are skipped."""
+        """Return the next pulse of a stage in a round, None after its last. Pixels without need of one are skipped."""
         frame, beam, drive = self._sequence.frames[each.source], draft.state.beams[stage], self._stages[stage].drive
         requested_us = self.compute_requested_us(frame.show_at_s)
         while beam.position < len(each.orders[stage]):

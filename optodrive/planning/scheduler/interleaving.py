@@ -39,7 +39,10 @@ class SimultaneousFrame:
 
 @dataclass(frozen=True)
 class CandidateSchedule:
-    """Result of one number of rounds; has_min_gaps: whether all sub-pulses of a pixel count separately."""
+    """Result of one number of rounds.
+
+    has_min_gaps: whether all sub-pulses of a pixel count separately
+    """
 
     rounds: int
     simultaneity: float
@@ -48,7 +51,7 @@ class CandidateSchedule:
 
 
 def split_pulses(single_pulses: Mapping[int, tuple[int, float]], rounds: int) -> PeriodsByPixel | None:
-    """Compute each pixel's sub-pulse width at full power; return None if a pulse is too short to be split.
+    """Compute each pixel's sub-pulse width at full power. Return None if a pulse is too short to be split.
 
     single_pulses: by pixel, width in PWM periods and duty of the single pulse that reaches the target
     """

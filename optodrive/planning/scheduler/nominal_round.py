@@ -112,7 +112,7 @@ def _solve_round(
     max_rows: int,
     pulses: RoundPulses,
 ) -> tuple[int, int, int, int, int]:
-    """Fill in the pulses [n]; return how many pixels were visited, and the beam after them.
+    """Fill in the pulses [n]. Return the number of visited pixels, and the beam after them.
 
     The number is −1 − n if pulse n is before its pixel's last event.
     """

@@ -80,7 +80,9 @@ class PeriodicSteadyState:
 
 
 def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, where: str) -> PulseRecipe:
-    """Compute the recipe of a train's pulses; drive.max_periods is the longest pulse that fits into a cycle.
+    """Compute the recipe of a train's pulses.
+
+    drive.max_periods is the longest pulse that fits into a cycle.
 
     Raises InputError (target_unreachable, bad_train) if no steady cycle has the train's height or peak-to-peak value.
     """
@@ -116,7 +118,10 @@ def compute_next_pulse(
 def compute_steady_state(
     train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, duty: float, lead_duty: float = 0.0
 ) -> PeriodicSteadyState:
-    """Simulate the steady state of identical pulses in every cycle; lead_duty: duty of the lead period, 0 for none."""
+    """Simulate the steady state of identical pulses in every cycle.
+
+    lead_duty: duty of the lead period, 0 for none
+    """
     pixel = cold_heat.pixels.elements[train.pixel]
     count = 2 + ceil(SETTLING_TAUS * (pixel.tau_s + pixel.tau_g_s) / train.period_s)
     lead_s = drive.period_s if lead_duty else 0.0

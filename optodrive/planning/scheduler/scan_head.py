@@ -29,7 +29,7 @@ class ScanHead:
 
     @cached_property
     def moves(self) -> "MoveTimes":
-        """Mirror angles of the pixels and times of moves, computed once; lead_in_us is that of an unknown pixel."""
+        """Mirror angles of the pixels and times of moves, computed once. lead_in_us is that of an unknown pixel."""
         x_rad, y_rad = self.field.angles_rad(self.layout.x_m, self.layout.y_m)
         return MoveTimes.from_table(self.settling, np.array(x_rad), np.array(y_rad), self.settling.lead_in_us)
 
@@ -40,7 +40,7 @@ class ScanHead:
 
 
 class MoveTimes(NamedTuple):
-    """Mirror angles of the pixels [p], and the times of moves between them, for kernels; as `SettlingTable`."""
+    """Mirror angles of the pixels [p], and the times of moves between them, for kernels, as in `SettlingTable`."""
 
     x_rad: FloatArray
     y_rad: FloatArray
@@ -54,7 +54,10 @@ class MoveTimes(NamedTuple):
 
     @classmethod
     def from_table(cls, table: SettlingTable, x_rad: FloatArray, y_rad: FloatArray, lead_in_us: int) -> "MoveTimes":
-        """Return the times of a table for pixels at these angles [p]; lead_in_us: of a move from an unknown pixel."""
+        """Return the times of a table for pixels at these angles [p].
+
+        lead_in_us: of a move from an unknown pixel
+        """
         long_x_us, long_y_us = (np.array(times_us, dtype=np.int64) for times_us in table.after_long_dwell)
         short_x_us, short_y_us = (np.array(times_us, dtype=np.int64) for times_us in table.after_short_dwell)
         dwell_us = table.long_dwell_us
@@ -78,7 +81,10 @@ class BeamPath:
         self._settling = scan_head.settling
 
     def compute_settling_us(self, origin: int | None, pixel: int, dwell_us: int = 0) -> int:
-        """Return the gate-off time of a move to `pixel` after `dwell_us` on `origin`; None: from an unknown pixel."""
+        """Return the gate-off time of a move to `pixel` after `dwell_us` on `origin`.
+
+        origin: None for an unknown pixel
+        """
         if origin is None:
             return self.lead_in_us
         return self._settling.settling_us(

@@ -65,7 +65,7 @@ class _Frame:
 
 
 class Scheduler:
-    """Plans a sequence batch by batch; a batch is a proposal until it is accepted.
+    """Plans a sequence batch by batch. A batch is a proposal until it is accepted.
 
     Exactly one of `accept`, `delay` and `pause` answers each batch from `next_batch`. Accepted pulses are applied to
     the heat before the next batch is planned, so the next batch accounts for what the limiter removed. `run` drives
@@ -130,7 +130,7 @@ class Scheduler:
         self._pending_pause: GalvoPause | None = None
 
     def run(self, heat: ThermalState, grant: Callable[[PulsePlan], Granted | None]) -> Iterator[Granted]:
-        """Plan every batch, submit it to `grant`, yield what is granted and then apply it to `heat`.
+        """Plan every batch, submit it to `grant`, yield the granted pulses and then apply them to `heat`.
 
         grant: returns the batch as the limiter passes it, or None after it called `delay` or `pause`.
         """
@@ -142,7 +142,7 @@ class Scheduler:
                 heat.apply_pulses(granted.pixel, granted.start_s, granted.width_s, granted.power_w, self._on_progress)
 
     def next_batch(self, heat: ThermalState) -> PulsePlan | None:
-        """Plan the next batch from `heat`, which is on the plan's time line; return None after the last batch."""
+        """Plan the next batch from `heat`, which is on the plan's time line. Return None after the last batch."""
         while self._steps:
             step = self._steps[0]
             if isinstance(step, _Frame):
@@ -163,7 +163,7 @@ class Scheduler:
         return None
 
     def _draft_round(self, step: Round, heat: ThermalState) -> BatchDraft:
-        """Draft the pulses of a round; those before the batch's last pause are the ones that were proposed before."""
+        """Draft the pulses of a round. Those before the batch's last pause are the ones that were proposed before."""
         kept = self._kept or self._planner.begin(self._state)
         if self._pending_pause is not None:
             self._planner.extend_round(kept, step, heat, self._pending_pause.rows)
@@ -179,7 +179,7 @@ class Scheduler:
         self._kept = None
 
     def delay(self, delay_us: int) -> None:
-        """Withdraw the proposed batch; it is planned again, and everything from it on starts `delay_us` later."""
+        """Withdraw the proposed batch. It is planned again, and everything from it on starts `delay_us` later."""
         self._take_draft()
         self._kept = None
         for beam in self._state.beams:
@@ -187,7 +187,7 @@ class Scheduler:
         self._state.delay_us += delay_us
 
     def pause(self, pause: GalvoPause) -> None:
-        """Withdraw the proposed batch; it is planned again with a pause after its first pulses, which stay."""
+        """Withdraw the proposed batch. It is planned again with a pause after its first pulses, which stay."""
         self._take_draft()
         self._pending_pause = pause
 

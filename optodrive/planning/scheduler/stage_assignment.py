@@ -40,7 +40,7 @@ class LightEstimate(NamedTuple):
 
     @classmethod
     def from_cold(cls, cold: ThermalState, max_m: FloatArray, drive: DriveRange) -> "LightEstimate":
-        """Tabulate the tallest pixel; others are alike at equal shares of their largest displacement."""
+        """Tabulate the tallest pixel. Others are alike at equal shares of their largest displacement."""
         pixel = int(np.argmax(max_m))
         widths_s = [0.0]
         for share in SHARES[1:]:
@@ -49,7 +49,7 @@ class LightEstimate(NamedTuple):
         return cls(max_m, np.array(widths_s), _tabulate_saved(cold, pixel, 0.5 * float(max_m[pixel]), drive))
 
     def compute_frames_s(self, target_m: FloatArray, show_at_s: FloatArray, stages: int, step_s: float) -> FloatArray:
-        """Return the estimated beam time of frames [f, p], 0 where one lights nothing: what is warm needs less.
+        """Return the estimated beam time of frames [f, p], 0 where one lights nothing. Warm pixels need less.
 
         show_at_s: begin of each frame; step_s: time of a move
         """
@@ -86,7 +86,9 @@ def _tabulate_saved(cold: ThermalState, pixel: int, target_m: float, drive: Driv
 
 
 class StageAssignment:
-    """The stage of each pixel, decided frame by frame as the plan reaches them, and for trains and what recurs before.
+    """The stage of each pixel, decided frame by frame as the plan reaches them.
+
+    The stages of the pixels of trains and of recurring pixels are decided before.
 
     stage_of: [p] stage of each pixel, NOBODY while it has none
     """
@@ -94,7 +96,10 @@ class StageAssignment:
     def __init__(
         self, sequence: FrameSequence, scan_heads: tuple[ScanHead, ...], reach: BoolArray, light: LightEstimate | None
     ) -> None:
-        """Assign trains and recurring pixels; reach: [k, p] whether a stage reaches a pixel; light: None with one."""
+        """Assign trains and recurring pixels.
+
+        reach: [k, p] whether a stage reaches a pixel; light: None with one stage
+        """
         self._sequence, self._first, self._reach, self._light = sequence, scan_heads[0], reach, light
         first = self._first
         self._step_s = first.settling.settling_us(first.settling.pitch_rad, 0.0) * 1e-6 if light else 0.0
@@ -154,7 +159,7 @@ class StageAssignment:
 
 
 def _cut(cost_s: FloatArray, free_s: FloatArray, reach: BoolArray) -> IntArray:
-    """Cut pixels [n] of a path into one stretch per stage [k], so that all end together; return their stages.
+    """Cut pixels [n] of a path into one stretch per stage [k], so that all end together. Return their stages.
 
     cost_s: beam time of each pixel; free_s: time from which each stage is free; reach: [k, n]
     """

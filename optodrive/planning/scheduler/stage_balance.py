@@ -34,7 +34,7 @@ class FrameLight(NamedTuple):
 
 
 def balance(light: FrameLight, cost_s: FloatArray, stage: IntArray, reach: BoolArray) -> None:
-    """Move and exchange pixels [n] between stages while the plan ends earlier; modifies stage and light.loads_s.
+    """Move and exchange pixels [n] between stages while the plan ends earlier. This modifies stage and light.loads_s.
 
     cost_s: [f, n] beam time of each pixel in each frame; stage: [n]; reach: [k, n]
     """
@@ -48,7 +48,10 @@ def balance(light: FrameLight, cost_s: FloatArray, stage: IntArray, reach: BoolA
 def _find_end_s(
     loads_s: FloatArray, shared_s: FloatArray, show_at_s: FloatArray, overlap_s: FloatArray, free_s: FloatArray
 ) -> float:
-    """Return the mean end of the frames, with the last one counted twice, and what stages wait; modifies free_s [k]."""
+    """Return the mean end of the frames, with the last one counted twice, and the waiting times of the stages.
+
+    Modifies free_s [k].
+    """
     stages, total, end_s = loads_s.shape[1], 0.0, 0.0
     free_s[:] = 0.0
     for frame in range(len(loads_s)):

@@ -25,7 +25,7 @@ PROGRESS_PULSES = 20_000
 
 
 class TrainPulse(NamedTuple):
-    """One requested pulse of a train; width and power are zero if they follow from a height."""
+    """One requested pulse of a train. Width and power are zero if they follow from a height."""
 
     requested_start_us: int
     source: int
@@ -159,7 +159,7 @@ class TrainPulses:
         return self._trains[source].target_m
 
     def plan_pulse(self, index: int, heat: ThermalState, start_us: int, late_us: int) -> tuple[int, float] | None:
-        """Compute width, µs, and power, W, of a pulse by height from the residual heat; None if no pulse is needed.
+        """Compute width, µs, and power, W, of a pulse by height from the residual heat. Return None if none is needed.
 
         late_us: delay of `start_us` after the requested start.
         """

@@ -76,7 +76,7 @@ def compile_kernels() -> None:
 
 @kernel
 def _move_rad(x_rad: FloatArray, y_rad: FloatArray, a: int, b: int) -> float:
-    """Return the length of a move, rad; 0 if either pixel is −1, which marks the end of a path."""
+    """Return the length of a move, rad, or 0 if either pixel is −1, which marks the end of a path."""
     if a < 0 or b < 0:
         return 0.0
     return float(max(abs(x_rad[a] - x_rad[b]), abs(y_rad[a] - y_rad[b])))
@@ -93,7 +93,7 @@ def path_rad(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) 
 
 @array_kernel
 def _find_neighbours(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, count: int) -> IntArray:
-    """Return the nearest pixels of each pixel of a tour, nearest first, [p, count]; −1 for pixels outside the tour."""
+    """Return the nearest pixels of each pixel of a tour, nearest first, [p, count], or −1 for pixels outside it."""
     neighbours = np.full((len(x_rad), count), -1)
     distance_rad = np.full(count, np.inf)
     for a in tour:
@@ -136,7 +136,7 @@ def _improve(tour: IntArray, neighbours: IntArray, x_rad: FloatArray, y_rad: Flo
 
 @kernel
 def _pixel_at(tour: IntArray, k: int, origin: int) -> int:
-    """Return the pixel at a position of the path; the origin before its start, −1 after its end."""
+    """Return the pixel at a position of the path, the origin before its start and −1 after its end."""
     if k < 0:
         return origin
     return int(tour[k]) if k < len(tour) else -1

@@ -56,7 +56,7 @@ _SUPPORTED_CHARACTERS = frozenset(ascii_letters) | DIGITS.keys() | PUNCTUATION.k
 
 
 def encode_lines(text: str, where: str) -> list[list[list[Cell]]]:
-    """Encode text as lines of words of cells; lines end at line breaks only.
+    """Encode text as lines of words of cells. Lines end at line breaks only.
 
     Raises InputError (bad_text) for a character without a cell.
     """
@@ -92,7 +92,7 @@ def encode_word(word: str) -> list[Cell]:
 
 
 def _select_letter_indicators(word: str, position: int, in_number: bool) -> tuple[Cell, ...]:
-    """Return the indicators before a letter; one word indicator covers a whole run of capitals."""
+    """Return the indicators before a letter. One word indicator covers a whole run of capitals."""
     if word[position].islower():
         return GRADE_1_INDICATOR if in_number and word[position] in "abcdefghij" else ()
     start, end = position, position

@@ -24,7 +24,7 @@ OVERLAP_TOLERANCE_S = 1e-9
 
 
 def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[TactileFrame, ...]:
-    """Parse the entries of `frames`; raises InputError (bad_time, bad_target, bad_priority, unknown_pixel, …)."""
+    """Parse the entries of `frames`. Raise InputError (bad_time, bad_target, bad_priority, unknown_pixel, …)."""
     pixel_by_name = {str(pixel): pixel for pixel in range(pixel_count)}
     frames: list[TactileFrame] = []
     for k, entry in enumerate(entries):

@@ -21,7 +21,7 @@ class GalvoTimeEstimator:
         self._available_rad2_per_s4 = cap_rad2_per_s4 - move_energy(self._galvo, 1e9) / self._galvo.averaging_s
 
     def compute_time_s(self, dx_rad: FloatArray, dy_rad: FloatArray, beam_time_s: float) -> float:
-        """Return the time of the moves, with room for a last pause, s; beam_time_s if the moves fit within it.
+        """Return the time of the moves, with room for a last pause, s, or beam_time_s if the moves fit within it.
 
         dx_rad, dy_rad: [n] moves of the two mirrors; beam_time_s: time of the pulses and of settling
         """

@@ -116,7 +116,7 @@ def _compute_overlap(place_count: int, pixel_count: int, scale: float) -> NDArra
 
 
 def _compute_brightness(image: "Image", invert: bool) -> NDArray[np.float32]:
-    """Compute brightness 0…1, [rows from the top, columns]; transparency is dark, inverted or not."""
+    """Compute brightness 0…1, [rows from the top, columns]. Transparency is dark, inverted or not."""
     from PIL import ImageOps
 
     image = ImageOps.exif_transpose(image)
@@ -141,7 +141,7 @@ def _duration_s(image: "Image") -> float:
 
 
 def _select_positions(image: "Image", where: str) -> range:
-    """Return the images of the file that belong to the animation; raises InputError (too_many)."""
+    """Return the images of the file that belong to the animation. Raise InputError (too_many)."""
     count = int(getattr(image, "n_frames", 1))
     if count > ANIMATION_FRAMES_MAX:
         raise InputError(where, f"{count} pictures", f"at most {ANIMATION_FRAMES_MAX}", code="too_many")
@@ -154,7 +154,7 @@ def _select_positions(image: "Image", where: str) -> range:
 
 @contextmanager
 def _open_image(file: bytes, where: str) -> Iterator["Image"]:
-    """Open an image of a supported format and size; every error while reading becomes an InputError."""
+    """Open an image of a supported format and size. Every error while reading becomes an InputError."""
     from PIL import Image, UnidentifiedImageError
 
     with warnings.catch_warnings():

@@ -14,7 +14,7 @@ TIME_MAX_S = 86_400.0
 
 
 def decode_json(body: bytes | str, where: str) -> object:
-    """Decode JSON text (UTF-8); raises InputError (bad_json) for invalid JSON and for repeated keys."""
+    """Decode JSON text (UTF-8). Raise InputError (bad_json) for invalid JSON and for repeated keys."""
 
     def require_unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
         table = dict(pairs)
@@ -65,7 +65,7 @@ def require_object(value: object, where: str, known: Sequence[str], required: Se
 
 
 def require_list(value: object, where: str, length_max: int) -> list[object]:
-    """Return a JSON list of bounded length; raises InputError (bad_json, too_many)."""
+    """Return a JSON list of bounded length. Raise InputError (bad_json, too_many)."""
     if not isinstance(value, list):
         raise InputError(where, value, "a list", code="bad_json")
     if len(value) > length_max:
@@ -74,7 +74,7 @@ def require_list(value: object, where: str, length_max: int) -> list[object]:
 
 
 def require_number(value: object, where: str, expected: str, code: str) -> float:
-    """Return a finite JSON number; booleans and strings are not numbers. Raises InputError."""
+    """Return a finite JSON number. Raise InputError for anything else. Booleans and strings are not numbers."""
     if type(value) is float and isfinite(value):
         return value
     if type(value) is int and abs(value) < 2**1000:
@@ -83,14 +83,14 @@ def require_number(value: object, where: str, expected: str, code: str) -> float
 
 
 def require_priority(value: object, where: str) -> int:
-    """Return the priority of a frame or train, an integer; raises InputError (bad_priority)."""
+    """Return the priority of a frame or train, an integer. Raise InputError (bad_priority)."""
     if type(value) is int and abs(value) <= PRIORITY_MAX:
         return value
     raise InputError(where, value, f"a whole number, -{PRIORITY_MAX}…{PRIORITY_MAX}", code="bad_priority")
 
 
 def require_time(value: object, where: str, expected: str, code: str, *, positive: bool) -> float:
-    """Return a time or duration in s, from 0 (or above 0 if positive) to one day; raises InputError."""
+    """Return a time or duration in s, from 0 (or above 0 if positive) to one day. Raise InputError."""
     time_s = require_number(value, where, expected, code)
     if time_s < 0 or (positive and time_s == 0) or time_s > TIME_MAX_S:
         bound = f" (at most {TIME_MAX_S:.0f} s)" if time_s > TIME_MAX_S else ""

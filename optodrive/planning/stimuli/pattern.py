@@ -26,7 +26,7 @@ TEXT_MAX = 2_000
 
 @dataclass(frozen=True)
 class PatternParameter:
-    """One parameter of a pattern; min and max bound a number, a required parameter has no default."""
+    """One parameter of a pattern. Min and max bound a number, a required parameter has no default."""
 
     name: str
     kind: ParameterKind
@@ -41,7 +41,10 @@ class PatternParameter:
 
 @dataclass(frozen=True)
 class PatternDescription:
-    """A pattern without its builder, as GET /v1/patterns lists it; policy: how it is treated above a cap by default."""
+    """A pattern without its builder, as GET /v1/patterns lists it.
+
+    policy: how it is treated above a cap by default
+    """
 
     name: str
     summary: str
@@ -65,7 +68,7 @@ class Pattern:
     policy: Policy = "trim"
 
     def describe_arguments(self, given: Mapping[str, object], config: Config) -> dict[str, str | float | bool | None]:
-        """Return all parameters in their own units, also those by default; a file by the digest of its bytes.
+        """Return all parameters in their own units, also those by default, and a file by the digest of its bytes.
 
         Raises InputError as `resolve_arguments`.
         """
@@ -107,7 +110,7 @@ class Pattern:
 
 
 def convert_value(value: object, parameter: PatternParameter, where: str, config: Config) -> ParameterValue:
-    """Convert a value, or its text, to the parameter's kind; raises InputError (bad_parameter, unknown_pixel)."""
+    """Convert a value, or its text, to the parameter's kind. Raise InputError (bad_parameter, unknown_pixel)."""
     match parameter.kind:
         case "number":
             return _convert_number(value, parameter, where)

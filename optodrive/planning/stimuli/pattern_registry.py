@@ -232,7 +232,7 @@ PATTERNS: dict[str, Pattern] = {pattern.name: pattern for pattern in _PATTERN_LI
 
 
 def find_pattern(name: str) -> Pattern:
-    """Return the pattern of a name; raises InputError (unknown_pattern) with the nearest known name."""
+    """Return the pattern of a name. Raise InputError (unknown_pattern) with the nearest known name."""
     if name not in PATTERNS:
         expected = f"a known pattern, {suggest_nearest(name[:60], list(PATTERNS))}"
         raise InputError("pattern", name, expected, code="unknown_pattern")
@@ -240,7 +240,7 @@ def find_pattern(name: str) -> Pattern:
 
 
 def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
-    """Build a pattern's sequence for a display; `given` maps parameters to values.
+    """Build a pattern's sequence for a display. `given` maps parameters to values.
 
     A value may be text, as from a command line; a file is its bytes, or these in base64.
 

@@ -48,7 +48,7 @@ class Lattice:
     def pixels_around(
         self, centre: int | None, offsets: Iterable[tuple[int, int]], where: str, requirement: str
     ) -> list[int]:
-        """Return the pixels at offsets (rows up, columns right) from a centre; None is the middle pixel.
+        """Return the pixels at offsets (rows up, columns right) from a centre. None is the middle pixel.
 
         requirement: what must surround the centre, for the message. Raises InputError (does_not_fit).
         """

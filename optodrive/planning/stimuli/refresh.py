@@ -57,7 +57,10 @@ class BeamTimeEstimator:
         return settling_s(self._servo, distance_m / (2.0 * self._scanner.focal_length_m), self._tolerance_rad)
 
     def beam_time_s(self, target_m: FloatArray) -> float:
-        """Return the beam time of a picture with its margin, in whole milliseconds, s; target_m: [p]."""
+        """Return the beam time of a picture with its margin, in whole milliseconds, s.
+
+        target_m: [p]
+        """
         driven = np.flatnonzero((target_m > 0) if self._lift is None else (target_m > 0) & (self._lift > 0))
         if not len(driven):
             return 0.0
@@ -102,7 +105,10 @@ def hold_picture(
 def build_steps(
     estimator: BeamTimeEstimator, pictures: list[FloatArray], step_s: float, name: str
 ) -> list[TactileFrame]:
-    """Build frames that show pictures once each, for step_s or as long as the beam needs; pictures: each [p]."""
+    """Build frames that show pictures once each, for step_s or as long as the beam needs.
+
+    pictures: each [p]
+    """
     frames: list[TactileFrame] = []
     start_s = 0.0
     for k, target_m in enumerate(pictures):
@@ -113,7 +119,7 @@ def build_steps(
 
 
 def sequence_end_s(sequence: FrameSequence) -> float:
-    """Return the end of the last frame, pulse, or cycle of a height train, s; 0 for an empty sequence."""
+    """Return the end of the last frame, pulse, or cycle of a height train, s, or 0 for an empty sequence."""
     frame_ends = [frame.show_at_s + frame.duration_s for frame in sequence.frames]
     train_ends = [
         float(train.pulse_starts_s()[-1]) + (train.period_s if isinstance(train, HeightTrain) else train.pulse_width_s)

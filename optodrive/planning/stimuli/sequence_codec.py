@@ -22,7 +22,7 @@ _Entry = tuple[str, float, float, _Target, bool, int]
 
 
 def encode_sequence(sequence: FrameSequence) -> bytes:
-    """Encode a sequence exactly; raises InputError (too_many) if it exceeds ENCODED_MAX_BYTES."""
+    """Encode a sequence exactly. Raise InputError (too_many) if it exceeds ENCODED_MAX_BYTES."""
     entries: list[_Entry] = [
         (f.frame_id, f.show_at_s, f.duration_s, _encode_target(f.target_m), f.simultaneous, f.priority)
         for f in sequence.frames

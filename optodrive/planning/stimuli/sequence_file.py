@@ -25,7 +25,10 @@ FILE_MAX_BYTES = 64_000_000
 
 
 def load_sequence(path: str | Path, config: Config) -> FrameSequence:
-    """Read FRAMES.json; raises InputError as `parse_sequence`, or if the file cannot be read (no_file, too_many)."""
+    """Read FRAMES.json.
+
+    Raises InputError as `parse_sequence`, or if the file cannot be read (no_file, too_many).
+    """
     try:
         with Path(path).open("rb") as file:
             body = file.read(FILE_MAX_BYTES + 1)
@@ -37,7 +40,7 @@ def load_sequence(path: str | Path, config: Config) -> FrameSequence:
 
 
 def parse_json(body: bytes | str, where: str) -> object:
-    """Decode JSON text; raises InputError (bad_json) for invalid JSON and for too deep nesting."""
+    """Decode JSON text. Raise InputError (bad_json) for invalid JSON and for too deep nesting."""
     try:
         return decode_json(body, where)
     except RecursionError:
@@ -45,7 +48,7 @@ def parse_json(body: bytes | str, where: str) -> object:
 
 
 def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
-    """Parse a sequence for a display from JSON text or decoded JSON; `where` names the source in errors.
+    """Parse a sequence for a display from JSON text or decoded JSON. `where` names the source in errors.
 
     Raises InputError with the place, and a code: bad_json, unknown_key, missing_key, unknown_pixel, bad_target,
     bad_time, bad_train, bad_priority, overlapping_trains, bad_label, too_many.
@@ -54,7 +57,7 @@ def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
 
 
 def parse_request(body: object, config: Config, where: str) -> tuple[FrameSequence, Labels]:
-    """Parse a sequence and its labels; raises InputError as `parse_sequence`."""
+    """Parse a sequence and its labels. Raise InputError as `parse_sequence`."""
     try:
         return _parse_decoded(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
     except RecursionError:  # the repr of a value that nests deeper than Python's stack
@@ -62,7 +65,7 @@ def parse_request(body: object, config: Config, where: str) -> tuple[FrameSequen
 
 
 def validate_sequence(sequence: FrameSequence, where: str, config: Config) -> FrameSequence:
-    """Return a pattern's sequence if it meets the bounds of a file; raises InputError (too_many, bad_train, …)."""
+    """Return a pattern's sequence if it meets the bounds of a file. Raise InputError (too_many, bad_train, …)."""
     frames_max = _compute_frames_max(len(build_pixel_layout(config.display)))
     if len(sequence.frames) > frames_max:
         raise InputError(f"{where}: frames", len(sequence.frames), f"at most {frames_max}", code="too_many")

@@ -32,7 +32,10 @@ def build_vibration(
     rate_hz: float,
     seconds: float,
 ) -> FrameSequence:
-    """Build a height train on one pixel (None: the middle); peak_to_peak_m None: that of the shortest pulses."""
+    """Build a height train on one pixel.
+
+    pixel: None for the middle; peak_to_peak_m: None for that of the shortest pulses
+    """
     chosen_pixel = Lattice.from_config(config).middle_pixel() if pixel is None else pixel
     return FrameSequence(trains=(HeightTrain(chosen_pixel, 0.0, seconds, 1.0 / rate_hz, height_m, peak_to_peak_m),))
 
@@ -51,7 +54,7 @@ def build_checkerboard(config: Config, where: str, height_m: float, seconds: flo
 
 
 def build_ring(config: Config, where: str, radius_m: float | None, height_m: float, seconds: float) -> FrameSequence:
-    """Build a ring about the display's middle, one pixel wide; raises InputError (does_not_fit)."""
+    """Build a ring about the display's middle, one pixel wide. Raise InputError (does_not_fit)."""
     ring = np.isin(np.arange(len(Lattice.from_config(config).layout)), find_ring_pixels(config, where, radius_m))
     return _hold_mask(config, ring, height_m, seconds, "circle")
 
@@ -59,7 +62,7 @@ def build_ring(config: Config, where: str, radius_m: float | None, height_m: flo
 def build_square_outline(
     config: Config, where: str, side_m: float | None, height_m: float, seconds: float
 ) -> FrameSequence:
-    """Build the outline of a square about the display's middle, one pixel wide; raises InputError (does_not_fit)."""
+    """Build the outline of a square about the display's middle, one pixel wide. Raise InputError (does_not_fit)."""
     layout = Lattice.from_config(config).layout
     half_m = _default_radius_m(config) if side_m is None else side_m / 2
     farthest_m = np.maximum(np.abs(layout.x_m), np.abs(layout.y_m))
@@ -81,7 +84,7 @@ def build_moving_edge(config: Config, where: str, direction: str, height_m: floa
 def build_moving_dot(
     config: Config, where: str, radius_m: float | None, height_m: float, step_s: float, turns: int
 ) -> FrameSequence:
-    """Build one pixel at a time along a ring, clockwise from the left; raises InputError (does_not_fit)."""
+    """Build one pixel at a time along a ring, clockwise from the left. Raise InputError (does_not_fit)."""
     layout = Lattice.from_config(config).layout
     ring = find_ring_pixels(config, where, radius_m)
     ring = ring[np.argsort(-np.arctan2(layout.y_m[ring], layout.x_m[ring]), kind="stable")]
@@ -90,7 +93,7 @@ def build_moving_dot(
 
 
 def find_ring_pixels(config: Config, where: str, radius_m: float | None) -> NDArray[np.int64]:
-    """Return the pixels of a ring about the middle by index (None: default radius); raises InputError."""
+    """Return the pixels of a ring about the middle by index (None: default radius). Raise InputError (does_not_fit)."""
     layout = Lattice.from_config(config).layout
     radius_m = _default_radius_m(config) if radius_m is None else radius_m
     ring = np.flatnonzero(_is_within_half_pitch(np.hypot(layout.x_m, layout.y_m), radius_m, config.display.pitch_m))

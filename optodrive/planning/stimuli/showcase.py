@@ -14,7 +14,7 @@ PAUSE_S = 0.3
 
 
 def build_showcase(config: Config, where: str) -> FrameSequence:
-    """Build a dot along a ring, the ring, "hello" in braille, and two pairs of fingers; about eight seconds.
+    """Build a dot along a ring, the ring, "hello" in braille, and two pairs of fingers, in about eight seconds.
 
     Raises InputError (does_not_fit) on a display too small for a hand.
     """

@@ -20,7 +20,7 @@ FRAME_DURATION_S = 3600.0
 
 
 def parse_live_frame(message: str | bytes, expected_number: int, pixel_count: int) -> tuple[int, FrameSequence]:
-    """Return a frame's number and its sequence; JSON without a number gets the expected one.
+    """Return a frame's number and its sequence. JSON without a number gets the expected one.
 
     Text: {"frame": 7, "target_um": …} with target_um as in FRAMES.json. Bytes, little-endian: "ODF1", u32 number,
     then a u16 per pixel, in 0.1 µm. Raises InputError (bad_json, bad_frame, bad_target, unknown_pixel, …).

@@ -101,7 +101,7 @@ def _find_cell_slot(lattice: Lattice, from_top: int, from_left: int, dot_step: i
 
 
 def wrap_words(lines: list[list[list[Cell]]], widths: list[int]) -> list[list[Cell]]:
-    """Wrap words into rows of cells, row k at most widths[k mod n] long; a word longer than its row is split."""
+    """Wrap words into rows of cells, row k at most widths[k mod n] long. A word longer than its row is split."""
     rows: list[list[Cell]] = []
     for words in lines:
         rows.append([])

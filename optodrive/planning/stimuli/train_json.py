@@ -121,7 +121,7 @@ def _guess(name: str, value: float, high: float) -> str:
 
 
 def validate_train(train: Train, where: str, config: Config) -> Train:
-    """Return the train with its width rounded to whole PWM periods; raises InputError (bad_train, bad_target)."""
+    """Return the train with its width rounded to whole PWM periods. Raise InputError (bad_train, bad_target)."""
     if isinstance(train, HeightTrain):
         return _validate_height_train(train, where, config)
     return _validate_pulse_train(train, where, config)
@@ -191,7 +191,9 @@ def _list_by_value(values: IntArray) -> list[IntArray]:
 def _find_clash(
     start_s: FloatArray, end_s: FloatArray, beams: int, number: IntArray | None = None
 ) -> tuple[int, int] | None:
-    """Return the first of the pulses [n] that finds all beams in use, behind the one that ends first; None without.
+    """Return the first of the pulses [n] that finds all beams in use, behind the one that ends first.
+
+    None if no pulse does.
 
     number: [n] by which the pulses are returned, by default their position
     """
@@ -214,7 +216,7 @@ def count_pulses(train: Train) -> int:
 
 
 def train_to_json(train: Train) -> dict[str, object]:
-    """Return a train in the form of FRAMES.json; heights are rounded to 1e-9 µm."""
+    """Return a train in the form of FRAMES.json. Heights are rounded to 1e-9 µm."""
     if isinstance(train, PulseTrain):
         return {key: getattr(train, key) for key in PULSE_TRAIN_KEYS}
     entry: dict[str, object] = {key: getattr(train, key) for key in HEIGHT_TRAIN_KEYS[:4]}
