@@ -23,7 +23,7 @@ from optodrive.planning.stimuli.pattern import PatternDescription
 
 
 class AsyncDisplay:
-    """A display behind a running daemon, as an asynchronous context manager; see `Display`."""
+    """A display behind a running daemon, as an asynchronous context manager. See `Display`."""
 
     def __init__(
         self, url: str | None = None, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
@@ -56,7 +56,7 @@ class AsyncDisplay:
         await self._client.close()
 
     async def arm(self, *, hold: bool = False) -> StateReport:
-        """See `Display.arm`; a loop that is blocked for a second disarms, too."""
+        """Arm the board as `Display.arm` does. A loop that is blocked for a second disarms, too."""
         if not hold:
             return await self._client.run(self._operations.arm())
         self._record_emission()

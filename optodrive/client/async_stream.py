@@ -30,7 +30,7 @@ from optodrive.device.config import PixelLayout
 
 
 class AsyncStream:
-    """A stream that opens when entered; see `Stream`."""
+    """A stream that opens when entered. See `Stream`."""
 
     def __init__(
         self,

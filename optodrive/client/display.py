@@ -27,7 +27,7 @@ RECONNECT_TIMEOUT_S = 2.5
 
 
 class Display:
-    """A display behind a running daemon, as a context manager that stops what this client has started.
+    """A display behind a running daemon, as a context manager that stops everything that this client started.
 
     url: if None, OPTODRIVE_URL, else http://127.0.0.1:8450
     token: if None, OPTODRIVE_TOKEN, else the file that the daemon wrote
@@ -70,7 +70,7 @@ class Display:
     # --- the board ----------------------------------------------------------------------------------------------
 
     def arm(self, *, hold: bool = False) -> StateReport:
-        """Arm the board unless it is armed; its indicator is on for two seconds first.
+        """Arm the board unless it is armed. Its indicator is on for two seconds first.
 
         hold: the board disarms, dark, when this display is closed, or when its process ends or stops for a second; a
         board that is armed already is refused. Raises NotReadyError or BoardFaultError.
@@ -82,7 +82,7 @@ class Display:
         return self.state()
 
     def disarm(self) -> StateReport:
-        """Disarm the board; this also acknowledges a fault whose cause is gone."""
+        """Disarm the board. This also acknowledges a fault whose cause is gone."""
         return self._client.run(self._operations.disarm())
 
     def dim(self, share: float) -> StateReport:
@@ -93,21 +93,21 @@ class Display:
         return self._client.run(self._operations.dim(share))
 
     def pause(self) -> StateReport:
-        """Switch the gate off and keep the board armed and all plans, for five minutes at most; then it is disarmed.
+        """Switch the gate off and keep the board armed and all plans, for five minutes at most. Then it is disarmed.
 
         Streamed frames are refused meanwhile. NotReadyError if the board is not armed.
         """
         return self._client.run(self._operations.pause())
 
     def resume(self) -> StateReport:
-        """Play what was left of the plan that was paused, limited again, and the plans that wait.
+        """Play the rest of the paused plan, limited again, and the plans that wait.
 
         NotReadyError if the board is not armed.
         """
         return self._client.run(self._operations.resume())
 
     def stop(self) -> StateReport:
-        """Switch the gate off, drop all plans, disarm the board; LinkError if no answer confirms it."""
+        """Switch the gate off, drop all plans, disarm the board. Raise LinkError if no answer confirms it."""
         return self._client.run(self._operations.stop())
 
     def state(self) -> StateReport:
@@ -120,7 +120,7 @@ class Display:
 
     @property
     def layout(self) -> PixelLayout:
-        """The positions of the pixels: x_m, y_m, row, column, all [p]; rows count from the bottom."""
+        """The positions of the pixels: x_m, y_m, row, column, all [p]. Rows count from the bottom."""
         return self._client.run(self._operations.read_layout())
 
     # --- showing ------------------------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ class Display:
         wait: bool = True,
         labels: LabelsLike = None,
     ) -> Plan:
-        """Raise each pixel once to its height within duration_s; wait until that is done unless `wait` is False.
+        """Raise each pixel once to its height within duration_s. Wait until that is done unless `wait` is False.
 
         heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
         positions without a pixel are ignored)
@@ -168,7 +168,10 @@ class Display:
         labels: LabelsLike = None,
         **parameters: Any,
     ) -> Plan:
-        """Play a named pattern with its parameters by name; `dry_run` plans only; policy None: that of the pattern."""
+        """Play a named pattern with its parameters by name.
+
+        dry_run: plan only; policy: None for that of the pattern
+        """
         return self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait, labels))
 
     def preview(
@@ -180,7 +183,7 @@ class Display:
         policy: Policy = "trim",
         fit: FitMode = "as_is",
     ) -> Plan:
-        """Plan what `show` would show; nothing moves."""
+        """Plan a frame as `show` would. Nothing moves."""
         operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, True, False)
         return self._client.run(operation)
 
@@ -201,11 +204,11 @@ class Display:
         return self._client.run(self._operations.read_plan(plan))
 
     def cancel(self, plan: Plan | str) -> Plan:
-        """Remove a plan from the queue, or end it if it runs; the board stays armed."""
+        """Remove a plan from the queue, or end it if it runs. The board stays armed."""
         return self._client.run(self._operations.cancel_plan(plan))
 
     def wait(self, plan: Plan | str) -> Plan:
-        """Wait until a plan has ended and return it; RefusedError if it failed."""
+        """Wait until a plan has ended and return it. Raise RefusedError if it failed."""
         return self._client.run(self._operations.wait_for_plan(plan))
 
     def _record_emission(self) -> None:

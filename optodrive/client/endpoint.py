@@ -48,7 +48,7 @@ class Endpoint:
         return {"Authorization": f"Bearer {self._token}"}
 
     def renew_token(self) -> bool:
-        """Read the token again after a refusal; return whether it changed: a restarted daemon has a new one."""
+        """Read the token again after a refusal and return whether it changed. A restarted daemon has a new one."""
         if self._explicit_token is not None:
             return False
         previous, self._token = self._token, self._read_token()
@@ -66,7 +66,7 @@ class Endpoint:
             raise
 
     def _probe(self) -> None:
-        """Connect and close; OSError if nobody listens."""
+        """Connect and close. Raise OSError if nobody listens."""
         if self.unix_path is not None:
             with socket.socket(socket.AF_UNIX) as connection:
                 connection.settimeout(PROBE_TIMEOUT_S)
@@ -76,7 +76,7 @@ class Endpoint:
             socket.create_connection((host, self._port), PROBE_TIMEOUT_S).close()
 
     def open_unix_socket(self) -> socket.socket | None:
-        """Connect to the Unix socket; None for a TCP address, OSError if the connection is refused."""
+        """Connect to the Unix socket, or return None for a TCP address. Raise OSError if the connection is refused."""
         if self.unix_path is None:
             return None
         connection = socket.socket(socket.AF_UNIX)

@@ -28,8 +28,9 @@ T = TypeVar("T")
 
 
 class Transmission(NamedTuple):
-    """A request to send; `on_new_connection`: on a connection of its own.
+    """A request to send.
 
+    on_new_connection: on a connection of its own
     timeout_s: longest wait for the answer to a stop or to a request that only reads, None for the client's
     """
 
@@ -60,7 +61,7 @@ class ExchangePolicy:
         self._has_responded = False
 
     def call(self, request: ApiRequest[Response]) -> Exchange[Response]:
-        """Send a request and parse its response; raise the error that a problem document describes.
+        """Send a request and parse its response. Raise the error that a problem document describes.
 
         A request that is not idempotent is repeated only if it was certainly not received.
         """
@@ -101,7 +102,7 @@ class ExchangePolicy:
 
 
 def parse_response(request: ApiRequest[Response], response: httpx.Response) -> Response:
-    """Parse a response as the request's model; raise the error that a problem document describes.
+    """Parse a response as the request's model. Raise the error that a problem document describes.
 
     Members that the model does not have are ignored: a newer daemon may send them.
     """

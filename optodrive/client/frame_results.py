@@ -13,7 +13,7 @@ RESULT_TIMEOUT_S = 30.0
 
 
 class ResultBuffer:
-    """Results of frames for one reader; another thread may add them."""
+    """Results of frames for one reader. Another thread may add them."""
 
     def __init__(self) -> None:
         self._unread: deque[FrameResult] = deque(maxlen=RESULTS_MAX)
@@ -51,7 +51,7 @@ class ResultBuffer:
         return result
 
     def is_owed(self, frame: int) -> bool:
-        """Return whether the daemon owes the final result of a frame; −1, before the first one: nothing is owed."""
+        """Return whether the daemon owes the final result of a frame. Nothing is owed for −1, before the first one."""
         return frame >= self._lost_before and frame not in self._final
 
 
@@ -66,7 +66,7 @@ def build_timeout_error(frame: int, timeout_s: float) -> LinkError:
 
 
 def raise_if_failed(result: FrameResult) -> FrameResult:
-    """Return the result; raise its error if the frame was refused or its plan failed."""
+    """Return the result. Raise its error if the frame was refused or its plan failed."""
     if result.problem is not None:
         raise build_error(result.problem)
     if result.status == "failed":

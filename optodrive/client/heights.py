@@ -19,7 +19,7 @@ TENTHS_UM_MAX = 0xFFFF
 
 
 def convert_to_pixels(heights_um: HeightsLike, layout: PixelLayout) -> FloatArray:
-    """Convert heights to [p] in µm, 0 for no target; InputError for an invalid shape or height."""
+    """Convert heights to [p] in µm, 0 for no target. Raise InputError for an invalid shape or height."""
     if isinstance(heights_um, Mapping):
         return _check_heights(_convert_mapping(heights_um, len(layout)))
     try:
@@ -61,7 +61,7 @@ def encode_json(heights_um: FloatArray) -> dict[str, float]:
 
 
 def encode_frame(number: int, heights_um: FloatArray) -> bytes:
-    """Encode a streamed frame; InputError for a height that does not fit in 16 bits."""
+    """Encode a streamed frame. Raise InputError for a height that does not fit in 16 bits."""
     tenths = np.rint(um_to_m(heights_um) / HEIGHT_UNIT_M)
     pixel = int(tenths.argmax())
     if tenths[pixel] > TENTHS_UM_MAX:

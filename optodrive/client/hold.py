@@ -24,7 +24,10 @@ CONNECTION_LOST = "the connection to the daemon was lost"
 
 
 class HoldState:
-    """What the daemon has reported about the arming. reason: what has ended it, '' while it lasts."""
+    """State of the arming as the daemon has reported it.
+
+    reason: cause of its end, '' while it lasts
+    """
 
     def __init__(self) -> None:
         self.is_armed = False
@@ -75,7 +78,7 @@ class Hold:
 
     @property
     def reason(self) -> str:
-        """What has ended the arming, '' while it lasts."""
+        """Cause of the end of the arming, '' while it lasts."""
         return self._state.reason
 
     def wait(self) -> str:
@@ -110,7 +113,7 @@ class Hold:
 
 
 class AsyncHold:
-    """Arming of the board that ends, dark, with `close`, or with the process; `open` arms.
+    """Arming of the board that ends, dark, with `close`, or with the process. `open` arms.
 
     A task sends the beats, so that a loop that is blocked for a second lets go, too.
     """
@@ -131,7 +134,7 @@ class AsyncHold:
 
     @property
     def reason(self) -> str:
-        """What has ended the arming, '' while it lasts."""
+        """Cause of the end of the arming, '' while it lasts."""
         return self._state.reason
 
     async def close(self) -> None:

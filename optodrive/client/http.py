@@ -27,7 +27,10 @@ PROBE: dict[str, Any] = {"method": "GET", "url": "/v1/health", "timeout": PROBE_
 
 
 class DaemonClient:
-    """A blocking client; `policy` states the retries. timeout_s: longest wait for a part of an answer."""
+    """A blocking client. `policy` states the retries.
+
+    timeout_s: longest wait for a part of an answer
+    """
 
     def __init__(
         self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0, timeout_s: float = TIMEOUT_S
@@ -76,7 +79,7 @@ class DaemonClient:
         return self._request_watched(arguments)
 
     def _request_watched(self, arguments: dict[str, Any]) -> httpx.Response:
-        """Send a request that may take long; raise TransportError as soon as the daemon no longer answers others."""
+        """Send a request that may take long. Raise TransportError as soon as the daemon no longer answers others."""
         future: Future[httpx.Response] = Future()
         Thread(target=_complete, args=(future, partial(self._client.request, **arguments)), daemon=True).start()
         while True:
@@ -93,7 +96,7 @@ def _complete(future: "Future[httpx.Response]", send: Callable[[], httpx.Respons
 
 
 class AsyncDaemonClient:
-    """An asynchronous client; `policy` states the retries."""
+    """An asynchronous client. `policy` states the retries."""
 
     def __init__(self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0) -> None:
         self.policy = ExchangePolicy(Endpoint(url, token), reconnect_timeout_s)

@@ -91,7 +91,7 @@ class DisplayOperations:
         return (yield from self._policy.call(READ_CONFIG))
 
     def read_layout(self) -> Exchange[PixelLayout]:
-        """Return the layout of the pixels; read it from the configuration once."""
+        """Return the layout of the pixels. Read it from the configuration once."""
         if self._layout is None:
             config = yield from self.read_config()
             self._layout = build_pixel_layout(config.display)
@@ -153,7 +153,7 @@ class DisplayOperations:
         return (yield from self._report(build_cancel_request(_get_plan_id(plan))))
 
     def wait_for_plan(self, plan: Plan | str) -> Exchange[Plan]:
-        """Wait until a plan has ended; RefusedError if it failed."""
+        """Wait until a plan has ended. Raise RefusedError if it failed."""
         poll = build_read_request(_get_plan_id(plan), pulses=False)
         while not (yield from self._policy.call(poll)).has_ended:
             yield Pause(POLL_PERIOD_S)

@@ -24,7 +24,7 @@ def interpolate_colour(fraction: float) -> tuple[int, int, int]:
 
 
 def render_png(layout: PixelLayout, heights_um: FloatArray) -> bytes:
-    """Render heights [p] in µm as PNG; row 0 is at the bottom, as on the display."""
+    """Render heights [p] in µm as PNG. Row 0 is at the bottom, as on the display."""
     rows, columns = int(layout.row.max()) + 1, int(layout.column.max()) + 1
     cell_px = max(4, min(CELL_MAX_PX, WIDTH_MAX_PX // max(columns, rows)))
     size = max(columns * cell_px, 220) + 2 * MARGIN_PX, rows * cell_px + 2 * MARGIN_PX + FOOTER_PX

@@ -19,7 +19,7 @@ class Plan(PlanReport):
     _layout: PixelLayout | None = PrivateAttr(default=None)
 
     def place_on(self, layout: PixelLayout) -> Self:
-        """Set the layout of the plan's pixels; return the plan."""
+        """Set the layout of the plan's pixels and return the plan."""
         self._layout = layout
         return self
 
@@ -43,7 +43,7 @@ class Plan(PlanReport):
         return heights_um
 
     def raise_if_failed(self) -> Self:
-        """Return the plan; RefusedError if it failed."""
+        """Return the plan. Raise RefusedError if it failed."""
         if self.status == "failed":
             raise RefusedError(f"plan {self.plan} failed: {self.error}")
         return self

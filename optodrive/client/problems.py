@@ -29,7 +29,7 @@ ERROR_BY_CODE: dict[str, type[OptodriveError]] = {
 
 
 def parse_problem(status: int, body: bytes) -> OptodriveError:
-    """Parse the body of an error response; LinkError if it is not a problem document."""
+    """Parse the body of an error response. Return LinkError if it is not a problem document."""
     try:
         problem = Problem.model_validate_json(body, extra="ignore")
     except ValidationError:
@@ -38,7 +38,7 @@ def parse_problem(status: int, body: bytes) -> OptodriveError:
 
 
 def build_error(problem: Problem) -> OptodriveError:
-    """Build the error that a problem document describes; the error keeps the document as `problem`."""
+    """Build the error that a problem document describes. The error keeps the document as `problem`."""
     error = _build_typed_error(problem)
     error.problem = problem.to_dict()
     error.code = problem.code

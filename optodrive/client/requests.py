@@ -73,7 +73,10 @@ def build_push_request(
 def build_play_request(
     name: str, parameters: Mapping[str, Any], policy: Policy | None, fit: FitMode, dry_run: bool, strict: bool = False
 ) -> ApiRequest[Plan]:
-    """Build the request that plays a named pattern; policy None: that of the pattern."""
+    """Build the request that plays a named pattern.
+
+    policy: None for that of the pattern
+    """
     query = {"fit": fit, "dry_run": dry_run, "strict": strict} | ({} if policy is None else {"policy": policy})
     path = f"/v1/patterns/{quote(name, safe='')}"
     return ApiRequest("POST", path, Plan, dry_run, {"json": dict(parameters), "params": query})

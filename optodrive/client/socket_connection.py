@@ -100,7 +100,7 @@ def _build_options(endpoint: Endpoint, silence_max_s: float, open_timeout_s: flo
 
 
 def _renew_token(endpoint: Endpoint, refused: InvalidStatus) -> None:
-    """Read the token again after a refusal; raise the error of the refusal if that does not help."""
+    """Read the token again after a refusal. Raise the error of the refusal if that does not help."""
     if refused.response.status_code != 401 or not endpoint.renew_token():
         raise parse_refusal(refused) from None
 

@@ -31,7 +31,7 @@ from optodrive.device.config import PixelLayout
 
 
 class Stream:
-    """An open stream; `Display.stream()` builds one. A broken connection is restored at the next frame.
+    """An open stream. `Display.stream()` builds one. A broken connection is restored at the next frame.
 
     on_send: called before each frame
     """
@@ -65,11 +65,11 @@ class Stream:
         self.close()
 
     def close(self) -> None:
-        """Close the stream; the daemon drops the pulses that are not yet committed to the board."""
+        """Close the stream. The daemon drops the pulses that are not yet committed to the board."""
         self._exit_stack.close()
 
     def send(self, heights_um: HeightsLike) -> int:
-        """Show a frame in place of the uncommitted rest of the previous one; return its number.
+        """Show a frame in place of the uncommitted rest of the previous one. Return its number.
 
         LinkError if the daemon does not answer or cannot be reached again. The board of a restarted daemon is not
         armed; frames are then refused until somebody arms it.
@@ -92,7 +92,7 @@ class Stream:
             return self._results.drain()
 
     def wait(self, frame: int | None = None, timeout_s: float = RESULT_TIMEOUT_S) -> FrameResult:
-        """Wait for the final result of a frame, by default the last one sent; raise its error if it failed."""
+        """Wait for the final result of a frame, by default the last one sent. Raise its error if it failed."""
         number = self._next_frame - 1 if frame is None else frame
         deadline_s = time.monotonic() + timeout_s
         with self._results_changed:

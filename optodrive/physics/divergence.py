@@ -28,7 +28,10 @@ def build_state_error(active: list[int], rows: list[int], state: FloatArray) -> 
 
 
 def build_signal_error(active: list[int], signals: tuple[FloatArray, ...]) -> DivergedError:
-    """Return the error that names a signal that is no number; active: rows of the active terms."""
+    """Return the error that names a signal that is no number.
+
+    active: rows of the active terms
+    """
     name = next(name for name, signal in zip(SIGNAL_NAMES, signals, strict=True) if not np.isfinite(signal).all())
     return DivergedError(_describe_terms(active), Unquoted(f"a {name} that is no number"), "finite signals")
 

@@ -90,7 +90,7 @@ class ExtendedThermalState:
         power_w: FloatArray,
         on_progress: Callable[[], None] = ignore_progress,
     ) -> PulsePeaks:
-        """Apply pulses in order of time, all [n], power_w the mean incident power; return their peaks.
+        """Apply pulses in order of time, all [n], power_w the mean incident power. Return their peaks.
 
         on_progress is called once per batch. Raises ValueError for a pulse that starts before the last event of its
         pixel or of a thermally coupled neighbour; the pulses before it remain applied.
@@ -150,7 +150,7 @@ class ExtendedThermalState:
         return np.array([by_kind[kind] for kind in kinds])
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Return the displacement of a pixel, m, at increasing times t_s [m]; the state does not change.
+        """Return the displacement of a pixel, m, at increasing times t_s [m]. The state does not change.
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
         pixel's last event.

@@ -42,7 +42,7 @@ def find_shortest_pulse(
     max_periods: int,
     peak_after_s: float,
 ) -> tuple[int, float]:
-    """Solve as `ExtendedThermalState.solve_pulse`, from the states work[0]; 0 periods if no pulse is needed.
+    """Solve as `ExtendedThermalState.solve_pulse`, from the states work[0]. Return 0 periods if no pulse is needed.
 
     Until the pulse the light is where the context says, then on this pixel, `index`.
     on_states: [max_periods + 1, STATE_COUNT], work space for the states after each period at full power
@@ -83,7 +83,7 @@ def _solve_duty(
     width_s: float,
     peak_after_s: float,
 ) -> float:
-    """Return the duty at which a pulse's peak is target_m, by the Illinois method; 1 if none is.
+    """Return the duty at which a pulse's peak is target_m, by the Illinois method, or 1 if none is.
 
     0 if what the laser still emits after its last pulse reaches the target as soon as the light is on the pixel.
     """

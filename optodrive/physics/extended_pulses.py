@@ -24,7 +24,9 @@ COLD_K = 1e-6
 
 
 class EventStates(NamedTuple):
-    """States of every pixel and, in the last row, of laser and panel, at the last event of each; kernels change them.
+    """States of every pixel and, in the last row, of laser and panel, at the last event of each.
+
+    Kernels change them.
 
     columns: [p, 6] the fields of `Pixel`; at_s, off_s: [p + 1] time of the last event, and time since gate off then;
     states: [p + 1, STATE_COUNT]; illuminated: [1] pixel of the last pulse, −1 before the first
@@ -59,7 +61,7 @@ def advance_states(
     since_edge_s: float,
     duration_s: float,
 ) -> tuple[float, float]:
-    """Advance the states work[0] by duration_s at the context's power; return the peaks meanwhile.
+    """Advance the states work[0] by duration_s at the context's power. Return the peaks meanwhile.
 
     since_edge_s: time since the last gate edge. The peaks are those of displacement, m, and absorber rise, K.
     """
@@ -90,7 +92,7 @@ def advance_states(
 
 @kernel
 def copy_states(source: FloatArray, target: FloatArray) -> None:
-    """Copy the states [STATE_COUNT] of a pixel; an assignment of arrays would create one."""
+    """Copy the states [STATE_COUNT] of a pixel. An assignment of arrays would create one."""
     for row in range(len(source)):
         target[row] = source[row]
 
@@ -125,7 +127,7 @@ def _vertex_m(begin_m: float, middle_m: float, end_m: float) -> float:
 def peak_after_off_m(
     pixel: Pixel, active: ActiveTerms, c: FloatArray, work: FloatArray, since_edge_s: float, peak_after_s: float
 ) -> float:
-    """Return the peak displacement, m, from peak_after_s after the states work[0] on; the gate is off."""
+    """Return the peak displacement, m, from peak_after_s after the states work[0] on, with the gate off."""
     c[POWER_W] = 0.0
     if peak_after_s > 0.0:
         advance_states(pixel, active, c, work, 0.0, since_edge_s, peak_after_s)
@@ -163,7 +165,7 @@ def advance_shared(events: EventStates, active: ActiveTerms, c: FloatArray, shar
 def advance_to(
     events: EventStates, active: ActiveTerms, c: FloatArray, shared: FloatArray, work: FloatArray, i: int, now_s: float
 ) -> float:
-    """Write the states of pixel i at now_s to work[0], the gate off since its last event; return the peak meanwhile.
+    """Write the states of pixel i at now_s to work[0], the gate off since its last event. Return the peak meanwhile.
 
     The context says on which pixel the light was, shared[0] how warm the panel is at now_s, which changes slowly.
     """
@@ -206,7 +208,7 @@ def apply_pulses(
     begin: int,
     end: int,
 ) -> int:
-    """Apply the pulses begin to end and fill in their peaks [n]; return the first that is out of order, or end.
+    """Apply the pulses begin to end and fill in their peaks [n]. Return the first that is out of order, or end.
 
     neighbours: [p, k] pixels that the light on a pixel also heats, −1 for none; last_pulse: [p] row of each pixel's
     last pulse so far, −1 for none
@@ -264,7 +266,7 @@ def add_peaks_after_off(
     end: int,
     peak_m: FloatArray,
 ) -> None:
-    """Raise the peaks of the last pulses of the pixels begin to end by what follows after gate off."""
+    """Raise the peaks of the last pulses of the pixels begin to end to those that follow after gate off."""
     work, c = np.zeros((8, events.states.shape[1])), context.copy()
     for i in range(begin, end):
         if last_pulse[i] >= 0:

@@ -26,7 +26,10 @@ class TermParameter:
 
     @property
     def if_omitted(self) -> float | None:
-        """Value where a parameter set states none: no effect, or the default of a shape; None if it must be stated."""
+        """Value where a parameter set states none, which has no effect or is the default of a shape.
+
+        None if it must be stated.
+        """
         return self.default if self.neutral is None and self.is_shape else self.neutral
 
 
@@ -97,7 +100,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class RecordingScope:
-    """What a recording covers, as far as hypotheses depend on it.
+    """Content of a recording, as far as hypotheses depend on it.
 
     signals: "temperature", "displacement", "force", "mirrors", those measured, in this order; pixels: the pixels
     measured; illuminated: pixels that received a pulse; has_neighbour_pulses: a measured pixel has runs in which

@@ -17,7 +17,7 @@ TIME_ROUNDING_S = 1e-9
 
 
 def ignore_progress() -> None:
-    """Do nothing; the default progress callback."""
+    """Do nothing, as the default progress callback."""
 
 
 class PulsePeaks(NamedTuple):
@@ -107,10 +107,11 @@ class NominalThermalState:
         power_w: FloatArray,
         on_progress: Callable[[], None] = ignore_progress,
     ) -> PulsePeaks:
-        """Apply pulses, all [n], those of each pixel in order of time; power_w is the mean incident power.
+        """Apply pulses, all [n], those of each pixel in order of time.
 
-        Returns their peaks. on_progress is not called: a million pulses take a fifth of a second. Raises ValueError for
-        a pulse that starts before its pixel's last event; the pulses before it remain applied.
+        power_w is the mean incident power. Returns their peaks. on_progress is not called: a million pulses take a
+        fifth of a second. Raises ValueError for a pulse that starts before its pixel's last event; the pulses before it
+        remain applied.
         """
         columns = build_kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
         peaks = PulsePeaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
@@ -156,7 +157,7 @@ class NominalThermalState:
         return parameters.kappa_m_per_k * peak_k
 
     def simulate_rises_k(self, pixel: int, pulses: FloatArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return absorber and gas rise of a pixel, K, each [m], at increasing times t_s [m]; the state does not change.
+        """Return absorber and gas rise of a pixel, K, each [m], at increasing times t_s [m]. The state does not change.
 
         pulses: [n, 3] start_s, width_s, power_w in order. Raises ValueError for a pulse or a time before the pixel's
         last event.
@@ -174,7 +175,7 @@ class NominalThermalState:
         return absorber_k, gas_k
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Return the displacement of a pixel, m, at increasing times t_s [m]; the state does not change.
+        """Return the displacement of a pixel, m, at increasing times t_s [m]. The state does not change.
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
         pixel's last event.
@@ -221,7 +222,7 @@ def _apply_pulses(
     peak_m: FloatArray,
     peak_k: FloatArray,
 ) -> int:
-    """Apply pulses [n] and fill in their peaks [n]; return the number of pulses before the first one out of order.
+    """Apply pulses [n] and fill in their peaks [n]. Return the number of pulses before the first one out of order.
 
     columns: [p, 6] the fields of `Pixel`; at_s, theta_k, gamma_k: [p] time of the last event and the rises then
     """
@@ -282,8 +283,9 @@ def solve_pulse_at(
     max_periods: int,
     peak_after_s: float,
 ) -> tuple[int, float]:
-    """Solve as `solve_pulse`; 0 periods if no pulse is needed, -1 if start_s is before the pixel's last event.
+    """Solve as `solve_pulse`.
 
+    Returns 0 periods if no pulse is needed, -1 if start_s is before the pixel's last event.
     It is one kernel because a call from Python costs as much as the computation.
     """
     one, off_s = pixel_at(columns, i), start_s - last_s[i]

@@ -81,7 +81,7 @@ class Bridge(_SiUnits):
 
 
 class ParameterSet(_SiUnits):
-    """A named set of pixel parameters; `claims` states what the set is valid for.
+    """A named set of pixel parameters. `claims` states the stimuli and quantities for which it is valid.
 
     terms: parameters of the terms that extend the nominal pixel, by the keys of `optodrive.physics.terms`. The limiter
     accounts for all of them; planner_terms: those that the planner simulates heights with.
@@ -120,7 +120,7 @@ class ParameterSet(_SiUnits):
 
 @dataclass(frozen=True, eq=False)
 class PixelArray:
-    """Nominal parameters of every pixel of a display, each [p]; names and units as in `Pixel`."""
+    """Nominal parameters of every pixel of a display, each [p], with names and units as in `Pixel`."""
 
     r_k_per_w: FloatArray
     c_j_per_k: FloatArray
@@ -152,7 +152,7 @@ class PixelArray:
 
 
 def load_parameters(name: str | Path) -> ParameterSet:
-    """Load a parameter set by its shipped name or from a file; raises InputError for invalid content."""
+    """Load a parameter set by its shipped name or from a file. Raise InputError for invalid content."""
     path = Path(name)
     if path.suffix != ".toml":
         known = sorted(p.stem for p in locate_shipped("parameters").glob("*.toml"))
@@ -207,7 +207,7 @@ def _complete_term(where: str, key: str, values: dict[str, Parameter]) -> dict[s
 
 
 def _merge_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
-    """Return the table merged over the set that it names as its base; terms are merged by key."""
+    """Return the table merged over the set that it names as its base. Terms are merged by key."""
     check_format(path, table, FORMAT, VERSION)
     base = table.pop("base", None)
     if base is None:
@@ -223,7 +223,7 @@ def _merge_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
 
 
 def build_display_pixels(config: Config, parameters: ParameterSet) -> PixelArray:
-    """Return the parameters of every pixel of a configured display; the pixel map's gains scale κ alone.
+    """Return the parameters of every pixel of a configured display. The pixel map's gains scale κ alone.
 
     Raises InputError as `load_pixel_map`, and for gains relative to another parameter set.
     """

@@ -110,7 +110,7 @@ class ActiveTerms(NamedTuple):
 
     @classmethod
     def from_values(cls, values: Mapping[str, TermValues]) -> "ActiveTerms":
-        """Return the set for term → parameter → SI value; terms without kernels have no effect."""
+        """Return the set for term → parameter → SI value. Terms without kernels have no effect."""
         on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), MAX_PARAMETERS))
         rows, laser_rows, panel_rows = [ABSORBER, GAS, NEIGHBOUR], list[int](), list[int]()
         for key, term_values in values.items():
@@ -284,7 +284,7 @@ def _fill_samples(
     index: int,
     out: FloatArray,
 ) -> int:
-    """Write the samples within the step from at_s to `out`, from `index` on; return the index of the next sample."""
+    """Write the samples within the step from at_s to `out`, from `index` on. Return the index of the next sample."""
     while index < len(t_s) and t_s[index] - clock_delay_s <= at_s + h_s:
         sample_s = max(at_s, t_s[index] - clock_delay_s)
         interpolate_states(active.state_rows, work, at_s, h_s, sample_s)

@@ -38,7 +38,9 @@ CHANGE = 1e-3
 
 
 def check_time_constants(values: Mapping[str, TermValues]) -> None:
-    """Raise DivergedError if a term has a time constant that is too short for the steps; term → parameter → SI value.
+    """Raise DivergedError if a term has a time constant that is too short for the steps.
+
+    values: term → parameter → SI value
 
     They are the inverse eigenvalues of the Jacobian of the term's own states, on a hot pixel in the light.
     """

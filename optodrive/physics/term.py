@@ -48,7 +48,7 @@ def add_follower(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) 
 
 
 class Kernels(NamedTuple):
-    """A term's part in the compiled pixel, one function per hook; None leaves the pixel as it is.
+    """A term's part in the compiled pixel, one function per hook. None leaves the pixel as it is.
 
     Each function takes (v, y, s, c, x): v the term's parameters in order, y the states, s the row of the term's first
     follower, c the context, x the value without the term. It returns the value with the term; `rates` writes to x.
@@ -112,7 +112,7 @@ class SignalDelays(NamedTuple):
 
 
 class Term:
-    """One physical effect. A term overrides what differs from the defaults, which leave the model unchanged.
+    """One physical effect. A term overrides the members that differ from the defaults, which leave the model unchanged.
 
     Identity: key, the term's name in files; label, a clause that completes "The nominal model is wrong because …".
     Physics: requires, keys of terms that it builds on; states, shared rows of the state vector that only it moves;
@@ -151,7 +151,7 @@ class Term:
         return self.kernels.membrane_drive is not None or self.kernels.displacement is not None
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
-        """Return an upper bound on the heat that the term adds; None without a bound, and the limiter refuses it."""
+        """Return an upper bound on the heat that the term adds, or None without a bound. The limiter refuses None."""
         return NO_HEAT_GAIN if self.cannot_add_heat else None
 
     def affected_pixel(self, values: TermValues) -> int | None:

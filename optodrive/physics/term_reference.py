@@ -37,7 +37,7 @@ def _describe_parameter(item: TermParameter) -> dict[str, Any]:
 
 
 def build_example(term: Term) -> list[str]:
-    """Return the lines of a parameter set that state a term; shapes and neutral values are omitted."""
+    """Return the lines of a parameter set that state a term. Shapes and neutral values are omitted."""
     stated = [item for item in term.parameters if item.if_omitted is None] or list(term.parameters[:1])
     lines = [f"[terms.{term.key}]"]
     lines += [

@@ -14,7 +14,7 @@ from optodrive.physics.pulse_for_height import DriveRange
 
 
 class ThermalState(Protocol):
-    """Mutable thermal state of every pixel; each pixel has its own time of last event, on one common time line."""
+    """Mutable thermal state of every pixel. Each pixel has its own time of last event, on one common time line."""
 
     pixels: PixelArray
 
@@ -32,7 +32,7 @@ class ThermalState(Protocol):
         power_w: FloatArray,
         on_progress: Callable[[], None] = ignore_progress,
     ) -> PulsePeaks:
-        """Apply pulses [n] in order of time and return the peaks that they cause; on_progress is called meanwhile."""
+        """Apply pulses [n] in order of time and return the peaks that they cause. on_progress is called meanwhile."""
 
     def solve_pulse(
         self,
@@ -53,7 +53,7 @@ class ThermalState(Protocol):
         """Return the largest displacement that one pulse can reach on each cold pixel, [p]."""
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Return the displacement of a pixel at t_s [m] under pulses [n, 4]; the state does not change."""
+        """Return the displacement of a pixel at t_s [m] under pulses [n, 4]. The state does not change."""
 
     def state_at(self, at_s: float) -> DisplayState:
         """Return every pixel at one time, with the gate off since its last event, or at that event if it is later."""

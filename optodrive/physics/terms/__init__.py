@@ -11,7 +11,7 @@ from optodrive.physics.term import Term
 
 @cache
 def discover_terms() -> dict[str, Term]:
-    """Return every term by its key; each module of this package defines one as `TERM`."""
+    """Return every term by its key. Each module of this package defines one as `TERM`."""
     modules = (import_module(f"{__name__}.{item.name}") for item in iter_modules(__path__))
     terms: list[Term] = [module.TERM for module in modules]
     return {term.key: term for term in terms}

@@ -30,7 +30,7 @@ def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) ->
 
 
 class BeamMisalignment(Term):
-    """P (1 − share) on one pixel; the rest heats its wall: time · dm/dt = resistance · share · P − m."""
+    """P (1 − share) on one pixel. The rest heats its wall: time · dm/dt = resistance · share · P − m."""
 
     key = "beam_misalignment"
     label = "on one pixel part of the beam misses the absorber"

@@ -14,7 +14,7 @@ def bridge_resistance(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: fl
 
 
 class BridgeConductivity(Term):
-    """R = R₀ (T / T₀)ⁿ with T the mean of absorber and wall and T₀ ambient; n = 1 is k ~ 1/T (Text S2)."""
+    """R = R₀ (T / T₀)ⁿ with T the mean of absorber and wall and T₀ ambient, where n = 1 is k ~ 1/T (Text S2)."""
 
     key = "bridge_conductivity"
     label = "the bridges conduct less heat when hot"

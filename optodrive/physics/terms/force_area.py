@@ -15,7 +15,7 @@ def force(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> floa
 
 
 class ForceArea(Term):
-    """F = A P_atm ΔT / T₀ with ΔT the gas's rise; share: steady rise of the gas over the absorber's."""
+    """F = A P_atm ΔT / T₀ with ΔT the gas's rise, and share the steady rise of the gas over the absorber's."""
 
     key = "force_area"
     label = "the blocked force acts on less than the whole aperture"

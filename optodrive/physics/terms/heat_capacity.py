@@ -31,7 +31,7 @@ class HeatCapacity(Term):
     signature = "initial slopes at several powers, with unchanged plateaus"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """Return the capacity of the hottest absorber over C₀; the capacity is never below C₀."""
+        """Return the capacity of the hottest absorber over C₀. The capacity is never below C₀."""
         return HeatGainBound(capacity_factor=1.0 + values["slope"] * envelope.absorber_k)
 
 

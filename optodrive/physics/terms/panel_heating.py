@@ -19,7 +19,7 @@ def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) ->
 
 
 class PanelHeating(Term):
-    """C dp/dt = share · P − p / R, with P the light on any pixel; bridge and gas see the panel's rise p."""
+    """C dp/dt = share · P − p / R, with P the light on any pixel. Bridge and gas see the panel's rise p."""
 
     key = "panel_heating"
     label = "the whole panel heats up"

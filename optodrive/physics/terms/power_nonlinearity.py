@@ -10,7 +10,7 @@ START = 0.1
 
 @kernel
 def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """Apply the threshold, then the curve, to the relative power; full power stays full power."""
+    """Apply the threshold, then the curve, to the relative power. Full power stays full power."""
     if x <= 0.0:
         return x
     share, threshold = c[POWER_W] / c[FULL_W], v[0] / c[FULL_W]
@@ -33,11 +33,11 @@ class PowerNonlinearity(Term):
     signature = "a series of powers with unchanged pulse shapes"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """Return the curve's largest gain, which it reaches at low power; a threshold only reduces power."""
+        """Return the curve's largest gain, which it reaches at low power. A threshold only reduces power."""
         return HeatGainBound(power_factor=1.0 + max(0.0, values["curvature"]))
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
-        """Return one hypothesis per parameter if the recording has several powers; the curve alone is linear."""
+        """Return one hypothesis per parameter if the recording has several powers. The curve alone is linear."""
         zero = {item.name: 0.0 for item in self.parameters}
         return [
             Hypothesis(

@@ -13,7 +13,7 @@ def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) ->
 
 
 class WallHeating(Term):
-    """C dw/dt = bridge flow − w / R; bridge and gas see the wall's rise w."""
+    """C dw/dt = bridge flow − w / R. Bridge and gas see the wall's rise w."""
 
     key = "wall_heating"
     label = "the walls heat up"
