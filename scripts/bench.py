@@ -152,7 +152,7 @@ def measure_once_s(work):
 
 
 def integrate_pulses(slope, count, columns):
-    """Integrate the pulses with solve_ivp from edge to edge; return the state [variables × pixels].
+    """Integrate the pulses with solve_ivp from edge to edge. Return the state [variables × pixels].
 
     `slope(pixel, light_w)` returns the function dy/dt.
     """
@@ -230,7 +230,7 @@ def read_rises_at_end(heat, columns):
 
 
 def bench_hour():
-    """Benchmark one hour of full frames on 1,511 pixels, nominal and with walls; one run each."""
+    """Benchmark one hour of full frames on 1,511 pixels, nominal and with walls, in one run each."""
     display, columns = build_hour_of_frames()
     pixel, neighbours = display.pixels.elements[0], Neighbours.from_display(display.config.display)
     walls = WallParameters.from_parameters(load_parameters("surroundings"))
@@ -294,7 +294,7 @@ HIDDEN_TERMS = (
 
 
 def bench_display():
-    """Benchmark the diagnosis of 100 pixels with 15 runs each on two worker processes; one run."""
+    """Benchmark the diagnosis of 100 pixels with 15 runs each on two worker processes, in one run."""
     from display_lab import display_lab
     from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
     from optodrive.lab.diagnosis.display_diagnosis import PixelTask, compile_kernels, diagnose_pixel

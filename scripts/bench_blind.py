@@ -24,7 +24,7 @@ REDUCED_GROUPS = 2
 
 
 def run_case(task: tuple[str, int]) -> dict[str, Any]:
-    """Sample, diagnose and score one case; where the answer is ambiguous, again after the recommended experiment."""
+    """Sample, diagnose and score one case. Repeat it after the recommended experiment where the answer is ambiguous."""
     from blind_lab import draw_case
     from blind_score import score_answer
 
@@ -128,7 +128,7 @@ def format_comparison(done: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run the benchmark and print the table; --save writes every answer to a folder."""
+    """Run the benchmark and print the table. --save writes every answer to a folder."""
     from rich.console import Console
     from rich.progress import track
 

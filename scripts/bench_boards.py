@@ -65,7 +65,7 @@ class Bench:
             self.daemon.arm()
 
     def draw_frame(self):
-        """Draw a full frame; return the true and the reported deviation of each pulse from its plan, s, [n, 2]."""
+        """Draw a full frame. Return the true and the reported deviation of each pulse from its plan, s, [n, 2]."""
         for board in self.boards:
             board.forget()
         body = {"frames": [{"show_at_s": 0, "duration_s": 0.1, "target_um": {str(k): 60.0 for k in range(437)}}]}

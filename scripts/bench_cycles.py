@@ -173,7 +173,7 @@ def build_simultaneous_table(display):
 
 
 def measure_shortening(display):
-    """Count the random frames that interleaving shortens; return one line."""
+    """Count the random frames that interleaving shortens. Return one line."""
     generator = np.random.default_rng(1)
     with record_candidates() as recorded:
         for _ in range(FRAMES):

@@ -31,7 +31,7 @@ class HiddenGeometryLab:
         self.code_m = 2.0 * self.config.scanner.focal_length_m * self.config.scanner.rad_per_code
 
     def fit_spots(self, seed, side):
-        """Fit a grid of spots with noise and outliers; return the ground truth and the fit."""
+        """Fit a grid of spots with noise and outliers. Return the ground truth and the fit."""
         truth, random = GroundTruthGeometry.sample(seed, self.config), np.random.default_rng([seed, side])
         axis_codes = np.rint(CENTRE_CODE + np.linspace(-self.half_m, self.half_m, side) / self.code_m)
         codes = np.stack(np.meshgrid(axis_codes, axis_codes), axis=-1).reshape(-1, 2)

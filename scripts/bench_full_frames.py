@@ -55,7 +55,7 @@ class LogCounter:
 
 
 class FrameStream:
-    """A WebSocket that sends a travelling wave on every pixel; it connects and arms again after an interruption."""
+    """A WebSocket that sends a travelling wave on every pixel. It connects and arms again after an interruption."""
 
     def __init__(self, daemon, duration_s):
         self._daemon, self._end_s = daemon, time.monotonic() + duration_s
@@ -117,7 +117,7 @@ def read_memory(daemon):
 
 
 def measure_full_frames(duration_s):
-    """Stream full frames for a time beside busy loops; return the rows of the table."""
+    """Stream full frames for a time beside busy loops. Return the rows of the table."""
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         log = LogCounter(folder / "board.jsonl")

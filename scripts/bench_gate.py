@@ -1,4 +1,4 @@
-"""What depends on the computer, in a few minutes: one table of times with their aims. Nothing is asserted.
+"""One table of times that depend on the computer, with their aims, in a few minutes. Nothing is asserted.
 
 Beside each row stands how late the computer woke a process that only sleeps, at the same time, and, where there is one,
 the ratio to a reference of the same run. Daemon, board, callers and this benchmark share the computer.
@@ -81,7 +81,7 @@ class Row:
     late_s: list[float] = field(default_factory=list)
 
     def report(self):
-        """Return the row as JSON values; times without a unit in their name are in the row's unit."""
+        """Return the row as JSON values. Times without a unit in their name are in the row's unit."""
         p50, p99, largest = (self._percentile(self.values, share) for share in (0.5, 0.99, 1.0))
         reference = self._percentile(self.reference_values, 0.5)
         return {
@@ -111,7 +111,10 @@ def to_ms(values_s):
 
 
 class Bench:
-    """What measurements share: boards and daemons that start when they are first needed, and end with the benchmark."""
+    """Boards and daemons that measurements share, started when they are first needed.
+
+    They end with the benchmark.
+    """
 
     def __init__(self, stack: ExitStack) -> None:
         self._stack = stack
@@ -134,7 +137,10 @@ class Bench:
 
     @contextmanager
     def daemon(self, text="", name="display-437") -> Iterator[tuple[Board, Daemon]]:
-        """Run a daemon on a board of its own. text: of its section [daemon]"""
+        """Run a daemon on a board of its own.
+
+        text: of its section [daemon]
+        """
         folder = self.make_folder()
         board = Board(folder, limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
         try:
@@ -455,7 +461,7 @@ def measure_restart(bench):
 
 
 def kill_and_await(board, daemon, name):
-    """Kill a process while a train runs; return the times until dark and until the next one serves, s."""
+    """Kill a process while a train runs. Return the times until dark and until the next one serves, s."""
     light(board, daemon)
     pid = daemon.find_process(name)
     killed_us, killed_s = board.now_us(), time.monotonic()
@@ -498,7 +504,10 @@ def measure_loss(bench):
 
 
 def lose(bench, board, daemon, number):
-    """Send a signal to every process of a daemon; return the times until dark and until the end of the command, s."""
+    """Send a signal to every process of a daemon.
+
+    Return the times until dark and until the end of the command, s.
+    """
     daemon.client.post("/v1/disarm")
     daemon.arm()
     board.forget()
@@ -539,7 +548,7 @@ def measure_end(bench):
 
 @measurement("board")
 def measure_board(bench):
-    """The exchanges of a session's clock; that of one of several boards has four per second."""
+    """Measure the exchanges of a session's clock. That of one of several boards has four per second."""
     folder = bench.make_folder()
     board = Board(folder)
     try:
@@ -589,7 +598,7 @@ def measure_boards(bench):
 
 
 def run(names):
-    """Run measurements; yield their names and rows."""
+    """Run measurements. Yield their names and rows."""
     with ExitStack() as stack:
         bench = Bench(stack)
         for name in names:

@@ -41,7 +41,7 @@ PAGE_SCRIPT = """async ([bodies, periodMs]) => {
 
 @dataclass
 class Frame:
-    """A frame with the monotonic times before and after it was sent, and what was reported of its plan."""
+    """A frame with the monotonic times before and after it was sent, and the report of its plan."""
 
     target_um: dict
     before_s: float = 0.0
@@ -116,7 +116,7 @@ def send_over_client(daemon, frames, rate_hz):
 
 
 class Relay:
-    """A TCP relay in front of a daemon, for when a browser's frames leave for it; the browser itself cannot tell.
+    """A TCP relay in front of a daemon that notes when a browser's frames leave for it. The browser itself cannot tell.
 
     frames: noted when the request that names their number passes
     """
@@ -172,7 +172,7 @@ def run_daemon(folder):
 
 
 def measure_errors(board, daemon, way, rate_hz, count=FRAMES):
-    """Show frames; return the errors of the reported latencies of those that gave light, s."""
+    """Show frames. Return the errors of the reported latencies of those that gave light, s."""
     if daemon.board_state() == "DISARMED":
         daemon.arm()
     board.forget()

@@ -35,7 +35,7 @@ class OrderBenchmark:
         self.x_rad, self.y_rad = scan_head.field.angles_rad(self.layout.x_m, self.layout.y_m)
 
     def compute_move_us(self, origin, pixel, dwell_us=LONG_DWELL_US):
-        """Return the settling time of a move, µs; the lead-in without an origin."""
+        """Return the settling time of a move, µs, or the lead-in without an origin."""
         if origin is None:
             return self.settling.lead_in_us
         return self.settling.settling_us(
@@ -43,7 +43,7 @@ class OrderBenchmark:
         )
 
     def compute_naive_move_us(self, origin, pixel, _dwell_us=0):
-        """Return the naive duration of a move, µs; the lead-in without an origin."""
+        """Return the naive duration of a move, µs, or the lead-in without an origin."""
         if origin is None:
             return self.settling.lead_in_us
         distance_rad = max(abs(self.x_rad[pixel] - self.x_rad[origin]), abs(self.y_rad[pixel] - self.y_rad[origin]))

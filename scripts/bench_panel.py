@@ -43,7 +43,7 @@ def build_display(name, room_c, has_panel):
 
 
 def measure(display, pixels, height_um, duration_s, is_warm):
-    """Show one frame after the other; return the raised pixels per second, and the panel's bound at the end, K.
+    """Show one frame after the other. Return the raised pixels per second, and the panel's bound at the end, K.
 
     is_warm: begin with the panel as warm as permanent light of full power makes its bound
     """

@@ -201,7 +201,10 @@ def connect_and_arm(session):
 
 
 def run_soak(total, lead_s=LEAD_S):
-    """Run the test; return the rows of the table and the failures. lead_s: time from the first point to the start."""
+    """Run the test. Return the rows of the table and the failures.
+
+    lead_s: time from the first point to the start
+    """
     memory = []
     with tempfile.TemporaryDirectory() as folder, SoakBoard(Path(folder)) as board_process:
         session = BoardSession(SerialPort(str(board_process.port), BAUD), MonotonicClock(), build_requirements(BAUD))

@@ -44,7 +44,7 @@ def build_display(name, count):
 
 
 def build_cases(display):
-    """Yield the name of each case and its sequence; frames are requested at once, one after the other."""
+    """Yield the name of each case and its sequence. Frames are requested at once, one after the other."""
     count, rng = len(display.pixels), np.random.default_rng(7)
     half = rng.choice(count, count // 2, replace=False)
     heights_m = np.zeros(count)

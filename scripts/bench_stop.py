@@ -33,7 +33,7 @@ GIVEN_UP = (OSError, AssertionError, httpx.HTTPError)
 
 @dataclass
 class FloodResult:
-    """What shows and their STOPs met under a flood.
+    """Results of shows and their STOPs under a flood.
 
     gate_off_s: from sending STOP to the board's abort; answered_s: from sending STOP to the first byte of its answer
     reference_s: times of the reference, measured before each STOP
@@ -61,7 +61,7 @@ def start_show(rig):
 
 
 def watch_show(rig, result, begin, duration_s):
-    """Let the show that began at an event run for a time, note what darkens it, and return whether it is lit."""
+    """Let the show that began at an event run for a time, note its darkenings, and return whether it is lit."""
     until_s = time.monotonic() + duration_s
     while time.monotonic() < until_s and not rig.find_darkness(begin):
         time.sleep(0.05)
@@ -138,7 +138,7 @@ def count_items(items):
 
 
 def measure_flood(name, options):
-    """Measure one flood on a new board and daemon; return its FloodResult."""
+    """Measure one flood on a new board and daemon. Return its FloodResult."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         rig = StopRig(Path(folder), lease_s=options.lease_s)
         try:

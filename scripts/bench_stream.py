@@ -125,7 +125,10 @@ def measure_superseding():
 
 
 def push_frames(url, seconds):
-    """Push frames for a time; return round trips, s, the answers, the final state, and the plans of the last frames."""
+    """Push frames for a time.
+
+    Return round trips, s, the answers, the final state, and the plans of the last frames.
+    """
     rng = np.random.default_rng(7)
     trips, answers = [], []
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30) as client:
@@ -151,7 +154,7 @@ def push_frames(url, seconds):
 
 
 def start_bare_server(folder, port):
-    """Start the bare FastAPI application; return its process and its URL."""
+    """Start the bare FastAPI application. Return its process and its URL."""
     script, url = Path(folder) / "bare.py", f"http://127.0.0.1:{port}"
     script.write_text(BARE_SERVER)
     process = subprocess.Popen([sys.executable, script, str(port)])
@@ -164,7 +167,10 @@ def start_bare_server(folder, port):
 
 
 def push_frames_under_load(url, tokens, load_hz, seconds):
-    """Push frames while other clients request the state; return what push_frames does, and the answers per second."""
+    """Push frames while other clients request the state.
+
+    Return the result of push_frames, and the answers per second.
+    """
     if load_hz is None:
         return push_frames(url, seconds), 0.0
     interval_s = CLIENTS / load_hz if load_hz else 0.0
@@ -187,7 +193,7 @@ def format_percentiles(name, values, unit="ms"):
 
 @dataclass
 class Streaming:
-    """What pushing frames under load met at the daemon and at a bare FastAPI.
+    """Results of pushing frames under load, at the daemon and at a bare FastAPI.
 
     rate_hz, bare_rate_hz: answers to the other clients; trips_s, bare_trips_s: round trips of the frames
     plans: the last ones; latencies: of those that were shown; state: the final one
@@ -232,7 +238,7 @@ def stream_under_load(load_hz=LOAD_HZ, lead_s=LEAD_S, seconds=SECONDS):
 
 
 def measure_latency(load_hz=LOAD_HZ, lead_s=LEAD_S):
-    """Measure frames over REST under load, at the daemon and at a bare FastAPI; return the rows of the table."""
+    """Measure frames over REST under load, at the daemon and at a bare FastAPI. Return the rows of the table."""
     measured = stream_under_load(load_hz, lead_s)
     finished, plans = measured.latencies, measured.plans
     first_byte_s = [latency["first_byte_s"] for latency in finished]

@@ -36,7 +36,7 @@ UNIT_SCALES = {"tau_g": 1e-3, "area": 1e-6, "kappa": 1e-6, "phi": 1e-3}
 
 
 def list_free_parameters(terms):
-    """Return the free parameters of a model; a term replaces the nominal parameter of its quantity."""
+    """Return the free parameters of a model. A term replaces the nominal parameter of its quantity."""
     names = ["share" if "gas_membrane" in terms else "kappa", "tau_g", "area" if "force_area" in terms else "phi"]
     return names + (["n"] if "bridge_conductivity" in terms else [])
 
@@ -60,7 +60,7 @@ def build_parameters(base, terms, values):
 
 
 def fit_terms(base, terms, half):
-    """Fit the logarithm of model over measured to one half; return the values and the fitted facts."""
+    """Fit the logarithm of model over measured to one half. Return the values and the fitted facts."""
     facts, names = load_paper_facts(), list_free_parameters(terms)
     fitted_facts = [fact for fact in HALVES[half] if "n" in names or "T_peak" not in fact]
 
@@ -97,7 +97,7 @@ def measure_gains():
 
 
 def format_table(results):
-    """Format the ratios by model as Markdown; facts of the fit are bold."""
+    """Format the ratios by model as Markdown. Facts of the fit are bold."""
     lines = [
         "| model | fitted half | " + " | ".join(JUDGED_FACTS) + " | held-out error |",
         "| --- " * (len(JUDGED_FACTS) + 3) + "|",

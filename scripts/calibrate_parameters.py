@@ -1,4 +1,4 @@
-"""Fit kappa, tau_g and phi to one fact each; epsilon, R and C keep the values of the paper."""
+"""Fit kappa, tau_g and phi to one fact each. Epsilon, R and C keep the values of the paper."""
 
 import argparse
 import re
@@ -80,7 +80,7 @@ def replace_value(parameters: ParameterSet, name: str, value: float) -> Paramete
 
 
 def format_toml(fitted: ParameterSet, sigmas: dict[str, float]) -> str:
-    """Format the calibrated set as TOML; parameters of the paper are copied from the file of the literal set."""
+    """Format the calibrated set as TOML. Parameters of the paper are copied from the file of the literal set."""
     own = locate_shipped("parameters", "paper_s1_literal.toml").read_text(encoding="utf-8")
     epsilon = re.search(r"\[epsilon\].*?(?=\n\[)", own, re.DOTALL).group()
     absorber = own[own.index("[R_width_product]") :]

@@ -38,7 +38,7 @@ TIME_UNITS = ("_s", "_ms", "_us", "_ns")
 
 
 class Kind(IntEnum):
-    """Kind of a value; of several, the largest prevails."""
+    """Kind of a value. Of several, the largest prevails."""
 
     OTHER = 0
     INSTANT = 1
@@ -62,7 +62,7 @@ class Facts:
         return sum(self.attributes.values()) + sum(self.results.values())
 
     def find_attribute(self, name: str) -> Kind:
-        """Return the kind of an attribute or key; only a name that ends in a unit of time has one."""
+        """Return the kind of an attribute or key. Only a name that ends in a unit of time has one."""
         if not name.endswith(TIME_UNITS):
             return Kind.OTHER
         return max(facts.attributes.get(name, Kind.OTHER) for facts in (self, *self.others))
@@ -174,7 +174,10 @@ class Scope:
 
 
 class Reader(ast.NodeVisitor):
-    """Follows the values of one file. problems: lines of refused comparisons"""
+    """Follows the values of one file.
+
+    problems: lines of refused comparisons
+    """
 
     def __init__(self, facts: Facts, tree: ast.Module) -> None:
         imported = {
@@ -285,7 +288,10 @@ def is_verdict(statement: ast.stmt | None) -> bool:
 
 
 def find_problems(sources: dict[str, str]) -> list[str]:
-    """Return one line per refused comparison. sources: texts by path"""
+    """Return one line per refused comparison.
+
+    sources: texts by path
+    """
     trees = {path: ast.parse(text) for path, text in sources.items()}
     modules = {path: Facts() for path in trees}
     for path, tree in trees.items():

@@ -41,7 +41,7 @@ def start_daemon(port: int, config: str | None) -> tuple[subprocess.Popen[bytes]
 
 
 def play_pattern(client: DaemonClient, pattern: str) -> Plan:
-    """Play a pattern to its end; return its plan."""
+    """Play a pattern to its end. Return its plan."""
     plan = client.call(build_play_request(pattern, {}, "trim", "as_is", dry_run=False))
     with Progress(
         TextColumn("{task.description}"),
@@ -69,7 +69,7 @@ def format_row(name: str, plan: Plan) -> list[str]:
 
 
 def print_report(shown: list[tuple[str, Plan]]) -> bool:
-    """Print what was shown; return whether every planned pulse was sent and executed."""
+    """Print the shown plans. Return whether every planned pulse was sent and executed."""
     done = [(name, plan) for name, plan in shown if plan.status == "done"]
     table = Table(*COLUMNS)
     for name, plan in done:

@@ -1,4 +1,4 @@
-"""Load test of a daemon with a simulated board: clients push frames and poll the state; a STOP every few seconds.
+"""Load test of a daemon with a simulated board: clients push frames, poll the state, and STOP every few seconds.
 
 Half of the pushing clients send dry runs, the others send frames that supersede waiting ones. The clients run at fixed
 rates in one process, STOP is sent by another. The time to gate off is taken from the board's log: the last edge minus
@@ -212,7 +212,7 @@ class StopTest:
             self.gate_off_s.append(max(0.0, 1e-6 * (edges[-1]["t_us"] - sent_us)))
 
     def _wait_for_gate_edge_us(self):
-        """Wait for an edge of the gate and return its time on the board's clock, µs; None if the gate stays off."""
+        """Wait for an edge of the gate and return its time on the board's clock, µs, or None if the gate stays off."""
         self._rig.read_new_events()
         end_s = time.monotonic() + 0.3
         while time.monotonic() < end_s:

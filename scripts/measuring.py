@@ -1,4 +1,4 @@
-"""What benchmarks share: an end to waiting, times of calls, the lateness of the computer, and percentiles."""
+"""Tools that benchmarks share: an end to waiting, times of calls, the lateness of the computer, and percentiles."""
 
 import json
 import os
@@ -47,7 +47,7 @@ class Sleeper:
 
 @contextmanager
 def time_limit(limit_s):
-    """Raise TimeoutError in this block after a time, wherever the main thread waits; such blocks may be nested."""
+    """Raise TimeoutError in this block after a time, wherever the main thread waits. Such blocks may be nested."""
 
     def end(*_):
         raise TimeoutError(f"it took longer than {limit_s:g} s")
@@ -66,7 +66,7 @@ def time_limit(limit_s):
 
 @contextmanager
 def realtime_priority():
-    """Run this block before all programs of usual priority, where that is permitted; processes it starts do not."""
+    """Run this block before all programs of usual priority, where that is permitted. Processes it starts do not."""
     scheduling = os.sched_getscheduler(0), os.sched_getparam(0)
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
@@ -87,6 +87,6 @@ def measure_median_cpu_s(work, runs=7):
 
 
 def compute_percentile(values, share):
-    """Return the value below which a share of the values lies; NaN without values."""
+    """Return the value below which a share of the values lies, or NaN without values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else float("nan")

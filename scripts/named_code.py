@@ -1,4 +1,4 @@
-"""Look up the code that a page names as `file:function`: a page must not outlive what it describes."""
+"""Look up the code that a page names as `file:function`. A page must not outlive the code that it describes."""
 
 import ast
 import re
@@ -9,7 +9,10 @@ NAMED = re.compile(r"`([\w/]+\.(?:py|c)):([\w.]+)`")
 
 
 def find_missing(markdown: str, root: Path = ROOT) -> list[str]:
-    """Return what a page names and the code lacks: files below optodrive/ or firmware_protocol/, functions, classes."""
+    """Return the code that a page names and that does not exist.
+
+    It consists of files below optodrive/ or firmware_protocol/, functions, classes.
+    """
     return [f"{file}:{name}" for file, name in NAMED.findall(markdown) if not _has(root, file, name)]
 
 

@@ -72,7 +72,7 @@ def format_type(schema: dict[str, Any]) -> str:
 
 
 def format_default(info: FieldInfo) -> str:
-    """Return a field's default as TOML, or what its absence means."""
+    """Return a field's default as TOML, or the meaning of its absence."""
     if info.default is PydanticUndefined:
         return "required"
     return "none" if info.default is None else f"`{info.default!r}`".replace("'", '"').replace("True", "true")
@@ -131,7 +131,7 @@ PAGES = {
 
 
 def main() -> None:
-    """Write every page; an argument names another folder."""
+    """Write every page. An argument names another folder."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
     for name, build in PAGES.items():
         (folder / name).write_text(build(), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The REST reference, generated from the application's own OpenAPI document; run as a script, it prints the page."""
+"""The REST reference, generated from the application's own OpenAPI document. Run as a script, it prints the page."""
 
 from pathlib import Path
 
@@ -92,7 +92,7 @@ def format_content(response):
 
 
 def format_model(name, schema, configured):
-    """Format one model: its description and members; the page on the configuration has those of `configured`."""
+    """Format one model: its description and members. The page on the configuration has those of `configured`."""
     lines = [f"### {name}", ""]
     if schema.get("description"):
         lines += [schema["description"].strip(), ""]
@@ -116,7 +116,7 @@ def format_parameter(schema):
 
 
 def format_type(schema, configured=frozenset()):
-    """Format the type of a schema; a model is linked."""
+    """Format the type of a schema. A model is linked."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return f"[{name}](configuration.md)" if name in configured else f"[{name}](#{name.lower()})"

@@ -106,7 +106,7 @@ def load_retired(text: str) -> Retired:
 
 
 def python_names(path: str, source: str) -> Iterator[Name]:
-    """Yield what a Python file defines, its keyword arguments and its string keys."""
+    """Yield the names that a Python file defines, its keyword arguments and its string keys."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             if not names_scenario(path, node.name):
@@ -138,7 +138,7 @@ def is_key(node: ast.expr | None) -> bool:
 
 
 def key_name(node: ast.expr | None, path: str) -> Name:
-    """Return the key that a node holds; only for nodes that `is_key` accepts."""
+    """Return the key that a node holds. Only nodes that `is_key` accepts are permitted."""
     assert isinstance(node, ast.Constant)
     return Name(str(node.value), path, node.lineno)
 
@@ -176,7 +176,7 @@ def tracked_files() -> list[str]:
 
 
 def main() -> int:
-    """Print every problem with its place; exit status 1 if there is one."""
+    """Print every problem with its place. The exit status is 1 if there is one."""
     glossary = GLOSSARY.read_text(encoding="utf-8")
     retired, phrases = load_retired(glossary), load_phrases(glossary)
     verdicts: dict[tuple[str, bool], str | None] = {}

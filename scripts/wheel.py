@@ -26,7 +26,7 @@ def build_wheel(folder):
 
 
 def install_wheel(wheel, folder, quick):
-    """Install the wheel and its dependencies into an empty environment; return the path of its `optodrive`.
+    """Install the wheel and its dependencies into an empty environment. Return the path of its `optodrive`.
 
     With `quick`, the dependencies of the current environment are used.
     """
@@ -42,7 +42,7 @@ def install_wheel(wheel, folder, quick):
 
 
 def try_installation(optodrive, outside):
-    """Check the shipped configurations, run the daemon, and return what it answers over HTTP."""
+    """Check the shipped configurations, run the daemon, and return its answers over HTTP."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     environment |= {"OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(outside)}
 

@@ -19,7 +19,7 @@ SENSOR_BAUD = 115_200
 
 
 def confirm_emission(confirmed: bool, action: str) -> None:
-    """Ask on the terminal whether the laser may emit; do nothing if that is confirmed already.
+    """Ask on the terminal whether the laser may emit. Do nothing if that is confirmed already.
 
     action: what the command is about to do. Raises InputError without a terminal to ask on, typer.Abort for a no.
     """
@@ -39,7 +39,7 @@ class BoardAccess(NamedTuple):
 
 @contextmanager
 def open_board(config: str | None, calibrated_field: bool = False, stage: str | None = None) -> Iterator[BoardAccess]:
-    """Open the configured board and sensor; on exit, send ABORT and close both.
+    """Open the configured board and sensor. On exit, send ABORT and close both.
 
     stage: name of the stage whose board it is, None for the only one
     calibrated_field: aim by the field of the configuration; by default by the nominal one, for an invalid field.toml

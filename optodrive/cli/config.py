@@ -41,7 +41,7 @@ def new(
         str | None, typer.Option("--port", metavar="DEVICE", help="Serial device of the board, or: simulated.")
     ] = None,
 ) -> None:
-    """Write a configuration; ask on the terminal for what no option states."""
+    """Write a configuration. Ask on the terminal for each value that no option states."""
     from optodrive.core.files import atomic_write, check_output
     from optodrive.device.config_template import NewDisplay, write_template
     from optodrive.planning.display_model import DisplayModel
@@ -99,7 +99,7 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
 
 
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Check a configuration file and the files that it names; the tokens only for the daemon's user."""
+    """Check a configuration file and the files that it names. Tokens are checked only for the daemon's user."""
     from optodrive.daemon.web.tokens import read_private_tokens
     from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
@@ -121,7 +121,7 @@ def migrate(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Rename the keys of an older configuration, or list the lines that only you can change; FILE stays as it is."""
+    """Rename the keys of an older configuration, or list the lines that only you can change. FILE stays as it is."""
     from optodrive.core.files import atomic_write, check_output
     from optodrive.device.config_migration import migrate_config
 

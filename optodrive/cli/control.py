@@ -53,7 +53,7 @@ def _print_stage(state: "StateReport", name: str, as_json: bool) -> None:
 
 
 def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption = False) -> None:
-    """Arm the board; its indicator is on for two seconds first. With --hold, until this command ends (Ctrl-C)."""
+    """Arm the board. Its indicator is on for two seconds first. With --hold, until this command ends (Ctrl-C)."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import ARM, READ_STATE
 
@@ -70,7 +70,7 @@ def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption
 
 
 def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Disarm the board; this also acknowledges a fault whose cause is gone."""
+    """Disarm the board. This also acknowledges a fault whose cause is gone."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import DISARM
 
@@ -82,7 +82,7 @@ def dim(
     url: UrlOption = DEFAULT_URL,
     json: JsonOption = False,
 ) -> None:
-    """Cap the power of every pulse of the plans from now on; only an armer may raise it again."""
+    """Cap the power of every pulse of the plans from now on. Only an armer may raise it again."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import build_dim_request
 
@@ -90,7 +90,7 @@ def dim(
 
 
 def pause(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Switch the gate off; the board stays armed and plans wait, for five minutes at most."""
+    """Switch the gate off. The board stays armed and plans wait, for five minutes at most."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import PAUSE
 
@@ -98,7 +98,7 @@ def pause(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def resume(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Play what was left at the pause, and what waits."""
+    """Play the rest of the paused plan, and the waiting plans."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import RESUME
 
@@ -106,7 +106,7 @@ def resume(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def reload(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Let the daemon read its configuration and tokens again; some keys apply at once, the others after a restart."""
+    """Let the daemon read its configuration and tokens again. Some keys apply at once, the others after a restart."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import RELOAD
 
@@ -118,7 +118,10 @@ def reload(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Switch the gate off, drop everything queued, disarm the board; on the daemon's computer even if it hangs."""
+    """Switch the gate off, drop everything queued, disarm the board.
+
+    On the daemon's computer it works even if the daemon hangs.
+    """
     from optodrive.cli.direct_stop import stop_directly
 
     result = stop_directly(url)
@@ -137,7 +140,10 @@ def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def _print_stopped(result: dict[str, Any], error: OptodriveError, as_json: bool) -> None:
-    """Print the result of the link process; error: why the daemon's state is not known."""
+    """Print the result of the link process.
+
+    error: why the daemon's state is not known
+    """
     board = result["board"]
     if as_json:
         print_json({"board": board})

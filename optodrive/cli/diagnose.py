@@ -30,7 +30,7 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class _DiagnosisOutput:
-    """A diagnosis as JSON document, text, HTML and TOML; model_toml is None without a model to write."""
+    """A diagnosis as JSON document, text, HTML and TOML. model_toml is None without a model to write."""
 
     document: dict[str, Any]
     narrative: list[str]

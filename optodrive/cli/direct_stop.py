@@ -26,7 +26,7 @@ def list_link_sockets(url: str) -> list[Path]:
 
 
 def stop_directly(url: str) -> dict[str, Any] | None:
-    """Stop at the link process; return its result, None if no link process can be reached from here.
+    """Stop at the link process. Return its result, or None if no link process can be reached from here.
 
     Raise LinkError if it does not confirm.
     """

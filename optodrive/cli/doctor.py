@@ -29,7 +29,7 @@ def doctor(
     watch: Annotated[bool, typer.Option("--watch", help="Repeat the checks until Ctrl-C and show changes.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Check computer, port and board without arming; exit status 1 where there is a problem."""
+    """Check computer, port and board without arming. The exit status is 1 where there is a problem."""
     if watch:
         _report_changes(config, stage, json)
         return
@@ -54,7 +54,7 @@ def _print_findings(findings: "list[Finding]") -> None:
 
 
 def _report_changes(config: str | None, stage: str | None, json: bool) -> None:
-    """Print all findings and then, with the time of day, those that change; with `json`, one line per change."""
+    """Print all findings and then, with the time of day, those that change. With `json`, print one line per change."""
     from json import dumps
 
     from optodrive.cli.doctor_watch import watch
@@ -71,7 +71,9 @@ def _report_changes(config: str | None, stage: str | None, json: bool) -> None:
 
 
 def examine(config: str | None, root: Path = Path("/"), stage: str | None = None) -> list["Finding"]:
-    """Return all findings in order; `root` replaces / in tests. stage: the only one to examine, of several.
+    """Return all findings in order. `root` replaces / in tests.
+
+    stage: the only one to examine, of several
 
     Raise InputError for a stage that the configuration does not have.
     """

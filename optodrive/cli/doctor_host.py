@@ -122,7 +122,7 @@ def check_disk() -> list[Finding]:
 
 
 def check_free_space(folder: Path, free_bytes: int) -> Finding:
-    """Check the space for logs and link captures; one hour at 100 pulses/s is a capture of about 30 MB."""
+    """Check the space for logs and link captures. One hour at 100 pulses/s is a capture of about 30 MB."""
     observation = f"{free_bytes / 1e9:.1f} GB free in {folder}"
     if free_bytes < DISK_FULL_BYTES:
         return report_problem("disk", observation, "free space: logs and recordings stop when the disk is full")

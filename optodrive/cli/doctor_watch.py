@@ -11,7 +11,7 @@ NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def watch(examine: Callable[[], list[Finding]], clock: Clock) -> Iterator[list[Finding]]:
-    """Yield all findings, and then, every INTERVAL_S, those that changed; without end.
+    """Yield all findings, and then, every INTERVAL_S, those that changed, without end.
 
     Numbers that vary, such as a round trip, are no change.
     """

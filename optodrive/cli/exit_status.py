@@ -16,6 +16,6 @@ SUMMARY = (
 
 
 def exit_unless_fits(feasibility: "FeasibilityReport | None") -> None:
-    """End the command with status 3 if its stimulus does not fit; None, of a plan without a report, ends nothing."""
+    """End the command with status 3 if its stimulus does not fit. None, of a plan without a report, ends nothing."""
     if feasibility is not None and not feasibility.fits:
         raise typer.Exit(DOES_NOT_FIT)

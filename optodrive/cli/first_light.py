@@ -31,7 +31,7 @@ def first_light(
     stage: StageOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Check the board, centre the mirrors and emit single weak pulses there; ends disarmed in every case."""
+    """Check the board, centre the mirrors and emit single weak pulses there. The board ends disarmed in every case."""
     from optodrive.cli.board_access import open_board
     from optodrive.device.config_file import load_config
     from optodrive.lab.commissioning.exclusive_board import check_spot_power, spot_width_s

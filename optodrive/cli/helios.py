@@ -54,7 +54,7 @@ def register(app: typer.Typer) -> None:
 
 
 def info(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Show the connected Helios and whether it may emit; it is stopped, and its shutter closed."""
+    """Show the connected Helios and whether it may emit. It is stopped, and its shutter closed."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.helios.dac import Helios
 
@@ -84,7 +84,7 @@ def play(
     fit: FitOption = "as_is",
     json: JsonOption = False,
 ) -> None:
-    """Plan, limit and verify frames, play them on a Helios, and report what was sent; Ctrl-C switches the light off."""
+    """Plan, limit and verify frames, play them on a Helios, report the sent pulses. Ctrl-C switches the light off."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.helios.dac import Helios
     from optodrive.link.helios.encoding import PointScale
@@ -134,7 +134,10 @@ def play(
 
 @contextmanager
 def _defer_signals() -> Iterator[Callable[[], None]]:
-    """Defer terminating signals, so that none interrupts a stop; yield the function that raises for a received one."""
+    """Defer terminating signals, so that none interrupts a stop.
+
+    Yield the function that raises for a received one.
+    """
     received: list[int] = []
 
     def raise_if_signalled() -> None:

@@ -25,7 +25,7 @@ def home(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Centre the mirrors; check travel, position outputs, interlock, key, emergency stop and indicator."""
+    """Centre the mirrors. Check travel, position outputs, interlock, key, emergency stop and indicator."""
     from optodrive.cli.board_access import open_board
     from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.homing import Homing

@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Run the command line and return its exit status; print a known error as one line on stderr."""
+    """Run the command line and return its exit status. Print a known error as one line on stderr."""
     try:
         status = app(args=arguments, prog_name="optodrive", standalone_mode=False, obj=tuple(arguments))
         sys.stdout.flush()

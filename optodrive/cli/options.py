@@ -61,7 +61,7 @@ DEFAULT_URL = "http://127.0.0.1:8450"
 
 
 def check_model_path(path: Path) -> Path:
-    """Return the path; raise InputError without suffix .toml, which would name a shipped parameter set."""
+    """Return the path. Raise InputError without suffix .toml, which would name a shipped parameter set."""
     if path.suffix != ".toml":
         raise InputError("--model", str(path), "a .toml file")
     return path

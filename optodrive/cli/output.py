@@ -11,13 +11,16 @@ TABLE_WIDTH_MAX = 500
 
 
 def print_json(document: object) -> None:
-    """Print one JSON object on stdout; it may be or contain Pydantic models."""
+    """Print one JSON object on stdout. It may be or contain Pydantic models."""
     json.dump(document, sys.stdout, indent=2, ensure_ascii=False, default=_convert_model)
     sys.stdout.write("\n")
 
 
 def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], numeric: frozenset[str] = frozenset()) -> None:
-    """Print a table on stdout, not narrower than its content; numeric: headings of the columns aligned to the right."""
+    """Print a table on stdout, not narrower than its content.
+
+    numeric: headings of the columns aligned to the right
+    """
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -45,7 +48,7 @@ def _convert_model(value: object) -> object:
 
 
 def announce_compilation() -> None:
-    """Announce on stderr that kernels are compiled, once the first is; count them where stderr is a terminal."""
+    """Announce on stderr that kernels are compiled, once the first is. Count them where stderr is a terminal."""
     from optodrive.core.kernels import observe_compilation
 
     shown: Any = None
@@ -71,7 +74,7 @@ def announce_compilation() -> None:
 
 @contextmanager
 def show_progress(label: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar on stderr where it is a terminal; yield the callback, which takes the fraction 0 to 1."""
+    """Show a progress bar on stderr where it is a terminal. Yield the callback, which takes the fraction 0 to 1."""
     if not sys.stderr.isatty():
         yield lambda fraction: None
         return
@@ -86,7 +89,7 @@ def show_progress(label: str) -> Iterator[Callable[[float], None]]:
 
 @contextmanager
 def show_step(first_step: str) -> Iterator[Callable[[str], None]]:
-    """Show the current step and the elapsed time on stderr where it is a terminal; yield the callback."""
+    """Show the current step and the elapsed time on stderr where it is a terminal. Yield the callback."""
     if not sys.stderr.isatty():
         yield lambda step: None
         return

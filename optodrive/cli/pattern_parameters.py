@@ -7,7 +7,7 @@ from optodrive.core.errors import InputError
 
 
 def parse_parameters(command: str, pattern: str, values: list[str]) -> dict[str, str]:
-    """Return the parameters as text; the content of files in base64.
+    """Return the parameters as text, with the content of files in base64.
 
     command: its name, for errors. Raises InputError for an unknown pattern, a value without a key and a file that
     cannot be read.

@@ -47,7 +47,7 @@ def plan(
     fit: FitOption = "as_is",
     json: JsonOption = False,
 ) -> None:
-    """Plan and limit frames; report feasibility, pulses, beam time, trimmed pulses and predicted displacement."""
+    """Plan and limit frames. Report feasibility, pulses, beam time, trimmed pulses and predicted displacement."""
     from optodrive.core.files import atomic_write, check_output
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility

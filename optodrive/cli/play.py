@@ -52,7 +52,7 @@ def push(
     label: LabelOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Plan frames and trains, show them, and report what was executed."""
+    """Plan frames and trains, show them, and report the executed pulses."""
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import build_push_request
 

@@ -31,7 +31,7 @@ def install(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write unit, user, udev rules and configuration; edited files are never overwritten."""
+    """Write unit, user, udev rules and configuration. Edited files are never overwritten."""
     from optodrive.cli.service_files import CONFIG_PATH, DEVICE_LINK, Installation, build_service_files
 
     installation = Installation(root)

@@ -70,7 +70,7 @@ def _follow_links(path: Path) -> Iterator[Path]:
 
 
 def _read_interpreter(program: Path) -> Path | None:
-    """Return the interpreter that a script names in its first line; None for a program of another kind."""
+    """Return the interpreter that a script names in its first line, or None for a program of another kind."""
     try:
         with program.open("rb") as file:
             line = file.readline(4096)
@@ -81,7 +81,7 @@ def _read_interpreter(program: Path) -> Path | None:
 
 
 def _read_home(interpreter: Path) -> Path | None:
-    """Return the folder of the base interpreter of a virtual environment; None without one."""
+    """Return the folder of the base interpreter of a virtual environment, or None without one."""
     try:
         lines = (interpreter.parent.parent / "pyvenv.cfg").read_text("utf-8", "replace").splitlines()
     except OSError:
@@ -91,7 +91,7 @@ def _read_home(interpreter: Path) -> Path | None:
 
 
 def _probe(interpreter: Path) -> tuple[list[Path], list[Path], list[Path]]:
-    """Ask an interpreter for its base, the package and its search path; return empty lists if it does not answer."""
+    """Ask an interpreter for its base, the package and its search path. Return empty lists if it does not answer."""
     if "python" not in interpreter.name:
         return [], [], []
     try:

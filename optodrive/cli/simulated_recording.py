@@ -27,7 +27,10 @@ class InstrumentSettings(NamedTuple):
     group: str | None
 
     def check(self, out: Path | None) -> None:
-        """Raise InputError for a setting out of range, or that needs a recording; out: the recording."""
+        """Raise InputError for a setting out of range, or that needs a recording.
+
+        out: the recording
+        """
         if not 0.0 <= self.noise <= 1000.0:
             raise InputError("--noise", self.noise, "a factor between 0 and 1000")
         if not 1 <= self.repeats <= REPEATS_MAX:
@@ -40,7 +43,7 @@ class InstrumentSettings(NamedTuple):
             raise InputError("--group", self.group, "--out, the recording of the group")
 
     def name_group(self, pixel: int, pixel_count: int) -> str | None:
-        """Return the group of a pixel's runs, None without repeats and name; different pixels never share a group."""
+        """Return the group of a pixel's runs, None without repeats and name. Different pixels never share a group."""
         if self.group is None and self.repeats == 1:
             return None
         name = self.group or DEFAULT_GROUP

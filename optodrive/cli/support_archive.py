@@ -47,7 +47,10 @@ class Entry(NamedTuple):
 
 
 def collect_entries(source: str | None, url: str, logs: list[Path]) -> list[Entry]:
-    """Collect all entries, without secrets. source: configuration file or shipped name; logs: besides the journal."""
+    """Collect all entries, without secrets.
+
+    source: configuration file or shipped name; logs: besides the journal
+    """
     path = _find_config(source)
     config: Config | None = None
     with suppress(OptodriveError):
@@ -100,7 +103,7 @@ def _read_file(path: Path) -> str:
 
 
 def _find_config(source: str | None) -> Path:
-    """Return the file of a configuration; without one, that of the service if it is installed."""
+    """Return the file of a configuration. Without one, return that of the service if it is installed."""
     if source is not None:
         return locate_shipped(f"{source}.toml") if source in list_shipped_configs() else Path(source)
     return CONFIG_PATH if os.path.lexists(CONFIG_PATH) else locate_shipped("display-437.toml")

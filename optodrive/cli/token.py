@@ -84,7 +84,7 @@ def list_tokens(file: FileOption = None, config: ConfigOption = None, json: Json
 
 
 def revoke(name: NameArgument, file: FileOption = None, config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Remove a token; a reload ends at once what was begun with it, also while the board is armed."""
+    """Remove a token. A reload ends everything begun with it at once, also while the board is armed."""
     from optodrive.daemon.web.token_file import remove_token
 
     path = _locate(file, config)

@@ -35,7 +35,7 @@ MIN_TABLE_WIDTH, USER_WIDTH = 130, 18
 
 @dataclass(frozen=True)
 class ValidationRow:
-    """One fact and its value in each model, SI; `model` is the user's parameter set, None without one.
+    """One fact and its value in each model, SI. `model` is the user's parameter set, None without one.
 
     Ratios are model over measured, None for a bound. `role` and `extended_role`: the calibrated or extended set was
     fitted on the fact, predicts it, or takes it as input. `remark` comments on an error of the calibrated set above
@@ -99,7 +99,7 @@ def _find_role(name: str, fitted_facts: set[str]) -> Role:
 
 
 def print_validation(json: bool = False, model: Path | None = None) -> None:
-    """Print the table, or one JSON object; `model` is a further parameter set to compare."""
+    """Print the table, or one JSON object. `model` is a further parameter set to compare."""
     rows = build_validation_rows(model)
     if json:
         from optodrive.cli.output import print_json
@@ -110,7 +110,7 @@ def print_validation(json: bool = False, model: Path | None = None) -> None:
 
 
 def build_document(rows: list[ValidationRow]) -> dict[str, Any]:
-    """Return the rows as JSON data in SI units; numbers that are not finite become null."""
+    """Return the rows as JSON data in SI units. Numbers that are not finite become null."""
     facts = [asdict(row.fact) | _to_plain(row) for row in rows]
     fitted = {"fitted_on": dict(FITTED_ON), "extended_fitted_on": dict(EXTENDED_FITTED_ON)}
     return {"facts": facts, "not_modelled": dict(NOT_MODELLED)} | fitted

@@ -30,7 +30,7 @@ def register(app: typer.Typer) -> None:
 
 
 def dump(file: CaptureArgument, json: JsonOption = False) -> None:
-    """List every message with its time, then totals; with --json one object per line."""
+    """List every message with its time, then totals. With --json, print one object per line."""
     from optodrive.link.protocol.transcript import Transcript
     from optodrive.link.transport.link_capture import CLOSED, OPENED, TO_BOARD, LinkCapture
 
@@ -108,7 +108,7 @@ def replay(
     baud: Annotated[int, typer.Option("--baud", min=300, help="Baud rate of the serial port.")] = 1_000_000,
     json: JsonOption = False,
 ) -> None:
-    """Send the captured bytes of the host to a board at their times; exit status 1 where its behaviour differs.
+    """Send the captured bytes of the host to a board at their times. The exit status is 1 where its behaviour differs.
 
     A real board is never armed.
     """

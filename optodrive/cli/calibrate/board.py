@@ -102,7 +102,7 @@ def delete_session(out: Path) -> None:
 def measure_on_board(
     config: str | None, stage: str | None, out: Path, request: BoardCalibrationRequest
 ) -> "MeasurementResult":
-    """Arm the board, measure spots and fit them; the board ends with the gate off and disarmed in every case.
+    """Arm the board, measure spots and fit them. The board ends with the gate off and disarmed in every case.
 
     The session file beside `out` receives every spot before the next one. Raises InputError for options that cannot
     be used, and LinkError, BoardFaultError or RefusedError where the measurement fails.
@@ -178,7 +178,7 @@ def format_board_stats(
 
 
 def _read_stdin_lines() -> "SimpleQueue[str | None]":
-    """Queue the lines of stdin, then None; a thread blocks on stdin, so that the lease is renewed meanwhile."""
+    """Queue the lines of stdin, then None. A thread blocks on stdin, so that the lease is renewed meanwhile."""
     lines: SimpleQueue[str | None] = SimpleQueue()
 
     def read() -> None:

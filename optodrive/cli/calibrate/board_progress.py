@@ -20,7 +20,7 @@ def print_status(message: str) -> None:
 def show_measurement_progress(
     spots_max: int, target_rms_um: float, manual: bool
 ) -> "Iterator[Callable[[MeasurementProgress], None]]":
-    """Show a bar with the error bound; one line per spot where stderr is no terminal or prompts a person."""
+    """Show a bar with the error bound, or one line per spot where stderr is no terminal or prompts a person."""
     if manual or not sys.stderr.isatty():
         yield lambda progress: print_status(
             f"spot {progress.spots} of max {spots_max}: {_format_progress(progress, target_rms_um)}"

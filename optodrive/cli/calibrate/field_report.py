@@ -33,7 +33,7 @@ class FieldCalibration:
 
 
 def check_calibration_outputs(out: Path | None, report: Path | None) -> None:
-    """Raise InputError unless the field and the report can be written; to be called before the measurement."""
+    """Raise InputError unless the field and the report can be written. Call it before the measurement."""
     from optodrive.core.files import check_output
 
     check_output("--out", out, ".toml")

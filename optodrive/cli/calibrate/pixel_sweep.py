@@ -17,7 +17,7 @@ README = "README.txt"
 
 
 def write_sweep(folder: Path, config: str | None, json: bool) -> None:
-    """Write the files of the sweep and a README, and print what they contain.
+    """Write the files of the sweep and a README, and print their summary.
 
     Raises InputError where a cell is too small for the offsets or the folder cannot be created.
     """

@@ -28,7 +28,7 @@ def sweep(
     config: ConfigOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Pulse every pixel at every aim under one arming, for `calibrate pixels`; resumes after an interruption."""
+    """Pulse every pixel at every aim under one arming, for `calibrate pixels`. It resumes after an interruption."""
     from optodrive.cli.board_access import open_board
     from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
@@ -74,7 +74,10 @@ def sweep(
 
 
 def _build_displays(out: Path, config: str | None, aims: "list[Aim]") -> "tuple[list[tuple[Aim, DisplayModel]], int]":
-    """Write the files of the sweep, and load the display with the map of each aim; return the number of pulses, too."""
+    """Write the files of the sweep, and load the display with the map of each aim.
+
+    Return the number of pulses, too.
+    """
     from optodrive.cli.calibrate.pixel_sweep import write_sweep_files
     from optodrive.cli.options import load_run_config
     from optodrive.planning.display_model import DisplayModel
