@@ -22,7 +22,7 @@ TEXTS = ("", "x" * 1000, "2024-13-45T99:00", "9999-12-31T23:59:59+00:00", "0001-
 TOKENS = (b"nan", b"inf", b"-1", b"1e308", b"9" * 400, b"\n", b",", b"0x1", b'"', b"\0", b"1_0", b";", b"\r\n")
 EXTRA_BYTES = 2**30
 """Address space beyond what the process has, which a diagnosis of a small recording may take."""
-QUICK = 6
+QUICK = 4
 
 
 def seeds(count, quick):
