@@ -28,7 +28,7 @@ class MessageLoop:
         self._selector = selectors.DefaultSelector()
 
     def add(self, connection: MessageSocket, on_message: MessageHandler, on_lost: LossHandler) -> None:
-        """Serve a connection until it ends; on_lost is called after its end, unless `remove` ended it."""
+        """Serve a connection until it ends. Call on_lost after its end, unless `remove` ended it."""
         self._selector.register(connection, selectors.EVENT_READ, _Connection(on_message, on_lost))
 
     def remove(self, connection: MessageSocket) -> None:
@@ -46,7 +46,7 @@ class MessageLoop:
         self._selector.unregister(descriptor)
 
     def poll(self, timeout_s: float) -> None:
-        """Wait for at most timeout_s and process what has arrived, on connections after what is watched."""
+        """Wait for at most timeout_s, serve the watched descriptors, then process the messages that have arrived."""
         ready = self._selector.select(max(0.0, timeout_s))
         for key, events in sorted(ready, key=lambda item: isinstance(item[0].data, _Connection)):
             if not isinstance(key.data, _Connection):
@@ -67,7 +67,7 @@ class MessageLoop:
             self._update_interest(connection, handlers)
 
     def close(self) -> None:
-        """Close the loop; its connections are closed by `remove`."""
+        """Close the loop. Its connections are closed by `remove`."""
         self._selector.close()
 
     def _serve(self, connection: MessageSocket, handlers: _Connection, events: int) -> None:

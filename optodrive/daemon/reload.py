@@ -59,7 +59,7 @@ def _find_differences(old: dict[str, Any], new: dict[str, Any], prefix: str) -> 
 
 @dataclass(frozen=True)
 class ReloadResult:
-    """What a reload changed: the section of the web process, its tokens, the keys and the line for the log.
+    """Result of a reload: the section of the web process, its tokens, the keys and the line for the log.
 
     revoked: tokens that are no longer valid
     """
@@ -99,7 +99,7 @@ class ConfigReloader:
         self._read_config = read_config
 
     def reload(self, board_state: str) -> ReloadResult:
-        """Return what changes, and use it from now on. Raise an OptodriveError and change nothing if it must not.
+        """Apply the changes and return them. Raise an OptodriveError and change nothing if they must not be applied.
 
         While the board may emit, tokens can be revoked, which can only make it darker; everything else must wait,
         because an armed board keeps the configuration of its arming.

@@ -95,7 +95,7 @@ def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
 
 
 def _create_folder(known_as: Path) -> tuple[Path, int]:
-    """Create the folder, or one where a socket fits and a link to it; return its path and its lock."""
+    """Create the folder, or one where a socket fits and a link to it. Return its path and its lock."""
     _remove_left_behind(known_as)
     if len(os.fsencode(known_as / "acceptor.sock")) <= SOCKET_PATH_MAX_BYTES:
         known_as.mkdir(mode=0o700)

@@ -58,7 +58,7 @@ class ActivePlan:
         return len(self.planned.plan) - self.first_row
 
     def add_executed(self, executed: ExecutedPulses, rows: IntArray) -> None:
-        """Add what the board reports of the points since the last interruption."""
+        """Add the executed pulses that the board reports since the last interruption."""
         executed = replace(executed, start_s=executed.start_s + self.zero_s)
         if self.executed is not None and self.executed_rows is not None:
             executed = concatenate_executed(self.executed, executed)
@@ -83,7 +83,7 @@ class ActivePlan:
         self.record.sent = self.executed_before
 
     def _fold_delay(self) -> None:
-        """Shift the plan's zero by the delay of what was executed, so that the rows that are left are as late."""
+        """Shift the plan's zero by the delay of the executed pulses, so that the remaining rows are as late."""
         delay_s, self.record.delay_s = max(0.0, self.record.delay_s), 0.0
         self.record.start_s += delay_s
         self.record.folded_delay_s += delay_s
@@ -91,7 +91,7 @@ class ActivePlan:
             self.executed = replace(self.executed, start_s=self.executed.start_s - delay_s)
 
     def update_execution(self) -> None:
-        """Write to the record what was executed and simulated so far."""
+        """Write the pulses executed and the displacements simulated so far to the record."""
         if self.executed is not None and self.executed_rows is not None:
             self.record.execution = Execution.from_pulses(
                 self.executed, self.executed_rows, self.simulated_m, self.record.largest_target

@@ -8,7 +8,7 @@ from optodrive.planning.display_model import DisplayModel
 
 
 def dim_display(display: DisplayModel, share: float) -> DisplayModel:
-    """Return a display whose pulses have at most a share of the laser's power; never more than configured."""
+    """Return a display whose pulses have at most a share of the laser's power, never more than configured."""
     caps = display.budget.caps
     if share >= caps.power_share:
         return display

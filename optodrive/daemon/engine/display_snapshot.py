@@ -86,7 +86,7 @@ class LiveThermalState:
         return self._heat.state_at(board_s)
 
     def take_peaks(self) -> DisplayState:
-        """Return the peaks of the pulses applied since the last call; 0 on pixels without any."""
+        """Return the peaks of the pulses applied since the last call, with 0 on pixels without any."""
         peaks, self._peaks = self._peaks, self._build_no_peaks()
         return peaks
 

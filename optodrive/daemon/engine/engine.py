@@ -269,7 +269,7 @@ class Engine:
         self._plan_queue.revoke(caller)
 
     def add_plan_end_callback(self, callback: Callable[[ActivePlan], None]) -> None:
-        """Register a callback for every plan that ends. Any thread may call it; it must not block."""
+        """Register a callback for every plan that ends. Any thread may call it, and it must not block."""
         self._plan_store.end_callbacks.append(callback)
 
     # --- state --------------------------------------------------------------------------------------------------

@@ -331,7 +331,7 @@ class PlanQueue:
                 self._delay_all(record.delay_s)
 
     def _interrupt(self, off_s: float) -> None:
-        """Let what ran when the light was paused wait for the rest of its pulses; drop that of a stream.
+        """Let the plans that ran at the pause wait for the rest of their pulses. Drop the rest of a stream.
 
         off_s: board time at which the light went off
         """
@@ -376,7 +376,7 @@ class PlanQueue:
                 run.job.delay(round(delay_s / self._session.tick_s))
 
     def end_running(self, status: PlanStatus, error: str | None, clock_shift_s: float = 0.0) -> None:
-        """End all running plans and record what they executed. clock_shift_s: as for fail_all."""
+        """End all running plans and record their executed pulses. clock_shift_s: as for fail_all."""
         with self.lock:
             ended = list(self.running)
             self.running.clear()

@@ -28,7 +28,7 @@ class LargestTarget(NamedTuple):
 
     @classmethod
     def from_planned(cls, planned: PlannedSequence) -> Self | None:
-        """Find the pulse; None if no pulse has a target."""
+        """Return the pulse with the largest target, or None if no pulse has a target."""
         plan = planned.plan
         target_m = np.nan_to_num(plan.target_m)
         if not len(plan) or not target_m.any():
@@ -39,7 +39,7 @@ class LargestTarget(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """What the board executed of a plan.
+    """Pulses of a plan that the board executed.
 
     start_s, width_s, power_w, pixel, stage, simulated_m: [n] columns as in `ExecutedPulses`, and displacements computed
     from them; all empty if n exceeds PULSES_LISTED_MAX; simulated_m is None until the simulation is done
@@ -93,7 +93,7 @@ class Execution:
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
 
     def to_columns(self) -> ExecutedColumns | None:
-        """Convert the columns to the units of a response; None if they are too long."""
+        """Return the columns in the units of a response, or None if they are too long."""
         if not self.is_listed:
             return None
         return ExecutedColumns(
@@ -108,7 +108,7 @@ class Execution:
 
 @dataclass
 class PlanRecord:
-    """One plan with its progress. It stays after the plan's end, so it holds only what its report states.
+    """One plan with its progress. It stays after the plan's end, so it holds only the data that its report states.
 
     pulse_count, duration_s: of the whole plan; summary_json: encoded `PlanSummary`, which is larger in memory
     pulses: None if there are too many to list
@@ -167,7 +167,10 @@ class PlanRecord:
         return len(self.summary_json) + sum(item.nbytes for item in columns if item is not None)
 
     def build_report(self, board_now_s: float, pulses: bool = True, clocks: ClockReading | None = None) -> PlanReport:
-        """Report the plan; `pulses` lists them one by one, and clocks give the onset of a plan that has not begun."""
+        """Report the plan.
+
+        pulses: whether the report lists them one by one; clocks: give the onset of a plan that has not begun
+        """
         execution = self.execution
         return PlanReport(
             plan=self.plan_id,

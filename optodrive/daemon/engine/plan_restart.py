@@ -22,7 +22,7 @@ from optodrive.planning.summary_schema import PlanSummary
 
 @dataclass(frozen=True, eq=False)
 class RestartedPlan:
-    """What replaces the parts of a plan that goes on.
+    """Replacements for the parts of a plan that goes on.
 
     start_s: board time at which its points begin; after: state after it, in board time; end_s: of its last pulse
     planned: the whole plan; its rows from plan.first_row on are limited and timed anew

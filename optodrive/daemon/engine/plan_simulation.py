@@ -16,7 +16,7 @@ def simulate_plan(plan: ActivePlan, status: PlanStatus, error: str | None) -> No
 
 
 def compute_simulated_m(plan: ActivePlan) -> FloatArray | None:
-    """Compute the peak displacements of the executed pulses, [n]; None without a report of the board."""
+    """Compute the peak displacements of the executed pulses, [n]. Return None without a report of the board."""
     executed = plan.executed
     if executed is None:
         return None

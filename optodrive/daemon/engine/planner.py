@@ -150,7 +150,7 @@ class Planner:
         return self._run_in_loop(commit)
 
     def _process(self, request: PlanningRequest) -> PlanReport:
-        """Plan one request; a streamed one before all programs of usual priority."""
+        """Plan one request, a streamed one before all programs of usual priority."""
         if not request.streamed:
             return self._plan(request)
         set_realtime_priority(PLANNING)

@@ -32,7 +32,10 @@ STATE_CHANGE_PERIOD_S = 0.02
 
 @dataclass
 class _Client:
-    """State of a connection. requests: events of callers that wait, by id; readers: of its telemetry."""
+    """State of a connection.
+
+    requests: events of callers that wait, by id; readers: of its telemetry
+    """
 
     requests: dict[int, tuple[threading.Event, "Future[PlanReport]"]] = field(default_factory=dict)
     readers: int = 0

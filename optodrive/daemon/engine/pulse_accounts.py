@@ -45,7 +45,7 @@ class PulseAccounts:
             plan.record.onset = clocks.convert(float(on_tick[0]) * self._session.tick_s)
 
     def collect_executed(self, run: PlanRun) -> None:
-        """Take what a job has executed into its plan. It ends with that, or is interrupted."""
+        """Take the executed pulses of a job into its plan. The job ends with that, or is interrupted."""
         self.count_progress(run)  # reports may have arrived with what ends the job
         plan, job = run
         record, start_s, scales = plan.record, plan.planned.plan.start_s, self._session.scales

@@ -26,7 +26,7 @@ class Restart(NamedTuple):
 
 
 class QueuePause:
-    """Pause of a queue. The queue's lock guards it; only the loop's thread changes it.
+    """Pause of a queue. The queue's lock guards it, and only the loop's thread changes it.
 
     off_s: board time at which the light went off, None once the queue goes on
     """
@@ -47,7 +47,7 @@ class QueuePause:
 
     @property
     def ends_in_s(self) -> float | None:
-        """Time until the pause ends disarmed, s; None if the light is not paused."""
+        """Time until the pause ends disarmed, s, or None if the light is not paused."""
         return self._session.pause_ends_in_s
 
     def require_no_pause(self) -> None:

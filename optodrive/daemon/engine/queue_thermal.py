@@ -49,7 +49,7 @@ class QueueThermal:
         return estimate_before_rest(plan, self._budget, self._on_progress)
 
     def rewind(self, ended: Sequence[ActivePlan], clock_shift_s: float = 0.0) -> None:
-        """Count only what plans that end early may have executed.
+        """Count only the pulses that the plans that end early may have executed.
 
         clock_shift_s: by which the board's clock has jumped since they were queued
         """

@@ -12,7 +12,7 @@ class RevokedCallers:
         self._revoked_s: dict[str, float] = {}
 
     def revoke(self, caller: str, board_s: float) -> str:
-        """Record a revocation at a board time, s; return the reason for people."""
+        """Record a revocation at a board time, s, and return the reason for people."""
         self._revoked_s[caller] = board_s
         return f"the token {caller!r} was revoked"
 

@@ -53,5 +53,5 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
 
 
 def _build_board_report(session: RemoteSession) -> BoardReport:
-    """Report the board; without a link its state is unknown, and the last one would be a claim."""
+    """Report the board. Without a link its state is unknown, and the last one would be a claim."""
     return BoardReport(**(session.board if session.connected else session.board.forget_state()).to_dict())

@@ -123,7 +123,7 @@ class TelemetryProducer:
             self._publish("budget", BudgetEvent(board_s=board_s, caps=caps, panel_c=panel_c))
 
     def _estimate_board_s(self, now_s: float) -> float:
-        """Estimate the board's time; it is extrapolated while there is no link."""
+        """Estimate the board's time, which is extrapolated while there is no link."""
         if self._engine.is_linked:
             self._board_clock_reference = now_s, self._engine.board_s()
         return self._board_clock_reference[1] + now_s - self._board_clock_reference[0]

@@ -48,7 +48,7 @@ def apply_executed(before: ThermalState, executed: ExecutedPulses) -> ThermalSta
 
 
 class EndedPlan(NamedTuple):
-    """What a plan that ended early leaves behind.
+    """Plan that ended early, with its initial state and its executed pulses.
 
     heat_before, budget_before: initial state, on the plan's own time line; start_s: board time of the plan's zero
     dropped: number of pulses at the plan's end that the board will never get; executed: None without a report

@@ -99,7 +99,7 @@ class Worker:
         os.kill(self.pid, signal.SIGKILL)  # the process is not reaped yet, so the id is its own
 
     def collect(self, waits: bool = False) -> OptodriveError | None:
-        """Return the error of a job that ended with the process; None while the process exists.
+        """Return the error of a job that ended with the process, or None while the process exists.
 
         Call it until the process has ended, and not again. On a busy computer a killed process of low priority may take
         seconds to end. waits: for the end.

@@ -9,7 +9,7 @@ from optodrive.daemon.responses.problem import Problem
 
 
 class HoldReport(JsonModel):
-    """What became of an arming that a client holds; a message has only the members that apply to its status.
+    """Status of an arming that a client holds. A message has only the members that apply to its status.
 
     problem: why the board was not armed; reason: what has ended the arming, as the end of a sentence
     """

@@ -7,7 +7,7 @@ from optodrive.planning.summary_schema import PlanSummary, PulseColumns
 
 
 class PlanLatency(JsonModel):
-    """Seconds from the request's arrival to three events of its plan; None before the event.
+    """Seconds from the request's arrival to three events of its plan, None before the event.
 
     arrival: when the kernel received the head of a request, or the first byte of a WebSocket's message
     planned_s: accepted into the queue; first_byte_s: handed to the link; first_light_s: gate on by the board's clock
@@ -40,7 +40,7 @@ class MaxTarget(JsonModel):
 
 
 class ExecutedColumns(JsonModel):
-    """Executed pulses by column, in order, as `PulseColumns`; `simulated_um` is empty until the simulation is done."""
+    """Executed pulses by column, in order, as `PulseColumns`. `simulated_um` is empty until the simulation is done."""
 
     start_s: FloatColumn
     width_s: FloatColumn
@@ -51,7 +51,7 @@ class ExecutedColumns(JsonModel):
 
 
 class PlanReport(JsonModel):
-    """A plan: what was planned, sent and executed.
+    """A plan with its planned, sent and executed pulses.
 
     caller: name of the token that submitted it; labels: its own; parameters: all of the pattern, a file as its digest
     pulses, executed_pulses: None if they were not requested or are too many
@@ -89,6 +89,6 @@ class PlanReport(JsonModel):
 
     @property
     def fits(self) -> bool | None:
-        """Whether the whole sequence fits on the beam; None if that was not requested (a stream)."""
+        """Whether the whole sequence fits on the beam, or None if that was not requested (a stream)."""
         feasibility = self.summary.feasibility
         return None if feasibility is None else feasibility.fits

@@ -4,7 +4,7 @@ from enum import StrEnum
 
 
 class PlanStatus(StrEnum):
-    """The status of a plan; that of a dry run stays `planned`."""
+    """The status of a plan. That of a dry run stays `planned`."""
 
     PLANNED = "planned"
     QUEUED = "queued"

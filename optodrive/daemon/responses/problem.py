@@ -52,5 +52,5 @@ class Problem(JsonModel):
 
 
 def build_problem(status: int, code: str, title: str, detail: str, **extensions: Any) -> Problem:
-    """Build a problem document; its type is a URN made of the code."""
+    """Build a problem document. Its type is a URN made of the code."""
     return Problem(type=f"urn:optodrive:{code}", title=title, status=status, detail=detail, code=code, **extensions)

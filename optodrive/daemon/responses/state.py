@@ -27,7 +27,7 @@ class LinkReport(JsonModel):
 
 
 class BoardReport(JsonModel):
-    """The board's last reported status; `hint` explains the fault and its remedy."""
+    """The board's last reported status. `hint` explains the fault and its remedy."""
 
     state: BoardState | Literal["UNKNOWN"]
     fault: str | None
@@ -52,8 +52,9 @@ class BoardReport(JsonModel):
 
 
 class StageReport(JsonModel):
-    """One of several stages: its board, and how well its clock is known against the host's; None before that.
+    """One of several stages: its board, and the error and drift of its clock against the host's.
 
+    clock_error_us, clock_drift_ppm: None before the clock is known
     connected: whether the link to its board is up; error: why it is not
     """
 
@@ -87,7 +88,7 @@ class RecentPlan(JsonModel):
 
 
 class QueuedPlan(RecentPlan):
-    """A plan that runs or waits; starts_in_s is negative once it has started, ends_in_s is None while it is paused."""
+    """A plan that runs or waits. starts_in_s is negative once it has started. ends_in_s is None while it is paused."""
 
     duration_s: float
     starts_in_s: float
@@ -109,7 +110,7 @@ class QueueReport(JsonModel):
 
 
 class PulseTotals(JsonModel):
-    """Pulses since the daemon started; `timing_error` is None before the first executed pulse."""
+    """Pulses since the daemon started. `timing_error` is None before the first executed pulse."""
 
     planned: int
     sent: int
@@ -143,7 +144,7 @@ class PlannerState(JsonModel):
 
 
 class StateReport(JsonModel):
-    """The daemon's state: display, link, board, queue, totals, planner and limits; `control` is null unless armed.
+    """The daemon's state: display, link, board, queue, totals, planner and limits. `control` is null unless armed.
 
     `board` is the sum of all boards, with the state of the one nearest to light; `stages` always has each of several,
     and is empty with one.
@@ -162,7 +163,7 @@ class StateReport(JsonModel):
 
 
 def build_control_report(control: Mapping[str, Any] | None) -> ControlReport | None:
-    """Build the report from the status of the link process, which has further fields; None while it is not armed."""
+    """Build the report from the status of the link process, which has further fields. Return None while not armed."""
     if control is None:
         return None
     return ControlReport(caller=control["caller"], armed_for_s=control["armed_for_s"], hold=control["hold"])

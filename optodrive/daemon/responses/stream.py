@@ -13,7 +13,7 @@ FrameStatus = PlanStatus | Literal["refused"]
 
 
 class FrameResult(JsonModel):
-    """The outcome of one streamed frame so far; a message has only the members that apply to its status.
+    """The outcome of one streamed frame so far. A message has only the members that apply to its status.
 
     frame: None if the daemon could not read the frame
     superseded_by: the newer frame, if that arrived before this one was planned

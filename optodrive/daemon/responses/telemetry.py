@@ -7,7 +7,7 @@ from optodrive.daemon.responses.state import StateReport
 
 
 class FaultEvent(JsonModel):
-    """A fault of the board or the link; all members except the states are null or empty without one."""
+    """A fault of the board or the link. All members except the states are null or empty without one."""
 
     board: str
     link: str
@@ -33,7 +33,7 @@ class DisplayEvent(JsonModel):
 
 
 class PulseBatch(JsonModel):
-    """Pulses of one plan by column; `row` counts in the plan, `start_s` is board time."""
+    """Pulses of one plan by column. `row` counts in the plan, and `start_s` is board time."""
 
     plan: str
     name: str
@@ -55,7 +55,7 @@ class PulsesEvent(JsonModel):
 
 
 class CapUsage(JsonModel):
-    """How much of a cap is used, and the pixel nearest to it; `fraction` is relative to ambient for temperatures."""
+    """How much of a cap is used, and the pixel nearest to it. `fraction` is relative to ambient for temperatures."""
 
     cap: str
     fraction: float

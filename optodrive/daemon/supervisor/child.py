@@ -26,7 +26,7 @@ StartProcess = Callable[[socket.socket, int], int]
 
 @dataclass(frozen=True)
 class StartFailure:
-    """What a child reported instead of its readiness: one line and the exit status for the daemon."""
+    """Failure that a child reported instead of its readiness: one line and the exit status for the daemon."""
 
     message: str
     exit_status: int
@@ -89,7 +89,7 @@ class Child:
         self.send_signal(signal.SIGKILL)
 
     def collect(self) -> str | None:
-        """Return how the process has ended and schedule its next start; None while it runs."""
+        """Return how the process has ended and schedule its next start. Return None while it runs."""
         if not self.is_running:
             return None
         pid, wait_status = os.waitpid(self.pid, os.WNOHANG)
@@ -121,7 +121,7 @@ class Child:
         return [self._exit_descriptor] if self.is_ready else [self._exit_descriptor, self._channel.fileno()]
 
     def receive(self) -> list[dict[str, Any]]:
-        """Take beats and reports that have arrived; return the other messages."""
+        """Take beats and reports that have arrived, and return the other messages."""
         others = []
         for fields in self._read_packets():
             kind = fields.get("kind")
@@ -148,7 +148,7 @@ class Child:
         return packets
 
     def send(self, fields: dict[str, Any]) -> bool:
-        """Send a control message; return whether the process can receive it."""
+        """Send a control message, and return whether the process can receive it."""
         if self._channel is None:
             return False
         try:

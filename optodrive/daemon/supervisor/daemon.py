@@ -115,7 +115,7 @@ def _build_link_start(
 
 
 def _load_display(config: Config) -> "DisplayModel":
-    """Load what the other processes need, so that they share its memory."""
+    """Load the display model that the other processes need, so that they share its memory."""
     from optodrive.core.kernels import release_compiler
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.pipeline import warm_up

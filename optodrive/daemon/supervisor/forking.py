@@ -22,7 +22,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def fork_child(run: Callable[[], int], name: str, kept: Iterable[int]) -> int:
-    """Fork a child that calls `run` and exits with the status that it returns; return its process id.
+    """Fork a child that calls `run` and exits with the status that it returns. Return its process id.
 
     name: of the process, for ps; kept: descriptors that stay open besides 0, 1 and 2. The child has the default signal
     handlers, except for ignored signals, and dies with this process. RuntimeError if this process has several threads,
@@ -53,7 +53,7 @@ def fork_child(run: Callable[[], int], name: str, kept: Iterable[int]) -> int:
 
 
 def _separate(parent: int, name: str, kept: set[int]) -> None:
-    """Give up what belongs to the parent: its signal handlers, its descriptors and its life after death."""
+    """Give up the parent's signal handlers and descriptors, and let this process die with the parent."""
     _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     _libc.prctl(PR_SET_NAME, name.encode(), 0, 0, 0)
     if os.getppid() != parent:  # it died before the signal was requested
@@ -70,7 +70,7 @@ def _separate(parent: int, name: str, kept: set[int]) -> None:
 
 
 def fork_with_beat(target: Callable[[BeatWriter], None], name: str, channel: int, kept: Iterable[int] = ()) -> int:
-    """Fork a child that calls `target` with its end of the channel and reports its failure; return its process id."""
+    """Fork a child that calls `target` with its end of the channel and reports its failure. Return its process id."""
 
     def run() -> int:
         beat = BeatWriter(channel)
@@ -93,7 +93,7 @@ def fork_with_beat(target: Callable[[BeatWriter], None], name: str, channel: int
 
 
 def execute_module(module: str, arguments: Sequence[str], inherited: Iterable[int]) -> int:
-    """Start a module in a fresh interpreter; return its process id. inherited: descriptors that it receives."""
+    """Start a module in a fresh interpreter and return its process id. inherited: descriptors that it receives."""
     actions = [(os.POSIX_SPAWN_DUP2, descriptor, descriptor) for descriptor in inherited]  # clears close-on-exec
     command = [sys.executable, "-P", "-m", module, *arguments]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # threads that nothing here needs

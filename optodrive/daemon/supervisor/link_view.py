@@ -43,7 +43,7 @@ class LinkView:
         return str(self.status.get("link_error") or "")
 
     def receive(self) -> None:
-        """Process what has arrived, and connect if there is no connection."""
+        """Process the messages that have arrived, and connect if there is no connection."""
         try:
             if self._connection is None:
                 self._connect()

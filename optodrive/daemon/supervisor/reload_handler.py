@@ -25,7 +25,7 @@ class ReloadHandler:
         self._callers: list[str] = []
 
     def request(self) -> None:
-        """Read the configuration and send what changed to the web process."""
+        """Read the configuration and send the changes to the web process."""
         self._notifier.notify_reloading()
         try:
             result = self._reloader.reload(self._supervisor.link_view.board_state)
@@ -50,7 +50,7 @@ class ReloadHandler:
         self._answer({"problem": build_error_problem(error).to_dict()})
 
     def on_web_message(self, fields: dict[str, Any]) -> None:
-        """Begin the reload that a caller requests; end one when the web process has applied it."""
+        """Begin the reload that a caller requests. End one when the web process has applied it."""
         if fields.get("kind") == REQUEST:
             self._callers.append(fields["id"])
             self.request()

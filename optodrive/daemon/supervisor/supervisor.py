@@ -27,7 +27,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StartError(OptodriveError):
-    """A process of the daemon did not start; the message is the one that it reported."""
+    """A process of the daemon did not start. The message is the one that it reported."""
 
     code = "start"
 
@@ -73,7 +73,7 @@ class Supervisor:
     # --- life -------------------------------------------------------------------------------------------------------
 
     def install_signal_handlers(self) -> None:
-        """Let SIGINT and SIGTERM end the daemon; SIGHUP as well, unless it asks for a reload.
+        """Let SIGINT and SIGTERM end the daemon, and SIGHUP as well unless it asks for a reload.
 
         Until the loop runs, they end the daemon by an exception.
         """
@@ -89,11 +89,11 @@ class Supervisor:
         self._signals.add(number)
 
     def start_link(self) -> None:
-        """Start the link process, which needs nothing of what the others need."""
+        """Start the link process, which needs none of the data that the others share."""
         self._link.start()
 
     def start_others(self, others: list[Child], web: Child) -> bool:
-        """Start the other children; return whether all serve each other and the link has an answer about the board.
+        """Start the other children. Return whether all serve each other and the link has an answer about the board.
 
         Return False if a signal ended the start. Raise StartError if a child cannot serve.
         """
@@ -224,14 +224,14 @@ class Supervisor:
         self.record_audit({"event": "restarted", "process": child.name, "reason": ended})
 
     def send_reload(self, fields: dict[str, Any]) -> bool:
-        """Send a reload to the processes that use the tokens; return whether the web process receives it."""
+        """Send a reload to the processes that use the tokens. Return whether the web process receives it."""
         for child in self._children:
             if child.name == "acceptor":
                 child.send(fields)
         return self.send_to_web(fields)
 
     def send_to_web(self, fields: dict[str, Any]) -> bool:
-        """Send a control message to the web process; return whether it serves and receives it."""
+        """Send a control message to the web process, and return whether it serves and receives it."""
         return self.web is not None and self.web.is_ready and self.web.send(fields)
 
     # --- audit, service manager, log --------------------------------------------------------------------------------

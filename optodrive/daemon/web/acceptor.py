@@ -57,7 +57,7 @@ def run_acceptor(
 
 
 class StopSender:
-    """Connection to the link process, for STOP only; it connects again when it is due."""
+    """Connection to the link process, for STOP only. It connects again when it is due."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -79,7 +79,7 @@ class StopSender:
             self.close()
 
     def receive(self) -> None:
-        """Discard what has arrived."""
+        """Discard the messages that have arrived."""
         try:
             if self._connection is not None:
                 self._connection.receive()
@@ -193,7 +193,7 @@ class Acceptor:
         return {descriptor for descriptor, _ in poll.poll(max(0.0, due_s - now_s) * 1e3)}
 
     def _rank(self, head: bytes) -> Rank:
-        """Rank a request; a permitted STOP goes to the link process before anything else happens."""
+        """Rank a request. A permitted STOP goes to the link process before anything else happens."""
         rank = rank_request(parse_head(head), self._policy)
         if rank is Rank.STOP:
             self._link.send()
@@ -255,7 +255,7 @@ class Acceptor:
             self._unopened.pop(number).sock.close()
 
     def _hand_over(self) -> None:
-        """Hand over what the web process accepts, the highest rank first."""
+        """Hand over the connections that the web process accepts, the highest rank first."""
         for rank in Rank:
             while self._web is not None and self._permitted[rank] and self._room.count(rank):
                 if not self._send(self._web, self._room.take(rank)):

@@ -25,7 +25,7 @@ def send_connection(link: socket.socket, waiting: Waiting) -> None:
 
 
 def receive_packet(link: socket.socket) -> Waiting | bytes:
-    """Receive a connection, or the bytes of another packet; b'' at the end. Raise BlockingIOError if there is none."""
+    """Receive a connection, or the bytes of another packet, b'' at the end. Raise BlockingIOError if there is none."""
     data, descriptors, _, _ = socket.recv_fds(link, 64, 1)
     if not descriptors:
         return data

@@ -96,7 +96,7 @@ class AccessMiddleware:
         return BoundedBody(receive, self._policy.body_max_bytes)
 
     async def _record_intent(self, request: RequestContext) -> Problem | None:
-        """Write an audit entry to disk before arming; return why arming is refused if that fails."""
+        """Write an audit entry to disk before arming. Return why arming is refused if that fails."""
         if self._policy.audit is None:
             return None
         error_text = await self._policy.audit.record_durably(request.audit_fields | {"event": "requested"})

@@ -40,7 +40,7 @@ class RequestContext:
 
     @property
     def audit_fields(self) -> dict[str, object]:
-        """Fields for the audit log: who calls what from where."""
+        """Fields for the audit log: the caller, its address and the call."""
         return {
             "name": self.token.name,
             "role": self.token.role if self.token.secret else None,
@@ -75,7 +75,7 @@ class AccessPolicy:
         self.update(tokens, daemon)
 
     def update(self, tokens: Tokens, daemon: DaemonSection) -> tuple[Token, ...]:
-        """Replace the tokens and limits; every caller's rate limit starts anew. Return the tokens that are revoked."""
+        """Replace the tokens and limits. Every caller's rate limit starts anew. Return the tokens that are revoked."""
         revoked, self.tokens = self.tokens.find_revoked(tokens), tokens
         self.body_max_bytes = daemon.body_max_bytes
         self._hosts = {*LOOPBACK_NAMES, *daemon.hosts}
@@ -87,7 +87,7 @@ class AccessPolicy:
         return token is not ANONYMOUS and token not in self.tokens.all
 
     def check(self, request: RequestContext, table: RouteTable) -> Problem | None:
-        """Identify token and route of a request; return why it is refused, None if it is accepted."""
+        """Identify token and route of a request. Return why it is refused, or None if it is accepted."""
         problem = self._check_host_and_origin(request)
         if problem is not None:
             return problem
@@ -115,7 +115,7 @@ class AccessPolicy:
         return self._check_host_and_origin(request) is None and self.find_token(request) is not None
 
     def acquire_frame(self, request: RequestContext) -> float:
-        """Count one streamed frame against the caller's rate; return the time to wait first, s."""
+        """Count one streamed frame against the caller's rate, and return the time to wait first, s."""
         return self._rate_limiter.acquire((request.token.name, request.address, "frames"), self._now_s())
 
     def _check_host_and_origin(self, request: RequestContext) -> Problem | None:

@@ -89,7 +89,7 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
 
     @routes.get("/v1/health", None)
     async def get_health() -> HealthReport:
-        """Return whether the daemon runs; needs no token."""
+        """Return whether the daemon runs. This needs no token."""
         return HealthReport(version=__version__)
 
     @routes.get("/v1/state", "viewer", response_model=StateReport)
@@ -115,7 +115,7 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
 
     @routes.post("/v1/arm", "armer", response_model=StateReport)
     async def arm(request: Request) -> Response:
-        """Arm the board; its indicator is on for at least two seconds before it emits."""
+        """Arm the board. Its indicator is on for at least two seconds before it emits."""
         await daemon.link.arm(request.scope[CALLER].name)
         return _send_state(daemon)
 
@@ -140,25 +140,25 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
 
     @routes.post("/v1/disarm", "operator", response_model=StateReport)
     async def disarm() -> Response:
-        """Disarm the board; this also acknowledges a fault whose cause is gone."""
+        """Disarm the board. This also acknowledges a fault whose cause is gone."""
         await daemon.link.command("disarm")
         return _send_state(daemon)
 
     @routes.post("/v1/pause", "operator", response_model=StateReport)
     async def pause() -> Response:
-        """Switch the gate off; the board stays armed and plans wait, for five minutes at most."""
+        """Switch the gate off. The board stays armed and plans wait, for five minutes at most."""
         await daemon.link.command("pause")
         return _send_state(daemon)
 
     @routes.post("/v1/resume", "operator", response_model=StateReport)
     async def resume() -> Response:
-        """Play what was left at the pause, limited again from the heat that is left, and what waits."""
+        """Play the pulses left at the pause, limited again from the heat that is left, and the plans that wait."""
         await daemon.link.command("resume")
         return _send_state(daemon)
 
     @routes.post("/v1/reload", "armer", response_model=ReloadReport)
     async def reload() -> Response:
-        """Read configuration and tokens again, and apply what can be applied at once, as SIGHUP does for a service."""
+        """Read configuration and tokens again, and apply changes that need no restart, as SIGHUP does for a service."""
         result = await daemon.reloads.request()
         if isinstance(result, Problem):
             return Response(result.to_json(), result.status, media_type=MEDIA_TYPE)
@@ -204,12 +204,12 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
 
     @routes.get("/v1/plans/{plan_id}", "viewer", response_model=PlanReport)
     async def get_plan(plan_id: PlanId, pulses: PulsesQuery = True) -> Response:
-        """Return one plan: what was planned, sent and executed."""
+        """Return one plan with its planned, sent and executed pulses."""
         return _relay(await daemon.planner.call("get_plan", plan=plan_id, pulses=pulses))
 
     @routes.delete("/v1/plans/{plan_id}", "operator", response_model=PlanReport)
     async def cancel_plan(plan_id: PlanId) -> Response:
-        """Remove a plan from the queue, or end it if it runs; the board stays armed."""
+        """Remove a plan from the queue, or end it if it runs. The board stays armed."""
         return _relay(await daemon.planner.call("cancel", plan=plan_id))
 
     @routes.get("/v1/patterns", "viewer", response_model=PatternList)

@@ -50,12 +50,12 @@ class AuditLog:
         self._is_failing = False
 
     def record(self, fields: AuditFields) -> None:
-        """Append an entry later; drop it if a thousand wait already."""
+        """Append an entry later. Drop it if a thousand wait already."""
         if self._free_slots.acquire(blocking=False):
             self._enqueue(fields, to_disk=False)
 
     async def record_durably(self, fields: AuditFields) -> str | None:
-        """Append an entry and wait until it is on the disk; return the cause if that fails, else None."""
+        """Append an entry and wait until it is on the disk. Return the cause if that fails, else None."""
         if not self._free_slots.acquire(blocking=False):
             return "too many entries wait to be written"
         try:

@@ -34,7 +34,7 @@ class BoundedHttp(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Parse what has been read, unless it is an endless body of a request that has been answered."""
+        """Parse the received bytes, unless they are an endless body of a request that has been answered."""
         if self.get_phase().phase == "drain" and b"transfer-encoding" in dict(self.headers):
             self._drained_bytes += len(data)
             if self._drained_bytes > DRAIN_MAX_BYTES:

@@ -82,7 +82,7 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         self._pump()
 
     def data_received(self, data: bytes) -> None:
-        """Parse the handshake at once, and frames at their pace; read no more until they are parsed."""
+        """Parse the handshake at once, and frames at their pace. Read no more until they are parsed."""
         if not self.handshake_initiated:
             super().data_received(data)
             return
@@ -118,7 +118,7 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         return message
 
     def _pump(self) -> None:
-        """Parse what has been read until a message is complete, the pace is exceeded or the turn is over."""
+        """Parse the received bytes until a message is complete, the pace is exceeded or the turn is over."""
         if self._pump_handle is not None:
             self._pump_handle.cancel()
             self._pump_handle = None
@@ -166,11 +166,11 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
             self._begin_next()
 
     def _begin_next(self) -> None:
-        """Let the next message begin with what has been read, if there is more of it."""
+        """Let the next message begin with the received bytes, if any are left."""
         self._begun = self._read if self._unparsed or self.conn.reader.buffer else None
 
     def handle_cont(self, event: Frame) -> None:
-        """Add a fragment; close the connection if its message has too many."""
+        """Add a fragment. Close the connection if its message has too many."""
         self._allowance -= 1.0
         if self.close_sent:
             return

@@ -33,7 +33,7 @@ class ConnectionOpener:
         acceptor.on_connection = self._receive
 
     def close(self) -> None:
-        """Take no more, and close what waits."""
+        """Take no more connections, and close those that wait."""
         self._acceptor.close()
         for handle, waiting in self._held.items():
             handle.cancel()

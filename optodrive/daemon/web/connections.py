@@ -45,7 +45,10 @@ class _Entry:
 
 
 class Connections:
-    """The open connections. now_s: monotonic clock; opening: number of those that are about to be added."""
+    """The open connections.
+
+    now_s: monotonic clock; opening: number of those that are about to be added
+    """
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
@@ -102,9 +105,10 @@ class Connections:
                 self._abort(transport)
 
     def close_revoked(self, tokens: Iterable[Token], is_final: bool) -> None:
-        """Close the connections of some tokens that are between requests; is_final: those in a stream, too.
+        """Close the connections of some tokens that are between requests.
 
         Requests that are being answered end first; they may be STOP.
+        is_final: close those in a stream, too
         """
         revoked = set(tokens)
         for transport, entry in list(self._entries.items()):

@@ -36,8 +36,9 @@ NO_EPOCH = 0
 
 
 class PushFields(NamedTuple):
-    """Fields of a push. arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token.
+    """Fields of a push.
 
+    arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token
     lists_pulses: whether the answer lists the pulses one by one
     """
 
@@ -82,7 +83,7 @@ class LinkClient:
             self._epochs.append((time.monotonic(), epoch))
 
     def require_epoch_at(self, arrived_s: float) -> int:
-        """Return the epoch at a monotonic time, or an older one; raise LinkError while there is none."""
+        """Return the epoch at a monotonic time, or an older one. Raise LinkError while there is none."""
         if self._epochs[-1][1] == NO_EPOCH:
             raise self.peer.build_loss_error()
         position = bisect_right(self._epochs, arrived_s, key=lambda entry: entry[0])
@@ -97,7 +98,10 @@ class LinkClient:
         self.peer.send(Message("stop", {"id": NO_REQUEST}))
 
     async def arm(self, caller: str, arming: int | None = None) -> None:
-        """Arm as `command` does. caller: name of the token; arming: new number of an arming that needs beats."""
+        """Arm as `command` does.
+
+        caller: name of the token; arming: new number of an arming that needs beats
+        """
         await self.command("arm", caller=caller, arming=arming or 0, hold=arming is not None)
 
     def hold(self, arming: int, age_s: float) -> None:
@@ -119,7 +123,7 @@ class LinkClient:
                 future.set_result(reason)
 
     async def command(self, kind: str, **fields: object) -> None:
-        """Carry out `stop`, `arm`, `disarm`, `pause` or `resume`; return when the board has done it.
+        """Carry out `stop`, `arm`, `disarm`, `pause` or `resume`. Return when the board has done it.
 
         Raise the error of a refusal.
         """
@@ -169,7 +173,10 @@ class PlannerClient:
         labels: LabelValues = NO_LABELS,
         parameters: ParameterValues = NO_LABELS,
     ) -> Message:
-        """Plan an encoded sequence and return the result. labels: of the caller; parameters: of the pattern, all."""
+        """Plan an encoded sequence and return the result.
+
+        labels: of the caller; parameters: of the pattern, all
+        """
         fields = push._asdict() | {"labels": dict(labels), "parameters": dict(parameters)}
         return await self.peer.call(Message("submit", fields, sequence))
 
@@ -238,7 +245,7 @@ class DaemonClient:
         return self.knows_state and self.preview.is_connected
 
     def build_state(self) -> StateReport:
-        """Report the state as last known; it is built once per change."""
+        """Report the last known state, which is built once per change."""
         if self._state is None:
             pixels = len(self.display.layout)
             self._state = merge_state(self.display.config, pixels, self.link.status, self.planner.state)
@@ -251,11 +258,11 @@ class DaemonClient:
         return self._state_json
 
     async def build(self, source: str, name: str, body: bytes, caller: str) -> Message:
-        """Build the sequence of a body in the preview process; return its result."""
+        """Build the sequence of a body in the preview process and return its result."""
         return await self.preview.call(Message("build", {"source": source, "name": name, "caller": caller}, body))
 
     async def plan_dry_run(self, source: str, body: bytes, push: PushFields) -> Message:
-        """Plan a body in the preview process from the planner's present state; return the result."""
+        """Plan a body in the preview process from the planner's present state, and return the result."""
         snapshot = await self.planner.call("snapshot")
         if snapshot.fields["status"] != 200:
             return snapshot
@@ -270,7 +277,7 @@ class DaemonClient:
         return await self.preview.call(Message("dry_run", fields, snapshot.payload + body))
 
     async def push(self, source: str, body: bytes, push: PushFields) -> Message:
-        """Build the sequence of a body, then plan it; return the result of the step that refuses it, or of the plan.
+        """Build the sequence of a body, then plan it. Return the result of the step that refuses it, or of the plan.
 
         The planner itself parses a small streamed body, because it is there three hand-overs earlier.
         """

@@ -14,7 +14,7 @@ DESCRIPTORS_MIN = 1024
 
 
 def open_tcp_listener(host: str, port: int) -> socket.socket:
-    """Open a socket that listens on a TCP port; InputError if the address is in use."""
+    """Open a socket that listens on a TCP port. Raise InputError if the address is in use."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # With an explicit protocol, asyncio disables Nagle's algorithm, which would delay each response by 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
@@ -40,7 +40,7 @@ def build_local_url(host: str, port: int) -> str:
 
 
 def describe_exposure(host: str, names: Sequence[str]) -> str | None:
-    """Return a warning if other computers can reach an address to listen on; None for loopback.
+    """Return a warning if other computers can reach an address to listen on, or None for loopback.
 
     names: to which the daemon answers besides loopback
     """

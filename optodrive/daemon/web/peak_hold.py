@@ -28,7 +28,7 @@ class PeakHold:
         self._count += 1
 
     def release(self, newest: DisplayEvent) -> DisplayEvent:
-        """Return the newest event with the peaks of all that were added, unchanged if it is alone; begin anew."""
+        """Return the newest event with the peaks of all that were added, unchanged if it is alone. Begin anew."""
         peaks, count = self._peaks, self._count
         self._peaks, self._count = None, 0
         if peaks is None or count == 1:

@@ -20,7 +20,10 @@ class Rank(IntEnum):
 
 
 def peek_head(sock: socket.socket) -> bytes | None:
-    """Return the bytes that wait in a socket, as far as a head may be long; b'' at its end, None if there are none."""
+    """Return the bytes that wait in a socket, as far as a head may be long.
+
+    Return b'' at its end, and None if there are none.
+    """
     try:
         return sock.recv(HEAD_MAX_BYTES, socket.MSG_PEEK | socket.MSG_DONTWAIT)
     except BlockingIOError:
@@ -35,7 +38,7 @@ def is_complete(head: bytes) -> bool:
 
 
 def parse_head(head: bytes, address: str = "") -> RequestContext | None:
-    """Return the request that a head states; None if it is none."""
+    """Return the request that a head states, or None if it states none."""
     first, *lines = head.partition(b"\r\n\r\n")[0].decode("latin-1").split("\r\n")
     words = first.split(" ")
     if len(words) != 3:
@@ -46,7 +49,7 @@ def parse_head(head: bytes, address: str = "") -> RequestContext | None:
 
 
 def rank_request(request: RequestContext | None, policy: AccessPolicy) -> Rank:
-    """Return the rank that a request gives its connection; None: no request."""
+    """Return the rank that a request gives its connection. request: None if there is none."""
     if request is None or policy.find_token(request) is None:
         return Rank.OTHER
     is_stop = request.method == "POST" and request.path == STOP_PATH and policy.permits_stop(request)

@@ -26,7 +26,7 @@ class BoundedBody:
         self.size_bytes = 0
 
     async def __call__(self) -> Message:
-        """Return the next chunk; BodyTooLargeError if the body exceeds its maximum size."""
+        """Return the next chunk. Raise BodyTooLargeError if the body exceeds its maximum size."""
         message = await self._receive()
         if message["type"] == "http.request":
             chunk = message.get("body", b"")
@@ -48,12 +48,12 @@ class BoundedBody:
 
     @property
     def audit_fields(self) -> dict[str, object]:
-        """Size and SHA-256 of the body; empty if there is none."""
+        """Size and SHA-256 of the body, empty if there is none."""
         return {"body_bytes": self.size_bytes, "body_sha256": self._digest.hexdigest()} if self.size_bytes else {}
 
 
 class RateLimitedFrames:
-    """Receives a stream's frames no faster than the caller's rate; frames beyond it wait in the caller's socket.
+    """Receives a stream's frames no faster than the caller's rate. Frames beyond it wait in the caller's socket.
 
     acquire: counts a frame and returns the time to wait first, s
     """
@@ -64,7 +64,7 @@ class RateLimitedFrames:
         self.frame_count = 0
 
     async def __call__(self) -> Message:
-        """Return the next message; a frame once its rate allows it."""
+        """Return the next message, a frame once its rate allows it."""
         message = await self._receive()
         if message["type"] == "websocket.receive":
             self.frame_count += 1

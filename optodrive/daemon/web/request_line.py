@@ -16,7 +16,7 @@ def normalise_path(path: str) -> str:
 
 
 def join_headers(lines: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return the headers by lower-case name; the values of a repeated one as a list, which no Host or Origin is."""
+    """Return the headers by lower-case name, the values of a repeated one as a list, which no Host or Origin is."""
     headers: dict[str, str] = {}
     for name, value in lines:
         key = name.lower()

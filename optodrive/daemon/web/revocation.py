@@ -20,7 +20,10 @@ def build_revoked_problem(token: Token) -> Problem:
 
 
 class RequestInProgress:
-    """Input and output of a request. status: of its response, None before that; 101 for an open WebSocket."""
+    """Input and output of a request.
+
+    status: of its response, None before that; 101 for an open WebSocket
+    """
 
     def __init__(self, kind: Literal["http", "websocket"], receive: Receive, send: Send) -> None:
         self.status: int | None = None
@@ -83,7 +86,7 @@ class RequestsInProgress:
             del self._requests[request]
 
     def revoke(self, tokens: Iterable[Token]) -> list[asyncio.Task[None]]:
-        """End the requests of some tokens at once; return the tasks that say so to their clients."""
+        """End the requests of some tokens at once. Return the tasks that say so to their clients."""
         revoked = set(tokens)
         return [
             asyncio.create_task(request.send_end(build_revoked_problem(token)))

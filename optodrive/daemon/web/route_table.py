@@ -22,7 +22,7 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
 class RoleRoutes:
-    """Declares the routes of an application, each with the lowest role that may call it; None: no token."""
+    """Declares the routes of an application, each with the lowest role that may call it, None if no token is needed."""
 
     def __init__(self, app: FastAPI) -> None:
         self._app = app
@@ -60,7 +60,7 @@ class RoleRoutes:
 
 @dataclass(frozen=True)
 class Route:
-    """One entry of the table; `key` is its method and path template."""
+    """One entry of the table. `key` is its method and path template."""
 
     key: str
     min_role: Role | None
@@ -81,7 +81,7 @@ class RouteTable:
 
     @property
     def roles(self) -> dict[str, Role | None]:
-        """Method and path template of every route → the lowest role that may call it; None: no token."""
+        """Method and path template of every route → the lowest role that may call it, None if no token is needed."""
         return {route.key: route.min_role for route in self._routes}
 
     def list_refused(self, role: Role) -> dict[str, str]:
@@ -93,11 +93,11 @@ class RouteTable:
         }
 
     def find(self, method: str, path: str) -> Route | None:
-        """Return the route of a request; None if there is none."""
+        """Return the route of a request, or None if there is none."""
         return next((route for route in self._routes if route.method == method and route.path.fullmatch(path)), None)
 
     def find_methods(self, path: str) -> tuple[str, ...]:
-        """Return the methods that a path accepts; none for an unknown path."""
+        """Return the methods that a path accepts, none for an unknown path."""
         return tuple(route.method for route in self._routes if route.path.fullmatch(path))
 
 

@@ -45,7 +45,7 @@ UNKNOWN_BOARD: Mapping[str, Any] = {"state": "UNKNOWN", "fault": None, "hint": "
 def merge_state(
     config: Config, pixels: int, status: Mapping[str, Any] | None, planner: PlannerState | None
 ) -> StateReport:
-    """Merge the states of the processes; None for a process that does not run.
+    """Merge the states of the processes, None for a process that does not run.
 
     config: names display, stages and ports; pixels: their number; status: of the link process
     """

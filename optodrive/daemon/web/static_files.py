@@ -61,7 +61,7 @@ def _get_page_folder() -> Traversable:
 
 
 def add_page_routes(routes: RoleRoutes) -> None:
-    """Serve the page at `/` and its files below `/page/`; all are read beforehand, so that no path leads elsewhere."""
+    """Serve the page at `/` and its files below `/page/`. All are read beforehand, so that no path leads elsewhere."""
     contents = dict(_read_files(_get_page_folder(), ""))
 
     @routes.get("/", "viewer", include_in_schema=False)

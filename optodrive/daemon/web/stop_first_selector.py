@@ -18,7 +18,7 @@ STOP = STOP_PATH.encode()
 
 
 class StopFirstSelector(selectors.EpollSelector):
-    """A selector that defers clients beyond the first of a turn; their sockets stay ready for the next turn.
+    """A selector that defers clients beyond the first of a turn. Their sockets stay ready for the next turn.
 
     permits_stop: whether the head of a request for STOP has what STOP needs; another one takes no precedence
     """
@@ -49,7 +49,7 @@ class StopFirstSelector(selectors.EpollSelector):
         return min(at_s for at_s in (received_s, waiting_s, time.monotonic()) if at_s is not None)
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Return what is ready: everything but clients, STOP first, then the clients that have waited longest."""
+        """Return the ready keys: everything but clients, STOP first, then the clients that have waited longest."""
         ready = super().select(timeout)
         if len(ready) <= CLIENTS_PER_TURN:
             return ready

@@ -33,7 +33,7 @@ class StopPriorityMiddleware:
         self._stop_done = asyncio.Event()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Forward the request when its turn comes; forward STOP at once. Routes get the path in its usual form."""
+        """Forward the request when its turn comes, and STOP at once. Routes get the path in its usual form."""
         if "path" in scope:
             path = normalise_path(scope["path"])
             if path != scope["path"]:

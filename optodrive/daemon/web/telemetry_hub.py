@@ -153,7 +153,7 @@ class TelemetryHub:
             self._remove_reader(rate_hz, hold)
 
     def _format_since(self, event_number: int, hold: PeakHold) -> str:
-        """Format the events after a number; that of the display has the peaks since the reader's last one."""
+        """Format the events after a number. That of the display has the peaks since the reader's last one."""
         texts = {kind: text for kind, (number, text) in self._latest.items() if number > event_number}
         if "display" in texts and self._display is not None:
             display = hold.release(self._display)
@@ -180,7 +180,7 @@ class TelemetryHub:
         self.on_readers(*self.readers)
 
     def _format_pulses_since(self, number: int) -> str:
-        """Format the event of all batches after a number, a `PulsesEvent`; of the newest if those are too many."""
+        """Format the event of all batches after a number, a `PulsesEvent`, or of the newest if those are too many."""
         texts: dict[str, list[str]] = {"planned": [], "executed": []}
         pulses = 0
         for batch in reversed(self._batches):

@@ -27,7 +27,7 @@ class TimedSocket(socket.socket):
     received_s: float | None = None
 
     def recv(self, size_bytes: int, flags: int = 0, /) -> bytes:
-        """Read as `socket.recv` does; one that only peeks leaves received_s."""
+        """Read as `socket.recv` does. A call that only peeks leaves received_s."""
         if flags & socket.MSG_PEEK:
             return super().recv(size_bytes, flags)
         data, ancillary, _, _ = self.recvmsg(size_bytes, _ANCILLARY_BYTES, flags)

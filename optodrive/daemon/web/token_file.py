@@ -76,7 +76,7 @@ def format_token(token: Token) -> str:
 
 
 def _cut_table(text: str, index: int) -> str:
-    """Return the text without a table, counted from 0; unchanged if there are fewer."""
+    """Return the text without a table, counted from 0, or unchanged if there are fewer."""
     starts = [match.start() for match in TABLE.finditer(text)] + [len(text)]
     if index + 1 >= len(starts):
         return text

@@ -48,7 +48,7 @@ class Tokens:
         self._secrets = [(token.secret.encode(), token) for token in self.all]
 
     def find(self, presented: str) -> Token | None:
-        """Return the presented token, None if it is unknown; the time does not depend on which token matches."""
+        """Return the presented token, None if it is unknown. The time does not depend on which token matches."""
         presented_bytes = presented.encode()
         found = None
         for secret, token in self._secrets:
@@ -85,8 +85,9 @@ def build_tokens_path(port: int) -> Path:
 
 
 def read_tokens(path: Path, *, private: bool = False) -> Tokens:
-    """Read the tokens of a file; InputError, which never contains a secret, if the file is unreadable or invalid.
+    """Read the tokens of a file.
 
+    Raise InputError, which never contains a secret, if the file is unreadable or invalid.
     private: refuse a file that others than its owner can read
     """
     table = read_toml(path, FILE_MAX_BYTES, private=private)
@@ -104,7 +105,7 @@ def read_tokens(path: Path, *, private: bool = False) -> Tokens:
 
 
 def read_private_tokens(path: Path) -> Tokens:
-    """Read a daemon's own tokens; InputError if others than the file's owner can read them."""
+    """Read a daemon's own tokens. Raise InputError if others than the file's owner can read them."""
     return read_tokens(path, private=True)
 
 
@@ -138,7 +139,7 @@ def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
 
 
 def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
-    """Load a daemon's tokens; return them with the path of their file.
+    """Load a daemon's tokens and return them with the path of their file.
 
     tokens_file: a file that persists, created if it does not exist; if empty, the daemon gets new tokens in the default
     file.
@@ -151,7 +152,7 @@ def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
 
 
 def read_token(port: int | None) -> str:
-    """Read the token with the highest role for a daemon on a TCP port; InputError if none is readable.
+    """Read the token with the highest role for a daemon on a TCP port. Raise InputError if none is readable.
 
     port: None for a daemon on a Unix socket
     """

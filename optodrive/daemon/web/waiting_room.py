@@ -25,8 +25,9 @@ END = select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR
 
 
 class Waiting(NamedTuple):
-    """A connection. since_s: monotonic time since which it waits for its head, or has had one; rank: by its head.
+    """A connection.
 
+    since_s: monotonic time since which it waits for its head, or has had one; rank: by its head
     number: of the connection among those that a web process has got
     """
 
@@ -65,7 +66,7 @@ class WaitingRoom:
         return self._epoll.fileno()
 
     def close(self) -> None:
-        """Accept no more, and close what waits."""
+        """Accept no more connections, and close those that wait."""
         self._epoll.close()
         for waiting in (self._silent, *self._ranked.values()):
             for entry in waiting.values():

@@ -112,7 +112,7 @@ class WebProcess:
             self._client.close()
 
     async def _wait_for_state(self) -> None:
-        """Let callers wait until the first answer is true; without link and planner the board is dark."""
+        """Let callers wait until the first answer is true. Without link and planner the board is dark."""
         deadline_s = time.monotonic() + READY_TIMEOUT_S
         while not (self._client.knows_state or self.server.should_exit or time.monotonic() > deadline_s):
             await asyncio.sleep(STATE_POLL_S)
@@ -170,7 +170,7 @@ class WebProcess:
             self.end()
 
     def _revoke(self, tokens: tuple[Token, ...]) -> None:
-        """End what was begun with tokens that are no longer valid: first the light."""
+        """End the light, then the requests and connections, of tokens that are no longer valid."""
         for token in tokens:
             self._client.revoke(token.name)
         tasks = self._policy.in_progress.revoke(tokens)
