@@ -146,7 +146,7 @@ def _split_frames(points: PointTable, scale: PointScale) -> Iterator[tuple[int, 
 
 
 def _find_gate_off_end(points: PointTable, first: int, longest: int) -> int | None:
-    """Return the latest frame end behind a blank point, in the second half of the longest frame; None without one."""
+    """Return the latest frame end behind a blank point, in the second half of the longest frame, None without one."""
     min_end = first + (longest - first) // 2
     for last in (min_end + 1 + np.flatnonzero(points[min_end:longest, 6] == 0))[::-1].tolist():
         if not is_whole_packets(last - first):

@@ -202,7 +202,7 @@ class HostConnection:
         return messages
 
     def _advance_window(self, next_seq: int, now_s: float) -> bool:
-        """Forget what was acknowledged. Return False for an acknowledgement that is older than one before."""
+        """Forget the acknowledged frames. Return False for an acknowledgement that is older than one before."""
         count = (next_seq - self._base_seq) % SEQ_MODULUS
         if count > len(self._unacked):
             return False

@@ -83,7 +83,7 @@ class WirePoints:
         return type(self)(np.concatenate([self.table, added]), row)
 
     def add_pause(self, ticks: int) -> Self:
-        """Return the points behind a further pause of `ticks`, with the gate off; gate-off points hold a long one."""
+        """Return the points behind a further pause of `ticks`, with the gate off. Gate-off points hold a long one."""
         if not len(self):
             return self
         count = max(0, -(-(int(self.table[0, 2]) + ticks - TICKS_MAX) // GATE_OFF_STEP_TICKS))

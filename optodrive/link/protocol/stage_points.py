@@ -35,7 +35,7 @@ class StagePoints:
 
     @classmethod
     def from_payload(cls, payload: bytes, counts: Sequence[int]) -> Self:
-        """Read what encode_payload() wrote. counts: number of points of each stage. Raise ValueError if they differ."""
+        """Read a payload of encode_payload(). counts: number of points per stage. Raise ValueError if they differ."""
         if len(payload) != POINT_BYTES * sum(counts) or min(counts) < 0:
             raise ValueError(f"{len(payload)} bytes for {sum(counts)} points")
         table = np.frombuffer(payload, dtype="<u2").reshape(-1, 5)

@@ -98,7 +98,7 @@ TRANSITIONS: dict[BoardState, dict[EventReason, BoardState]] = {
 
 
 def next_state(state: BoardState, event: EventReason) -> BoardState:
-    """Return the state that an event leads to; raise LocalProtocolError for an event that the state does not know."""
+    """Return the state that an event leads to. Raise LocalProtocolError for an event that the state does not know."""
     try:
         return TRANSITIONS[state][event]
     except KeyError:

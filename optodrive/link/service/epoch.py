@@ -2,14 +2,17 @@
 
 
 class Epoch:
-    """The present epoch. number: greater than all earlier ones; reason: what has ended the one before, for people."""
+    """The present epoch.
+
+    number: greater than all earlier ones; reason: cause that has ended the one before, for people
+    """
 
     def __init__(self, number: int) -> None:
         self.number = number
         self.reason = "the link process has started"
 
     def end(self, reason: str) -> None:
-        """Begin the next epoch. reason: what ends this one, as the end of a sentence."""
+        """Begin the next epoch. reason: cause that ends this one, as the end of a sentence."""
         self.number += 1
         self.reason = reason
 

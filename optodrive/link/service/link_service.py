@@ -203,13 +203,13 @@ class LinkService:
             raise NotReadyError(f"{self._control.describe_caller()} {doing}; only a DISARMED board can be armed")
 
     def _build_control(self, fields: dict[str, Any]) -> Control:
-        """Build the control of an arming that is requested now; `hold`: whether it needs beats from now on."""
+        """Build the control of an arming that is requested now. `hold`: whether it needs beats from now on."""
         now_s = self._clock.now_s()
         held_s = now_s if fields.get("hold") else None
         return Control(str(fields.get("caller", "")), now_s, int(fields.get("arming", 0)), held_s)
 
     def _hold(self, arming: int, age_s: float) -> None:
-        """Record a beat of the client that holds an arming; age_s: time since it arrived."""
+        """Record a beat of the client that holds an arming. age_s: time since it arrived."""
         if self._control is not None and self._control.arming == arming:
             self._control = self._control.record_beat(self._clock.now_s() - max(0.0, age_s))
 
@@ -257,7 +257,7 @@ class LinkService:
         return min(self._boards.compute_wait_s(), WAIT_MAX_S)
 
     def step(self, wait_s: float = 0.0) -> None:
-        """Send what is due to the board and process what it has sent. wait_s: longest wait for its first byte."""
+        """Send the due messages to the board and process its messages. wait_s: longest wait for its first byte."""
         if self._boards.connected:
             self._step_session(wait_s)
         else:

@@ -9,7 +9,10 @@ from optodrive.link.service.settings import BoardSettings, LinkSettings
 
 
 def build_link_settings(config: Config, socket_path: Path, socket_mode: int, capture_path: Path | None) -> LinkSettings:
-    """Build the settings of the link process. socket_path: the socket on which it listens; socket_mode: its mode."""
+    """Build the settings of the link process.
+
+    socket_path: the socket on which it listens; socket_mode: its mode
+    """
     return LinkSettings(
         boards=build_board_settings(config),
         skew_max_s=config.limits.stage_skew_max_s,

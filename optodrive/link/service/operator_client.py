@@ -16,7 +16,7 @@ RETRY_S = 0.005
 
 
 def stop_board(path: Path, timeout_s: float = TIMEOUT_S) -> dict[str, Any] | None:
-    """Switch the gate off, drop everything queued and disarm; return the result with the fields `board` and `epoch`.
+    """Switch the gate off, drop everything queued and disarm. Return the result with the fields `board` and `epoch`.
 
     Return None if no link process listens at the path or this user may not open it: nothing was sent then. Raise the
     error of the link process, or LinkError if it does not answer.
@@ -38,7 +38,7 @@ def stop_board(path: Path, timeout_s: float = TIMEOUT_S) -> dict[str, Any] | Non
 
 
 def _connect(connection: socket.socket, path: Path, deadline_s: float) -> bool:
-    """Connect, and wait while others connect; return False if nobody listens or the access is denied."""
+    """Connect, and wait while others connect. Return False if nobody listens or the access is denied."""
     while True:
         try:
             connection.settimeout(max(0.001, deadline_s - time.monotonic()))

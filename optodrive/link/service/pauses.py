@@ -9,7 +9,10 @@ PAUSE_MAX_S = 300.0
 
 
 class Pauses:
-    """Pauses of the light since this process started. number: of the latest one; began_s: board time of its begin."""
+    """Pauses of the light since this process started.
+
+    number: of the latest one; began_s: board time of its begin
+    """
 
     def __init__(self, clock: Clock) -> None:
         self.number = 0
@@ -24,7 +27,7 @@ class Pauses:
 
     @property
     def ends_in_s(self) -> float | None:
-        """Time until the pause is too long, s; None if the light is not paused."""
+        """Time until the pause is too long, s, or None if the light is not paused."""
         return None if self._since_s is None else self._since_s + PAUSE_MAX_S - self._clock.now_s()
 
     @property

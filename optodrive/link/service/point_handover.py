@@ -87,7 +87,7 @@ class PointHandover:
         boards.on_executed = self._forward_executed
 
     def clear(self) -> None:
-        """Report what was executed, and forget all jobs."""
+        """Report the executed pulses, and forget all jobs."""
         self._send_executed()
         self._jobs.clear()
         self._progress.clear()
@@ -193,7 +193,7 @@ class PointHandover:
         self._executed.clear()
 
     def report_progress(self) -> None:
-        """Send what has changed since the last report if one is due, and forget finished jobs."""
+        """Send the progress that has changed since the last report if one is due, and forget finished jobs."""
         now_s = self._clock.now_s()
         is_finished = any(job.is_finished for job in self._jobs.values())
         if not is_finished and now_s - self._reported_s < REPORT_INTERVAL_S:

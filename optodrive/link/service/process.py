@@ -80,7 +80,7 @@ class LinkProcess:
         self._ending = self._stop_requested = False
 
     def install_signals(self) -> None:
-        """Let SIGUSR1 stop and SIGTERM end; ignore the terminal's signals, which the supervisor handles."""
+        """Let SIGUSR1 stop and SIGTERM end. Ignore the terminal's signals, which the supervisor handles."""
         self._wakeup.setblocking(False)
         self._wakeup_write.setblocking(False)
         signal.set_wakeup_fd(self._wakeup_write.fileno(), warn_on_full_buffer=False)
@@ -178,7 +178,7 @@ def read_settings(path: Path) -> LinkSettings:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the link process; return its exit status."""
+    """Run the link process and return its exit status."""
     parser = argparse.ArgumentParser(prog="optodrive.link.service.process", description="Link process of the daemon.")
     parser.add_argument("--settings", type=Path, required=True, help="file of the settings, JSON")
     parser.add_argument("--supervisor", type=int, required=True, help="descriptor of the supervisor's channel")

@@ -65,7 +65,7 @@ class RemoteJob(StagedJob):
         return self._first_sent_tick
 
     def update(self, first_index: Sequence[int], sent_points: Sequence[int], first_sent_tick: float | None) -> None:
-        """Take over what the link process reports."""
+        """Take over the progress that the link process reports."""
         self._first_sent_tick = first_sent_tick
         for part, first, sent in zip(self.parts, first_index, sent_points, strict=True):
             part.first_index, part.next_to_send = first, first + sent
@@ -77,7 +77,10 @@ class RemoteJob(StagedJob):
 
 
 class LeaseStats:
-    """Statistics of the lease renewals. ages: distribution of their intervals, s; slack_s: minimum remaining lease."""
+    """Statistics of the lease renewals.
+
+    ages: distribution of their intervals, s; slack_s: minimum remaining lease
+    """
 
     def __init__(self) -> None:
         self.ages = Histogram(AGE_BUCKETS_S)
@@ -157,7 +160,7 @@ class RemoteSession:
         return self._socket is not None and self._socket.wants_write
 
     def receive(self) -> None:
-        """Process messages that have arrived, a bounded number, and send what waits.
+        """Process messages that have arrived, a bounded number, and send the messages that wait.
 
         Never wait; a lost connection is no error.
         """
@@ -323,7 +326,7 @@ class RemoteSession:
 
     @property
     def is_held(self) -> bool:
-        """Whether the light is paused, or reports of what ran before a pause may still arrive."""
+        """Whether the light is paused, or reports of pulses emitted before a pause may still arrive."""
         return self.pause_ends_in_s is not None or self._drained_number != self._pause_number
 
     def pop_drained(self) -> float | None:

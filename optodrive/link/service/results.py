@@ -8,7 +8,10 @@ from optodrive.core.ipc import Message
 
 
 def build_result(request_id: int, error: OptodriveError | None, fields: dict[str, Any]) -> Message:
-    """Return the result of a request. error: None if it was carried out; fields: further fields."""
+    """Return the result of a request.
+
+    error: None if it was carried out; fields: further fields
+    """
     error_fields = None
     if error is not None:
         error_fields = {"code": error.code, "message": str(error), "type": type(error).__name__}

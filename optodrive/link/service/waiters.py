@@ -39,7 +39,7 @@ class StateWaiters:
         self._waiters.append(Waiter(client, request_id, command, now_s + TIMEOUT_S))
 
     def drop_client(self, client: int) -> bool:
-        """Forget a client that has left; return whether it was arming the board."""
+        """Forget a client that has left, and return whether it was arming the board."""
         dropped = [waiter for waiter in self._waiters if waiter.client == client]
         self._waiters = [waiter for waiter in self._waiters if waiter.client != client]
         return any(waiter.command == "arm" for waiter in dropped)

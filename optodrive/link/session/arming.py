@@ -22,7 +22,7 @@ class Arming:
         self._nonce: int | None = None
 
     def begin(self) -> m.ArmReq:
-        """Begin an arming; return its request."""
+        """Begin an arming and return its request."""
         self.is_present, self.is_lost = True, False
         self._progress, self._nonce = 0, secrets.randbits(32)
         return m.ArmReq(host_nonce=self._nonce)

@@ -124,7 +124,7 @@ class BoardGroup:
 
     @property
     def board(self) -> BoardView:
-        """Latest reported state of all boards: sums of what they count, and the state of the one nearest to light."""
+        """Latest reported state of all boards: the sums of their counts, and the state of the one nearest to light."""
         boards = [session.board for session in self.sessions]
         if not self.has_several:
             return boards[0]
@@ -163,7 +163,7 @@ class BoardGroup:
 
     @property
     def has_arming(self) -> bool:
-        """Whether the arming of all boards is present: none has left what it had reached."""
+        """Whether the arming of all boards is present: none has left the state that it had reached."""
         return all(session.has_arming for session in self.sessions)
 
     @property
@@ -274,7 +274,7 @@ class BoardGroup:
     # --- loop ---------------------------------------------------------------------------------------------------
 
     def step(self, wait_s: float, renew_lease: bool, stalled: str = "planner") -> None:
-        """Run one iteration of each session, as `BoardSession.step`; only the first waits for bytes."""
+        """Run one iteration of each session, as `BoardSession.step`. Only the first waits for bytes."""
         self._drop_late_points()
         self._seek_clocks()
         for session in self.sessions:
@@ -434,7 +434,7 @@ class BoardGroup:
     # --- statistics ---------------------------------------------------------------------------------------------
 
     def collect_link_stats(self) -> dict[str, Any]:
-        """Return the statistics of all links: sums of what they count, the largest of times."""
+        """Return the statistics of all links: the sums of their counts, and the largest of their times."""
         stats = [session.collect_link_stats() for session in self.sessions]
         if not self.has_several:
             return stats[0]
@@ -446,7 +446,7 @@ class BoardGroup:
         return merged
 
     def list_stages(self) -> list[dict[str, Any]]:
-        """Return name, port, board, link and clock of each of several stages, for the status; nothing of one.
+        """Return name, port, board, link and clock of each of several stages, for the status, or nothing of one.
 
         A board without a link has no known state.
         """

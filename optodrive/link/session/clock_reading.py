@@ -11,6 +11,6 @@ class ClockReading(NamedTuple):
     unix_s: float
 
     def convert(self, board_s: float) -> "ClockReading":
-        """Return another moment of the board's clock on all three; its error grows with the distance and the drift."""
+        """Return another moment of the board's clock on all three. Its error grows with the distance and the drift."""
         elapsed_s = board_s - self.board_s
         return ClockReading(board_s, self.monotonic_s + elapsed_s, self.unix_s + elapsed_s)

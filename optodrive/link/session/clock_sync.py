@@ -91,7 +91,7 @@ class ClockSync:
         self._best = min(self._samples, key=lambda each: each[0] - DRIFT_MAX * each[1])[1:]
 
     def compute_contradiction_s(self, stamp: int, reply_s: float, board_s: float) -> float:
-        """Return by how much a reply lies outside of what the latest exchange permits, s; 0 for an unknown stamp."""
+        """Return how far a reply lies outside the range that the latest exchange permits, s, 0 for an unknown stamp."""
         request_s = self._request_s.get(stamp)
         if request_s is None or not self._samples:
             return 0.0
@@ -115,7 +115,7 @@ class ClockSync:
 
     @property
     def best_sample(self) -> tuple[float, float] | None:
-        """Host time and board time, s, of the exchange whose bracket is the narrowest now; None before the first."""
+        """Host time and board time, s, of the exchange whose bracket is the narrowest now, or None before the first."""
         return self._best
 
     def fit(self, host_s: float) -> ClockFit | None:

@@ -24,7 +24,7 @@ BOARD_COUNTER_MODULUS = 2**16
 
 
 class LinkErrorCounts(NamedTuple):
-    """Error counts of a link since it was opened; board_bad_frames: of the board, modulo BOARD_COUNTER_MODULUS."""
+    """Error counts of a link since it was opened. board_bad_frames: of the board, modulo BOARD_COUNTER_MODULUS."""
 
     host_bad_frames: int = 0
     board_bad_frames: int = 0
@@ -32,7 +32,7 @@ class LinkErrorCounts(NamedTuple):
     naks: int = 0
 
     def count_since(self, then: "LinkErrorCounts") -> "LinkErrorCounts":
-        """Return what was counted since an earlier time."""
+        """Return the errors counted since an earlier time."""
         counts = LinkErrorCounts(*(now - before for now, before in zip(self, then, strict=True)))
         return counts._replace(board_bad_frames=counts.board_bad_frames % BOARD_COUNTER_MODULUS)
 

@@ -132,7 +132,7 @@ class PlanJob:
         return self._table[position : position + count].tobytes()
 
     def _follow_host(self, timing: PointTiming, position: int) -> None:
-        """Shift the points from a position on by what the board's clock has drifted since the last were sent."""
+        """Shift the points from a position on by the drift of the board's clock since the last were sent."""
         off_ticks, on_ticks = (int(value) for value in self._table[position, 2:4])
         planned_tick = timing.start_tick + int(self._planned_end_tick[position]) - on_ticks
         error = timing.to_board_tick(planned_tick) - float(self._end_tick[position] - on_ticks)
@@ -222,7 +222,7 @@ class PlanJob:
         return self._row[self._pulse_points]
 
     def read_reports(self, pulses: IntArray) -> ReportedPulses:
-        """Return what was reported of pulses [n], given as their positions among all; on_tick is −1 without a report.
+        """Return the reports of pulses [n], given as their positions among all. on_tick is −1 without a report.
 
         Any thread may call it.
         """

@@ -57,7 +57,7 @@ class PointStream:
         return self._sent_index
 
     def find_contradiction(self, message: m.Executed) -> str:
-        """Return what a report contradicts of the points that were sent, '' if nothing."""
+        """Return how a report contradicts the points that were sent, or '' if it does not."""
         return next((text for job in self._jobs if (text := job.find_contradiction(message))), "")
 
     @property

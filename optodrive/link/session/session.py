@@ -156,7 +156,7 @@ class BoardSession:
 
     @property
     def has_arming(self) -> bool:
-        """Whether the board was armed from here, or is being armed, and has not left what it had reached."""
+        """Whether the board was armed from here, or is being armed, and has not left the state that it had reached."""
         return self._arming.is_present
 
     @property
@@ -210,7 +210,7 @@ class BoardSession:
         self._watch.on_reconnect_failed(self._clock.now_s())
 
     def _handshake(self) -> Iterator[float]:
-        """Send what is due in each step of the handshake, and yield how long to wait for bytes."""
+        """Send the messages due in each step of the handshake, and yield how long to wait for bytes."""
         self.end_arming()
         self._reset()
         self._send_hello()
@@ -302,7 +302,7 @@ class BoardSession:
     # --- loop ---------------------------------------------------------------------------------------------------
 
     def step(self, wait_s: float, renew_lease: bool, stalled: str = "planner") -> None:
-        """Run one loop iteration: send what is due, wait at most wait_s for bytes and process them.
+        """Run one loop iteration: send the due messages, wait at most wait_s for bytes and process them.
 
         The lease is renewed only while an arming from here is present. ABORT goes out when the board has left it, and
         when it is armed without one.
@@ -548,7 +548,7 @@ class BoardSession:
         return self._points.last
 
     def find_lateness_s(self) -> float:
-        """Return by how much the next unsent point is late, s; at most 0 while there is time to send it."""
+        """Return by how much the next unsent point is late, s, at most 0 while there is time to send it."""
         start_tick = self._points.find_start_tick()
         return -inf if start_tick is None else self.board_s() - start_tick * self.scale.tick_s
 

@@ -25,7 +25,7 @@ class TimingError:
 
 
 def compute_timing_error(planned_s: FloatArray, executed_s: FloatArray) -> TimingError | None:
-    """Compute the error from planned and executed starts of the same pulses, [n] each; None without pulses."""
+    """Compute the error from planned and executed starts of the same pulses, [n] each. Return None without pulses."""
     if not len(planned_s):
         return None
     error_s = executed_s - planned_s

@@ -170,7 +170,7 @@ class BoardCore:
     # --- messages -----------------------------------------------------------------------------------------------
 
     def _dispatch_sequenced(self, message: m.Message) -> str:
-        """Carry out a sequenced message; return the NAK reason, '' if it is accepted."""
+        """Carry out a sequenced message. Return the NAK reason, or '' if it is accepted."""
         handlers: dict[type[m.Message], Callable[[Any], str]] = {
             m.Limits: self.machine.tighten_limits,
             m.Data: self._on_data,

@@ -35,7 +35,7 @@ LOWER_LIMITS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
 
 
 def tighten(current: Limits, requested: Limits) -> Limits:
-    """Return the tighter value of each field; full_power_uw stays as it is."""
+    """Return the tighter value of each field. full_power_uw stays as it is."""
     tighter = {name: min(getattr(current, name), getattr(requested, name)) for name in UPPER_LIMITS}
     tighter |= {name: max(getattr(current, name), getattr(requested, name)) for name in LOWER_LIMITS}
     return replace(current, **tighter)

@@ -238,7 +238,7 @@ class BoardMachine:
             self._log("gate", on=on, reason=reason)
 
     def _change_state(self, event: EventReason) -> None:
-        """Change to the state that the event leads to, and report it; only RUNNING leaves the gate as it is."""
+        """Change to the state that the event leads to, and report it. Only RUNNING leaves the gate as it is."""
         state = next_state(self.state, event)
         if state != BoardState.RUNNING:
             self._close_gate(event)
@@ -248,7 +248,7 @@ class BoardMachine:
         self._event_sink(m.Event(m.STATES.index(state), fault, m.EVENT_REASONS.index(event), self.current_tick))
 
     def _close_gate(self, reason: str) -> None:
-        """Close the gate and record what an interrupted pulse emitted."""
+        """Close the gate and record the emission of an interrupted pulse."""
         point, gate_was_on = self._current_point, self.gate
         self._set_gate(False, reason)
         if point is not None and gate_was_on:
@@ -256,7 +256,7 @@ class BoardMachine:
         self._current_point = None
 
     def disarm(self, event: EventReason) -> None:
-        """Drop the queue and leave any armed state; DISARMED and FAULT stay."""
+        """Drop the queue and leave any armed state. DISARMED and FAULT stay."""
         self._confirmed = False
         self._board_nonce = None
         if self.state not in IDLE_STATES:
@@ -282,7 +282,7 @@ class BoardMachine:
             self._enter_fault(INPUT_FAULTS[name])
 
     def clear_fault(self) -> str:
-        """Acknowledge a fault; forget the underruns."""
+        """Acknowledge a fault and forget the underruns."""
         if self.state != BoardState.FAULT:
             return "STATE"
         if self.inputs != SAFE_INPUTS:
@@ -302,7 +302,7 @@ class BoardMachine:
         self._is_version_supported = is_version_supported
 
     def renew_lease(self, duration_ms: int) -> None:
-        """Extend the lease up to the board's own maximum from now; it never shortens."""
+        """Extend the lease up to the board's own maximum from now. It never shortens."""
         if self.state in LEASED_STATES:
             until_us = self.now_us + 1000 * min(duration_ms, self.limits.lease_ms)
             self.lease_until_us = max(self.lease_until_us, until_us)
@@ -315,7 +315,7 @@ class BoardMachine:
         return ""
 
     def request_arming(self, host_nonce: int) -> str:
-        """Enter ARMING; `challenge` then holds the nonces to confirm."""
+        """Enter ARMING. `challenge` then holds the nonces to confirm."""
         if self.state != BoardState.DISARMED:
             return "STATE"
         if not self._is_version_supported:
@@ -340,7 +340,7 @@ class BoardMachine:
         return self._host_nonce, self._board_nonce
 
     def confirm_arming(self, host_nonce: int, board_nonce: int) -> str:
-        """Confirm the challenge; a challenge is valid for one attempt, right or wrong."""
+        """Confirm the challenge. A challenge is valid for one attempt, right or wrong."""
         challenge, self._board_nonce = self.challenge, None
         if self.state != BoardState.ARMING or self._confirmed:
             return "STATE"
@@ -416,7 +416,7 @@ class BoardMachine:
         return ""
 
     def flush(self) -> str:
-        """Drop the queue and the job; the board stays armed."""
+        """Drop the queue and the job. The board stays armed."""
         if self.state not in ARMED_STATES:
             return "STATE"
         if self.state != BoardState.ARMED:

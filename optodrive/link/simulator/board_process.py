@@ -38,7 +38,7 @@ def _check_options(options: argparse.Namespace) -> None:
 def main(
     arguments: list[str] | None = None, build_core: BackendFactory = BoardCore, actions: ScriptActions = NO_ACTIONS
 ) -> int:
-    """Run a board until SIGTERM or SIGINT; return the exit status."""
+    """Run a board until SIGTERM or SIGINT, and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="optodrive.link.simulator.board_process", description="Simulated board on a pty."
     )

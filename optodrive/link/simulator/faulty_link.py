@@ -4,7 +4,7 @@ import random
 
 
 class FaultyLink:
-    """Transmits bytes with faults; rates are per byte."""
+    """Transmits bytes with faults, at rates per byte."""
 
     def __init__(self, seed: int | None = None) -> None:
         self._random = random.Random(seed)

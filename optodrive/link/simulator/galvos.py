@@ -24,7 +24,7 @@ class GalvoMove(NamedTuple):
 
 
 class SimulatedGalvos:
-    """Two mirrors that follow codes with the configured servo; angles are nominal, in rad.
+    """Two mirrors that follow codes with the configured servo. Angles are nominal, in rad.
 
     Overlapping moves are superposed. The slew limit makes this inexact while they overlap; the end positions are exact.
     """

@@ -12,7 +12,7 @@ Cell = tuple[int, int, int]
 
 
 class EmissionGuards:
-    """Accounts of gate-on time, mean power and energy of one board; times in µs."""
+    """Accounts of gate-on time, mean power and energy of one board, with times in µs."""
 
     def __init__(self, cell_codes: int) -> None:
         self._cell_codes = cell_codes

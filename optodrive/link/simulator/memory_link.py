@@ -8,7 +8,7 @@ EXCHANGE_MIN_S = 1e-4
 
 
 class MemoryLink:
-    """Connects a host to a `BoardCore`; `read` advances the clock."""
+    """Connects a host to a `BoardCore`. `read` advances the clock."""
 
     name = "simulated board, virtual time"
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class QueuedPoint(NamedTuple):
-    """One queued point, numbered over the session; positions in codes, times in µs."""
+    """One queued point, numbered over the session, with positions in codes and times in µs."""
 
     number: int
     x: int
@@ -66,7 +66,7 @@ class PointQueue:
         return is_complete or len(self._points) >= job.watermark
 
     def append(self, points: Iterable[QueuedPoint]) -> None:
-        """Queue points; an idle queue continues with the number of the first one."""
+        """Queue points. An idle queue continues with the number of the first one."""
         was_idle = self.is_idle
         for point in points:
             if was_idle:

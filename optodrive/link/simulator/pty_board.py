@@ -135,7 +135,7 @@ class PtyBoard:
         self._signal_count += 1
 
     def run(self) -> None:
-        """Run until stopped; then disarm and remove the link."""
+        """Run until stopped, then disarm and remove the link."""
         try:
             while self._running:
                 self._run_once()

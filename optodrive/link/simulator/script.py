@@ -33,8 +33,9 @@ ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", *SENSO
 
 @dataclass(frozen=True)
 class ScriptStep:
-    """One step. kind: "set" or "do"; name: the input or the action.
+    """One step.
 
+    kind: "set" or "do"; name: the input or the action
     origin: what at_s counts from, the start or the first pulse; "signal": the step waits for a signal instead
     """
 

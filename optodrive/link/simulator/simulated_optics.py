@@ -19,7 +19,7 @@ LINE_MAX = 64
 
 
 class SimulatedOptics:
-    """Galvos and spot sensor that follow the board's log; the sensor answers on its own pty."""
+    """Galvos and spot sensor that follow the board's log. The sensor answers on its own pty."""
 
     def __init__(
         self,

@@ -56,7 +56,7 @@ class GroundTruthGeometry:
 
     @classmethod
     def sample(cls, seed: int, config: Config) -> Self:
-        """Sample a geometry within assembly tolerances of the configuration; reproducible by seed."""
+        """Sample a geometry within assembly tolerances of the configuration, reproducible by seed."""
         random = np.random.default_rng(seed)
         layout = build_pixel_layout(config.display)
         twice_f_m = 2.0 * config.scanner.focal_length_m
@@ -105,7 +105,7 @@ class GroundTruthGeometry:
         )
 
     def mirror_angles_rad(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the steady mechanical mirror angles of codes, integer or not; any shape."""
+        """Return the steady mechanical mirror angles of codes of any shape, integer or not."""
         codes = np.array(np.broadcast_arrays(x_code, y_code), dtype=np.float64) - CENTRE_CODE
         command_rad = codes * self.nominal_rad_per_code
         gain, offset_rad, cross, cubic = (
@@ -117,7 +117,7 @@ class GroundTruthGeometry:
         return x_rad, y_rad
 
     def landing_point_m(self, x_rad: ArrayLike, y_rad: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the beam's landing point in the display's axes for mirror angles, m; any shape."""
+        """Return the beam's landing point in the display's axes, m, for mirror angles of any shape."""
         mirror_rad = np.array(np.broadcast_arrays(x_rad, y_rad), dtype=np.float64)
         start, direction = self._trace_mirrors(*mirror_rad)
         at_lens = start + direction * ((self.lens_position_m - start[2]) / direction[2])
@@ -141,7 +141,7 @@ class GroundTruthGeometry:
         return x_m + dx_m, y_m + dy_m
 
     def position_m(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the beam's landing point on the display for codes, integer or not, m; any shape, float64."""
+        """Return the beam's landing point on the display, m, float64, for codes of any shape, integer or not."""
         return self.landing_point_m(*self.mirror_angles_rad(x_code, y_code))
 
     @property
@@ -170,7 +170,7 @@ class GroundTruthGeometry:
 
 
 def _reflect(direction: FloatArray, normal: FloatArray) -> FloatArray:
-    """Reflect directions at plane mirrors; directions and unit normals are [3, ...]."""
+    """Reflect directions at plane mirrors. Directions and unit normals are [3, ...]."""
     mirrored: FloatArray = direction - 2.0 * (direction * normal).sum(axis=0) * normal
     return mirrored
 

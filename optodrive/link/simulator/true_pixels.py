@@ -38,7 +38,7 @@ class GroundTruthPixels:
 
     @classmethod
     def sample(cls, seed: int, config: Config) -> Self:
-        """Sample pixels within manufacturing tolerances, 4 % dead but at least one; reproducible by seed."""
+        """Sample pixels within manufacturing tolerances, 4 % dead but at least one, reproducible by seed."""
         random, count = np.random.default_rng([seed, 0x9135]), len(build_pixel_layout(config.display))
         displacement_gain = np.clip(np.exp(GAIN_SIGMA * random.standard_normal(count)), *GAIN_RANGE)
         x_m, y_m = np.clip(OFFSET_SIGMA_M * random.standard_normal((2, count)), -OFFSET_MAX_M, OFFSET_MAX_M)

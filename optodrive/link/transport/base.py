@@ -31,7 +31,10 @@ class Transport(Protocol):
 
 
 class TransportKind(NamedTuple):
-    """Kind of transport. name: its value of `board.transport`; create: from an address, without opening it."""
+    """Kind of transport.
+
+    name: its value of `board.transport`; create: from an address, without opening it
+    """
 
     name: str
     create: Callable[[PortSettings], Transport]

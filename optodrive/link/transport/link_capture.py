@@ -30,7 +30,10 @@ QUEUE_MAX = 8192
 
 
 class CaptureEntry(NamedTuple):
-    """Event on the link. kind: one of KINDS; host_s: monotonic time; data: empty for opened and closed."""
+    """Event on the link.
+
+    kind: one of KINDS; host_s: monotonic time; data: empty for opened and closed
+    """
 
     kind: str
     host_s: float

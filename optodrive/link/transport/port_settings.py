@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class PortSettings:
-    """Address of a board. transport: name of a transport; port: serial device; baud: its bit rate, 1/s.
+    """Address of a board.
 
+    transport: name of a transport; port: serial device; baud: its bit rate, 1/s
     vendor_id, product_id, serial_number: of a USB device; an empty serial number accepts the only device of its kind
     own_settings: the settings that a simulated board has by itself, by their name in its file of limits
     """
