@@ -52,7 +52,7 @@ def compute_corrections(field: CalibratedField) -> FloatArray:
 
 
 def read_correction_grid(path: Path) -> tuple[float, FloatArray]:
-    """Read codes per millimetre, and dx and dy [65, 65, 2]; raises InputError for another kind of file."""
+    """Read codes per millimetre, and dx and dy [65, 65, 2]. Raise InputError for another kind of file."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -71,7 +71,7 @@ def read_correction_grid(path: Path) -> tuple[float, FloatArray]:
 
 
 def fit_correction_grid(path: Path, prior: FieldPrior) -> CalibratedField:
-    """Fit a field to a grid's corrections; raises InputError if no field fits.
+    """Fit a field to a grid's corrections. Raise InputError if no field fits.
 
     A grid states no uncertainty: sigma is the largest deviation of the field from it.
     """

@@ -59,7 +59,7 @@ class FieldFit:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square length of the inliers' residuals, m; NaN without spots."""
+        """Root mean square length of the inliers' residuals, m. It is NaN without spots."""
         inlier_m = self.residual_m[~self.outlier]
         return float(np.sqrt((inlier_m**2).sum(axis=1).mean())) if len(inlier_m) else float("nan")
 
@@ -98,7 +98,11 @@ def fit_field(spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None = N
 
 
 class _FieldFitter:
-    """State of a fit; z: [u] parameters in units of their sigma; weight: [n] of each spot, 0 to 1."""
+    """State of a fit.
+
+    z: [u] parameters in units of their sigma
+    weight: [n] of each spot, 0 to 1
+    """
 
     def __init__(self, spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None) -> None:
         self.spots, self.prior, self.known_noise_m = spots, prior, noise_m
@@ -145,7 +149,7 @@ class _FieldFitter:
         )
 
     def gauss_newton_step(self, noise_m: float) -> None:
-        """Take one full Gauss-Newton step; the problem is nearly linear, so that no step overshoots."""
+        """Take one full Gauss-Newton step. The problem is nearly linear, so that no step overshoots."""
         matrix, vector = self._normal_equations(noise_m)
         step = np.linalg.solve(matrix + np.eye(PARAMETER_COUNT), vector - self.z)
         self.z = np.asarray(self.z + step, dtype=np.float64)

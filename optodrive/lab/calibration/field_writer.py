@@ -10,7 +10,10 @@ from optodrive.lab.calibration.field_fit import FieldFit
 
 
 def write_field(path: Path, fit: FieldFit, source: str = "") -> None:
-    """Write the field of a fit atomically; source: plain-text origin of the measurement."""
+    """Write the field of a fit atomically.
+
+    source: plain-text origin of the measurement
+    """
     metadata: dict[str, str | float | int] = {
         "source": strip_toml_specials(source),
         "spots": len(fit.spots),

@@ -16,7 +16,10 @@ ARROW_FRACTION_MAX = 0.07
 
 
 def summarize_fit(fit: FieldFit) -> dict[str, Any]:
-    """Return the numbers of a fit: µm per axis unless they are lengths; rows are counted from 0, as in the spots."""
+    """Return the numbers of a fit.
+
+    They are in µm per axis unless they are lengths. Rows are counted from 0, as in the spots.
+    """
     inlier_m = np.hypot(*fit.residual_m[~fit.outlier].T)
     sigma_um = 1e6 * region_sigma_m(fit)
     return {
@@ -50,7 +53,7 @@ def sigma_rms_m(fit: FieldFit) -> float:
 
 
 def draw_residuals(fit: FieldFit) -> str:
-    """Draw the residuals as arrows at their spots, outliers as crosses; returns SVG."""
+    """Draw the residuals as arrows at their spots, outliers as crosses. Return SVG."""
     x, y = _to_picture(fit, fit.spots.x_code, fit.spots.y_code)
     is_inlier = ~fit.outlier
     longest_m = max(1e-9, float(np.hypot(*fit.residual_m[is_inlier].T).max())) if is_inlier.any() else 1.0
@@ -72,7 +75,7 @@ def draw_residuals(fit: FieldFit) -> str:
 
 
 def draw_sigma_map(fit: FieldFit) -> str:
-    """Draw one sigma over the field, dark where it is large, with each cell's number as title; returns SVG."""
+    """Draw one sigma over the field, dark where it is large, with each cell's number as title. Return SVG."""
     grid_um = 1e6 * fit.field.sigma_grid_m[::-1]
     size = (PICTURE_SIDE - 2 * PICTURE_MARGIN) / len(grid_um)
     low, high = float(grid_um.min()), float(grid_um.max())

@@ -49,7 +49,10 @@ AXIS_ERRORS = {
 
 
 def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
-    """Check that a field can be fitted to spots; raises InputError with the cause, `where` names the file."""
+    """Check that a field can be fitted to spots. Raise InputError with the cause.
+
+    where: names the file
+    """
     if len(spots) < SPOTS_MIN:
         raise InputError(f"{where}: spots", len(spots), f"at least {SPOTS_MIN}")
     codes = np.column_stack([spots.x_code, spots.y_code])
@@ -80,7 +83,7 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
 
 
 def check_fit(where: str, fit: FieldFit) -> None:
-    """Check a fit; raises InputError if half of its spots or more are outliers, or too few are inliers."""
+    """Check a fit. Raise InputError if half of its spots or more are outliers, or too few are inliers."""
     outlier_count = int(fit.outlier.sum())
     if 2 * outlier_count >= len(fit.spots) or len(fit.spots) - outlier_count < SPOTS_MIN:
         found = f"{outlier_count} of {len(fit.spots)} spots are outliers"
@@ -149,7 +152,10 @@ def _check_scale(where: str, scale: float) -> None:
 
 
 def _check_axes(where: str, directions: FloatArray) -> None:
-    """Check the orientation of the axes and the rotation; directions: [2, 2] without scale."""
+    """Check the orientation of the axes and the rotation.
+
+    directions: [2, 2] without scale
+    """
     similarity = {signs: float(np.array(signs) @ directions.ravel()) / 2.0 for signs in [*AXIS_ERRORS, (1, 0, 0, 1)]}
     nearest = max(similarity, key=lambda signs: similarity[signs])
     if nearest in AXIS_ERRORS:

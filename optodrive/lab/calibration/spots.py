@@ -16,7 +16,7 @@ COLUMNS = ("x_code", "y_code", "x_m", "y_m")
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSpots:
-    """Codes of the converter, and positions of the beam on the display, m; all [n]."""
+    """Codes of the converter, and positions of the beam on the display, m, all [n]."""
 
     x_code: FloatArray
     y_code: FloatArray
@@ -41,7 +41,7 @@ class MeasuredSpots:
 
 
 def read_spots(path: Path) -> MeasuredSpots:
-    """Read spots.csv; raises InputError with file, row, column, value and expected value."""
+    """Read spots.csv. Raise InputError with file, row, column, value and expected value."""
     table = read_columns(path, COLUMNS)
     if len(table) and np.all(np.abs(table[:, :2]) < 1.0) and np.any(table[:, :2]):
         swapped = np.abs(table[:, 2:]).max() > 100.0

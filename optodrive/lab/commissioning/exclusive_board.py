@@ -143,7 +143,10 @@ class ExclusiveBoard:
             self.step()
 
     def arm(self) -> float:
-        """Arm the board and return the time from the request to ARMED, s; the indicator is on for two seconds of it."""
+        """Arm the board and return the time from the request to ARMED, s.
+
+        The indicator is on for two seconds of it.
+        """
         start_s = self._clock.now_s()
         self.session.arm()
         self._arm_requested = True
@@ -281,7 +284,7 @@ class ExclusiveBoard:
         return np.clip(codes, [limits.x_min, limits.y_min], [limits.x_max, limits.y_max])
 
     def _limit_when_feasible(self, plan: PulsePlan) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
-        """Wait until the limiter passes the plan; return it with the state before and after, and its start, s."""
+        """Wait until the limiter passes the plan. Return it with the state before and after, and its start, s."""
         while True:
             start_s = self.session.board_s() + START_LEAD_S
             before = shift_state(

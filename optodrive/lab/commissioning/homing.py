@@ -35,7 +35,7 @@ AXES = "xy"
 
 
 class HomingPosition(NamedTuple):
-    """Commanded mirror angles, position outputs and spot position; None without an instrument."""
+    """Commanded mirror angles, position outputs and spot position. The latter two are None without an instrument."""
 
     commanded_rad: tuple[float, float]
     output_rad: tuple[float, float] | None

@@ -60,7 +60,7 @@ class SpotLocator(Protocol):
         """Return the candidate of each spot, -1 for none, [n]."""
 
     def measure(self, place: int, x_code: int, y_code: int) -> SpotRow | None:
-        """Measure the spot of a candidate; return None if no spot is found."""
+        """Measure the spot of a candidate. Return None if no spot is found."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class MeasurementLoop:
         self._unseen_places: set[int] = set()
 
     def run(self, on_progress: Callable[[MeasurementProgress], None]) -> MeasurementResult:
-        """Measure until the error bound meets the target or spots_max is reached; report progress after each spot.
+        """Measure until the error bound meets the target or spots_max is reached. Report progress after each spot.
 
         Continue an interrupted session only if its first spot is still at the same position, else raise RefusedError.
         """
@@ -172,7 +172,7 @@ class MeasurementLoop:
             )
 
     def _measure_next(self, fit: FieldFit) -> None:
-        """Measure one more spot; exclude positions where no spot is found."""
+        """Measure one more spot. Exclude positions where no spot is found."""
         misses = 0
         while True:
             codes = np.rint(self._locator.candidate_codes(fit))

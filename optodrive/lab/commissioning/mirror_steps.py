@@ -29,7 +29,11 @@ HOLD_GROWTH = 1.25
 
 @dataclass(frozen=True, eq=False)
 class StepRun:
-    """Steps of one size. codes: [n, 2] of x and y, the first before any step; hold_ticks: [n] time at each."""
+    """Steps of one size.
+
+    codes: [n, 2] of x and y, the first before any step
+    hold_ticks: [n] time at each
+    """
 
     name: str
     codes: IntArray
@@ -40,7 +44,7 @@ class StepRun:
 
 
 def plan_step_runs(board: ExclusiveBoard, step_count: int) -> tuple[StepRun, ...]:
-    """Plan the runs, one per size; mirror x moves at every step and mirror y at every other one.
+    """Plan the runs, one per size. Mirror x moves at every step and mirror y at every other one.
 
     Steps follow each other as fast as the mirrors settle and the galvo cap permits. Raises InputError for a number of
     steps outside STEPS_MIN to STEPS_MAX, or if they exceed the cap at HOLD_MAX_S.

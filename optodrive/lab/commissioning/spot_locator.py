@@ -125,7 +125,7 @@ class ManualLocator:
             x_code, y_code = new_x_code, new_y_code
 
     def _read_line(self, x_code: int, y_code: int) -> str:
-        """Return the next typed line; flash the spot while waiting. Raise RefusedError at the end of input."""
+        """Return the next typed line. Flash the spot while waiting. Raise RefusedError at the end of input."""
         while True:
             try:
                 line = self._input_lines.get_nowait()

@@ -28,7 +28,7 @@ class SpotReader:
         return self._sensor.port
 
     def read_spot(self, x_code: int, y_code: int, power_w: float, readings: int) -> SpotReading | None:
-        """Measure a spot as the mean of several readings without outliers; return None if no spot is detected.
+        """Measure a spot as the mean of several readings without outliers. Return None if no spot is detected.
 
         Raise RefusedError if the sensor detects a spot with the gate off.
         """
@@ -53,7 +53,7 @@ class SpotReader:
         return None
 
     def read_mirrors_rad(self) -> tuple[float, float] | None:
-        """Return the position outputs of the mirrors, rad; None without position outputs."""
+        """Return the position outputs of the mirrors, rad. Return None without position outputs."""
         return self._sensor.parse_mirrors_rad(self._query("mirrors"))
 
     def open(self) -> None:
@@ -82,7 +82,7 @@ class SpotReader:
 
 
 def robust_mean(readings: list[SpotReading]) -> SpotReading:
-    """Return the mean of the readings near their median; the first reading if none is near."""
+    """Return the mean of the readings near their median. Return the first reading if none is near."""
     x_m, y_m = median(each.x_m for each in readings), median(each.y_m for each in readings)
     inliers = [
         each

@@ -39,7 +39,7 @@ class SpotSensorClient:
         self._transport.release()
 
     def send_request(self, request: str) -> None:
-        """Send a request line; discard input that arrived before it."""
+        """Send a request line. Discard input that arrived before it."""
         self._read()
         self._buffer = b""
         try:
@@ -64,7 +64,7 @@ class SpotSensorClient:
             raise LinkError(f"sensor: {error}") from None
 
     def parse_spot(self, line: str) -> SpotReading | None:
-        """Parse the answer to `spot`; None if the sensor detected no spot."""
+        """Parse the answer to `spot`. Return None if the sensor detected no spot."""
         numbers = self._parse_numbers(line, "spot", 3)
         if numbers is None:
             return None
@@ -72,7 +72,7 @@ class SpotSensorClient:
         return SpotReading(x_m, y_m, sigma_m)
 
     def parse_mirrors_rad(self, line: str) -> tuple[float, float] | None:
-        """Parse the answer to `mirrors`, rad; None if the driver has no position outputs."""
+        """Parse the answer to `mirrors`, rad. Return None if the driver has no position outputs."""
         numbers = self._parse_numbers(line, "mirrors", 2)
         return None if numbers is None else (numbers[0], numbers[1])
 

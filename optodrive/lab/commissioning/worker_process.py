@@ -25,7 +25,7 @@ PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
-    """Runs one function at a time; it ends with its parent process, however that ends."""
+    """Runs one function at a time. It ends with its parent process, however that ends."""
 
     def __init__(self) -> None:
         context = mp.get_context("spawn")  # a fork would keep the board's port open after the parent ended

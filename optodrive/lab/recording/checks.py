@@ -125,7 +125,7 @@ def check_samples(place: str, t_s: FloatArray, value: FloatArray) -> None:
 
 
 def parse_pixel(place: str, signal: str, attributes: Attributes) -> int:
-    """Return the index of the measured pixel; mirror signals may omit it."""
+    """Return the index of the measured pixel. Mirror signals may omit it."""
     value = attributes.get("pixel")
     if value is None and signal in MIRROR_SIGNALS:
         return 0

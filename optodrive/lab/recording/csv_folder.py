@@ -36,7 +36,7 @@ TOML_BYTES_MAX = 64 * TEXT_BYTES_MAX
 
 
 class CsvTree:
-    """Recording in a folder of CSV files; implements `RecordingTree`."""
+    """Recording in a folder of CSV files. It implements `RecordingTree`."""
 
     def __init__(self, path: Path) -> None:
         """Read `recording.toml`."""
@@ -48,7 +48,7 @@ class CsvTree:
         return self
 
     def __exit__(self, *details: object) -> None:
-        """Do nothing; no file stays open."""
+        """Do nothing. No file stays open."""
 
     def format_place(self, *names: str) -> str:
         """Return the place of a run, signal or field for messages."""

@@ -35,13 +35,16 @@ class RecordingPart:
 
 @dataclass(frozen=True)
 class PixelRuns:
-    """References to the runs of one pixel, small enough to be sent to a worker; pixel: None for the mirrors."""
+    """References to the runs of one pixel, small enough to be sent to a worker.
+
+    pixel: None for the mirrors
+    """
 
     pixel: int | None
     parts: tuple[RecordingPart, ...]
 
     def read(self) -> Measurement:
-        """Read the runs with this pixel's signals only; raises InputError if the data are invalid."""
+        """Read the runs with this pixel's signals only. Raise InputError if the data are invalid."""
         runs = [self._select_signals(part, run) for part in self.parts for run in _read_part(part)]
         values = [signal.value for run in runs for signal in run.signals.values()]
         subject = "mirrors" if self.pixel is None else f"pixel {self.pixel}"
@@ -72,7 +75,7 @@ class DisplayRuns:
 
     @classmethod
     def open(cls, paths: list[Path]) -> "DisplayRuns":
-        """Index recordings without reading samples; raises InputError if a path is not a recording."""
+        """Index recordings without reading samples. Raise InputError if a path is not a recording."""
         pixels: dict[int, list[RecordingPart]] = {}
         mirrors: list[RecordingPart] = []
         for path in paths:
@@ -91,7 +94,7 @@ class DisplayRuns:
 
 
 def _read_part(part: RecordingPart) -> tuple[Run, ...]:
-    """Read the runs of a part; a file that was probed once is trusted while its stamp is unchanged."""
+    """Read the runs of a part. A file that was probed once is trusted while its stamp is unchanged."""
     if part.stamp is not None and part.path.is_file() and _stat_file(part.path) != part.stamp:
         raise InputError(str(part.path), Unquoted("a changed file"), "the file as it was when the diagnosis began")
     return read_runs(part.path, list(part.names), trusted=part.stamp is not None).runs

@@ -33,7 +33,7 @@ from optodrive.lab.recording.storage import (
 
 
 def import_h5py() -> Any:
-    """Return the module h5py; raises InputError if the extra that provides it is not installed."""
+    """Return the module h5py. Raise InputError if the extra that provides it is not installed."""
     try:
         import h5py
     except ImportError:
@@ -42,7 +42,7 @@ def import_h5py() -> Any:
 
 
 class Hdf5Tree:
-    """Recording in an HDF5 file that is open for reading; implements `RecordingTree`."""
+    """Recording in an HDF5 file that is open for reading. It implements `RecordingTree`."""
 
     def __init__(self, path: Path) -> None:
         """Open a file that `probe_in_sandbox` has accepted."""
@@ -86,7 +86,7 @@ class Hdf5Tree:
         return self._read_attributes(self.format_place(run, signal), self._open_signal(run, signal))
 
     def list_plans(self) -> list[str]:
-        """Return the IDs of a session's plans; none for another recording."""
+        """Return the IDs of a session's plans. Return none for another recording."""
         if "plans" not in self._file:
             return []
         place = f"{self._path}: /plans"
@@ -163,7 +163,7 @@ class Hdf5Tree:
         return t_s, value
 
     def _list_groups(self, place: str, group: Any) -> list[str]:
-        """Return the names in a group; raises InputError at the first link, and for an object of two names.
+        """Return the names in a group. Raise InputError at the first link, and for an object of two names.
 
         Links cost no space: a small file could have any number of runs.
         """

@@ -14,7 +14,11 @@ from optodrive.lab.recording.storage import COMMANDS, MIRROR_SIGNALS, Attributes
 
 @dataclass(frozen=True)
 class SignalIndex:
-    """One signal of a run; sample_count includes missing samples, sigma is the stated noise."""
+    """One signal of a run.
+
+    sample_count: includes missing samples
+    sigma: the stated noise
+    """
 
     pixel: int
     sample_count: int
@@ -23,7 +27,11 @@ class SignalIndex:
 
 @dataclass(frozen=True)
 class RunIndex:
-    """One run; pulsed_pixels: pixels with a pulse, sorted; signals: by the format's names."""
+    """One run.
+
+    pulsed_pixels: pixels with a pulse, sorted
+    signals: by the format's names
+    """
 
     name: str
     ambient_k: float
@@ -41,7 +49,7 @@ class RunIndex:
 
 @dataclass(frozen=True)
 class RecordingIndex:
-    """Index of a recording; `read` reads the samples of selected runs."""
+    """Index of a recording. `read` reads the samples of selected runs."""
 
     path: Path
     instrument_notes: str
@@ -49,7 +57,7 @@ class RecordingIndex:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Index a recording; raises InputError if it is invalid, as far as that shows without its samples."""
+        """Index a recording. Raise InputError if it is invalid, as far as that shows without its samples."""
         with open_tree(path) as tree, convert_errors(str(path), "a recording that can be read"):
             names, notes = read_header(tree)
             return cls(path, notes, tuple(_build_run_index(tree, name) for name in names))

@@ -24,7 +24,7 @@ def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measur
 
 
 def read_recording_or_session(path: Path) -> tuple[Measurement, bool]:
-    """Read a recording, or a session's runs, which have pulses and no signals; return also whether it is a session."""
+    """Read a recording, or a session's runs, which have pulses and no signals. Return also whether it is a session."""
     with open_tree(path) as tree, convert_errors(str(path), "a readable recording"):
         names, _ = read_header(tree)
         is_session = not any(name in SIGNALS for run in names for name in tree.list_members(run))

@@ -28,7 +28,7 @@ BACKGROUND_COLOUR, TEXT_COLOUR, FRAME_COLOUR, PULSE_COLOUR, CURVE_COLOUR, MISSIN
 
 
 def write_plot(path: Path, measurement: Measurement) -> int:
-    """Write the plot as a PNG file atomically; return the number of plotted runs, which is at most `RUNS_MAX`."""
+    """Write the plot as a PNG file atomically. Return the number of plotted runs, which is at most `RUNS_MAX`."""
     check_output(str(path), path, ".png")
     with np.errstate(over="ignore"):  # a pulse may end beyond the largest finite number
         image, count = _draw(measurement)
@@ -106,7 +106,10 @@ def _normalize(values: FloatArray, low: float, high: float) -> FloatArray:
 
 
 def _draw_curve(draw: "ImageDraw", x: Any, y: FloatArray, is_finite: Any) -> None:
-    """Draw a line broken at missing samples; per image column through first, minimum, maximum and last sample."""
+    """Draw a line broken at missing samples.
+
+    It leads through the first, minimum, maximum and last sample per image column.
+    """
     edges = np.flatnonzero(np.diff(is_finite.astype(np.int8))) + 1
     for part in np.split(np.arange(len(x)), edges):
         if not is_finite[part[0]]:

@@ -22,7 +22,7 @@ from optodrive.lab.recording.storage import (
 
 
 def read_recording(path: Path) -> Measurement:
-    """Read a recording; raises InputError with file, run, signal and expectation if it is invalid."""
+    """Read a recording. Raise InputError with file, run, signal and expectation if it is invalid."""
     return read_with_notes(path)[0]
 
 
@@ -39,7 +39,10 @@ def read_with_notes(path: Path) -> tuple[Measurement, str]:
 
 
 def read_runs(path: Path, names: list[str], trusted: bool = False) -> Measurement:
-    """Read only the named runs, in this order; trusted: the file has been probed already."""
+    """Read only the named runs, in this order.
+
+    trusted: the file has been probed already
+    """
     with open_tree(path, trusted) as tree, convert_errors(str(path), "a readable recording"):
         known, _ = read_header(tree)
         for name in names:
@@ -49,7 +52,10 @@ def read_runs(path: Path, names: list[str], trusted: bool = False) -> Measuremen
 
 
 def open_tree(path: Path, trusted: bool = False) -> RecordingTree:
-    """Open a recording in either form; trusted: skip the probe of an HDF5 file in a sandboxed process."""
+    """Open a recording in either form.
+
+    trusted: skip the probe of an HDF5 file in a sandboxed process
+    """
     path = Path(path)
     with convert_errors(str(path), "a recording: an HDF5 file or a folder"):
         if path.is_dir():
@@ -64,7 +70,7 @@ def open_tree(path: Path, trusted: bool = False) -> RecordingTree:
 
 
 def read_header(tree: RecordingTree) -> tuple[list[str], str]:
-    """Check format and version; return the run names in natural order and the notes on the instruments."""
+    """Check format and version. Return the run names in natural order and the notes on the instruments."""
     head = tree.read_root_attributes()
     checks.check_format(tree.format_place(), head)
     names = tree.list_runs()

@@ -29,7 +29,7 @@ _probed_files: set[tuple[str, int, int, int, int]] = set()
 
 
 def probe_in_sandbox(path: Path) -> None:
-    """Read a file in a sandboxed process, once per file and process; raises InputError if that process fails."""
+    """Read a file in a sandboxed process, once per file and process. Raise InputError if that process fails."""
     status = path.stat()
     identity = (str(path.resolve()), status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
     if identity in _probed_files:
@@ -64,7 +64,10 @@ def _limit_resources(file_limit_s: int) -> None:
 
 
 def _extend_cpu_limit(run_limit_s: int) -> None:
-    """Set the CPU limit to run_limit_s from now; the kernel kills the process if it makes no progress until then."""
+    """Set the CPU limit to run_limit_s from now.
+
+    The kernel kills the process if it makes no progress until then.
+    """
     _, hard_s = resource.getrlimit(resource.RLIMIT_CPU)
     resource.setrlimit(resource.RLIMIT_CPU, (min(ceil(process_time()) + run_limit_s, hard_s), hard_s))
 

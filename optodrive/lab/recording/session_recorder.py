@@ -43,10 +43,13 @@ def encode_entry(metadata: Mapping[str, Any], arrays: Arrays) -> bytes:
 
 
 class SessionRecorder:
-    """The daemon's side of the recorder; on_failure receives one line when recording ends early."""
+    """The daemon's side of the recorder.
+
+    on_failure: receives one line when recording ends early
+    """
 
     def __init__(self, path: Path, metadata: Mapping[str, Any], on_failure: Callable[[str], None]) -> None:
-        """Create a new file; raises InputError if the path exists or cannot be written."""
+        """Create a new file. Raise InputError if the path exists or cannot be written."""
         import_h5py()
         if path.exists():
             raise InputError("--record-session", str(path), "a path that does not exist: no file is overwritten")
@@ -70,7 +73,7 @@ class SessionRecorder:
         self._thread.start()
 
     def record(self, build_entry: Callable[[], SessionEntry]) -> None:
-        """Queue a plan; the recorder's thread calls build_entry. Never blocks and never raises."""
+        """Queue a plan. The recorder's thread calls build_entry. Never blocks and never raises."""
         if not self.is_recording:
             return
         try:

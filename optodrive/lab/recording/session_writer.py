@@ -29,7 +29,7 @@ class SessionRecordingFile:
     """A session's file, open only during a write."""
 
     def __init__(self, path: Path, metadata: dict[str, Any]) -> None:
-        """Create the file; raises OSError if it cannot be written."""
+        """Create the file. Raise OSError if it cannot be written."""
         self._path = path
         self._metadata = metadata
         self._run_number = 0
@@ -45,7 +45,7 @@ class SessionRecordingFile:
             file.create_group("plans").create_dataset("config", data=metadata["config"])
 
     def add_plan(self, metadata: dict[str, Any], arrays: Arrays) -> None:
-        """Write a plan; raises OSError if the disk is full and then leaves the file unchanged."""
+        """Write a plan. Raise OSError if the disk is full and then leave the file unchanged."""
         reserve_disk_space(self._path, 2 * sum(array.nbytes for array in arrays.values()) + RESERVED_BYTES)
         with import_h5py().File(self._path, "r+") as file:
             executed = arrays.get("executed")
@@ -89,7 +89,7 @@ class SessionRecordingFile:
 
 
 def reserve_disk_space(path: Path, size: int) -> None:
-    """Allocate disk space beyond the end of the file, released on close; raises OSError if the disk is full."""
+    """Allocate disk space beyond the end of the file, released on close. Raise OSError if the disk is full."""
     with path.open("r+b") as file:
         end = file.seek(0, os.SEEK_END)
         try:
@@ -100,7 +100,7 @@ def reserve_disk_space(path: Path, size: int) -> None:
 
 
 def read_entry(stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]] | None:
-    """Read the next entry; return None at the end of the stream, also in the middle of an entry."""
+    """Read the next entry. Return None at the end of the stream, also in the middle of an entry."""
     head = stream.read(LENGTH_PREFIX.size)
     if len(head) < LENGTH_PREFIX.size:
         return None

@@ -53,7 +53,7 @@ _INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**64 - 1
 
 
 class RecordingTree(Protocol):
-    """An open recording in either form; arrays are read on request."""
+    """An open recording in either form. Arrays are read on request."""
 
     def __enter__(self) -> Self: ...
 
@@ -88,13 +88,13 @@ class RecordingTree(Protocol):
 
 
 class MemoryBudget:
-    """Limit on the numbers read into memory; a damaged file may claim any size."""
+    """Limit on the numbers read into memory. A damaged file may claim any size."""
 
     def __init__(self, numbers: int = NUMBERS_MAX) -> None:
         self._remaining = numbers
 
     def reserve(self, place: str, numbers: int) -> None:
-        """Count numbers that are about to be read; raises InputError if the limit is exceeded."""
+        """Count numbers that are about to be read. Raise InputError if the limit is exceeded."""
         self._remaining -= numbers
         if self._remaining < 0:
             raise InputError(

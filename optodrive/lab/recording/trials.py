@@ -42,7 +42,7 @@ class Trial:
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """Read the trials of a session in their order; raises InputError if the file is none of a session."""
+    """Read the trials of a session in their order. Raise InputError if the file is none of a session."""
     trials = read_trials_if_any(path)
     if not trials:
         expected = "the file of a session with at least one ended plan, output of `serve --record-session`"
@@ -51,7 +51,7 @@ def read_trials(path: Path) -> list[Trial]:
 
 
 def read_trials_if_any(path: Path) -> list[Trial]:
-    """Read the trials of a recording; none if it is not of a session."""
+    """Read the trials of a recording. Return none if it is not of a session."""
     with open_tree(path) as tree, convert_errors(str(path), "a readable session"):
         if not isinstance(tree, Hdf5Tree):
             return []

@@ -84,7 +84,7 @@ class IdentifiedServo:
 
 
 def identify(where: str, trace: StepTrace, assumed_slew_rad_per_s: float) -> IdentifiedServo:
-    """Fit a servo to a trace; keep the assumed slew if the steps do not identify it.
+    """Fit a servo to a trace. Keep the assumed slew if the steps do not identify it.
 
     Raise InputError, naming `where`, if sampling or noise do not permit an identification.
     """
@@ -138,7 +138,7 @@ def _residual(trace: StepTrace, packed: FloatArray) -> tuple[FloatArray, float, 
 
 
 def _fit(trace: StepTrace, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
-    """Fit from a starting point; return parameters, cost, and covariance with zeros for fixed parameters."""
+    """Fit from a starting point. Return parameters, cost, and covariance with zeros for fixed parameters."""
 
     def expand(part: FloatArray) -> FloatArray:
         packed = start.copy()

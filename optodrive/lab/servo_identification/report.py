@@ -32,7 +32,7 @@ CRITICAL_DAMPING = 0.99
 def build_report(
     mirrors: tuple[IdentifiedServo, IdentifiedServo], common: CommonServo, config: Config
 ) -> dict[str, Any]:
-    """Build the report in SI units; intervals are 95 %."""
+    """Build the report in SI units. Intervals are 95 %."""
     return {
         "scanner": scanner_table(common.servo),
         "galvo": {"share": common.galvo_share},

@@ -15,7 +15,7 @@ from optodrive.device.servo import Servo
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Commands of one mirror: command_rad from at_s (s) on; the first one holds from the beginning. All [k]."""
+    """Commands of one mirror, all [k]: command_rad from at_s (s) on. The first one holds from the beginning."""
 
     at_s: FloatArray
     command_rad: FloatArray

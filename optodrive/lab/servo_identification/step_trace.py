@@ -39,7 +39,11 @@ class TraceSegment:
 
 @dataclass(frozen=True, eq=False)
 class StepTrace:
-    """All runs of one mirror. axis: 0 for x, 1 for y; spacing_s: median time between samples."""
+    """All runs of one mirror.
+
+    axis: 0 for x, 1 for y
+    spacing_s: median time between samples
+    """
 
     axis: int
     segments: tuple[TraceSegment, ...]
@@ -78,7 +82,7 @@ def extract_trace(where: str, measurement: Measurement, axis: int) -> StepTrace:
 
 
 def _extract_segment(run: Run, axis: int, steps_left: int) -> TraceSegment | None:
-    """Extract up to steps_left steps of a run and the samples near them; None for a run without steps."""
+    """Extract up to steps_left steps of a run and the samples near them. Return None for a run without steps."""
     signal, commands = run.signals[f"mirror_{AXES[axis]}_rad"], run.commands
     assert commands is not None  # noqa: S101
     finite = np.isfinite(signal.value)
@@ -149,7 +153,7 @@ def _check_following(where: str, runs: list[Run], axis: int) -> None:
 
 
 def _noise_rad(steps: Steps, t_s: FloatArray, value_rad: FloatArray) -> float:
-    """Return the rms noise of a sample from second differences late in each hold; at least NOISE_MIN of a step."""
+    """Return the rms noise of a sample from second differences late in each hold, at least NOISE_MIN of a step."""
     row = _find_settled_rows(steps.at_s, t_s)
     second_differences = np.abs(np.diff(value_rad, 2)[(row[:-2] == row[2:]) & (row[:-2] >= 0)])
     sigma_rad = 1.4826 * float(np.median(second_differences)) / np.sqrt(6.0) if len(second_differences) else 0.0

@@ -33,7 +33,7 @@ AICC_INDISTINGUISHABLE = 2.0 * log(REQUIRED_ODDS)
 
 @dataclass(frozen=True)
 class CauseFit:
-    """Set of causes with the positions in their ranges that fit best, χ² and the criterion; lower is better."""
+    """Set of causes with the positions in their ranges that fit best, χ² and the criterion. Lower is better."""
 
     keys: tuple[str, ...]
     fractions: tuple[float, ...]
@@ -75,7 +75,10 @@ class CauseSearch:
         return CorrectedModel(self.base, fit.values)
 
     def fit(self, keys: Sequence[str], start_fit: CauseFit | None = None) -> CauseFit:
-        """Fit causes together; start_fit: a fit of most of them that provides the start."""
+        """Fit causes together.
+
+        start_fit: a fit of most of them that provides the start
+        """
         cached = self._fits.get(frozenset(keys))
         if cached is None:
             cached = self._fit_from_starts(tuple(keys), start_fit or self.nominal)
@@ -212,19 +215,20 @@ class CauseSearch:
 
 
 def _rank(fit: CauseFit, criterion: float) -> tuple[float, list[int]]:
-    """Return a sorting key by a criterion; equal to within a fit's convergence, the order of CAUSES decides.
+    """Return a sorting key by a criterion.
 
+    Where it is equal to within a fit's convergence, the order of CAUSES decides.
     Two causes of one fact fit it equally well: the last digits, which depend on the processor, must not choose.
     """
     return round(criterion, CHI2_DIGITS), sorted(CAUSES.index(CAUSES_BY_KEY[key]) for key in fit.keys)
 
 
 def compute_aicc(chi2: float, cause_count: int, fact_count: int) -> float:
-    """Return Akaike's criterion corrected for small samples; errors are known, so χ² is −2 log likelihood."""
+    """Return Akaike's criterion corrected for small samples. Errors are known, so χ² is −2 log likelihood."""
     spare = fact_count - cause_count - 1
     return chi2 + 2.0 * cause_count + 2.0 * cause_count * (cause_count + 1) / spare if spare > 0 else inf
 
 
 def compute_cost(aicc: float, cause_count: int) -> float:
-    """Return the criterion plus the cost of the causes; the set with the least cost is chosen."""
+    """Return the criterion plus the cost of the causes. The set with the least cost is chosen."""
     return aicc + CAUSE_COST * cause_count

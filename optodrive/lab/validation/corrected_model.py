@@ -54,7 +54,7 @@ GAS_GRID_K = np.linspace(0.0, 1500.0, 6001)
 
 @cache
 def _membrane_table_m() -> FloatArray:
-    """Return the displacement of the stretched membrane at GAS_GRID_K; it depends on share × rise only."""
+    """Return the displacement of the stretched membrane at GAS_GRID_K. It depends on share × rise only."""
     volume_m3 = load_paper_facts()["V_pixel"].value
     return np.array([equilibrium_height_m(gas_k / AMBIENT_K, volume_m3) for gas_k in GAS_GRID_K])
 
@@ -67,11 +67,14 @@ class CorrectedModel:
     values: CauseValues
 
     def compute_log_errors(self, data: Sequence[Datum]) -> FloatArray:
-        """Return the logarithms of model over measured; for rates, of the height reached in the time per pixel."""
+        """Return the logarithms of model over measured.
+
+        For rates, they are of the height reached in the time per pixel.
+        """
         return np.array([self._compute_log_error(datum) for datum in data])
 
     def compute_outcome(self, name: str) -> float:
-        """Return a fact, SI, temperatures as rises; for an unreachable height, the rate of the longest pulse."""
+        """Return a fact, SI, temperatures as rises. For an unreachable height, return the rate of the longest pulse."""
         if name in RATE_HEIGHTS_M:
             return self._rate_per_s(RATE_HEIGHTS_M[name])
         if name in PULSE_FACTS:
@@ -89,7 +92,10 @@ class CorrectedModel:
         return {}
 
     def _build_pixel(self, width_m: float, from_table: bool = True) -> Pixel:
-        """Return the pixel with scaled parameters; R and C from Table S3, or from the smooth law between its rows."""
+        """Return the pixel with scaled parameters.
+
+        R and C are from Table S3, or from the smooth law between its rows.
+        """
         key = (width_m, from_table)
         if key not in self._pixels:
             self._pixels[key] = self._scale_pixel(width_m, from_table)

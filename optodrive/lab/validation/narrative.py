@@ -178,7 +178,7 @@ def describe_assumptions(result: StudyResult) -> list[str]:
 
 
 def build_study_answer(result: StudyResult) -> dict[str, Any]:
-    """Return the result as JSON values, SI units; temperatures as rises, K."""
+    """Return the result as JSON values, SI units, temperatures as rises, K."""
     groups, each = compute_overall_factors(result.group_predictions), compute_overall_factors(result.predictions)
     sides = zip(result.data, result.nominal_ratios, result.extended_ratios, result.errors_sigma, strict=True)
     return {

@@ -14,7 +14,7 @@ def pulse_peak_k(pixel: Pixel, power_w: float, width_s: float) -> float:
 
 
 def width_to_reach_s(pixel: Pixel, power_w: float, height_m: float) -> float:
-    """Return the width, s, of the shortest pulse from the cold state to a height; infinite if it is unreachable."""
+    """Return the width, s, of the shortest pulse from the cold state to a height, infinite if it is unreachable."""
     target_k = height_m / pixel.kappa_m_per_k
     low_s, high_s = 0.0, MAX_PULSE_S
     if pulse_peak_k(pixel, power_w, high_s) < target_k:

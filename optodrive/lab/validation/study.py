@@ -76,7 +76,10 @@ class HeldOutPrediction:
 
 @dataclass(frozen=True)
 class StudyResult:
-    """Result of a study; nominal_ratios, extended_ratios: model over measured, by fact."""
+    """Result of a study.
+
+    nominal_ratios, extended_ratios: model over measured, by fact
+    """
 
     base: str
     data: tuple[Datum, ...]
@@ -155,7 +158,10 @@ def run_study(
 def predict_held_out(
     base: ParameterSet, data: Sequence[Datum], label: str, names: Sequence[str], named: Sequence[NamedCause]
 ) -> HeldOutPrediction:
-    """Repeat choice and fit without some facts and predict these; named: the causes named by all facts."""
+    """Repeat choice and fit without some facts and predict these.
+
+    named: the causes named by all facts
+    """
     search = CauseSearch(base, [datum for datum in data if datum.id not in names])
     chosen = search.choose()
     held_out_data = [datum for datum in data if datum.id in names]

@@ -124,7 +124,7 @@ def test_a_refused_reload_changes_nothing(config, tmp_path):
 
 
 def test_an_error_that_no_reader_foresees_is_a_refusal_in_one_line(config, capsys):
-    """The supervisor, which watches the other processes, goes on with what it had."""
+    """The supervisor, which watches the other processes, goes on with the configuration that it had."""
 
     def read_config():
         raise ZeroDivisionError("a\nb")

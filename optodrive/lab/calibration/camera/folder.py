@@ -34,7 +34,7 @@ FileName = Annotated[str, Item(min_length=1)]
 
 
 class GridSection(Section):
-    """The grid: rows × columns of inner corners or of dots, pitch_m apart; its first picture shows it in the plane."""
+    """The grid: rows × columns of inner corners or of dots, pitch_m apart. Its first picture shows it in the plane."""
 
     kind: Literal["chessboard", "circles"]
     rows: Annotated[int, Item(ge=3, le=200)]
@@ -91,7 +91,10 @@ class SpotPicture:
 
 @dataclass(frozen=True)
 class PictureFolder:
-    """A folder as described by pictures.toml; dark: the plane without the beam, None if there is no such picture."""
+    """A folder as described by pictures.toml.
+
+    dark: the plane without the beam, None if there is no such picture
+    """
 
     path: Path
     grid: GridSection
@@ -102,7 +105,7 @@ class PictureFolder:
 
 
 def read_picture_folder(folder: Path) -> PictureFolder:
-    """Read FOLDER/pictures.toml and check that every picture exists; raises InputError with file, key and value."""
+    """Read FOLDER/pictures.toml and check that every picture exists. Raise InputError with file, key and value."""
     path = folder / DESCRIPTION_FILE
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)

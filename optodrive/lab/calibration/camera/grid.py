@@ -17,7 +17,7 @@ MARK_TOLERANCE = 0.5
 
 
 def find_grid(path: Path, image: Image, grid: GridSection) -> FloatArray:
-    """Find the grid's positions in the picture, px, [rows, columns, 2]; the first corner is ambiguous.
+    """Find the grid's positions in the picture, px, [rows, columns, 2]. The first corner is ambiguous.
 
     Raises InputError with the picture.
     """

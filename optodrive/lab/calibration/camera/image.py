@@ -19,7 +19,7 @@ MEDIAN_BLOCK_ROWS = 200
 
 
 def import_opencv() -> Any:
-    """Import OpenCV; raises InputError (missing_extra) if it is not installed."""
+    """Import OpenCV. Raise InputError (missing_extra) if it is not installed."""
     try:
         import cv2
     except ImportError:
@@ -28,8 +28,9 @@ def import_opencv() -> Any:
 
 
 def read_image(path: Path) -> Image:
-    """Read a picture as [rows, columns], 8 or 16 bits; of a colour picture the blue channel, which holds the beam.
+    """Read a picture as [rows, columns], 8 or 16 bits.
 
+    Of a colour picture it is the blue channel, which holds the beam.
     Raises InputError if OpenCV cannot read it.
     """
     cv2 = import_opencv()
@@ -59,7 +60,7 @@ class PictureReader:
         self._depth = first.dtype
 
     def __call__(self, path: Path) -> Image:
-        """Read a picture; raises InputError if its size or depth differs from the first."""
+        """Read a picture. Raise InputError if its size or depth differs from the first."""
         image = read_image(path)
         if image.shape != (self.rows, self.columns):
             size = f"{image.shape[1]} × {image.shape[0]} pixels"

@@ -41,7 +41,7 @@ class CameraMeasurement:
 
 
 def measure_folder(folder: Path) -> CameraMeasurement:
-    """Measure every spot of a folder; raises InputError with the picture and its defect."""
+    """Measure every spot of a folder. Raise InputError with the picture and its defect."""
     pictures = read_picture_folder(folder)
     reader = PictureReader(pictures)
     plane = _fit_grid_plane(pictures, reader)

@@ -49,7 +49,9 @@ class DetectedSpot(NamedTuple):
 
 
 def find_spot(where: str, picture: Image, background: Image) -> DetectedSpot:
-    """Find the one spot in a picture; background: the same picture without the beam.
+    """Find the one spot in a picture.
+
+    background: the same picture without the beam
 
     Raises InputError with the picture if there is no single, complete spot on a plain background.
     """

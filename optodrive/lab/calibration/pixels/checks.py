@@ -20,7 +20,7 @@ UNIT_TOLERANCE = 1.2
 
 
 def check_responses(where: str, by_pixel: dict[int, list[PixelResponse]], optics: Optics) -> None:
-    """Check that a display responds in metres and upwards; raises InputError with the probable cause."""
+    """Check that a display responds in metres and upwards. Raise InputError with the probable cause."""
     means = []
     for responses in by_pixel.values():
         aim_m = np.array([[item.aim_x_m for item in responses], [item.aim_y_m for item in responses]])

@@ -30,7 +30,7 @@ GAUSS_NEWTON_STEPS = 12
 
 
 class PixelEstimate(NamedTuple):
-    """Estimate of one pixel; sigmas are NaN if not determined."""
+    """Estimate of one pixel. Sigmas are NaN if not determined."""
 
     state: str
     gain: float
@@ -61,7 +61,7 @@ class Optics:
         )
 
     def absorbed_fraction(self, axis: int, offset_m: FloatArray) -> FloatArray:
-        """Return the fraction of the focus on the absorber at an offset between their centres; any shape."""
+        """Return the fraction of the focus on the absorber at an offset of any shape between their centres."""
         focus_half_m = self.focus_half_m[axis]
         overlap_m = self.absorber_half_m[axis] + focus_half_m - np.abs(offset_m)
         return np.asarray(np.clip(overlap_m / (2.0 * focus_half_m), 0.0, 1.0), dtype=np.float64)
@@ -73,13 +73,13 @@ class Optics:
         return np.where(is_on_edge, -np.sign(offset_m) / (2.0 * self.focus_half_m[axis]), 0.0)
 
     def search_range_m(self, axis: int) -> float:
-        """Return the largest searched offset, m; beyond it hardly any of the focus is on the absorber."""
+        """Return the largest searched offset, m. Beyond it hardly any of the focus is on the absorber."""
         return min(self.offset_max_m[axis], self.absorber_half_m[axis] + 0.6 * self.focus_half_m[axis])
 
 
 @dataclass(frozen=True, eq=False)
 class _ResponseTable:
-    """Responses of one pixel as columns [k]; aim_m [2, k]."""
+    """Responses of one pixel as columns [k], aim_m [2, k]."""
 
     aim_m: FloatArray
     ratio: FloatArray
@@ -122,7 +122,10 @@ def fit_pixel(responses: list[PixelResponse], optics: Optics) -> PixelEstimate:
 
 
 def select_centred(aim_m: FloatArray, optics: Optics) -> BoolArray:
-    """Return which aims [2, k] have the whole focus nominally on the absorber; if none, those with at least half."""
+    """Return which aims [2, k] have the whole focus nominally on the absorber.
+
+    If there are none, return those with at least half.
+    """
     fraction = optics.absorbed_fraction(0, aim_m[0]) * optics.absorbed_fraction(1, aim_m[1])
     is_whole = fraction > 1.0 - EDGE_FRACTION_MIN
     return np.asarray(is_whole if is_whole.any() else fraction >= 0.5, dtype=np.bool_)
@@ -185,7 +188,7 @@ def _compute_chi2(table: _ResponseTable, optics: Optics, gain: float, offset_m: 
 def _refine(
     table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Refine by Gauss-Newton from the grid's best offset; a step that increases chi-square is halved."""
+    """Refine by Gauss-Newton from the grid's best offset. A step that increases chi-square is halved."""
     columns = np.array([True, *is_offset_free])
     best_chi2 = _compute_chi2(table, optics, gain, offset_m)
     for _ in range(GAUSS_NEWTON_STEPS):

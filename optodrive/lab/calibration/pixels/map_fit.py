@@ -17,7 +17,10 @@ from optodrive.lab.calibration.pixels.response import PixelResponse, PredictHeig
 
 @dataclass
 class PixelMapFitter:
-    """Collects the responses of runs and fits the pixel map; predict: heights by the model of this display."""
+    """Collects the responses of runs and fits the pixel map.
+
+    predict: heights by the model of this display
+    """
 
     config: Config
     predict: PredictHeights
@@ -28,7 +31,7 @@ class PixelMapFitter:
         self._optics, self._pixel_count = Optics.from_config(self.config), len(build_pixel_layout(self.config.display))
 
     def add_run(self, where: str, run: Run) -> None:
-        """Add a run; raises InputError for an unknown pixel or an invalid aim."""
+        """Add a run. Raise InputError for an unknown pixel or an invalid aim."""
         pitch_m = self.config.display.pitch_m
         for signal in run.signals.values():
             if not 0 <= signal.pixel < self._pixel_count:
@@ -40,7 +43,7 @@ class PixelMapFitter:
             self.by_pixel.setdefault(response.pixel, []).append(response)
 
     def fit(self, where: str, model: str) -> PixelMap:
-        """Return the map; raises InputError if the heights do not match a display of this model."""
+        """Return the map. Raise InputError if the heights do not match a display of this model."""
         check_responses(where, self.by_pixel, self._optics)
         estimates = [fit_pixel(self.by_pixel.get(pixel, []), self._optics) for pixel in range(self._pixel_count)]
         offset_m = np.array([found.offset_m for found in estimates]).T.copy()

@@ -29,7 +29,10 @@ GATE_OFF_S = 0.05
 
 
 class Aim(NamedTuple):
-    """Position of the beam from each pixel's middle, m; name: of its files."""
+    """Position of the beam from each pixel's middle, m.
+
+    name: of its files
+    """
 
     name: str
     x_m: float
@@ -96,7 +99,7 @@ def is_reachable(config: Config, field: ScanField, aim: Aim) -> BoolArray:
 
 
 def build_aim_map(aim: Aim, reached: BoolArray) -> PixelMap:
-    """Return the pixel map that moves the beam of every pixel to an aim; pixels that it does not reach stay."""
+    """Return the pixel map that moves the beam of every pixel to an aim. Pixels that it does not reach stay."""
     unmoved = PixelMap.uniform(len(reached))
     return replace(unmoved, offset_x_m=np.where(reached, aim.x_m, 0.0), offset_y_m=np.where(reached, aim.y_m, 0.0))
 

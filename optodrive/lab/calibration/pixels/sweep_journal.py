@@ -20,7 +20,11 @@ PRE_PULSE_S = 0.02
 
 
 class SweepPulse(NamedTuple):
-    """An executed pulse. start_unix_s: gate on, by the host's clock; start_board_s: by the board's."""
+    """An executed pulse.
+
+    start_unix_s: gate on, by the host's clock
+    start_board_s: by the board's
+    """
 
     aim: str
     pixel: int
@@ -34,7 +38,10 @@ HEADER = ",".join(SweepPulse._fields)
 
 
 class SweepJournal:
-    """The journal of one display in a file; its own thread writes it, because a disk may take longer than a lease."""
+    """The journal of one display in a file.
+
+    Its own thread writes it, because a disk may take longer than a lease.
+    """
 
     def __init__(self, path: Path, pulses: list[SweepPulse], file: int) -> None:
         self.path, self.pulses = path, pulses
@@ -78,7 +85,7 @@ class SweepJournal:
             raise InputError(str(self.path), self._error.strerror, "a file that can be written")
 
     def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write the remaining lines and close the file."""
         self._lines.put(None)
         self._thread.join()
         os.close(self._file)
