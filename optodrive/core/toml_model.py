@@ -69,6 +69,8 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
         expected = f"a known key, {suggest_nearest(str(first['loc'][-1]), known)}" if known else "no such key"
         return InputError(label, str(first["loc"][-1]), expected, code="unknown_key")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if first["type"] == "model_type":
+        message = "a table with keys, as in { value = … }" if isinstance(first["input"], int | float) else "a table"
     if first["type"] == "missing":
         return InputError(label, None, "this key")
     if first["type"] == "value_error" and not isinstance(first["input"], str):

@@ -117,6 +117,14 @@ WRONG_TERMS = {
 }
 
 
+def test_a_parameter_without_its_table_is_refused_with_the_form_of_one(tmp_path):
+    path = tmp_path / "mine.toml"
+    head = 'format = "optodrive-parameters"\nversion = 1\nname = "mine"\nbase = "calibrated"\nclaims = "none"\n'
+    path.write_text(head + "terms.gas_leak.rate = 4.0\n")
+    with pytest.raises(InputError, match=r"gas_leak.rate: got 4.0, expected a table with keys, as in { value = … }"):
+        load_parameters(path)
+
+
 @pytest.mark.parametrize("case", WRONG_TERMS)
 def test_wrong_terms_are_refused_in_one_line(case, tmp_path):
     (term, name, value, unit), message = WRONG_TERMS[case]
