@@ -65,7 +65,7 @@ def tables(draw, stages=ONE):
             "damping": damping,
             "delay_s": draw(st.sampled_from([0.0, 3e-5, 1e-3])),
             "slew_rad_per_s": slew_rad_per_s,
-            "aim_error_m": margin_m * draw(st.floats(0.0, 0.9)),
+            "aim_error_m": margin_m * draw(st.floats(0.01, 0.9)),
         },
         "limits": {
             "absorber_max_c": 200.0 + draw(st.integers(0, 30)) * 10.0,
@@ -74,7 +74,7 @@ def tables(draw, stages=ONE):
             # A little above the load of one long move, or much above it.
             "galvo_acceleration_rms_max_rad_per_s2": slew_rad_per_s
             * (2.0 * np.pi * bandwidth_hz / damping) ** 0.5
-            * draw(log_uniform(1.0, 30.0)),
+            * draw(log_uniform(1.4, 30.0)),
             "galvo_mean_s": draw(log_uniform(0.5, 5.0)),
             "pulse_energy_max_j": draw(log_uniform(5e-3, 0.3)),
             "pulse_width_max_s": width_s,

@@ -6,12 +6,15 @@ The chain of README: check, plan, simulate, diagnose. A simulation of the planne
 import json
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, given, reject, settings
 from hypothesis import strategies as st
 
+from exclusive_rig import ExclusiveRig
 from optodrive.cli.exit_status import DOES_NOT_FIT
 from optodrive.cli.main import run
 from optodrive.device.config_file import load_config
+from optodrive.lab.commissioning.exclusive_board import max_spot_power_w
+from optodrive.lab.commissioning.homing import Homing
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 from optodrive.planning.display_model import DisplayModel
@@ -19,7 +22,7 @@ from own_configs import frames, tables, write_config
 
 SEEDS = st.integers(0, 1000)
 SETTINGS = settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.filter_too_much],
     phases=[Phase.reuse, Phase.generate],  # shrinking takes minutes
 )
 
@@ -61,19 +64,22 @@ def check_chain(tmp_path, capsys, data, table, seed):
     """Fail where a command refuses a configuration that `config check` accepts."""
     path = write_config(tmp_path / "own.toml", table)
     if (display := check(capsys, path)) is None:
-        return
+        reject()
     record(capsys, tmp_path, path, data.draw(frames(display)), seed)
     for stage in display.config.list_stage_configs():
         limits = build_board_requirements(stage).limits
         assert len(limits.encode_body()) == limits.LAYOUT.size
         GroundTruthGeometry.sample(437, stage)
+        rig = ExclusiveRig(DisplayModel.from_config(stage), lambda x_code, y_code, at_us: None)
+        Homing(rig.held, None, max_spot_power_w(stage)).run(lambda result: None)
+        assert len(rig.of("pulse")) == 5, "at the centre and at both ends of both mirrors"
 
 
 def check_diagnosis(tmp_path, capsys, data, table, seed):
     """Fail where the diagnosis of a simulation of the planned model names an error."""
     path = write_config(tmp_path / "own.toml", table)
     if (display := check(capsys, path)) is None:
-        return
+        reject()
     recording, executed = record(capsys, tmp_path, path, data.draw(frames(display)), seed)
     status, answer, error = call(capsys, "diagnose", recording, "--config", path, "--json", "-")
     assert status == 0 or not executed, error

@@ -35,6 +35,7 @@ from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
 
 LOOP_STEP_S = 0.002
@@ -75,6 +76,9 @@ class ExclusiveBoard:
         self._timeline_zero_s: float | None = None
         self._accounted_pixel = find_weakest_pixel(display)
         self._settling_s, self._width_s = max_settling_s(config), spot_width_s(config)
+        # The mirrors leave for a single point when it begins, which is earlier than the lead-in of a plan.
+        leaving_s = np.full_like(display.budget.galvos.lead_in_s, self._settling_s)
+        self._point_budget = display.budget._replace(galvos=display.budget.galvos._replace(lead_in_s=leaving_s))
         self._arm_requested = self._armed = False
 
     def __enter__(self) -> Self:
@@ -247,9 +251,9 @@ class ExclusiveBoard:
         scale = self.session.scale
         x_rad, y_rad = scale.to_angles_rad(np.array([x_code, y_code]))
         plan = self._plan(x_rad, y_rad, power_w)
-        limited, before, after, start_s = self._limit_when_feasible(plan)
+        limited, before, after, start_s = self._limit_when_feasible(plan, self._point_budget)
         points = quantise(limited, scale)
-        self._verify_encoded(points, limited, before, int(gate_on))
+        self._verify_encoded(points, limited, before, int(gate_on), self._point_budget)
         self._state, self._timeline_zero_s = after, start_s
         self._timeline_zero_s += self._stream(points, limited, start_s, gate_on)
 
@@ -283,7 +287,9 @@ class ExclusiveBoard:
         limits = self._limits
         return np.clip(codes, [limits.x_min, limits.y_min], [limits.x_max, limits.y_max])
 
-    def _limit_when_feasible(self, plan: PulsePlan) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
+    def _limit_when_feasible(
+        self, plan: PulsePlan, budget: Budget | None = None
+    ) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
         """Wait until the limiter passes the plan. Return it with the state before and after, and its start, s."""
         while True:
             start_s = self.session.board_s() + START_LEAD_S
@@ -291,7 +297,7 @@ class ExclusiveBoard:
                 self._state, (start_s if self._timeline_zero_s is None else self._timeline_zero_s) - start_s
             )
             try:
-                limited, after = limit(plan, before, self._display.budget, "refuse")
+                limited, after = limit(plan, before, budget or self._display.budget, "refuse")
             except OverBudgetError as error:
                 if error.fits_after_s == inf:
                     raise
@@ -299,12 +305,14 @@ class ExclusiveBoard:
                 continue
             return limited, before, after, start_s
 
-    def _verify_encoded(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, pulses: int) -> None:
+    def _verify_encoded(
+        self, points: WirePoints, plan: LimitedPlan, before: BudgetState, pulses: int, budget: Budget | None = None
+    ) -> None:
         """Decode the encoded points and verify them against the budget."""
         decoded = decode(points.encode_payload(), self.session.scale)
         if len(decoded.index) != pulses:
             raise LocalProtocolError(f"{len(decoded.index)} points with the gate on, expected {pulses}")
-        verify(plan, points.row[decoded.index], decoded, before, self._display.budget)
+        verify(plan, points.row[decoded.index], decoded, before, budget or self._display.budget)
 
     def _stream(
         self,
