@@ -20,6 +20,8 @@ HALF_FIELD_MIN_M = 0.01
 WAVE_COUNT = 3
 MAX_ERROR_RANGE_M = (0.5e-3, 3.0e-3)
 """Range of the maximum error of the uncorrected beam over the display; sampling repeats until it is met."""
+SAMPLES_MAX = 300
+"""Number of samples from which the nearest to that range is taken where a large display or a short lens meets none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +64,15 @@ class GroundTruthGeometry:
         twice_f_m = 2.0 * config.scanner.focal_length_m
         step_rad = config.scanner.rad_per_code
         codes = CENTRE_CODE + np.array([layout.x_m, layout.y_m]) / (twice_f_m * step_rad)
-        for _ in range(1000):
+        sampled: list[tuple[float, Self]] = []
+        for _ in range(SAMPLES_MAX):
             geometry = cls._sample_once(random, config)
             x_m, y_m = geometry.position_m(codes[0], codes[1])
             max_error_m = float(np.hypot(x_m - layout.x_m, y_m - layout.y_m).max())
             if MAX_ERROR_RANGE_M[0] <= max_error_m <= MAX_ERROR_RANGE_M[1]:
                 return geometry
-        raise AssertionError(f"no geometry of seed {seed} has a maximum error within {MAX_ERROR_RANGE_M} m")
+            sampled.append((max(MAX_ERROR_RANGE_M[0] - max_error_m, max_error_m - MAX_ERROR_RANGE_M[1]), geometry))
+        return min(sampled, key=lambda item: item[0])[1]
 
     @classmethod
     def _sample_once(cls, random: np.random.Generator, config: Config) -> Self:
