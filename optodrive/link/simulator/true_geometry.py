@@ -20,7 +20,7 @@ HALF_FIELD_MIN_M = 0.01
 WAVE_COUNT = 3
 MAX_ERROR_RANGE_M = (0.5e-3, 3.0e-3)
 """Range of the maximum error of the uncorrected beam over the display; sampling repeats until it is met."""
-SAMPLES_MAX = 300
+SAMPLES_MAX = 1000
 """Number of samples from which the nearest to that range is taken where a large display or a short lens meets none."""
 
 
