@@ -16,7 +16,10 @@ MIN_INDEPENDENT_FRACTION = 1e-4
 
 
 def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[CandidateCause, ...]:
-    """Return the judgement of every hypothesis; gains: reduction on held-out runs by label."""
+    """Return the judgement of every hypothesis.
+
+    gains: reduction on held-out runs by label
+    """
     chosen = verdict.chosen
     tests = max(len(verdict.nominal_detection.scores), 1)
     out = []
@@ -61,7 +64,10 @@ def _describe_detection_limit(score: Score) -> str:
 
 
 def list_rivals(verdict: Verdict, gains: dict[str, float]) -> tuple[RivalModel, ...]:
-    """Return the refitted candidates, best first; gains: reduction on held-out runs by label."""
+    """Return the refitted candidates, best first.
+
+    gains: reduction on held-out runs by label
+    """
     candidates = verdict.candidates
     if not candidates:
         return ()

@@ -94,7 +94,7 @@ def open_client(
 
 @contextmanager
 def _block_sigint() -> Iterator[None]:
-    """Block SIGINT in threads started within the block and in their processes; this process ends them."""
+    """Block SIGINT in threads started within the block and in their processes. This process ends them."""
     resource_tracker.ensure_running()  # a later start would unblock SIGINT in the calling thread
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -187,7 +187,7 @@ def _check_scheduler(client: Any, timeout_s: float) -> None:
 
 
 def _wait_for_error(future: Any) -> Exception | None:
-    """Return the exception of a future; raises OptodriveError if the scheduler is lost."""
+    """Return the exception of a future. Raise OptodriveError if the scheduler is lost."""
     error: Exception | None = future.exception()
     if future.status in ("cancelled", "lost"):
         raise OptodriveError("the Dask scheduler was lost before all tasks ended; no file is written")

@@ -35,7 +35,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """Properties of a run other than its samples; runs that repeat one experiment share a group.
+    """Properties of a run other than its samples. Runs that repeat one experiment share a group.
 
     has_stated_group: whether the recording states the group, rather than equal pulses
     """
@@ -85,7 +85,7 @@ class Dataset:
         return sorted({block.pixel for block in self.blocks if block.kind in PIXEL_KINDS})
 
     def split_subsystems(self) -> list["Dataset"]:
-        """Split the data into pixel signals and mirror signals, which share only the clock; empty parts are omitted."""
+        """Split the data into pixel and mirror signals, which share only the clock. Empty parts are omitted."""
         subsystems = []
         for kinds in (PIXEL_KINDS, MIRROR_KINDS):
             runs = sorted({block.run for block in self.blocks if block.kind in kinds})
@@ -107,7 +107,7 @@ class Dataset:
         return len(self.runs) - len(self.groups)
 
     def select(self, runs: list[int], kinds: tuple[int, ...] = (*PIXEL_KINDS, *MIRROR_KINDS)) -> "Dataset":
-        """Return the data of these runs and signal kinds; doses and session times stay unchanged."""
+        """Return the data of these runs and signal kinds. Doses and session times stay unchanged."""
         new_numbers = {old: number for number, old in enumerate(runs)}
         blocks: list[Block] = []
         values: list[FloatArray] = []
@@ -138,7 +138,7 @@ class Dataset:
 
 
 def build_dataset(measurement: Measurement) -> Dataset:
-    """Convert a recording to vector form; raises InputError if it has no finite sample."""
+    """Convert a recording to vector form. Raise InputError if it has no finite sample."""
     runs = measurement.runs
     start_times_s = _compute_start_times_s(runs)
     order = np.argsort(start_times_s, kind="stable")
@@ -216,7 +216,7 @@ def _is_off_edges(t_s: FloatArray, pulses: FloatArray) -> BoolArray:
 
 
 def _build_run_infos(runs: tuple[Run, ...]) -> tuple[RunInfo, ...]:
-    """Return the properties of the runs; runs without a group but with the same drive and pixels share one."""
+    """Return the properties of the runs. Runs without a group but with the same drive and pixels share one."""
     first: dict[tuple[object, ...], str] = {}
     infos = []
     for run in runs:

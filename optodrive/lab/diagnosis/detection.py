@@ -119,7 +119,10 @@ def detect(
 def score_effects(
     problem: FitProblem, base: ModelFit, simulated: SimulatedEffects, seed: int, extra_columns: FloatArray | None = None
 ) -> Detection:
-    """Score the effects beside the fit that they were computed for; extra_columns [m, k] are marginalised too."""
+    """Score the effects beside the fit that they were computed for.
+
+    extra_columns: [m, k], are marginalised too
+    """
     data, sensitivity = problem.data, simulated.sensitivity
     fitted_columns, candidates = simulated.fitted_columns, simulated.effects
     if extra_columns is not None:
@@ -143,7 +146,10 @@ def score_effects(
 
 
 def count_noise_degrees(data: Dataset) -> int:
-    """Return the degrees of freedom of the noise model; mirror noise, raised above its estimate, counts as known."""
+    """Return the degrees of freedom of the noise model.
+
+    Mirror noise, raised above its estimate, counts as known.
+    """
     mirrors = all(kind in MIRROR_KINDS for kind in data.kinds)
     return NOISE_KNOWN_DEGREES if mirrors or not data.contrast_count else NOISE_PRIOR_DEGREES + data.contrast_count
 

@@ -51,7 +51,10 @@ from optodrive.physics.terms import discover_terms
 
 @dataclass(frozen=True, eq=False)
 class _SubsystemFit:
-    """Results for the pixels or for the mirrors; covariance: of the final parameters, discrepancy marginalised."""
+    """Results for the pixels or for the mirrors.
+
+    covariance: of the final parameters, discrepancy marginalised
+    """
 
     data: Dataset
     held_out: Dataset

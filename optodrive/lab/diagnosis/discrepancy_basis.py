@@ -119,7 +119,10 @@ def compute_covariance(
 
 
 def _marginalise(gram: FloatArray, right: FloatArray, prior_sigma: Sequence[float], count: int) -> FloatArray:
-    """Return the covariance of the first `count` columns, the others being a discrepancy; right: columns × residual."""
+    """Return the covariance of the first `count` columns, the others being a discrepancy.
+
+    right: columns × residual
+    """
     weights = np.zeros(len(gram))
     weights[: len(prior_sigma)] = 1.0 / np.square(prior_sigma)
     alone = solve(gram[:count, :count] + np.diag(weights[:count]), right[:count])

@@ -21,7 +21,11 @@ MAX_JOINT_PIXELS = 4
 
 @dataclass(frozen=True)
 class PixelTask:
-    """Diagnosis of one pixel, for any worker; pixel: None for the mirrors; read: reads the pixel's runs."""
+    """Diagnosis of one pixel, for any worker.
+
+    pixel: None for the mirrors
+    read: reads the pixel's runs
+    """
 
     pixel: int | None
     read: Callable[[], Measurement]
@@ -31,7 +35,10 @@ class PixelTask:
 
 @dataclass(frozen=True, eq=False)
 class PixelAnswer:
-    """Diagnosis of one pixel without residual traces, or the error that prevented it; width_m: if known."""
+    """Diagnosis of one pixel without residual traces, or the error that prevented it.
+
+    width_m: if known
+    """
 
     pixel: int | None
     discrepancy: Discrepancy | None
@@ -109,7 +116,7 @@ class DisplayAnswer:
         return sorted(groups, key=lambda item: (-len(item.answers), item.verdict, item.causes))
 
     def build_model(self) -> tuple[Discrepancy | None, float | None, str]:
-        """Return one pixel model of the display, its bridge width and its description; or None, None and the reason.
+        """Return one pixel model of the display, its bridge width and its description, or None, None and the reason.
 
         The model has the medians over the largest group, provided that it holds more than half of all pixels and has a
         definite verdict.
@@ -137,7 +144,7 @@ class DisplayAnswer:
 
 
 def diagnose_pixel(task: PixelTask) -> PixelAnswer:
-    """Run one task; invalid data yield an answer with an error."""
+    """Run one task. Invalid data yield an answer with an error."""
     try:
         measurement = task.read()
         prior, epsilon, width_m = build_prior(measurement, task.config)

@@ -37,7 +37,10 @@ class PixelMark:
 def build_display_report(
     answer: DisplayAnswer, title: str, config: Config | None, provenance: Provenance | None = None
 ) -> str:
-    """Return the report as HTML; config: provides the pixel layout."""
+    """Return the report as HTML.
+
+    config: provides the pixel layout
+    """
     columns = ("pixel", "verdict", "parameters, 95 %", "gain")
     marks = _assign_marks(answer)
     positions, caption = _place_pixels(answer, config)

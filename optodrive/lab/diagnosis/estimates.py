@@ -20,7 +20,10 @@ LIMIT_SHARE = 1e-3
 
 
 def compute_estimates(data: Dataset, final: ModelFit, covariance: FloatArray) -> dict[str, Estimate]:
-    """Return the estimate of each fitted parameter by name; covariance: of base, then free parameters."""
+    """Return the estimate of each fitted parameter by name.
+
+    covariance: of base, then free parameters
+    """
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     out: dict[str, Estimate] = {}
     t_quantile = float(student.ppf(0.975, count_noise_degrees(data)))

@@ -88,7 +88,7 @@ def apply_step(point: ParameterPoint, free: Sequence[FreeParameter], step: Float
 def compute_step_limits(
     problem: FitProblem, point: ParameterPoint, free: Sequence[FreeParameter]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the limits of one step in base and free parameters: their ranges, and what a linear model is good for."""
+    """Return the limits of one step in base and free parameters: their ranges, and the range of a linear model."""
     to_centre = np.subtract(problem.prior.mean, point.base)
     lower, upper = np.maximum(-0.5, to_centre - BASE_LOG_SPAN), np.minimum(0.5, to_centre + BASE_LOG_SPAN)
     for item in free:

@@ -24,7 +24,10 @@ MAX_NOISE = 0.1
 
 @dataclass(frozen=True)
 class _Push:
-    """One push in one run: measured and predicted heights, m; noise: standard deviation of the measured one."""
+    """One push in one run: measured and predicted heights, m.
+
+    noise_m: standard deviation of the measured one
+    """
 
     measured_m: float
     nominal_m: float
@@ -35,7 +38,7 @@ class _Push:
 def compute_height_error(
     problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint
 ) -> HeightError | None:
-    """Return the error of planned heights over all pushes; None if no measured push is clear of the noise."""
+    """Return the error of planned heights over all pushes. Return None if no measured push is clear of the noise."""
     if not len(data.value):
         return None
     problem = replace(problem, data=data)

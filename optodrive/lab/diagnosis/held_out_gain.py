@@ -52,7 +52,7 @@ def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
 def compute_held_out_gain(
     problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint, seed: int
 ) -> HeldOutGain | None:
-    """Compare both models on held-out runs; return None if no held-out run shows an error of the nominal model.
+    """Compare both models on held-out runs. Return None if no held-out run shows an error of the nominal model.
 
     The reduction is that of residuals averaged over repeats in time bins, because model errors lie far below the noise
     of one sample. Its interval is clipped at −1: bootstrap draws of groups that hardly show the effect give arbitrary
@@ -107,7 +107,10 @@ def compute_held_out_errors(
 
 
 def _draw_interval(chi2_pairs: FloatArray, seed: int) -> tuple[float, float] | None:
-    """Return the 95 % interval of the reduction over draws of the groups; None for one group, which cannot vary."""
+    """Return the 95 % interval of the reduction over draws of the groups.
+
+    Return None for one group, which cannot vary.
+    """
     count = chi2_pairs.shape[1]
     if count < 2:
         return None
@@ -121,7 +124,7 @@ def _draw_interval(chi2_pairs: FloatArray, seed: int) -> tuple[float, float] | N
 
 
 def _compute_reduction(chi2_pairs: FloatArray) -> float:
-    """Return the reduction from [nominal and extended, groups, 2] χ² and degrees; the floor is χ² = degrees."""
+    """Return the reduction from [nominal and extended, groups, 2] χ² and degrees. The floor is χ² = degrees."""
     (nominal, degrees), (extended, _) = chi2_pairs.sum(axis=1)
     rms_nominal, rms_extended = np.sqrt(nominal / degrees), np.sqrt(max(extended, degrees) / degrees)
     return float((rms_nominal - rms_extended) / max(rms_nominal - 1.0, 1e-9))

@@ -152,7 +152,7 @@ def _describe_gain(discrepancy: Discrepancy) -> list[str]:
 
 
 def _deduplicate_by_label(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
-    """Return the first candidate of each label, sorted; pixels come before mirrors."""
+    """Return the first candidate of each label, sorted. Pixels come before mirrors."""
     first: dict[str, CandidateCause] = {}
     for item in candidates:
         first.setdefault(item.label, item)

@@ -19,7 +19,10 @@ class NextStep:
 
 
 def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str]) -> list[NextStep]:
-    """Return the steps in their order; recordings: names of those that were diagnosed."""
+    """Return the steps in their order.
+
+    recordings: names of those that were diagnosed
+    """
     steps = [_inspect_term(label) for label in discrepancy.failures]
     if discrepancy.verdict == "unexplained":
         show = ("recording", "show", recordings[0], "--out", "signals.png")

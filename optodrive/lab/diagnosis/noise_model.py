@@ -99,7 +99,10 @@ def _whiten(
     omega: float,
     out: FloatArray,
 ) -> float:
-    """Write whitened columns [n, k] to out and return ln |Σ|; states: first part, second part and its quadrature."""
+    """Write whitened columns [n, k] to out and return ln |Σ|.
+
+    States are the first part, the second part and its quadrature.
+    """
     n, k = columns.shape
     x = np.zeros((k, 3))
     v1, v2, q = sigma_1 * sigma_1, sigma_2 * sigma_2, white * white

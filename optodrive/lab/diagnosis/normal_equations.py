@@ -25,7 +25,10 @@ class NormalEquations:
 def compute_normal_equations(
     data: Dataset, columns: FloatArray, noise: NoiseModel, power: FloatArray, timing: FloatArray
 ) -> NormalEquations:
-    """Compute the gram matrices of columns [m, k]; power, timing: sensitivities [m] as in `JitterSensitivity`."""
+    """Compute the gram matrices of columns [m, k].
+
+    power, timing: sensitivities [m] as in `JitterSensitivity`
+    """
     kinds, count = data.kinds, columns.shape[1]
     size = 2 + len(kinds)
     grams = np.zeros((len(data.runs), count + size, count + size))

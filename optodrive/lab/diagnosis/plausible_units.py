@@ -49,7 +49,7 @@ RESISTANCE_FACTORS = (0.5, 1.0, 2.0)
 
 
 class _TimeUnits(NamedTuple):
-    """Factors from the stated numbers to seconds, and what is in which unit if they fit."""
+    """Factors from the stated numbers to seconds, and the quantity with its unit if they fit."""
 
     samples: float
     starts: float
@@ -106,7 +106,7 @@ def check_recording_units(measurement: Measurement, pixel: Pixel, place: str = "
 def _check_pixel_signal(
     where: str, run: Run, name: str, measured_pixel: int, pixel: Pixel, t_s: FloatArray, value: FloatArray
 ) -> float | None:
-    """Check times and values of one signal; return its size relative to the reference pixel's if shapes agree."""
+    """Check times and values of one signal. Return its size relative to the reference pixel's if shapes agree."""
     if name == "absorber_temperature_K":
         _check_temperature(f"{where}/{name}", run, t_s, value)
     own = run.pulses[run.pulses[:, 3] == measured_pixel]
@@ -201,7 +201,7 @@ def _refuse(where: str, observed: str, unit: str, likely: str) -> NoReturn:
 
 
 def _refuse_size(where: str, observed: str, ratio: float, unit: str) -> NoReturn:
-    """Refuse values that are too large by this ratio; the unit's prefix is the nearest power of a thousand."""
+    """Refuse values that are too large by this ratio. The unit's prefix is the nearest power of a thousand."""
     step = int(np.clip(round(np.log10(ratio) / 3.0), 1, 3))
     _refuse(where, observed, unit, ("m", "µ", "n")[step - 1] + unit)
 

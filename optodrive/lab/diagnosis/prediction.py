@@ -36,7 +36,7 @@ class ParameterPoint:
 def predict(
     data: Dataset, point: ParameterPoint, epsilon: float = 0.66, power_factor: float = 1.0, delay_s: float = 0.0
 ) -> FloatArray:
-    """Predict all samples [m]; power_factor scales all optical power, delay_s delays all signals.
+    """Predict all samples [m]. power_factor scales all optical power, delay_s delays all signals.
 
     Raises DivergedError if a term is too fast for the integrator, a state leaves its range, or a sample is no number.
     """

@@ -25,7 +25,10 @@ MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
 
 @dataclass(frozen=True, eq=False)
 class RefittedCandidate:
-    """One or two hypotheses, refitted; bic: χ² plus ln samples per free parameter."""
+    """One or two hypotheses, refitted.
+
+    bic: χ² plus ln samples per free parameter
+    """
 
     hypotheses: tuple[Hypothesis, ...]
     fit: ModelFit
@@ -82,7 +85,7 @@ def refit_pairs(
     seed: int,
     log: SearchLog,
 ) -> list[RefittedCandidate]:
-    """Refit second causes beside each of the best first causes; best pairs first."""
+    """Refit second causes beside each of the best first causes. Return the best pairs first."""
     candidates: list[RefittedCandidate] = []
     for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
         others = [item for item in hypotheses if item.key not in first.causes]
@@ -101,7 +104,7 @@ def refit_alone(
     singles: list[RefittedCandidate],
     log: SearchLog,
 ) -> list[RefittedCandidate]:
-    """Return the single causes with those of a pair refitted from where the pair ended; best first.
+    """Return the single causes, best first, with those of a pair refitted from where the pair ended.
 
     A fit alone may have ended in another minimum; the pair would then be named for what one of its causes explains.
     """

@@ -14,11 +14,14 @@ def ignore_progress(stage: str) -> None:
 
 @dataclass(frozen=True)
 class SearchLog:
-    """Log of a search; failures: why a hypothesis could not be computed, by its label."""
+    """Log of a search.
+
+    failures: why a hypothesis could not be computed, by its label
+    """
 
     on_progress: ProgressCallback = ignore_progress
     failures: dict[str, str] = field(default_factory=dict)
 
     def add_failure(self, label: str, error: DivergedError) -> None:
-        """Note that a hypothesis could not be computed; its first error is kept."""
+        """Note that a hypothesis could not be computed. Its first error is kept."""
         self.failures.setdefault(label, str(error))

@@ -27,7 +27,7 @@ class ModelComparison:
         return tuple(self._trace(block) for block in first.values())
 
     def trace_examples(self) -> tuple[ExampleTrace, ...]:
-        """Return the worst and the typical run of each signal; of a single run, only the worst."""
+        """Return the worst and the typical run of each signal. Return only the worst of a single run."""
         examples = []
         for kind in self._data.kinds:
             blocks = sorted(
