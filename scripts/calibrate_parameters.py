@@ -1,4 +1,4 @@
-"""Fit kappa, tau_g and phi to one fact each. Epsilon, R and C keep the values of the paper."""
+"""Fit kappa, tau_g and phi to one fact each. The parameters epsilon, R and C keep the values of the paper."""
 
 import argparse
 import re

@@ -1,4 +1,4 @@
-"""Load test of a daemon with a simulated board: clients push frames, poll the state, and STOP every few seconds.
+"""Load test of a daemon with a simulated board: clients push frames and poll the state, with a STOP every few seconds.
 
 Half of the pushing clients send dry runs, the others send frames that supersede waiting ones. The clients run at fixed
 rates in one process, STOP is sent by another. The time to gate off is taken from the board's log: the last edge minus

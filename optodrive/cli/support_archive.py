@@ -1,4 +1,4 @@
-"""The entries of a support archive."""
+"""The entries of a support archive. A source that cannot be read is an entry that says why."""
 
 import gzip
 import io

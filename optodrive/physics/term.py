@@ -151,7 +151,7 @@ class Term:
         return self.kernels.membrane_drive is not None or self.kernels.displacement is not None
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
-        """Return an upper bound on the heat that the term adds, or None without a bound. The limiter refuses None."""
+        """Return an upper bound on the heat that the term adds. The limiter refuses a term without a bound (None)."""
         return NO_HEAT_GAIN if self.cannot_add_heat else None
 
     def affected_pixel(self, values: TermValues) -> int | None:

@@ -26,7 +26,7 @@ TEXT_MAX = 2_000
 
 @dataclass(frozen=True)
 class PatternParameter:
-    """One parameter of a pattern. Min and max bound a number, a required parameter has no default."""
+    """One parameter of a pattern. `min` and `max` bound a number. A required parameter has no default."""
 
     name: str
     kind: ParameterKind
