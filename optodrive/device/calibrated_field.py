@@ -57,11 +57,11 @@ class CalibratedField:
             return bool(np.all(np.isfinite(positions_m * positions_m)) and np.all(np.ptp(positions_m, axis=1) > 0.0))
 
     def position_m(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the beam's position on the display for codes, which may be fractional, m; any shape."""
+        """Return the beam's position on the display for codes, which may be fractional and of any shape, m."""
         return _apply_blockwise(self._block_position_m, x_code, y_code)
 
     def codes(self, x_m: ArrayLike, y_m: ArrayLike, extrapolate: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Return the unrounded codes that send the beam to display positions, m; any shape.
+        """Return the unrounded codes that send the beam to display positions of any shape, m.
 
         The codes are NaN for a position outside the converter's range. extrapolate: return codes outside it as well.
         """
@@ -72,12 +72,12 @@ class CalibratedField:
         return np.where(outside, np.nan, x_code), np.where(outside, np.nan, y_code)
 
     def angles_rad(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the commanded mechanical mirror angles, rad, for display positions, m; NaN as in `codes`."""
+        """Return the commanded mechanical mirror angles, rad, for display positions, m, or NaN as in `codes`."""
         x_code, y_code = self.codes(x_m, y_m)
         return (x_code - CENTRE_CODE) * self.rad_per_code, (y_code - CENTRE_CODE) * self.rad_per_code
 
     def sigma_m(self, x_code: ArrayLike, y_code: ArrayLike) -> FloatArray:
-        """Return the standard uncertainty of the position per axis, m, for codes; infinite outside the extent."""
+        """Return the standard uncertainty of the position per axis, m, for codes, or infinity outside the extent."""
         u = self.extent.normalise(np.asarray(x_code, dtype=np.float64), np.asarray(y_code, dtype=np.float64))
         last = len(self.sigma_grid_m) - 1
         inside = (np.abs(u[0]) <= 1.0) & (np.abs(u[1]) <= 1.0)

@@ -122,7 +122,7 @@ class Config(Section):
         return self
 
     def check_optics(self) -> None:
-        """Check laser, scanner and board of the only stage, and that its beam has pixels; raises ConflictError."""
+        """Check laser, scanner and board of the only stage, and that its beam has pixels. Raise ConflictError."""
         self._check_reach()
         if self.limits.pulse_width_max_s < 1.0 / self.laser.pwm_hz:
             expected = f"at least one period of laser.pwm_hz, {1 / self.laser.pwm_hz}"
@@ -167,7 +167,7 @@ class Config(Section):
             raise ConflictError("scanner.half_range_codes", self.scanner.half_range_codes, expected)
 
     def list_stage_configs(self) -> tuple["Config", ...]:
-        """Return one configuration per stage, whose sections and only stage are that one's; itself without stages."""
+        """Return one configuration per stage, whose sections and only stage are its own, or itself without stages."""
         if not self.stages:
             return (self,)
         sections = ("laser", "scanner", "board")
@@ -187,7 +187,7 @@ class Config(Section):
         return max(stage.board.stream_lead_s for stage in self.list_stage_configs())
 
     def select_stage(self, name: str | None) -> "Config":
-        """Return the configuration of the stage of this name; None for the only one. Raise InputError without it."""
+        """Return the configuration of a stage by name, None for the only one. Raise InputError for an unknown name."""
         if name is None and len(self.stages) < 2:
             return self
         for stage, config in zip(self.stages, self.list_stage_configs(), strict=False):
@@ -209,7 +209,7 @@ class Config(Section):
 
     @property
     def min_power_w(self) -> float:
-        """Laser power of the board's smallest duty step, W; the board rounds down."""
+        """Laser power of the board's smallest duty step, W. The board rounds down."""
         steps = HELIOS_POWER_STEPS if self.board.transport == "helios" else POWER_STEPS
         return self.laser.max_power_w / steps
 
@@ -226,7 +226,7 @@ class Config(Section):
 
 @dataclass(frozen=True, eq=False)
 class PixelLayout:
-    """Pixel positions [p], m, from the optical axis, x to the right, y up; indices count by rows from the bottom."""
+    """Pixel positions [p], m, from the optical axis, x to the right, y up. Indices count by rows from the bottom."""
 
     x_m: FloatArray
     y_m: FloatArray
@@ -241,7 +241,7 @@ class PixelLayout:
 
 
 def build_pixel_layout(display: DisplaySection) -> PixelLayout:
-    """Compute the pixel positions of a lattice; missing places have no index."""
+    """Compute the pixel positions of a lattice. Missing places have no index."""
     missing = set(display.missing)
     places = [
         (row, column)

@@ -100,7 +100,7 @@ class GalvoSection(Section):
 
 
 class MirrorsFile(Section):
-    """mirrors.toml as `optodrive calibrate servo` writes it; about and axes are informative."""
+    """The file mirrors.toml as `optodrive calibrate servo` writes it. The tables about and axes are informative."""
 
     format: Literal["optodrive-mirrors"]
     version: Literal[1]

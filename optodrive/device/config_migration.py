@@ -62,7 +62,7 @@ def _list_sections(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _rename_keys(table: dict[str, Any]) -> tuple[str, ...]:
-    """Rename keys in the table; return those that it had, with their new names."""
+    """Rename keys in the table. Return those that it had, with their new names."""
     renamed = []
     for place, new in RENAMED_KEYS.items():
         name, old = place.split(".")
@@ -95,7 +95,7 @@ def _list_changes(table: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _rename_in_text(text: str) -> str:
-    """Return the text with renamed keys and the present version; comments and order stay."""
+    """Return the text with renamed keys and the present version. Comments and order stay."""
     names = {tuple(place.split(".")): new for place, new in RENAMED_KEYS.items()}
     section, lines = "", []
     for line in text.splitlines(keepends=True):

@@ -121,7 +121,7 @@ class ServoSection(Section):
 
 
 class ScannerSection(ServoSection):
-    """The mirrors and the lens; without a calibrated field an ideal f-theta lens, x = f · 2 · angle."""
+    """The mirrors and the lens. Without a calibrated field the lens is an ideal f-theta lens, x = f · 2 · angle."""
 
     focal_length_m: Positive
     """Focal length of the f-theta lens, m."""
@@ -143,7 +143,7 @@ class ScannerSection(ServoSection):
 
 
 class UncertaintySection(Section):
-    """Declared half-widths of the model's parameters, relative unless stated; the limiter covers the whole box."""
+    """Declared half-widths of the model's parameters, relative unless stated. The limiter covers the whole box."""
 
     absorbed_power: HalfWidth = 0.03
     """Absorbed power."""
@@ -243,7 +243,7 @@ class BoardSection(Section):
 
     @property
     def address(self) -> tuple[str | int | None, ...]:
-        """What tells the board from others on this computer; empty for a simulated one."""
+        """Properties that tell the board from others on this computer, empty for a simulated one."""
         if self.transport == "simulated":
             return ()
         if self.transport == "serial":
@@ -252,13 +252,13 @@ class BoardSection(Section):
 
     @property
     def timing_slack_s(self) -> float:
-        """Largest reduction of the interval between two planned times on this board, s; zero for ticks."""
+        """Largest reduction of the interval between two planned times on this board, s, and zero for ticks."""
         point_s = 1.0 / self.points_per_s + HELIOS_POINT_EXCESS_S
         return HELIOS_TIMING_SLACK_POINTS * point_s if self.transport == "helios" else 0.0
 
 
 class SensorSection(Section):
-    """A spot sensor on its own serial port (SENSOR.md); a simulated board includes one."""
+    """A spot sensor on its own serial port (SENSOR.md). A simulated board includes one."""
 
     port: Annotated[str, Field(min_length=1)]
     """Serial device of the sensor."""

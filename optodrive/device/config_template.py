@@ -19,7 +19,10 @@ HEAD_LINES = 2
 
 @dataclass(frozen=True)
 class NewDisplay:
-    """What tells a new display from the template, in SI units. port: a serial device, or `simulated`."""
+    """Values that tell a new display from the template, in SI units.
+
+    port: a serial device, or `simulated`
+    """
 
     name: str
     rows: int

@@ -46,7 +46,7 @@ class FieldGeometry(NamedTuple):
 
 
 def beam_position_m(geometry: FieldGeometry, x_rad: FloatArray, y_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the beam's position on the display, in its axes, m, for commanded mirror angles, rad; any shape."""
+    """Return the beam's position on the display, in its axes, m, for commanded mirror angles of any shape, rad."""
     g = geometry
     beam_x = 2.0 * (g.gain_x * x_rad * (1.0 + g.cubic_x_per_rad2 * x_rad * x_rad) + g.cross_x * y_rad)
     beam_y = 2.0 * (g.gain_y * y_rad * (1.0 + g.cubic_y_per_rad2 * y_rad * y_rad) + g.cross_y * x_rad)

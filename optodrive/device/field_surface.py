@@ -28,7 +28,7 @@ class Extent:
     y_half: float
 
     def normalise(self, x_code: FloatArray, y_code: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return codes in units of the half range from the centre, −1 to 1 inside; any shape."""
+        """Return codes of any shape in units of the half range from the centre, −1 to 1 inside."""
         return (x_code - self.x_code) / self.x_half, (y_code - self.y_code) / self.y_half
 
     def build_grid(self, count: int) -> tuple[FloatArray, FloatArray]:

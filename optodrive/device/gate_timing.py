@@ -20,7 +20,7 @@ def build_servo(scanner: ScannerSection) -> Servo:
 
 
 def pole_per_s(servo: Servo) -> complex:
-    """Return the pole λ of the servo's free ringing, 1/s; its damping ratio is below 1."""
+    """Return the pole λ of the servo's free ringing, 1/s. Its damping ratio is below 1."""
     omega = 2.0 * pi * servo.frequency
     return complex(-servo.damping * omega, omega * sqrt(1.0 - servo.damping**2))
 

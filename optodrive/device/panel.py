@@ -22,7 +22,7 @@ class Panel(NamedTuple):
 
 
 def complete_panel(config: Config) -> Panel:
-    """Return the panel of a configuration; what it does not state is estimated."""
+    """Return the panel of a configuration. Values that it does not state are estimated."""
     display, panel = config.display, config.panel
     width_m = panel.width_m or display.columns * display.pitch_m + 2 * RIM_M
     height_m = panel.height_m or display.rows * display.pitch_m + 2 * RIM_M

@@ -122,7 +122,7 @@ def replace_pixel_map(config: Config, path: Path | None) -> Config:
 
 
 def load_pixel_map(config: Config) -> PixelMap | None:
-    """Load the pixel map that a configuration names and check it against the display; None if it names none."""
+    """Load the pixel map that a configuration names and check it against the display. Return None if it names none."""
     if config.display.pixel_map is None:
         return None
     path = Path(config.display.pixel_map)
@@ -138,7 +138,7 @@ def load_pixel_map(config: Config) -> PixelMap | None:
 
 
 def build_aim_layout(config: Config) -> PixelLayout:
-    """Return the aim points of all pixels as a layout; raises as `load_pixel_map`."""
+    """Return the aim points of all pixels as a layout. Raise InputError as `load_pixel_map`."""
     layout, pixel_map = build_pixel_layout(config.display), load_pixel_map(config)
     if pixel_map is None:
         return layout
@@ -152,7 +152,10 @@ def max_aim_offset_m(config: Config) -> tuple[float, float]:
 
 
 def write_pixel_map(path: Path, pixel_map: PixelMap, config: Config, about: dict[str, str | float | int]) -> None:
-    """Write pixels.toml atomically. about: informative entries; text without quotes or backslashes."""
+    """Write pixels.toml atomically.
+
+    about: informative entries, text without quotes or backslashes
+    """
     display = config.display
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
     lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]

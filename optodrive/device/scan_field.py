@@ -16,7 +16,7 @@ class ScanField(Protocol):
     """Map from display positions to mirror angles, ideal or calibrated."""
 
     def angles_rad(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the commanded mechanical angles of both mirrors, rad, for display positions, m; any shape."""
+        """Return the commanded mechanical angles of both mirrors, rad, for display positions of any shape, m."""
         ...
 
 
@@ -27,7 +27,7 @@ class IdealField:
     focal_length_m: float
 
     def angles_rad(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the mechanical mirror angles, rad, for display positions, m; any shape."""
+        """Return the mechanical mirror angles, rad, for display positions of any shape, m."""
         return x_m / (2.0 * self.focal_length_m), y_m / (2.0 * self.focal_length_m)
 
 
@@ -45,7 +45,7 @@ def list_adjacent_pixels(layout: PixelLayout) -> IntArray:
 
 
 def max_neighbour_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatArray) -> float:
-    """Return the largest angle of either mirror between adjacent pixels, diagonals included; 0 without neighbours."""
+    """Return the largest angle of either mirror between adjacent pixels, diagonals included, 0 without neighbours."""
     one, other = list_adjacent_pixels(layout)
     if not len(one):
         return 0.0

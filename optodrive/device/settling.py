@@ -48,7 +48,10 @@ class SettlingTable:
 
     @classmethod
     def from_config(cls, config: Config, field: ScanField | None = None) -> Self:
-        """Compute the tables of a configuration; field: the calibrated field, None for the ideal one."""
+        """Compute the tables of a configuration.
+
+        field: the calibrated field, None for the ideal one
+        """
         return cls._for_whole_pitches(config) if field is None else cls._for_any_distance(config, field)
 
     @classmethod

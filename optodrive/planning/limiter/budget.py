@@ -16,7 +16,7 @@ TOLERANCE = 1e-9
 
 
 class HeatBound(NamedTuple):
-    """Worst-case coefficients of the thermal bound over the declared uncertainty; `build_heat_bound` computes them.
+    """Worst-case coefficients of the thermal bound over the declared uncertainty. `build_heat_bound` computes them.
 
     Absorber:
     epsilon, r_k_per_w, c_low_j_per_k, c_high_j_per_k: [p] absorbed fraction, bridge resistance at the reference
@@ -91,7 +91,7 @@ class HeatBound(NamedTuple):
 
 
 class GalvoModel(NamedTuple):
-    """Second-order servos of both mirrors; their targets follow a command after delay_s, at the slew limit.
+    """Second-order servos of both mirrors. Their targets follow a command after delay_s, at the slew limit.
 
     omega_rad_per_s: natural frequency; lead_in_s: smallest time from the start of a plan to its first pulse
     averaging_s: time constant of the mean-square acceleration

@@ -21,13 +21,19 @@ class CapScale(Enum):
     """Setting: root mean square; value: mean square."""
 
     def to_value(self, setting: float, base_c: float) -> float:
-        """Return the kernels' value of a setting; base_c: temperature at which rises are zero."""
+        """Return the kernels' value of a setting.
+
+        base_c: temperature at which rises are zero
+        """
         if self is CapScale.TEMPERATURE:
             return setting - base_c
         return setting**2 if self is CapScale.RMS else setting
 
     def to_setting(self, value: float, limit: float, setting: float) -> float:
-        """Return a value in the unit of the setting; limit: the kernels' value of `setting`."""
+        """Return a value in the unit of the setting.
+
+        limit: the kernels' value of `setting`
+        """
         if self is CapScale.TEMPERATURE:
             return setting - (limit - value)
         return sqrt(value) if self is CapScale.RMS else value
@@ -159,7 +165,7 @@ REASONS = ("", *CAP_NUMBERS, "order")
 
 
 class CapValues(NamedTuple):
-    """Values of all caps and their parameters for kernels; temperatures as rises, infinite where a cap is absent.
+    """Values of all caps and their parameters for kernels, with temperatures as rises, infinite where a cap is absent.
 
     pulse_gap_s: gate-off time after which pulses on a pixel count separately
     pixel_window_s, display_window_s: lengths of the windows over which mean powers are taken

@@ -11,7 +11,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 
 
 class PulseHistory(NamedTuple):
-    """Recent pulses, then those of the current plan, in order of time, [m]; the first n_valid [1] rows are valid."""
+    """Recent pulses, then those of the current plan, in order of time, [m]. The first n_valid [1] rows are valid."""
 
     start_s: FloatArray
     width_s: FloatArray

@@ -67,7 +67,7 @@ def effective_delay_s(galvo: GalvoModel) -> float:
 def apply_move(
     galvo: GalvoModel, state: GalvoState, dx_rad: float, dy_rad: float, previous_end_s: float, start_s: float
 ) -> GalvoState:
-    """Return the state after a move to a pulse at `start_s`; the previous pulse ends at `previous_end_s`."""
+    """Return the state after a move to a pulse at `start_s`. The previous pulse ends at `previous_end_s`."""
     dx_rad, dy_rad = abs(dx_rad) + galvo.rad_per_code, abs(dy_rad) + galvo.rad_per_code
     # The mirrors leave when a pulse ends; for the first pulse of a plan, at the start of its lead-in at the latest.
     at_s = max(previous_end_s, start_s - galvo.lead_in_s) + max(dx_rad, dy_rad) / galvo.slew_rad_per_s

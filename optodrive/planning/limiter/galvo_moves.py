@@ -47,7 +47,7 @@ def count_galvo_feasible(
     x_rad: FloatArray,
     y_rad: FloatArray,
 ) -> int:
-    """Count the pulses before the first whose move exceeds the galvo cap; modifies the mirrors in `budgets`."""
+    """Count the pulses before the first whose move exceeds the galvo cap. Modify the mirrors in `budgets`."""
     for row in range(len(start_s)):
         request = PulseRequest(0, stage[row], start_s[row], width_s[row], x_rad[row], y_rad[row], 0.0, 0.0)
         if is_move(budgets, request):

@@ -43,7 +43,7 @@ COOLING_STEP_GROWTH = 1.1
 
 
 class ThermalNodes(NamedTuple):
-    """Temperature bounds of all nodes while a plan is applied; the arrays are modified.
+    """Temperature bounds of all nodes while a plan is applied. The arrays are modified.
 
     absorber_k, lower_bound_k: [p] upper and lower bound of the absorber's rise over its wall at last_pulse_end_s [p]
     wall_k, touch_k: [p, 2] bounds for the smallest and the largest capacity or lag, at nodes_at_s [p]
@@ -195,7 +195,7 @@ def _relax(
 
 @kernel
 def _advance_all(heat: HeatBound, nodes: ThermalNodes, from_s: float, to_s: float) -> None:
-    """Advance every pixel to a later time; pixels without a pulse since `from_s` share their decay factors."""
+    """Advance every pixel to a later time. Pixels without a pulse since `from_s` share their decay factors."""
     cached_w_per_k, wall_0, wall_1 = -1.0, 1.0, 1.0
     touch_0 = exp(-(to_s - from_s) / heat.touch_lag_s[0])
     touch_1 = exp(-(to_s - from_s) / heat.touch_lag_s[1])
@@ -214,7 +214,7 @@ def _advance_all(heat: HeatBound, nodes: ThermalNodes, from_s: float, to_s: floa
 
 @kernel
 def exchange_wall_heat(heat: HeatBound, nodes: ThermalNodes, to_s: float, pulse_width_s: float) -> None:
-    """Exchange heat between walls up to `to_s` in steps; `inflow_w` then holds for one step and one more pulse."""
+    """Exchange heat between walls up to `to_s` in steps. `inflow_w` then holds for one step and one more pulse."""
     if heat.exchange_step_s == inf:  # no walls
         return
     if nodes.exchanged_at_s[0] == -inf:

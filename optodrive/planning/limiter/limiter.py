@@ -37,7 +37,7 @@ def _ignore_progress() -> None:
 
 
 class _EncodedPulses(NamedTuple):
-    """Encoded pulses, together with the omitted pulses at zero power; all arrays [n]."""
+    """Encoded pulses, together with the omitted pulses at zero power, all arrays [n]."""
 
     start_s: FloatArray
     width_s: FloatArray
@@ -47,7 +47,7 @@ class _EncodedPulses(NamedTuple):
 
 
 class TimedPulses(Protocol):
-    """Pulses in order of their starts; all arrays [n]."""
+    """Pulses in order of their starts, all arrays [n]."""
 
     @property
     def start_s(self) -> FloatArray:
@@ -129,7 +129,7 @@ def shift_state(state: BudgetState, offset_s: float) -> BudgetState:
 def limit(
     plan: PulsePlan, state: BudgetState, budget: Budget, policy: Policy = "trim"
 ) -> tuple[LimitedPlan, BudgetState]:
-    """Reduce the power of each pulse until it is within all caps; times and widths do not change.
+    """Reduce the power of each pulse until it is within all caps. Times and widths do not change.
 
     plan.start_s and state.at_s are on the same time line. Returns the limited plan and the state after it.
 
@@ -154,7 +154,7 @@ def limit(
 
 
 def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float:
-    """Compute the delay after which the plan fits without trimming, s; infinite if it never fits."""
+    """Compute the delay after which the plan fits without trimming, s, or infinity if it never fits."""
 
     def fits(delay_s: float) -> bool:
         return _apply_plan(plan.pixel, plan.stage, plan, delay_s, state, budget, STOP)[0] == len(plan)
@@ -198,7 +198,7 @@ def galvo_feasible_prefix(
 
 
 def concatenate(batches: list[LimitedPlan], state: BudgetState, budget: Budget) -> LimitedPlan:
-    """Concatenate limited batches in order; without batches, return the empty plan of a display in `state`."""
+    """Concatenate limited batches in order. Without batches, return the empty plan of a display in `state`."""
     if not batches:
         return limit(EMPTY_PLAN, state, budget)[0]
     columns = {

@@ -7,7 +7,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Declared relative half-widths of the parameters; the exponent's half-width is absolute."""
+    """Declared relative half-widths of the parameters. The exponent's half-width is absolute."""
 
     absorbed_power: float
     bridge_resistance: float

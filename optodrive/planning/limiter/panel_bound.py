@@ -15,7 +15,10 @@ PANEL_LAG_RATIO = 4.0
 
 @dataclass(frozen=True, eq=False)
 class PanelBound:
-    """Worst-case coefficients of the panel; k_per_s: its fastest rise."""
+    """Worst-case coefficients of the panel.
+
+    k_per_s: its fastest rise
+    """
 
     k_per_j: FloatArray
     tau_s: FloatArray

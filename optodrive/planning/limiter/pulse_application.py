@@ -40,10 +40,11 @@ def apply_pulses(
     granted_w: FloatArray,
     cause: IntArray,
 ) -> int:
-    """Apply n pulses in order of their starts; modifies the workspace, `granted_w` [n] and `cause` [n] (cap numbers).
+    """Apply n pulses in order of their starts.
 
-    Returns the number of applied pulses. Under STOP it can be less than n; granted_w and cause of the following row
-    then hold the power that would have been granted and the binding cap.
+    Modifies the workspace, `granted_w` [n] and `cause` [n] (cap numbers). Returns the number of applied pulses. Under
+    STOP it can be less than n; granted_w and cause of the following row then hold the power that would have been
+    granted and the binding cap.
     """
     for row in range(len(pixel)):
         panel_off_s = start_s[row] - workspace.nodes.panel_at_s[0]

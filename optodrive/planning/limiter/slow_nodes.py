@@ -65,7 +65,7 @@ class PulseRequest(NamedTuple):
 
 @kernel
 def _touch_cap_k(budget: Budget, panel_k: float) -> float:
-    """Return the touch surface's cap as a rise over what the panel warms it; negative if the panel is above the cap."""
+    """Return the touch surface's cap as a rise over its warming by the panel, negative for a panel above the cap."""
     return budget.caps.touch_k - budget.heat.touch_per_panel * panel_k
 
 

@@ -10,7 +10,10 @@ from optodrive.planning.limiter.heat_bound import panel_peak_k
 
 
 class Usage(NamedTuple):
-    """Use of one cap, in the unit of its `CapValues` field; pixel: the one with the highest use, None per display."""
+    """Use of one cap, in the unit of its `CapValues` field.
+
+    pixel: the one with the highest use, None per display
+    """
 
     cap: str
     used: float
@@ -31,5 +34,5 @@ def compute_usage(state: BudgetState, budget: Budget, at_s: float) -> tuple[Usag
 
 
 def compute_panel_k(state: BudgetState, budget: Budget, at_s: float) -> float:
-    """Return the bound on the panel's rise at `at_s`, K, with the gate off since the state; zero without a panel."""
+    """Return the bound on the panel's rise at `at_s`, K, with the gate off since the state, or zero without a panel."""
     return float(panel_peak_k(budget.heat, state.panel_k, at_s - state.panel_at_s, 0.0))

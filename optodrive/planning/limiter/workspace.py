@@ -16,7 +16,7 @@ T = TypeVar("T", bound=np.generic)
 
 
 class PixelBudgets(NamedTuple):
-    """Budgets of the pixels, and the state of every stage's beam; the arrays are modified.
+    """Budgets of the pixels, and the state of every stage's beam. The arrays are modified.
 
     bucket_j, merged_width_s: [p] energy bucket, and total width of pulses without a gap, after the pixel's last pulse
     begun_s: [1] start of the last pulse; end_s: [k] end of each stage's last pulse
@@ -36,7 +36,10 @@ class PixelBudgets(NamedTuple):
 
 
 class LimiterWorkspace(NamedTuple):
-    """Everything that changes while a plan is applied; pixel_chains, stage_chains: one chain per pixel or stage."""
+    """Everything that changes while a plan is applied.
+
+    pixel_chains, stage_chains: one chain per pixel or stage
+    """
 
     nodes: ThermalNodes
     budgets: PixelBudgets

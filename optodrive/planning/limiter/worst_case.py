@@ -136,7 +136,7 @@ def _compute_bridge_ratio(model: NominalThermalModel, caps: CapValues, rise_k: F
 
 @dataclass(frozen=True, eq=False)
 class _WallBound:
-    """Worst-case coefficients of the walls; without walls, those that leave the bound at zero."""
+    """Worst-case coefficients of the walls, or those that leave the bound at zero without walls."""
 
     w_per_k: FloatArray
     j_per_k: FloatArray
@@ -204,7 +204,10 @@ def _build_wall_bound(
 
 @dataclass(frozen=True, eq=False)
 class _TouchBound:
-    """Worst-case coefficients of the touch surface; gas_s: weight of the gas's rise over the wall."""
+    """Worst-case coefficients of the touch surface.
+
+    gas_s: weight of the gas's rise over the wall
+    """
 
     lag_s: FloatArray
     k_per_j: FloatArray
