@@ -1,7 +1,7 @@
 """Check names and prose against docs/glossary.md.
 
 Three rules: no retired word in an identifier or a public key, no retired phrase in any text, and one plain sentence as
-the first line of every module's docstring.
+the first line of every docstring.
 """
 
 import ast
@@ -78,11 +78,13 @@ def find_phrases(path: str, source: str, phrases: re.Pattern[str]) -> Iterator[s
             yield f"{path}:{number}: {match[0]!r} (docs/glossary.md retires the phrase)"
 
 
-def find_vague_docstring(path: str, source: str) -> Iterator[str]:
-    """Yield a problem if a module's docstring does not begin with one plain sentence."""
-    lines = (ast.get_docstring(ast.parse(source)) or "").splitlines()
-    if lines and (not lines[0].endswith(".") or VAGUE.search(lines[0])):
-        yield f"{path}:1: {lines[0]!r} is not one plain sentence"
+def find_vague_docstrings(path: str, source: str) -> Iterator[str]:
+    """Yield a problem for each docstring of a file whose first line is not one plain sentence."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            lines = (ast.get_docstring(node) or "").splitlines()
+            if lines and (not lines[0].endswith(".") or VAGUE.search(lines[0])):
+                yield f"{path}:{node.body[0].lineno}: {lines[0]!r} is not one plain sentence"
 
 
 def split_words(name: str) -> tuple[str, ...]:
@@ -189,7 +191,7 @@ def main() -> int:
         if ROOT / path not in (GLOSSARY, Path(__file__).resolve()):  # both spell the phrases out
             problems.update(find_phrases(path, source, phrases))
         if suffix == ".py" and path.startswith("optodrive/"):
-            problems.update(find_vague_docstring(path, source))
+            problems.update(find_vague_docstrings(path, source))
         for name in READERS[suffix](path, source) if suffix in READERS else ():
             key = (name.text, name.is_function)
             if key not in verdicts:

@@ -10,7 +10,7 @@ sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 from vocabulary import (
     c_names,
     find_phrases,
-    find_vague_docstring,
+    find_vague_docstrings,
     load_phrases,
     load_retired,
     python_names,
@@ -101,4 +101,11 @@ def test_a_retired_phrase_is_found_in_any_text(text, count):
     ],
 )
 def test_the_first_line_of_a_module_is_one_plain_sentence(docstring, count):
-    assert len(list(find_vague_docstring("x.py", f'"""{docstring}"""'))) == count
+    assert len(list(find_vague_docstrings("x.py", f'"""{docstring}"""'))) == count
+
+
+@pytest.mark.parametrize("head", ["def f():", "async def f():", "class F:", "class F:\n    def f(self):"])
+def test_the_docstrings_of_functions_and_classes_are_checked_too(head):
+    indent = "        " if "\n" in head else "    "
+    (problem,) = find_vague_docstrings("x.py", f'{head}\n{indent}"""Return x; raise y."""\n')
+    assert problem.endswith("'Return x; raise y.' is not one plain sentence")
