@@ -14,7 +14,7 @@ from rich.table import Table
 from optodrive.client.http import DaemonClient
 from optodrive.client.plan import Plan
 from optodrive.client.requests import ARM, READ_STATE, STOP, build_play_request, build_read_request
-from optodrive.core.errors import LinkError, OptodriveError, RefusedError
+from optodrive.core.errors import InputError, LinkError, OptodriveError, RefusedError
 from optodrive.daemon.web.tokens import build_tokens_path
 
 PATTERNS = ("showcase", "experiment-1", "experiment-2", "experiment-3", "experiment-4", "experiment-5", "experiment-6")
@@ -38,6 +38,21 @@ def start_daemon(port: int, config: str | None) -> tuple[subprocess.Popen[bytes]
                 return daemon, client
         time.sleep(0.05)
     raise RefusedError("the daemon did not start; its message above gives the reason")
+
+
+def choose_patterns(client: DaemonClient) -> list[str]:
+    """Return the patterns that the display has the space for, and print why it has none for the others."""
+    chosen = []
+    for pattern in PATTERNS:
+        try:
+            client.call(build_play_request(pattern, {}, "trim", "as_is", dry_run=True))
+        except InputError as error:
+            print(f"left out: {error}", flush=True)
+        else:
+            chosen.append(pattern)
+    if not chosen:
+        raise RefusedError("no pattern of the demo fits this display")
+    return chosen
 
 
 def play_pattern(client: DaemonClient, pattern: str) -> Plan:
@@ -99,7 +114,8 @@ def main() -> int:
         print("arming: the board's indicator is on for two seconds first", flush=True)
         client.call(ARM)
         started_s = time.monotonic()
-        for pattern in itertools.cycle(PATTERNS):
+        patterns = choose_patterns(client)
+        for pattern in itertools.cycle(patterns):
             if options.seconds is not None and shown and time.monotonic() - started_s >= options.seconds:
                 break
             shown.append((pattern, play_pattern(client, pattern)))

@@ -11,8 +11,12 @@ from optodrive.device.config_file import build_config, locate_shipped
 
 TEMPLATE = "display-16"
 SIMULATED = "simulated"
-FULL_SIZE_PITCH_M = 3e-3
-"""Smallest pitch at which absorbers and focus keep the size that they have in the template."""
+FULL_SIZE_PITCH_M = 3.5e-3
+"""Smallest pitch at which absorbers and focus keep the size that they have in the template.
+
+Below it both shrink with the pitch. Across an edge of the absorber, a sweep of the pixels moves the focus by up to
+1.7 mm from the middle, its half width included, and may not leave the pixel's cell.
+"""
 HEAD_LINES = 2
 """Lines of the template that describe its display."""
 

@@ -11,18 +11,32 @@ from rig import config_text
 DEMO = Path(__file__).parents[2] / "scripts" / "demo.py"
 
 
-def test_every_planned_pulse_is_executed(tmp_path):
-    """With a lease that a stalled computer outlasts, which the simulated board permits as the configuration's."""
+def show(tmp_path, text):
+    """Run the demo for one pattern on the display of a configuration's text. Return how it ended."""
     config = tmp_path / "config.toml"
-    config.write_text(config_text())
+    config.write_text(text)
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         port = unused.getsockname()[1]
-    ended = subprocess.run(
+    return subprocess.run(
         [sys.executable, DEMO, "--seconds", "0.1", "--port", str(port), "--config", config],
         env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
         capture_output=True,
         text=True,
     )
+
+
+def test_every_planned_pulse_is_executed(tmp_path):
+    """With a lease that a stalled computer outlasts, which the simulated board permits as the configuration's."""
+    ended = show(tmp_path, config_text())
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "pulses planned 624, sent 624, executed 624" in ended.stdout
+    assert "left out" not in ended.stdout
+
+
+def test_a_small_display_shows_the_patterns_that_it_has_the_space_for(tmp_path):
+    ended = show(tmp_path, config_text(name="display-16"))
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    refused = [line for line in ended.stdout.splitlines() if line.startswith("left out: pattern ")]
+    assert [line.split()[3] for line in refused] == ["showcase:", "experiment-6:"]
+    assert "experiment-1" in ended.stdout

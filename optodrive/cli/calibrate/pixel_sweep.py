@@ -54,19 +54,22 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
     from optodrive.core.files import atomic_write, create_folder
     from optodrive.core.types.stimuli import FrameSequence
     from optodrive.device.field_loader import load_scan_field
-    from optodrive.device.pixel_map import max_aim_offset_m, remove_pixel_map, write_pixel_map
-    from optodrive.lab.calibration.pixels.sweep import build_aim_map, build_sweep, is_reachable, list_aims
+    from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
+    from optodrive.lab.calibration.pixels.sweep import (
+        build_aim_map,
+        build_sweep,
+        compute_pitch_min_m,
+        is_reachable,
+        list_aims,
+    )
     from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
     loaded = remove_pixel_map(load_run_config(config, None))
-    offset_max_m = max_aim_offset_m(loaded)
     aims = list_aims(loaded)
-    for aim in aims:
-        if abs(aim.x_m) > offset_max_m[0] or abs(aim.y_m) > offset_max_m[1]:
-            offset_mm = max(abs(aim.x_m), abs(aim.y_m)) * 1e3
-            raise InputError(
-                "display.pitch_m", loaded.display.pitch_m, f"cells that contain the focus at {offset_mm:.2f} mm offset"
-            )
+    pitch_min_m = compute_pitch_min_m(loaded, aims)
+    if loaded.display.pitch_m < pitch_min_m:
+        expected = f"at least {pitch_min_m:.6g}, so that the focus across an absorber's edge stays in the pixel's cell"
+        raise InputError("display.pitch_m", loaded.display.pitch_m, expected)
     create_folder(folder)
     field = load_scan_field(loaded)
     reached = [is_reachable(loaded, field, aim) for aim in aims]

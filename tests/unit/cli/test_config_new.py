@@ -66,6 +66,25 @@ def test_the_file_is_valid_for_every_display(changes, tmp_path):
     assert config.board.port == ("/dev/ttyACM0" if "port" in changes else "")
 
 
+@pytest.mark.parametrize("pitch_mm", [1.5, 2.5, 3, 3.4, 3.49, 3.5, 4, 6])
+def test_its_pixels_can_be_swept_at_every_pitch(pitch_mm, tmp_path):
+    path = tmp_path / "mine.toml"
+    assert write(path, pitch_mm=pitch_mm) == 0
+    assert run(["calibrate", "pixels", "--sweep", str(tmp_path / "sweep"), "--config", str(path)]) == 0
+
+
+def test_a_sweep_states_the_pitch_that_it_needs(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    assert write(path, pitch_mm=4) == 0
+    wide = path.read_text()
+    for pitch, status in (("0.0033", 2), ("0.0034", 0)):
+        path.write_text(wide.replace("pitch_m = 0.004", f"pitch_m = {pitch}"))
+        sweep = tmp_path / f"sweep{status}"
+        assert run(["calibrate", "pixels", "--sweep", str(sweep), "--config", str(path)]) == status
+        assert sweep.exists() == (status == 0)
+    assert "display.pitch_m: got 0.0033, expected at least 0.0034, so that" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -60,6 +60,16 @@ def list_aims(config: Config) -> list[Aim]:
     return aims
 
 
+def compute_pitch_min_m(config: Config, aims: list[Aim]) -> float:
+    """Return the smallest pitch at which the focus stays in the pixel's cell at every aim, m."""
+    widths_m = [
+        2.0 * abs(offset_m) + focus_m
+        for aim in aims
+        for offset_m, focus_m in ((aim.x_m, config.laser.focus_width_m), (aim.y_m, config.laser.focus_height_m))
+    ]
+    return max(widths_m)
+
+
 def compute_pulse(config: Config, aim: Aim) -> tuple[float, float]:
     """Return width, s, and power, W, of an aim's pulses: short ones on the middle, weak ones across an edge."""
     laser, limits = config.laser, config.limits
