@@ -86,7 +86,8 @@ def dim(
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import build_dim_request
 
-    _print_state(DaemonClient(url).call(build_dim_request(share)), json)
+    request = build_dim_request(share)
+    _print_state(DaemonClient(url).call(request), json)
 
 
 def pause(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:

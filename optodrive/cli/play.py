@@ -1,7 +1,8 @@
 """`optodrive push | play`: frames and named patterns to a running daemon."""
 
 import time
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from optodrive.client.plan import Plan
 
 POLL_S = 0.1
+BODY = "body"
+"""The daemon's name of a request's body in errors."""
 
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Plan and limit only; do not show.")]
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the plan has been shown.")]
@@ -61,9 +64,12 @@ def push(
     except OSError as error:
         raise InputError(str(frames), error.strerror, "a readable file") from None
     content = add_labels(str(frames), body, label) if label else body
+    request = build_push_request(content, policy, fit, dry_run, strict)
     client = DaemonClient(url)
     with _hold_if(hold, client, dry_run, wait):
-        plan = _follow_plan(client, client.call(build_push_request(content, policy, fit, dry_run, strict)), wait, json)
+        with _name_source(frames):
+            submitted = client.call(request)
+        plan = _follow_plan(client, submitted, wait, json)
     exit_unless_fits(plan.summary.feasibility)
 
 
@@ -92,6 +98,17 @@ def play(
     with _hold_if(hold, client, dry_run, wait):
         plan = _follow_plan(client, client.call(request), wait, json)
     exit_unless_fits(plan.summary.feasibility)
+
+
+@contextmanager
+def _name_source(path: Path) -> Iterator[None]:
+    """Name the file in an InputError of the daemon, which knows only the request's body."""
+    try:
+        yield
+    except InputError as error:
+        if not error.where.startswith(BODY):
+            raise
+        raise InputError(f"{path}{error.where.removeprefix(BODY)}", error.value, error.expected, error.code) from None
 
 
 def _hold_if(hold: bool, client: "DaemonClient", dry_run: bool, wait: bool) -> AbstractContextManager[object]:

@@ -16,6 +16,7 @@ from optodrive.client.exchange import RETRY_S, RETRY_TIMEOUT_MIN_S
 from optodrive.client.frame_results import (
     RESULT_TIMEOUT_S,
     ResultBuffer,
+    build_closed_error,
     build_stream_path,
     build_timeout_error,
     raise_if_failed,
@@ -48,6 +49,7 @@ class AsyncStream:
         self._results = ResultBuffer()
         self._reconnect_timeout_s = reconnect_timeout_s
         self._was_silent = False
+        self._is_closed = False
         self._results_changed = asyncio.Condition()
         self._exit_stack = AsyncExitStack()
         self._connection: ClientConnection | None = None
@@ -64,12 +66,15 @@ class AsyncStream:
 
     async def close(self) -> None:
         """See `Stream.close`."""
+        self._is_closed = True
         await self._exit_stack.aclose()
         if self._reader_task is not None:
             await asyncio.gather(self._reader_task, return_exceptions=True)
 
     async def send(self, heights_um: HeightsLike) -> int:
         """See `Stream.send`."""
+        if self._is_closed:
+            raise build_closed_error()
         number, self._next_frame = self._next_frame, self._next_frame + 1
         frame = encode_frame(number, convert_to_pixels(heights_um, await self._read_layout()))
         self._on_send()
@@ -81,6 +86,8 @@ class AsyncStream:
                     return number
             except ConnectionClosed:
                 self._connection = None
+            if self._is_closed:  # meanwhile, by another task
+                raise build_closed_error()
             if deadline_s is None:
                 was_silent, self._was_silent = self._was_silent, False
                 deadline_s = time.monotonic() + (0.0 if was_silent else self._reconnect_timeout_s)

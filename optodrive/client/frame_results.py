@@ -3,7 +3,7 @@
 from collections import deque
 
 from optodrive.client.problems import build_error
-from optodrive.core.errors import LinkError, RefusedError
+from optodrive.core.errors import LinkError, NotReadyError, RefusedError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.stream import FrameResult
 
@@ -58,6 +58,11 @@ class ResultBuffer:
 def build_stream_path(policy: Policy) -> str:
     """Build the path of the stream's WebSocket."""
     return f"/v1/stream?policy={policy}"
+
+
+def build_closed_error() -> NotReadyError:
+    """Build the error for a frame that is sent after the stream was closed, which nobody would end."""
+    return NotReadyError("the stream is closed; open another with `stream()` of the display")
 
 
 def build_timeout_error(frame: int, timeout_s: float) -> LinkError:

@@ -7,8 +7,10 @@ from urllib.parse import quote
 
 from pydantic import BaseModel
 
+from optodrive.client.body import encode_body
 from optodrive.client.heights import encode_json
 from optodrive.client.plan import Plan
+from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.patterns import PatternList
@@ -47,8 +49,10 @@ STOP = ApiRequest("POST", "/v1/stop", StateReport)
 
 
 def build_dim_request(share: float) -> ApiRequest[StateReport]:
-    """Build the request that caps the power of plans at a share of the laser's."""
-    return ApiRequest("PUT", "/v1/dim", StateReport, True, {"json": {"share": share}})
+    """Build the request that caps the power of plans at a share of the laser's. Raise InputError beyond 0 to 1."""
+    if not 0.0 <= share <= 1.0:  # also NaN
+        raise InputError("share", share, "a number from 0 to 1")
+    return ApiRequest("PUT", "/v1/dim", StateReport, True, encode_body({"share": share}))
 
 
 def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bool) -> dict[str, Any]:
@@ -62,12 +66,7 @@ def build_push_request(
 ) -> ApiRequest[Plan]:
     """Build the request that plans frames and trains, given as an object or as the bytes of a file."""
     query = {"policy": policy, "fit": fit, "dry_run": dry_run, "strict": strict}
-    content: dict[str, Any] = (
-        {"content": body, "headers": {"Content-Type": "application/json"}}
-        if isinstance(body, bytes)
-        else {"json": body}
-    )
-    return ApiRequest("POST", "/v1/plans", Plan, dry_run, content | {"params": query})
+    return ApiRequest("POST", "/v1/plans", Plan, dry_run, encode_body(body) | {"params": query})
 
 
 def build_play_request(
@@ -79,7 +78,7 @@ def build_play_request(
     """
     query = {"fit": fit, "dry_run": dry_run, "strict": strict} | ({} if policy is None else {"policy": policy})
     path = f"/v1/patterns/{quote(name, safe='')}"
-    return ApiRequest("POST", path, Plan, dry_run, {"json": dict(parameters), "params": query})
+    return ApiRequest("POST", path, Plan, dry_run, encode_body(parameters) | {"params": query})
 
 
 def build_read_request(plan_id: str, pulses: bool = True) -> ApiRequest[Plan]:

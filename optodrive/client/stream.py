@@ -17,6 +17,7 @@ from optodrive.client.exchange import RETRY_S, RETRY_TIMEOUT_MIN_S
 from optodrive.client.frame_results import (
     RESULT_TIMEOUT_S,
     ResultBuffer,
+    build_closed_error,
     build_stream_path,
     build_timeout_error,
     raise_if_failed,
@@ -52,6 +53,7 @@ class Stream:
         self._results = ResultBuffer()
         self._reconnect_timeout_s = reconnect_timeout_s
         self._was_silent = False
+        self._is_closed = False
         self._results_changed = threading.Condition()
         self._exit_stack = ExitStack()
         self._connection = self._connect()
@@ -66,14 +68,17 @@ class Stream:
 
     def close(self) -> None:
         """Close the stream. The daemon drops the pulses that are not yet committed to the board."""
+        self._is_closed = True
         self._exit_stack.close()
 
     def send(self, heights_um: HeightsLike) -> int:
         """Show a frame in place of the uncommitted rest of the previous one. Return its number.
 
         LinkError if the daemon does not answer or cannot be reached again. The board of a restarted daemon is not
-        armed; frames are then refused until somebody arms it.
+        armed; frames are then refused until somebody arms it. NotReadyError after `close`.
         """
+        if self._is_closed:
+            raise build_closed_error()
         number, self._next_frame = self._next_frame, self._next_frame + 1
         frame = encode_frame(number, convert_to_pixels(heights_um, self._layout))
         self._on_send()
@@ -83,6 +88,8 @@ class Stream:
                 self._connection.send(frame)
                 return number
             except ConnectionClosed:
+                if self._is_closed:  # meanwhile, by another thread
+                    raise build_closed_error() from None
                 deadline_s = deadline_s or self._compute_deadline_s()
                 self._reconnect(deadline_s)
 

@@ -127,6 +127,28 @@ def test_a_stream_reports_the_result_of_each_frame(board, daemon):
     assert dark_and_disarmed(board)
 
 
+def test_a_closed_stream_shows_no_frame(board, daemon):
+    """It would otherwise reconnect, as after a broken connection, and nobody would end what it shows."""
+
+    async def send_after_the_block():
+        async with AsyncDisplay(daemon.url, TOKEN) as display:
+            await display.arm()
+            async with display.stream() as stream:
+                await stream.wait(await stream.send({5: 100.0}))
+            with pytest.raises(NotReadyError, match="the stream is closed"):
+                await stream.send({6: 100.0})
+
+    with Display(daemon.url, TOKEN) as display:
+        display.arm()
+        with display.stream() as stream:
+            stream.wait(stream.send({5: 100.0}))
+        with pytest.raises(NotReadyError, match="the stream is closed"):
+            stream.send({6: 100.0})
+    asyncio.run(send_after_the_block())
+    assert len(board.of("pulse")) == 2
+    assert dark_and_disarmed(board)
+
+
 def test_the_client_reconnects_to_a_restarted_daemon_that_is_not_armed(make_board, make_daemon, tmp_path, monkeypatch):
     """The new daemon has the same port and another token, which the client reads from its file again."""
     board = make_board()

@@ -81,7 +81,7 @@ def test_wrong_input(armed, tmp_path):
         (("plan", path, "--fit", "evenly"), "evenly"),
         (("push", path, "--fit", "evenly", "--url", armed.url), "evenly"),
         (("play", "dot", "--fit", "evenly", "--url", armed.url), "evenly"),
-        (("push", path, "--url", armed.url), "priority"),
+        (("push", path, "--url", armed.url), f"{path}: frames[0].priority: got 'high', expected a whole number"),
     ):
         done = run(*arguments)
         assert done.returncode == 2, done.stderr
