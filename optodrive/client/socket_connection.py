@@ -10,6 +10,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.problems import parse_problem
+from optodrive.client.tls_socket import build_tls_context
 from optodrive.core.errors import OptodriveError
 
 OPEN_TIMEOUT_S = 2.5
@@ -43,6 +44,8 @@ def open_connection(
 
     def connect() -> websockets.sync.client.ClientConnection:
         options = _build_options(endpoint, silence_max_s, open_timeout_s)
+        if endpoint.url.startswith("https"):
+            options["ssl"] = build_tls_context()
         opened: websockets.sync.client.ClientConnection = websockets.sync.client.connect(
             build_socket_url(endpoint, path), **options
         )

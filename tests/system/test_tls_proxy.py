@@ -1,11 +1,12 @@
 """The daemon behind a TLS proxy, for other computers and phones: names, origins, cookie, WebSockets, client."""
 
-import asyncio
 import os
+import select
 import socket
 import ssl
 import subprocess
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import httpx
@@ -15,6 +16,7 @@ from websockets.sync.client import connect
 
 from forked_process import run_process
 from optodrive.client import Display
+from optodrive.client.tls_socket import build_tls_context
 from optodrive.core.errors import NotReadyError
 from rig import OPTODRIVE, TOKEN
 
@@ -34,40 +36,41 @@ class TlsProxy:
         self._context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         self._context.load_cert_chain(self.certificate, key)
         self._target_port = target_port
-        self._loop, listening = asyncio.new_event_loop(), threading.Event()
-        self._thread = threading.Thread(target=lambda: self._loop.run_until_complete(self._serve(listening)))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._clients = []
+        self._thread = threading.Thread(target=self._serve)
         self._thread.start()
-        listening.wait()
 
-    async def _serve(self, listening):
-        self._ending = asyncio.Event()
-        async with asyncio.TaskGroup() as group:
-            server = await asyncio.start_server(
-                lambda *client: group.create_task(self._pass_on(*client)), "127.0.0.1", 0, ssl=self._context
-            )
-            self.port = server.sockets[0].getsockname()[1]
-            listening.set()
-            await self._ending.wait()
-            server.close()
+    def _serve(self):
+        with ThreadPoolExecutor(16) as executor, suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                self._clients.append(client)
+                executor.submit(self._pass_on, client)
 
-    async def _pass_on(self, from_client, to_client):
-        from_daemon, to_daemon = await asyncio.open_connection("127.0.0.1", self._target_port)
-        await asyncio.gather(copy(from_client, to_daemon), copy(from_daemon, to_client))
+    def _pass_on(self, raw):
+        """Pass bytes on until one side ends."""
+        with (
+            suppress(OSError),
+            self._context.wrap_socket(raw, server_side=True) as client,
+            socket.create_connection(("127.0.0.1", self._target_port)) as daemon,
+        ):
+            self._clients.append(client)
+            sinks = {client: daemon, daemon: client}
+            while True:
+                for source in [client] if client.pending() else select.select([*sinks], [], [])[0]:
+                    data = source.recv(65536)
+                    if not data:
+                        return
+                    sinks[source].sendall(data)
 
     def close(self):
-        self._loop.call_soon_threadsafe(self._ending.set)
+        for sock in (self._listener, *self._clients):
+            with suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
         self._thread.join()
-        self._loop.close()
-
-
-async def copy(source, sink):
-    with suppress(OSError):
-        while data := await source.read(65536):
-            sink.write(data)
-            await sink.drain()
-    with suppress(OSError):
-        sink.close()
-        await sink.wait_closed()
+        self._listener.close()
 
 
 @pytest.fixture
@@ -109,8 +112,8 @@ def test_the_page_opens_with_the_cookie_of_its_name(behind_proxy):
 
 def test_websockets_pass_a_proxy_for_their_own_origin_only(behind_proxy):
     _, proxy = behind_proxy
-    context = ssl.create_default_context(cafile=proxy.certificate)
-
+    context = build_tls_context()  # a plain one is unfit for a client of two threads
+    context.load_verify_locations(proxy.certificate)
     options = {"ssl": context, "additional_headers": AUTHORIZATION, "proxy": None}
     address, url = ("127.0.0.1", proxy.port), f"wss://{NAME}/v1/stream"
     with (
