@@ -174,4 +174,5 @@ class AsyncDisplay:
         )
 
     def _record_emission(self) -> None:
+        self._client.require_open()
         self._operations.may_emit = True

@@ -62,7 +62,7 @@ class Display:
             self.close()
 
     def close(self) -> None:
-        """Close the connections without stopping anything, but for an arming that they hold."""
+        """Close the connections without stopping anything, but for an arming that they hold. Only `stop` works then."""
         if self._hold is not None:
             self._hold.close()
         self._client.close()
@@ -189,6 +189,7 @@ class Display:
 
     def stream(self, policy: Policy = "trim") -> Stream:
         """Open a stream of frames, of which the newest wins: `with display.stream() as stream: stream.send(…)`."""
+        self._client.require_open()
         return Stream(
             self._client.policy.endpoint, self.layout, policy, self._reconnect_timeout_s, self._record_emission
         )
@@ -212,6 +213,7 @@ class Display:
         return self._client.run(self._operations.wait_for_plan(plan))
 
     def _record_emission(self) -> None:
+        self._client.require_open()
         self._operations.may_emit = True
 
     # --- notebooks ----------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import httpx
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import Exchange, ExchangePolicy, Pause, Step, T, Transmission
 from optodrive.client.requests import ApiRequest, Response
+from optodrive.core.errors import NotReadyError
 from optodrive.daemon.responses.state import StateReport
 
 READ_TIMEOUT_S = 2.5
@@ -42,6 +43,10 @@ class DaemonClient:
     def close(self) -> None:
         """Close the connections."""
         self._client.close()
+
+    def require_open(self) -> None:
+        """Raise NotReadyError after `close`."""
+        _require_open(self._client)
 
     def call(self, request: ApiRequest[Response]) -> Response:
         """Run `ExchangePolicy.call`."""
@@ -73,6 +78,7 @@ class DaemonClient:
         if step.on_new_connection:
             with self.policy.endpoint.open_client(step.timeout_s) as client:
                 return client.request(**_build_arguments(step.request, self.policy.endpoint))
+        self.require_open()
         arguments = _build_arguments(step.request, self.policy.endpoint)
         if step.request.method == "GET":
             return self._client.request(**arguments, timeout=min(_limit_read_s(step), self._timeout_s))
@@ -106,6 +112,10 @@ class AsyncDaemonClient:
         """Close the connections."""
         await self._client.aclose()
 
+    def require_open(self) -> None:
+        """Raise NotReadyError after `close`."""
+        _require_open(self._client)
+
     async def run(self, exchange: Exchange[T]) -> T:
         """Run an exchange and return its result."""
         try:
@@ -128,6 +138,7 @@ class AsyncDaemonClient:
         if step.on_new_connection:
             async with self.policy.endpoint.open_async_client(step.timeout_s) as client:
                 return await client.request(**_build_arguments(step.request, self.policy.endpoint))
+        self.require_open()
         arguments = _build_arguments(step.request, self.policy.endpoint)
         if step.request.method == "GET":
             return await self._client.request(**arguments, timeout=_limit_read_s(step))
@@ -138,6 +149,11 @@ class AsyncDaemonClient:
             return task.result()
         finally:
             task.cancel()
+
+
+def _require_open(client: httpx.Client | httpx.AsyncClient) -> None:
+    if client.is_closed:
+        raise NotReadyError("this display is closed, and only `stop` works; open another `Display`")
 
 
 def _limit_read_s(step: Transmission) -> float:

@@ -149,6 +149,38 @@ def test_a_closed_stream_shows_no_frame(board, daemon):
     assert dark_and_disarmed(board)
 
 
+def test_a_closed_display_only_stops(board, daemon):
+    """Nobody would end what it arms or shows after its block, as by a connection of its own for --hold or a stream."""
+
+    async def use_after_the_block():
+        async with AsyncDisplay(daemon.url, TOKEN) as display:
+            await display.layout()
+            stream = display.stream()
+        async with stream:
+            for use in (lambda: display.arm(hold=True), lambda: stream.send({5: 100.0}), display.arm, display.state):
+                with pytest.raises(NotReadyError, match="this display is closed"):
+                    await use()
+        await display.stop()
+
+    with Display(daemon.url, TOKEN) as display:
+        stream = display.stream()
+    for use in (
+        lambda: display.arm(hold=True),
+        lambda: stream.send({5: 100.0}),
+        display.stream,
+        display.arm,
+        display.state,
+        lambda: display.show({5: 100.0}),
+    ):
+        with pytest.raises(NotReadyError, match="this display is closed"):
+            use()
+    stream.close()
+    assert "this display is closed" in display._repr_html_()
+    display.stop()
+    asyncio.run(use_after_the_block())
+    assert not any(state["state"] == "ARMED" for state in board.of("state"))
+
+
 def test_the_client_reconnects_to_a_restarted_daemon_that_is_not_armed(make_board, make_daemon, tmp_path, monkeypatch):
     """The new daemon has the same port and another token, which the client reads from its file again."""
     board = make_board()
