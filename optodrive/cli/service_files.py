@@ -2,7 +2,6 @@
 
 import json
 import re
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from hashlib import sha256
@@ -14,7 +13,7 @@ from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.files import atomic_write
 from optodrive.core.toml_file import parse_toml
 from optodrive.device.config import Config
-from optodrive.device.config_file import DEFAULT_CONFIG, load_config, locate_shipped
+from optodrive.device.config_file import DEFAULT_CONFIG, build_config, list_named_files, load_config, locate_shipped
 
 CONFIG_PATH = Path("/etc/optodrive/config.toml")
 UNIT_PATH = Path("/etc/systemd/system/optodrive.service")
@@ -55,6 +54,7 @@ def build_service_files(source: str | Path | None, program: Path) -> tuple[Confi
         ServiceFile(UNIT_PATH, _render_unit(config, program)),
         ServiceFile(USERS_PATH, locate_shipped("systemd", "optodrive.sysusers").read_text("utf-8")),
         ServiceFile(CONFIG_PATH, text, preserve_edits=True),
+        *_copy_named_files(_locate_configuration(source), text),
     ]
     if config.board.vendor_id is not None and config.board.product_id is not None:
         files.append(ServiceFile(RULES_PATH, _render_rules(config)))
@@ -63,13 +63,32 @@ def build_service_files(source: str | Path | None, program: Path) -> tuple[Confi
 
 def _load_configuration(source: str | Path | None) -> tuple[Config, str]:
     load_config(source)  # reports errors under the given name
+    path = _locate_configuration(source)
+    text = _add_daemon_paths(path.read_text("utf-8"), str(path))
+    return build_config(path, parse_toml(text.encode(), str(path))), text
+
+
+def _locate_configuration(source: str | Path | None) -> Path:
     path = Path(DEFAULT_CONFIG if source is None else source)
-    text = (path if path.exists() else locate_shipped(f"{path}.toml")).read_text("utf-8")
-    text = _add_daemon_paths(text, str(path))
-    with tempfile.NamedTemporaryFile("w", suffix=".toml", encoding="utf-8") as whole:
-        whole.write(text)
-        whole.flush()
-        return load_config(whole.name), text
+    return path if path.exists() else locate_shipped(f"{path}.toml")
+
+
+def _copy_named_files(path: Path, text: str) -> list[ServiceFile]:
+    """Build the copies, for the configuration's new folder, of the files that it names relative to its own.
+
+    Raises InputError for a file that cannot be read, or has no place there.
+    """
+    folder = CONFIG_PATH.parent
+    copies = {}
+    for section, key in list_named_files(parse_toml(text.encode(), str(path))):
+        name = Path(section[key])
+        if name.is_absolute():
+            continue
+        if ".." in name.parts or folder / name in (CONFIG_PATH, MANIFEST_PATH):
+            expected = f"an absolute path, or a file in the configuration's folder that {folder} has no other of"
+            raise InputError(f"{path}: {key}", str(name), expected)
+        copies[folder / name] = ServiceFile(folder / name, _read_text(path.parent / name), preserve_edits=True)
+    return list(copies.values())
 
 
 def _add_daemon_paths(text: str, where: str) -> str:

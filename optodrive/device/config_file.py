@@ -1,6 +1,7 @@
 """Configuration files: shipped ones, loading, and the measured servo that a configuration may name."""
 
 import os
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -59,11 +60,8 @@ def build_config(path: Path, table: dict[str, Any]) -> Config:
         raise InputError(f"{path}: version", table["version"], expected)
     check_format(path, table, FORMAT, VERSION)
     check_units(path, table)
-    stages = table.get("stages")
-    for section in (table, *(stages if isinstance(stages, list) else ())):
-        if isinstance(section, dict):
-            _resolve_paths(path, section.get("scanner"), ("field", "mirrors"))
-    _resolve_paths(path, table.get("display"), ("pixel_map",))
+    for section, key in list_named_files(table):
+        section[key] = str(path.parent / section[key])
     try:
         config = Config.model_validate(table)
     except ValidationError as error:
@@ -85,11 +83,22 @@ def _apply_measured_servos(config: Config) -> Config:
     return config.model_copy(update={"stages": stages, "limits": limits})
 
 
-def _resolve_paths(path: Path, section: object, keys: tuple[str, ...]) -> None:
-    """Resolve the files that a table names relative to the configuration's folder."""
-    for key in keys:
-        if isinstance(section, dict) and isinstance(section.get(key), str) and section[key]:
-            section[key] = str(path.parent / section[key])
+def list_named_files(table: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
+    """Yield each section, and its key, that names another file, relative to the configuration's folder.
+
+    A parameter set is a file only with the suffix .toml.
+    """
+    stages = table.get("stages")
+    named = [(table.get("display"), "pixel_map"), (table.get("pixel_model"), "parameters")]
+    for part in (table, *(stages if isinstance(stages, list) else ())):
+        if isinstance(part, dict):
+            named += [(part.get("scanner"), "field"), (part.get("scanner"), "mirrors")]
+    for section, key in named:
+        if not isinstance(section, dict):
+            continue
+        name = section.get(key)
+        if isinstance(name, str) and name and (key != "parameters" or name.endswith(".toml")):
+            yield section, key
 
 
 class GalvoSection(Section):

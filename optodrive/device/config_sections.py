@@ -78,7 +78,7 @@ class PixelModelSection(Section):
     """The thermal and mechanical model of the pixels."""
 
     parameters: str = "calibrated"
-    """Name of a parameter set in configs/parameters."""
+    """Name of a parameter set in configs/parameters, or a file, model.toml, relative to the configuration's folder."""
 
 
 class PanelSection(Section):

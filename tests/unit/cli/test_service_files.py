@@ -1,12 +1,15 @@
 """`optodrive service install | remove | show` below a temporary root."""
 
 import json
+import re
 
 import pytest
 
 from optodrive.cli.main import run
 from optodrive.cli.service_files import CONFIG_PATH, MANIFEST_PATH, RULES_PATH, UNIT_PATH, USERS_PATH
 from optodrive.device.config_file import load_config, locate_shipped
+from optodrive.device.pixel_map import PixelMap, write_pixel_map
+from optodrive.planning.display_model import DisplayModel
 
 PROGRAM = "/opt/optodrive/bin/optodrive"
 USB_BOARD = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n'
@@ -106,6 +109,54 @@ def test_a_file_that_somebody_else_put_there_is_not_overwritten(install, at):
     at(USERS_PATH).write_text("u other\n")
     install(status=1)
     assert at(USERS_PATH).read_text() == "u other\n"
+    assert not at(UNIT_PATH).exists()
+
+
+def own_config(folder, **named):
+    """Write a configuration that names files, by sections and keys as `section__key`. Return its path."""
+    text = locate_shipped("display-16.toml").read_text()
+    for place, name in named.items():
+        section, key = place.split("__")
+        text = re.sub(rf'(?m)^{key} = "[^"]*"', "", text).replace(f"[{section}]", f'[{section}]\n{key} = "{name}"')
+    path = folder / "own" / "mine.toml"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_files_that_the_configuration_names_are_installed_beside_it(install, at, tmp_path):
+    """In a folder that is not the caller's, and so that the installed configuration loads everything it names."""
+    names = {"scanner__mirrors": "servo/mirrors.toml", "display__pixel_map": "pixels.toml"}
+    path = own_config(tmp_path, pixel_model__parameters="model.toml", **names)
+    (path.parent / "servo").mkdir()
+    config = load_config("display-16")
+    mirrors = "\n".join(
+        f"{key} = {getattr(config.scanner, key)!r}" for key in ("bandwidth_hz", "damping", "delay_s", "slew_rad_per_s")
+    )
+    (path.parent / "servo/mirrors.toml").write_text(
+        f'format = "optodrive-mirrors"\nversion = 1\n[scanner]\n{mirrors}\n[galvo]\nshare = 0.9\n'
+    )
+    parameters = locate_shipped("parameters", "surroundings.toml").read_text()
+    (path.parent / "model.toml").write_text(parameters)
+    write_pixel_map(path.parent / "pixels.toml", PixelMap.uniform(16, 0.0, 0.0), config, {})
+    output = install("--config", path).out
+    folder = CONFIG_PATH.parent
+    assert all(f"{folder / name}: written" in output for name in ("servo/mirrors.toml", "pixels.toml", "model.toml"))
+    installed = DisplayModel.from_config(load_config(at(CONFIG_PATH)))
+    assert installed.config.limits.galvo_acceleration_rms_max_rad_per_s2 == 9e4
+    assert at(folder / "model.toml").read_text() == parameters
+
+    at(folder / "model.toml").write_text(f"{parameters}\n# ours\n")
+    assert f"{folder / 'model.toml'}: edited, kept" in install().out
+    install(command="remove")
+    assert sorted(each.name for each in at(folder).iterdir() if each.is_file()) == ["installed.json", "model.toml"]
+
+
+@pytest.mark.parametrize("name", ["../field.toml", "config.toml", "installed.json", "absent.toml"])
+def test_a_named_file_that_cannot_be_installed_is_refused(install, at, tmp_path, name):
+    error = install("--config", own_config(tmp_path, scanner__field=name), status=2).err
+    assert name in error
+    assert error.count("\n") == 1
     assert not at(UNIT_PATH).exists()
 
 
