@@ -56,6 +56,13 @@ def build_cases(display):
     x_m, y_m = display.layout.x_m, display.layout.y_m
     offset_m = np.abs(np.hypot(x_m, y_m)[None, :] - np.linspace(0.2, 0.9, 8)[:, None] * np.hypot(x_m, y_m).max())
     yield "rings, twice", [*np.where(offset_m < 0.7 * display.config.display.pitch_m, 100e-6, 0.0)] * 2
+    angle, rng = np.arctan2(y_m, x_m), np.random.default_rng(5)
+    yield "tenth at random, eight frames", [np.where(rng.random(count) < 0.1, 150e-6, 0.0) for _ in range(8)]
+    dots_m = [np.where(rng.random(count) < 0.1, rng.uniform(20e-6, 150e-6, count), 0.0) for _ in range(20)]
+    yield "tenth at random, 20 to 150 µm, 20 frames", dots_m
+    turn = np.abs(np.angle(np.exp(1j * (angle[None, :] - np.arange(16)[:, None] * np.pi / 8))))
+    is_bar = (turn < 0.2) & (np.hypot(x_m, y_m) > display.config.display.pitch_m)
+    yield "rotating bar, twice", [*np.where(is_bar, 100e-6, 0.0)] * 2
     for name, pattern, given in (
         ("braille, one page", "text", {"text": TEXT, "height_um": 150}),
         ("moving edge", "edge", {"height_um": 100}),

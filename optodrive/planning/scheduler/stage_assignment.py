@@ -1,7 +1,7 @@
 """Which stage draws which pixel within a plan: all beams are to end each frame together, each on a short path.
 
-Pixels that recur in a plan are shared before it begins, so that the whole of it ends early. The others that a frame
-adds are cut into stretches of one path over them, one per stage: the stage that is ahead gets the longest.
+Pixels that recur in a plan are shared before it begins where the whole of it then ends clearly earlier. The others that
+a frame adds are cut into stretches of one path over them, one per stage: the stage that is ahead gets the longest.
 """
 
 from heapq import heapify, heapreplace
@@ -14,7 +14,7 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.scheduler.scan_head import ScanHead
-from optodrive.planning.scheduler.stage_balance import FrameLight, balance
+from optodrive.planning.scheduler.stage_balance import FrameLight, balance, find_drawing_s
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 
 NOBODY = -1
@@ -22,6 +22,9 @@ SHARES = np.linspace(0.0, 1.0, 41)
 """Shares of a pixel's largest displacement at which widths are tabulated."""
 BALANCED_MAX = 2_000_000
 """Frames times recurring pixels that are shared before a plan begins; later frames keep what the first ones decide."""
+GAIN_ENOUGH = 0.01
+"""Share of the time for less of which recurring pixels are not assigned before a plan begins: estimates are off by
+more, and frame by frame the plan corrects them."""
 COOLING_S = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 60)])
 """Times after a pulse at which the displacement that is left is tabulated, s."""
 TRAIN_SHARE = 0.5
@@ -108,32 +111,48 @@ class StageAssignment:
             self._assign_recurring(light)
 
     def _assign_recurring(self, light: LightEstimate) -> None:
-        """Assign the pixels that several frames light: stretches of a path per frame, balanced over the whole plan."""
+        """Assign the pixels that several frames light over the whole plan, if it is then drawn in clearly less time."""
         frames = self._sequence.frames[: max(2, BALANCED_MAX // len(self.stage_of))]
         target_m = np.array([frame.target_m for frame in frames]).reshape(len(frames), len(self.stage_of))
-        is_drawn = target_m > 0
-        recurring = np.flatnonzero((np.count_nonzero(is_drawn, axis=0) > 1) & (self.stage_of == NOBODY))
+        is_drawn, is_free, stages = target_m > 0, self.stage_of == NOBODY, len(self._reach)
+        recurring = np.flatnonzero((np.count_nonzero(is_drawn, axis=0) > 1) & is_free)
         if not len(recurring):
             return
         show_at_s = np.array([frame.show_at_s for frame in frames])
-        cost_s = light.compute_frames_s(target_m, show_at_s, len(self._reach), self._step_s)
-        is_shared = self.stage_of == NOBODY
-        is_shared[recurring] = False
-        stages = len(self._reach)
-        loads_s = np.zeros((len(frames), stages))
-        for frame, each in enumerate(frames):
-            pixels = recurring[is_drawn[frame, recurring]]
-            path = self._order_path(pixels[self.stage_of[pixels] == NOBODY])
-            known = np.setdiff1d(pixels, path, assume_unique=True)
-            loads_s[frame] = _compute_train_light_s(self._sequence.trains, each, self.stage_of, stages)
-            loads_s[frame] += np.bincount(self.stage_of[known], cost_s[frame, known], stages)
-            stage = self.stage_of[path] = _cut(cost_s[frame, path], loads_s[frame], self._reach[:, path])
-            loads_s[frame] += np.bincount(stage, cost_s[frame, path], stages)
+        cost_s = light.compute_frames_s(target_m, show_at_s, stages, self._step_s)
         overlap_s = np.append(0.0, cost_s.sum(axis=1) / np.maximum(np.count_nonzero(is_drawn, axis=1), 1))[:-1]
-        frame_light = FrameLight(loads_s, cost_s[:, is_shared].sum(axis=1), show_at_s, overlap_s)
-        stage = self.stage_of[recurring]
-        balance(frame_light, cost_s[:, recurring], stage, self._reach[:, recurring])
-        self.stage_of[recurring] = stage
+        light_s = FrameLight(np.zeros((len(frames), stages)), np.zeros(len(frames)), show_at_s, overlap_s)
+        self._try_by_frame(light_s, cost_s, is_carried=True)
+        by_frame_s = find_drawing_s(light_s)
+        if by_frame_s <= (1.0 + GAIN_ENOUGH) * light_s.loads_s.sum() / stages:
+            return
+        stage = self._try_by_frame(light_s, cost_s, is_carried=False)
+        is_free[recurring] = False
+        for frame, each_s in enumerate(np.where(is_free, cost_s, 0.0)):
+            light_s.loads_s[frame] -= np.bincount(stage, each_s, stages)
+            light_s.shared_s[frame] = each_s.sum()
+        share = stage[recurring]
+        balance(light_s, cost_s[:, recurring], share, self._reach[:, recurring])
+        if by_frame_s > (1.0 + GAIN_ENOUGH) * find_drawing_s(light_s):
+            self.stage_of[recurring] = share
+
+    def _try_by_frame(self, light_s: FrameLight, cost_s: FloatArray, is_carried: bool) -> IntArray:
+        """Assign frame by frame in the model of the plan. Return the stages [p]. This modifies light_s.loads_s.
+
+        cost_s: [f, p] beam time of each pixel in each frame; is_carried: whether a frame levels what the one before
+        left uneven, as in the plan, or each begins level
+        """
+        given, free_s = self.stage_of.copy(), np.zeros(len(self._reach))
+        for source, (pixels_s, loads_s) in enumerate(zip(cost_s, light_s.loads_s, strict=True)):
+            begin_s = max(light_s.show_at_s[source], free_s.max() - light_s.overlap_s[source])
+            free_s = np.maximum(free_s, begin_s) if is_carried else np.zeros(len(free_s))
+            self.assign(source, free_s)
+            frame, active = self._sequence.frames[source], np.flatnonzero(pixels_s)
+            loads_s[:] = _compute_train_light_s(self._sequence.trains, frame, self.stage_of, len(free_s))
+            loads_s += np.bincount(self.stage_of[active], pixels_s[active], len(free_s))
+            free_s = free_s + loads_s
+        stage, self.stage_of = np.maximum(self.stage_of, 0), given  # pixels that no frame lights have no stage
+        return stage
 
     def _order_path(self, pixels: IntArray) -> IntArray:
         """Return pixels in the order of a short path over them."""

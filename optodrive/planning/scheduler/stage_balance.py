@@ -15,8 +15,6 @@ WORK_MAX = 5_000_000
 PASSES_MAX = 20
 LEVEL_WEIGHT = 0.1
 """Weight of what the stages wait for the last one of a frame, against the time at which it ends."""
-LEVEL_ENOUGH = 1.005
-"""Time of a plan over its light ÷ stages that needs no search; estimates are off by more."""
 GAIN_MIN = 1e-7
 
 
@@ -38,19 +36,30 @@ def balance(light: FrameLight, cost_s: FloatArray, stage: IntArray, reach: BoolA
 
     cost_s: [f, n] beam time of each pixel in each frame; stage: [n]; reach: [k, n]
     """
-    free_s = np.zeros(len(reach))
-    _find_end_s(*light, free_s)
-    if free_s.max() > LEVEL_ENOUGH * (light.loads_s.sum() + light.shared_s.sum()) / len(reach):
-        _search(*light, np.ascontiguousarray(cost_s.T), stage, reach, free_s)
+    _search(*light, np.ascontiguousarray(cost_s.T), stage, reach, np.zeros(len(reach)), np.zeros(len(cost_s)))
+
+
+def find_drawing_s(light: FrameLight) -> float:
+    """Return the time in which frames are drawn, without the waits for the begin of the next, s."""
+    frames, stages = light.loads_s.shape
+    ends_s = np.zeros(frames)
+    _find_end_s(*light, np.zeros(stages), ends_s)
+    begins_s = np.maximum(light.show_at_s, np.append(0.0, ends_s[:-1]))
+    return float((ends_s - begins_s).clip(min=0.0).sum())
 
 
 @kernel
 def _find_end_s(
-    loads_s: FloatArray, shared_s: FloatArray, show_at_s: FloatArray, overlap_s: FloatArray, free_s: FloatArray
+    loads_s: FloatArray,
+    shared_s: FloatArray,
+    show_at_s: FloatArray,
+    overlap_s: FloatArray,
+    free_s: FloatArray,
+    ends_s: FloatArray,
 ) -> float:
     """Return the mean end of the frames, with the last one counted twice, and the waiting times of the stages.
 
-    Modifies free_s [k].
+    Modifies free_s [k] and ends_s, the ends of the frames [f].
     """
     stages, total, end_s = loads_s.shape[1], 0.0, 0.0
     free_s[:] = 0.0
@@ -65,6 +74,7 @@ def _find_end_s(
             if shared_s[frame] > 0.0:
                 free_s[k] = max(free_s[k], level_s)
             end_s = max(end_s, free_s[k])
+        ends_s[frame] = end_s
         total += end_s + LEVEL_WEIGHT * max(0.0, end_s - level_s)
     return float(total / len(loads_s) + end_s)
 
@@ -86,9 +96,10 @@ def _search(
     stage: IntArray,
     reach: BoolArray,
     free_s: FloatArray,
+    ends_s: FloatArray,
 ) -> None:
     stages, pixels, work = loads_s.shape[1], len(stage), 0
-    best_s = _find_end_s(loads_s, shared_s, show_at_s, overlap_s, free_s)
+    best_s = _find_end_s(loads_s, shared_s, show_at_s, overlap_s, free_s, ends_s)
     for _ in range(PASSES_MAX):
         has_changed = False
         for a in range(pixels):
@@ -97,7 +108,7 @@ def _search(
                     continue
                 before = stage[a]
                 _move(loads_s, cost_s[a], before, k)
-                end_s = _find_end_s(loads_s, shared_s, show_at_s, overlap_s, free_s)
+                end_s = _find_end_s(loads_s, shared_s, show_at_s, overlap_s, free_s, ends_s)
                 work += loads_s.size
                 if end_s < best_s - GAIN_MIN:
                     best_s, stage[a], has_changed = end_s, k, True
@@ -109,7 +120,7 @@ def _search(
                     continue
                 _move(loads_s, cost_s[a], first, second)
                 _move(loads_s, cost_s[b], second, first)
-                end_s = _find_end_s(loads_s, shared_s, show_at_s, overlap_s, free_s)
+                end_s = _find_end_s(loads_s, shared_s, show_at_s, overlap_s, free_s, ends_s)
                 work += loads_s.size
                 if end_s < best_s - GAIN_MIN:
                     best_s, stage[a], stage[b], has_changed = end_s, second, first, True

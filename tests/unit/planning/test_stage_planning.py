@@ -117,6 +117,35 @@ def test_decided_frame_by_frame_recurring_dots_would_be_uneven(display, monkeypa
     assert compute_excess(display, planned) > 1.06
 
 
+def build_rotating_bar(display):
+    """Build two turns of a bar from the centre to the edge."""
+    layout = display.layout
+    angle, radius_m = np.arctan2(layout.y_m, layout.x_m), np.hypot(layout.x_m, layout.y_m)
+    turns = [np.abs(np.angle(np.exp(1j * (angle - k * np.pi / 8)))) for k in range(16)] * 2
+    targets_m = [np.where((turn < 0.2) & (radius_m > display.config.display.pitch_m), 100e-6, 0.0) for turn in turns]
+    return [TactileFrame(f"f{k}", 1e-3 * k, 10.0, target_m) for k, target_m in enumerate(targets_m)]
+
+
+def test_frames_that_are_level_one_by_one_are_not_shared_before(display):
+    """The model expects less of a share over the whole plan than it errs; frame by frame the plan corrects itself."""
+    assert compute_excess(display, plan(display, *build_rotating_bar(display))) <= 1.015
+
+
+def test_a_share_that_the_model_prefers_by_less_than_it_errs_would_end_later(monkeypatch):
+    """Mutant: any gain counts."""
+    monkeypatch.setattr("optodrive.planning.scheduler.stage_assignment.GAIN_ENOUGH", 0.0)
+    display = build_display("display-437", 4)
+    assert compute_excess(display, plan(display, *build_rotating_bar(display))) > 1.02
+
+
+@pytest.mark.parametrize("interval_s", [1e-3, 1.0])
+def test_recurring_dots_are_shared_before_with_and_without_pauses_between_frames(display, interval_s):
+    pages = [replace(page, show_at_s=interval_s * k) for k, page in enumerate(build_pages(display))]
+    stage_of = display.build_assignment(FrameSequence(tuple(pages))).stage_of
+    is_recurring = np.sum([page.target_m > 0 for page in pages], axis=0) > 1
+    assert ((stage_of >= 0) == is_recurring).all()
+
+
 def test_each_stage_keeps_to_its_reach_where_dots_recur():
     display = build_display("display-437", 2, columns=((0, 14), (8, 22)))
     planned = plan(display, *build_pages(display))
