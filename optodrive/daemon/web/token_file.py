@@ -14,6 +14,7 @@ from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_regular_file
 from optodrive.daemon.web.roles import Role
 from optodrive.daemon.web.tokens import (
+    EXPECTED_VALUES,
     FILE_MAX_BYTES,
     FORMAT,
     NAME_PATTERN,
@@ -31,7 +32,7 @@ TABLE = re.compile(r"^(?:[ \t]*#[^\n]*\n)*[ \t]*\[", re.MULTILINE)
 def create_token(name: str, role: Role) -> Token:
     """Create a token with a random secret. Raise InputError for a name that is not allowed."""
     if not re.fullmatch(NAME_PATTERN, name):
-        raise InputError("NAME", name, "1 to 40 letters, digits, spaces or any of . _ @ -")
+        raise InputError("NAME", name, EXPECTED_VALUES["name"])
     return Token(name, role, secrets.token_urlsafe(32))
 
 

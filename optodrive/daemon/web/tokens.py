@@ -13,13 +13,19 @@ from pydantic import Field, ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format
+from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.daemon.web.roles import PERMISSIONS, ROLES, Role
 
 ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
 FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"
 ALLOWED_PATTERN = r"^[!-~]{16,200}$"
 NAME_PATTERN = r"^[\w.@ -]{1,40}$"
+EXPECTED_VALUES = {
+    "name": "1 to 40 letters, digits, spaces or any of . _ @ -",
+    "role": f"one of {', '.join(ROLES)}",
+    "secret": "16 to 200 letters, digits or signs, no spaces",
+}
+"""What each key of a token holds."""
 SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
 FORMAT = "optodrive-tokens"
 VERSION = 1
@@ -95,9 +101,11 @@ def read_tokens(path: Path, *, private: bool = False) -> Tokens:
     try:
         entries = _TokensFile.model_validate(table).token
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: {place}", "a value that is not shown", first["msg"]) from None
+        named = build_input_error(error, str(path), _TokensFile)
+        if named.value is None or named.code == "unknown_key":
+            raise named from None
+        expected = EXPECTED_VALUES.get(named.where.rpartition(".")[2], named.expected)
+        raise InputError(named.where, "a value that is not shown", expected) from None
     for key in ("name", "secret"):
         if len({getattr(entry, key) for entry in entries}) < len(entries):
             raise InputError(f"{path}: token", f"a {key} twice", "each once")
@@ -116,9 +124,7 @@ def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
     the file cannot be created.
     """
     if armer_secret and not re.fullmatch(ALLOWED_PATTERN, armer_secret):
-        raise InputError(
-            ENVIRONMENT_VARIABLE, "a value that is not shown", "16 to 200 letters, digits or signs, no spaces"
-        )
+        raise InputError(ENVIRONMENT_VARIABLE, "a value that is not shown", EXPECTED_VALUES["secret"])
     tokens = Tokens(
         Token(role, role, armer_secret if armer_secret and role == "armer" else secrets.token_urlsafe(32))
         for role in ROLES

@@ -55,6 +55,30 @@ def test_the_environment_gives_the_armers(monkeypatch):
     assert read_tokens(path).highest_role.secret == SECRET
 
 
+@pytest.mark.parametrize(
+    ("line", "wrong", "says"),
+    [
+        ('role = "armer"', 'role = "boss"', "token.0.role: got 'a value that is not shown', expected one of viewer,"),
+        (
+            f'secret = "{SECRET}"',
+            'secret = "short"',
+            "token.0.secret: got 'a value that is not shown', expected 16 to",
+        ),
+        ('name = "anna"', 'name = "a/b"', "token.0.name: got 'a value that is not shown', expected 1 to 40 letters"),
+        ('role = "armer"', "", "token.0.role: got None, expected this key"),
+        ('role = "armer"', 'rol = "armer"', "token.0.rol: got 'rol', expected "),
+    ],
+    ids=str,
+)
+def test_a_wrong_entry_is_named_with_what_is_expected_and_not_shown(tmp_path, line, wrong, says):
+    path = write_tokens(tmp_path / "tokens.toml", ("anna", "armer", SECRET))
+    path.write_text(path.read_text().replace(line, wrong))
+    with pytest.raises(InputError) as caught:
+        read_tokens(path)
+    assert says in str(caught.value)
+    assert not any(text in str(caught.value) for text in (SECRET, "boss", "short'", "a/b", "should"))
+
+
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o777])
 def test_a_daemons_file_that_others_may_read_is_refused(tmp_path, mode):
     path = write_tokens(tmp_path / "tokens.toml", ("anna", "armer", SECRET))
