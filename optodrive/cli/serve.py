@@ -36,7 +36,11 @@ def serve(
     ] = None,
 ) -> None:
     """Run the daemon: the processes that drive the board, plan, and serve the REST API and the live page."""
+    from optodrive.core.files import check_output
     from optodrive.daemon.supervisor.daemon import run
+    from optodrive.lab.recording.storage import HDF5_SUFFIXES
+
+    check_output("--record-session", record_session, *HDF5_SUFFIXES)
 
     def load() -> "Config":
         loaded = load_run_config(config, model, field, mirrors, pixel_map)

@@ -137,7 +137,7 @@ class CsvTree:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise InputError(str(path), None, "a TOML file that describes the recording")
+        raise InputError(str(path), Unquoted("no file of this name"), "a TOML file that describes the recording")
     return read_toml(path, TOML_BYTES_MAX)
 
 

@@ -15,6 +15,8 @@ WRITERS = {
     "plan": (["plan", "absent.json", "--out"], ".csv"),
     "recording convert": (["recording", "convert", "absent.h5"], ".h5"),
     "recording show": (["recording", "show", "absent.h5", "--out"], ".png"),
+    "recording trials": (["recording", "trials", "absent.h5", "--out"], ".csv"),
+    "serve --record-session": (["serve", "--config", "absent.toml", "--record-session"], ".h5"),
     "recording merge": (["recording", "merge", "absent.h5", "absent.h5", "--out"], ".h5"),
     "field": (["field", "--calibration", "absent.toml", "--points", "absent.csv", "--out"], ".csv"),
     "field --import": (["field", "--import", "absent.cor", "--out"], ".toml"),

@@ -88,7 +88,7 @@ def forgotten(folder):
 
 HEIGHT = "run2/displacement_m.csv"
 REFUSALS = {
-    "no description": (gone("recording.toml"), ["recording.toml", "TOML"]),
+    "no description": (gone("recording.toml"), ["recording.toml: got no file of this name, ", "TOML"]),
     "no TOML": (text("recording.toml", "version = 1", "version 1"), ["recording.toml", "TOML", "line 2"]),
     "no text": (content("recording.toml", b"\xff\xfe\x00"), ["recording.toml", "TOML"]),
     "format": (text("recording.toml", "optotactile", "opto"), ["format", "'opto-recording'"]),
