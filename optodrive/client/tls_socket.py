@@ -29,17 +29,26 @@ class SerialTlsSocket(ssl.SSLSocket):
         self._lock, self._is_shared = threading.Lock(), True
 
     def settimeout(self, value: float | None) -> None:
-        """Set the longest wait of the calls to come, s; None: without end."""
+        """Set the longest wait of later calls.
+
+        value: s, None for no end
+        """
         self._timeout_s = value
         if not self._is_shared:  # the TLS handshake still blocks in OpenSSL
             super().settimeout(value)
 
     def recv(self, buflen: int = 1024, flags: int = 0) -> bytes:
-        """Return what has arrived, waiting for its first byte. Raise TimeoutError after the timeout."""
+        """Wait for the first byte and return the received ones.
+
+        Raises TimeoutError after the timeout.
+        """
         return bytes(self._call(lambda: super(SerialTlsSocket, self).recv(buflen, flags)))
 
     def send(self, data: Any, flags: int = 0) -> int:
-        """Send the first part of some bytes; return its size. Raise TimeoutError after the timeout."""
+        """Send the first part of some bytes and return its size.
+
+        Raises TimeoutError after the timeout.
+        """
         piece = memoryview(data)[:PIECE_BYTES]
         return int(self._call(lambda: super(SerialTlsSocket, self).send(piece, flags)))
 
@@ -50,11 +59,11 @@ class SerialTlsSocket(ssl.SSLSocket):
                 try:
                     return function()
                 except (ssl.SSLWantReadError, BlockingIOError):
-                    wanted = select.POLLIN
+                    event = select.POLLIN
                 except ssl.SSLWantWriteError:
-                    wanted = select.POLLOUT
+                    event = select.POLLOUT
             wait_s = None if end_s is None else end_s - time.monotonic()
-            self._wait(wanted, wait_s)
+            self._wait(event, wait_s)
 
     def _wait(self, event: int, wait_s: float | None) -> None:
         """Wait until the kernel's socket is ready. Raise TimeoutError after wait_s."""
