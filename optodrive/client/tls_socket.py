@@ -1,5 +1,6 @@
 """TLS sockets that one thread may read while another writes."""
 
+import errno
 import select
 import ssl
 import threading
@@ -62,17 +63,17 @@ class SerialTlsSocket(ssl.SSLSocket):
                     event = select.POLLIN
                 except ssl.SSLWantWriteError:
                     event = select.POLLOUT
-            wait_s = None if end_s is None else end_s - time.monotonic()
-            self._wait(event, wait_s)
+            self._wait(event, None if end_s is None else end_s - time.monotonic())
 
     def _wait(self, event: int, wait_s: float | None) -> None:
-        """Wait until the kernel's socket is ready. Raise TimeoutError after wait_s."""
+        """Wait until the kernel's socket is ready. Raise TimeoutError after wait_s, OSError if it was closed."""
+        descriptor = self.fileno()
+        if descriptor < 0:
+            raise OSError(errno.EBADF, "the socket was closed while a thread used it")
         poll = select.poll()
-        poll.register(self.fileno(), event)
-        if wait_s is not None and (wait_s <= 0.0 or not poll.poll(1e3 * wait_s)):
+        poll.register(descriptor, event)
+        if (wait_s is not None and wait_s <= 0.0) or not poll.poll(None if wait_s is None else 1e3 * wait_s):
             raise TimeoutError("timed out")
-        if wait_s is None:
-            poll.poll()
 
 
 def build_tls_context() -> ssl.SSLContext:

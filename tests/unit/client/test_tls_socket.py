@@ -4,7 +4,7 @@ import socket
 import ssl
 import subprocess
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import pytest
 
@@ -42,7 +42,8 @@ def connect_to_echo(certificate, socket_class):
     try:
         with client_context.wrap_socket(near, server_hostname="localhost") as client:
             yield client
-            client.shutdown(socket.SHUT_RDWR)
+            with suppress(OSError):  # the test has done it
+                client.shutdown(socket.SHUT_RDWR)
     finally:
         thread.join()
 
@@ -121,3 +122,13 @@ def test_a_wait_ends_with_its_timeout(certificate):
         client.settimeout(None)
         client.sendall(b"y")
         assert client.recv(10) == b"y"
+
+
+def test_a_reader_learns_that_the_socket_was_shut_down(certificate):
+    with connect_to_echo(certificate, SerialTlsSocket) as client:
+        left = []
+        thread = threading.Thread(target=lambda: left.append(client.recv(10)))
+        thread.start()
+        client.shutdown(socket.SHUT_RDWR)
+        thread.join()
+    assert left == [b""]
