@@ -172,4 +172,5 @@ def read_token(port: int | None) -> str:
         if os.access(path, os.R_OK):
             return read_tokens(path).highest_role.secret
     listed = " or ".join(str(path) for path in candidates)
-    raise InputError(ENVIRONMENT_VARIABLE, None, f"a token: set it, or make {listed} readable")
+    expected = f"a token: set it, name a file of tokens by {FILE_ENVIRONMENT_VARIABLE}, or make {listed} readable"
+    raise InputError(ENVIRONMENT_VARIABLE, None, expected)

@@ -121,7 +121,7 @@ def test_another_version_is_refused_by_name(tmp_path):
 
 
 def test_a_caller_uses_whichever_is_there(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="set it"):
+    with pytest.raises(InputError, match=f"set it, name a file of tokens by {FILE_ENVIRONMENT_VARIABLE}, or make "):
         read_token(8450)
     tokens, _ = load_daemon_tokens("", 8450)
     assert read_token(8450) == tokens.find(tokens.all[2].secret).secret == tokens.all[2].secret
