@@ -16,7 +16,7 @@ from hypothesis.stateful import (
 from virtual_rig import VirtualRig
 from wire_format import HOST
 
-from optodrive.core.errors import LinkError
+from optodrive.core.errors import LinkError, NotReadyError
 from optodrive.link.session.session import BoardSession
 
 UNSAFE = (("interlock", False), ("key", False), ("estop", True))
@@ -77,12 +77,17 @@ class Owner(RuleBasedStateMachine):
 
     @rule(wait_s=st.sampled_from([0.0, 1.0, 2.5, 2.5, 2.5]))
     def arm(self, wait_s):
-        """Acknowledge a fault, then arm once."""
+        """Acknowledge a fault, end an arming that has not succeeded, then arm once."""
         self.connect()
         if self.is_in("FAULT"):
             self.inputs_are_safe_again()
             self.session.disarm()
             self.pass_time(lambda: self.is_in("DISARMED"), 0.5)
+        if self.is_in("DISARMED") and self.session.has_arming:
+            with pytest.raises(NotReadyError, match="being armed already"):
+                self.session.arm()
+            self.session.abort()
+            self.pass_time(lambda: self.session.is_acknowledged and self.is_in("DISARMED"), 0.5)
         if self.is_in("DISARMED"):
             self.allowed = self.times("armed") + 1
             self.session.arm()
