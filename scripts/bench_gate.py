@@ -572,7 +572,7 @@ def measure_boards(bench):
         boards.read_starts()
         boards.arm()
         time.sleep(5.0)  # until the rates of the clocks are known
-        skews_s = np.concatenate([boards.draw_frame() for _ in range(4)])
+        skews_s = np.concatenate([boards.draw_frame() for _ in range(4)])[:, 0]
         stops_s = []
         for _ in range(4):
             boards.arm()
