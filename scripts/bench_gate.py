@@ -442,8 +442,7 @@ def wait_for_dark_us(board):
 def light(board, daemon):
     """Let a long train run."""
     if daemon.board_state() != "ARMED":
-        daemon.client.post("/v1/disarm")
-        daemon.arm()
+        arm_when_ready(daemon)
     board.forget()
     daemon.call("POST", "/v1/plans", json=long_train(seconds=30.0))
     wait_for(lambda: len(board.of("pulse")) > 3, "pulses")
@@ -480,6 +479,15 @@ def kill_and_await(board, daemon, name):
     return find_dark_s(board, killed_us), time.monotonic() - killed_s
 
 
+def arm_when_ready(daemon):
+    """Acknowledge a fault and arm, once the daemon's processes and its link have recovered from an earlier loss."""
+
+    def is_armed():
+        return all(daemon.client.post(path).status_code == 200 for path in ("/v1/disarm", "/v1/arm"))
+
+    wait_for(is_armed, "an armed board")
+
+
 def find_dark_s(board, since_us):
     """Return the time from one of the board's clock until the gate was off for good, s."""
     off_us = [event["t_us"] for event in board.of("gate") if not event["on"]]
@@ -508,8 +516,7 @@ def lose(bench, board, daemon, number):
 
     Return the times until dark and until the end of the command, s.
     """
-    daemon.client.post("/v1/disarm")
-    daemon.arm()
+    arm_when_ready(daemon)
     board.forget()
     frames = bench.make_folder() / "frames.json"
     frames.write_text(json.dumps(long_train(seconds=30.0)))
