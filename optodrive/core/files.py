@@ -1,5 +1,6 @@
 """Atomic writing of files, and reading of regular files of bounded size."""
 
+import fcntl
 import os
 import stat
 import tempfile
@@ -65,6 +66,20 @@ def create_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a folder that can be created") from None
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Let one process at a time change the files of a folder. Raise InputError for one that cannot be opened."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise InputError(str(folder), error.strerror or str(error), "an existing folder") from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> bytes:

@@ -4,12 +4,12 @@ import fcntl
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from optodrive.core.errors import InputError
+from optodrive.core.files import lock_folder
 
 SOCKET_PATH_MAX_BYTES = 100
 """Longest path of a socket; the kernel allows 107."""
@@ -82,7 +82,7 @@ def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
         raise InputError("daemon.socket", str(unix), "a shorter path, because the link's socket lies beside it")
     try:
         known_as.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with _lock_folder(known_as.parent):  # no other daemon is between creation and lock of its own folder
+        with lock_folder(known_as.parent):  # no other daemon is between creation and lock of its own folder
             path, lock = _create_folder(known_as)
             _remove_unused(known_as)
         if unix is not None:  # a command that knows only the TCP port finds it here
@@ -106,16 +106,6 @@ def _create_folder(known_as: Path) -> tuple[Path, int]:
     lock = os.open(path, FOLDER_FLAGS)
     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return path, lock
-
-
-@contextmanager
-def _lock_folder(folder: Path) -> Iterator[None]:
-    lock = os.open(folder, FOLDER_FLAGS)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(lock)
 
 
 def _remove_unused(own: Path) -> None:

@@ -23,7 +23,8 @@ Streams. A source that sends frames wants the newest shown, not a queue of the p
 plan leave only `stream_lead_s` before they are due; a newer plan cuts the running one at the first point that has not
 left (`build_cut_snapshot`) and is spliced behind it, one job for the board. The lead is longer without real-time
 priority, because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is
-refused by link, and the plan is made again; `truncate_stream` is the last resort, which always succeeds.
+refused by link, and the plan is made again; after two such plans `truncate_stream` cuts the running one at once, and
+the third begins behind it without a deadline.
 
 Pauses. The board drops its queue; what was not executed becomes the rest of the same plan, which waits at the front and
 is limited again for the time at which the light returns (decision 37). A stream is dropped, as it shows the present.

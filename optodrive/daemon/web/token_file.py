@@ -1,17 +1,15 @@
 """Changes of a file of tokens: one is added or removed, and every other line stays as it was written."""
 
-import fcntl
 import json
 import os
 import re
 import secrets
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from optodrive.core.errors import InputError, suggest_nearest
-from optodrive.core.files import read_regular_file
+from optodrive.core.files import lock_folder, read_regular_file
 from optodrive.daemon.web.roles import Role
 from optodrive.daemon.web.tokens import (
     EXPECTED_VALUES,
@@ -41,7 +39,7 @@ def add_token(path: Path, token: Token) -> None:
 
     Raises InputError, which never contains a secret, for a name that is taken and for a file that cannot be used.
     """
-    with _lock_folder(path):
+    with lock_folder(path.absolute().parent):
         text, known = (_read_text(path), read_private_tokens(path).all) if path.exists() else (HEAD, ())
         if token.name in {other.name for other in known}:
             raise InputError("NAME", token.name, f"a name that no token in {path} has; revoke that one first")
@@ -50,7 +48,7 @@ def add_token(path: Path, token: Token) -> None:
 
 def remove_token(path: Path, name: str) -> Token:
     """Remove a token from the file and return it. Raise InputError for an unknown name, and for the last token."""
-    with _lock_folder(path):
+    with lock_folder(path.absolute().parent):
         known = {token.name: token for token in read_private_tokens(path).all}
         if name not in known:
             raise InputError("NAME", name, f"a token in {path}, {suggest_nearest(name, list(known))}")
@@ -82,20 +80,6 @@ def _cut_table(text: str, index: int) -> str:
     if index + 1 >= len(starts):
         return text
     return (text[: starts[index]] + text[starts[index + 1] :]).rstrip("\n") + "\n"
-
-
-@contextmanager
-def _lock_folder(path: Path) -> Iterator[None]:
-    """Let one command at a time change the files of a folder."""
-    try:
-        descriptor = os.open(path.absolute().parent, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise InputError(str(path), error.strerror, "a file in an existing folder") from None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _read_text(path: Path) -> str:

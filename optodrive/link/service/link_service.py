@@ -9,9 +9,8 @@ it, be accepted after the next arming, and light what nobody asks for any more.
 Epochs. Everything that stops the light ends the epoch: STOP, disarm, a fault, a board that has left its arming, the
 loss of the link, of the planner or of the web process, a revoked caller. A request carries the epoch of its arrival,
 and its points are never lit in another one: the handover refuses them (gate 1, `point_handover.py`), and arming drops
-those handed over before (gate 2, in the session). A successor of this process begins with a greater epoch. Ending an
-epoch always sends ABORT, also when the board is said to be dark already: it does not end what has ended, and what is
-said may be false.
+those handed over before (gate 2, in the session). A successor of this process begins with a greater epoch. Its end
+sends ABORT (DISARM where that was the command), also when the board is said to be dark already: that may be false.
 
 Lease. It is renewed while the planner and a web process beat, and the planner is idle or makes progress (`clients.py`):
 a process that could not stop the light must not keep it on. With `on_web_loss = "finish"` a running plan may outlive

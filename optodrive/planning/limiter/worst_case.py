@@ -10,8 +10,8 @@ Which end. Temperatures rise monotonically with absorbed power, resistances, cou
 taken at one end. Capacities and lags are not monotone: a smaller one warms faster, a larger one cools more slowly. Each
 such node is bounded with both ends, and `specht_ratio` is the proven price of the values in between.
 
-Concave loss. A bridge conducts less when hot: its loss is concave, and chords from 0 to the cap lie below it. Less
-loss is the worse case. Where the exponent is uncertain, chords are laid even for a nominally constant bridge.
+Concave loss. A bridge conducts less when hot: its loss is concave, and chords from 0 to the cap lie below it. Less loss
+is the worse case. Where the exponent is uncertain, chords are laid even for a nominally constant bridge.
 
 Delays. The bound lets heat arrive at once. Where a node in between delays it, it arrives later, when the counted heat
 has already decayed; a factor 1 / (1 − rate × delay) makes up for that, and exists only if the node is slow enough
@@ -22,9 +22,9 @@ panel warms walls and touch surface by its whole rise, increased as each follows
 Credits. `wall_transit_credit`, `touch_transit_credit` and the lower bound of the absorber are the opposite: they reduce
 a bound, and are therefore taken at the other end, with deficits for what neighbours and panel warm.
 
-Invariant. Every field of `Uncertainty` and of `HeatBound` enters here and nowhere else; a test walks over all declared
-uncertainties and requires each to be counted. Judged by an integrator that shares no code with the limiter
-(`tests/reference_models`). Decisions: 7, 40, 41 (skew of stages), 45.
+Invariant. Every field of `Uncertainty` and of `HeatBound` enters here or, for the panel, in `panel_bound.py`; a test
+walks over all declared uncertainties and requires each to be counted. Judged by an integrator that shares no code with
+the limiter (`tests/reference_models`). Decisions: 7, 40, 41 (skew of stages), 45.
 """
 
 from dataclasses import dataclass

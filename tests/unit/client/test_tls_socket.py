@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from optodrive.client.tls_socket import SerialTlsSocket, build_tls_context
+from optodrive.client.tls_socket import build_tls_context
 
 COUNT, SIZE = 300, 40_000
 
@@ -23,14 +23,13 @@ def certificate(tmp_path):
 
 
 @contextmanager
-def connect_to_echo(certificate, socket_class):
-    """Connect with a TLS socket of a class to a server that returns what it gets."""
+def connect_to_echo(certificate):
+    """Connect to a server that returns the bytes that it gets."""
     path, key = certificate
     near, far = socket.socketpair()
     server_context, client_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), build_tls_context()
     server_context.load_cert_chain(path, key)
     client_context.load_verify_locations(path)
-    client_context.sslsocket_class = socket_class
 
     def echo():
         with server_context.wrap_socket(far, server_side=True) as server:
@@ -88,34 +87,12 @@ def count_overlaps(monkeypatch, client):
 
 
 def test_no_two_calls_enter_a_connection_at_once(monkeypatch, certificate):
-    with connect_to_echo(certificate, SerialTlsSocket) as client:
+    with connect_to_echo(certificate) as client:
         assert count_overlaps(monkeypatch, client) == 0
 
 
-def test_a_plain_tls_socket_is_entered_by_both(monkeypatch, certificate):
-    """The reader waits in OpenSSL while the other thread sends."""
-    entered = threading.Event()
-    original = ssl.SSLSocket.read
-
-    def read(self, *arguments):
-        entered.set()
-        return original(self, *arguments)
-
-    monkeypatch.setattr(ssl.SSLSocket, "read", read)
-    with connect_to_echo(certificate, ssl.SSLSocket) as client:
-        entered.clear()
-        left = []
-        thread = threading.Thread(target=lambda: left.append(client.recv(10)))
-        thread.start()
-        entered.wait()
-        assert not left
-        client.sendall(b"x")
-        thread.join()
-    assert left == [b"x"]
-
-
 def test_a_wait_ends_with_its_timeout(certificate):
-    with connect_to_echo(certificate, SerialTlsSocket) as client:
+    with connect_to_echo(certificate) as client:
         client.settimeout(0.01)
         with pytest.raises(TimeoutError):
             client.recv(1)
@@ -125,7 +102,7 @@ def test_a_wait_ends_with_its_timeout(certificate):
 
 
 def test_a_reader_learns_that_the_socket_was_shut_down(certificate):
-    with connect_to_echo(certificate, SerialTlsSocket) as client:
+    with connect_to_echo(certificate) as client:
         left = []
         thread = threading.Thread(target=lambda: left.append(client.recv(10)))
         thread.start()

@@ -209,14 +209,20 @@ def test_a_board_that_falls_silent_ends_the_light_of_all(rig):
     assert finish(rig, submit(rig, build_frame())).status == "done"
 
 
-@pytest.mark.parametrize("lost_for_s", [0.05, 5.0])
-def test_every_stage_is_listed_with_its_state_after_one_was_lost(monkeypatch, lost_for_s):
-    """The links to the others stay open. A last known state of the lost board would be a claim."""
+def build_breaking(monkeypatch):
+    """Return three boards that draw, over links that may break."""
     rig = StageRig(monkeypatch, build_stages("display-16", 3), link_type=BreakingLink).ready()
     rig.run(2.0)
     rig.arm()
     record = submit(rig, build_trains(3, 9.0))
     rig.until(lambda: record.executed_count > 20)
+    return rig
+
+
+@pytest.mark.parametrize("lost_for_s", [0.05, 5.0])
+def test_every_stage_is_listed_with_its_state_after_one_was_lost(monkeypatch, lost_for_s):
+    """The links to the others stay open. A last known state of the lost board would be a claim."""
+    rig = build_breaking(monkeypatch)
     rig.links[1].is_broken = True
     rig.cores[1].on_link_lost(rig.links[1]._now_us())
     rig.run(lost_for_s)
@@ -236,11 +242,7 @@ def test_every_stage_is_listed_with_its_state_after_one_was_lost(monkeypatch, lo
 
 def test_abort_goes_to_the_other_boards_in_the_step_that_finds_one_lost(monkeypatch):
     """They would also be aborted later, as boards without an arming, once they have acknowledged all that was sent."""
-    rig = StageRig(monkeypatch, build_stages("display-16", 3), link_type=BreakingLink).ready()
-    rig.run(2.0)
-    rig.arm()
-    record = submit(rig, build_trains(3, 9.0))
-    rig.until(lambda: record.executed_count > 20)
+    rig = build_breaking(monkeypatch)
     rig.links[2].is_broken = True
     assert [core.state for core in rig.cores[:2]] == [BoardState.RUNNING] * 2
     with pytest.raises(LinkError, match="unplugged"):
