@@ -9,7 +9,6 @@ import asyncio
 import fcntl
 import json
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -20,7 +19,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
@@ -32,9 +30,8 @@ from bench_boards import Bench as SeveralBoards
 from bench_latency import RATES_HZ, WAYS, measure_errors, run_daemon
 from bench_stop import run_flood
 from bench_stream import start_bare_server, stream_under_load
-from measuring import Sleeper, compute_percentile, realtime_priority, time_limit
-from rich.console import Console
-from rich.table import Table
+from measured_rows import Row, print_table, report_lateness, to_ms
+from measuring import Sleeper, realtime_priority, time_limit
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -62,52 +59,6 @@ STOP_MAX_MS = 50.0
 FLOODS = ("rest", "refused bodies of 8 MB", "valid previews", "pings", "idle connections", "connection churn")
 FLOOD_S, STREAM_S = 3.0, 4.0
 BARE = "a bare FastAPI's answer"
-
-
-@dataclass
-class Row:
-    """A measured quantity, in ms unless stated otherwise.
-
-    aim: largest value wanted; reference: what the ratio is to, with its values; late_s: lateness of the computer
-    """
-
-    quantity: str
-    aim: float | None
-    values: list[float]
-    unit: str = "ms"
-    reference: str = ""
-    reference_values: list[float] = field(default_factory=list)
-    note: str = ""
-    late_s: list[float] = field(default_factory=list)
-
-    def report(self):
-        """Return the row as JSON values. Times without a unit in their name are in the row's unit."""
-        p50, p99, largest = (self._percentile(self.values, share) for share in (0.5, 0.99, 1.0))
-        reference = self._percentile(self.reference_values, 0.5)
-        return {
-            "quantity": self.quantity,
-            "unit": self.unit,
-            "aim": self.aim,
-            "n": len(self.values),
-            "median": p50,
-            "p99": p99,
-            "max": largest,
-            "misses_aim": self.aim is not None and (p99 is None or p99 > self.aim),
-            "late_p99_ms": self._percentile([1e3 * late_s for late_s in self.late_s], 0.99),
-            "late_max_ms": self._percentile([1e3 * late_s for late_s in self.late_s], 1.0),
-            "reference": self.reference or None,
-            "reference_median": reference,
-            "ratio": p50 / reference if p50 is not None and reference else None,
-            "note": self.note,
-        }
-
-    @staticmethod
-    def _percentile(values, share):
-        return compute_percentile(values, share) if values else None
-
-
-def to_ms(values_s):
-    return [1e3 * value_s for value_s in values_s]
 
 
 class Bench:
@@ -612,35 +563,14 @@ def run(names):
             sleeper, begin_s = Sleeper(), time.monotonic()
             try:
                 with time_limit(LIMIT_S):
-                    rows = MEASUREMENTS[name](bench)
+                    rows = [row.report() for row in MEASUREMENTS[name](bench)]
             except Exception as error:
                 traceback.print_exc()
-                rows = [Row(name, None, [], note=f"failed: {type(error).__name__}: {error}")]
-            late_s = sleeper.finish()
+                rows = [Row(name, None, [], note=f"failed: {type(error).__name__}: {error}").report()]
+            lateness = report_lateness(sleeper.finish())
             print(f"{time.monotonic() - begin_s:5.1f} s  {name}", file=sys.stderr, flush=True)
             for row in rows:
-                row.late_s = late_s
-                yield {"name": name, **row.report()}
-
-
-def format_number(value):
-    return "" if value is None else f"{value:,.0f}" if value >= 100 else f"{value:.1f}"
-
-
-def print_table(rows):
-    table = Table(title="What depends on the computer; ! misses its aim")
-    for column in ("quantity", "unit", "aim ≤", "", "n", "median", "p99", "max", "late p99, max, ms", "ratio", "of"):
-        table.add_column(column, justify="left" if column in ("quantity", "unit", "of") else "right")
-    for row in rows:
-        late = f"{format_number(row['late_p99_ms'])}, {format_number(row['late_max_ms'])}"
-        numbers = [format_number(row[key]) for key in ("median", "p99", "max")]
-        quantity = row["quantity"] + (f" ({row['note']})" if row["note"] else "")
-        mark = "!" if row["misses_aim"] else ""
-        cells = (quantity, row["unit"], format_number(row["aim"]), mark, str(row["n"]), *numbers, late)
-        table.add_row(*cells, format_number(row["ratio"]), row["reference"] or "")
-    Console(width=190).print(table)
-    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
-    print(f"{platform.machine()}, {os.cpu_count()} cores, load averages {load}, including these processes")
+                yield {"name": name, **row, **lateness}
 
 
 def main():
