@@ -185,6 +185,7 @@ static void receive(struct port *port, bool last) {
     uint8_t bytes[READ_MAX];
     size_t n;
     while ((n = line_read(&port->line, bytes, port->at_us, last)) > 0) {
+        run_ticks_until(port, now_us(port)); /* or a reply to CLOCK could tell a time before its request was sent */
         uint64_t until_us = port->board.lease_until_us;
         board_receive(&port->board, bytes, n, port->at_us);
         if (port->board.lease_until_us > until_us) {

@@ -39,6 +39,8 @@ class BoardCore:
         self._settings = settings or BoardSettings()
         self._sink: LogSink = sink or (lambda event: None)
         self._random = random.Random(seed)
+        self.read_present_us: Callable[[], int] = lambda: self.machine.now_us
+        """Present time. A process that ran late processes bytes as of the time at which a board would have got them."""
         self.machine = BoardMachine(
             self._settings, self._random, self._sink, mirror_sink or (lambda x, y, at_us: None), self._send
         )
@@ -159,7 +161,8 @@ class BoardCore:
         if isinstance(message, m.Lease):
             self.machine.renew_lease(message.ms)
         elif isinstance(message, m.ClockRequest):
-            self._send(m.ClockReply(message.host_t, self.machine.current_tick))
+            # Not the time as of which the bytes are processed: that may lie before the host sent the request.
+            self._send(m.ClockReply(message.host_t, self.read_present_us() - self.machine.epoch_us))
         elif isinstance(message, m.Get):
             self._send(self._build_status())
         elif isinstance(message, m.GetExecuted):

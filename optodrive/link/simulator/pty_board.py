@@ -93,6 +93,8 @@ class PtyBoard:
         self._clock = clock
         self._running = True
         self._core = build_core(settings, self._log)
+        if isinstance(self._core, BoardCore):
+            self._core.read_present_us = self._now_us
         if clock != EXACT_CLOCK:
             self._log({"t_us": 0, "event": "clock", "monotonic_s": self._started_s})
         self._faults = FaultyLink()
