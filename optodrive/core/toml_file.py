@@ -14,8 +14,8 @@ DEPTH_MAX = 16
 """Most tables and lists within each other."""
 KEY_MAX = 255
 """Longest key, characters."""
-INTEGER_MAX = 2**63 - 1
-"""Largest absolute integer, that of TOML but for one."""
+INTEGER_MIN, INTEGER_MAX = -(2**63), 2**64 - 1
+"""Integers of 64 bits, with or without a sign: an attribute in HDF5 may be either."""
 MESSAGE_MAX = 100
 LONG_DOTTED_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){128}""", re.ASCII)
 """A key, or text, of more parts than any file has; the parser's time is quadratic in their number."""
@@ -66,7 +66,7 @@ def _check_bounds(where: str, value: object, depth: int) -> None:
     elif isinstance(value, list):
         for index, item in enumerate(value):
             _check_bounds(f"{where}[{index}]", item, depth + 1)
-    elif isinstance(value, int) and abs(value) > INTEGER_MAX:
+    elif isinstance(value, int) and not INTEGER_MIN <= value <= INTEGER_MAX:
         raise _build_integer_error(where)
 
 

@@ -5,7 +5,7 @@ import shutil
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
@@ -249,6 +249,7 @@ FINITE = st.floats(allow_nan=False, allow_infinity=False)
     st.floats(150.0, 600.0),
     st.none() | st.floats(1e-300, 1e300),
 )
+@example([*range(6)], [0.0] * 12, {"n": 2**64 - 1, "m": -(2**63)}, 300.0, None)
 def test_every_number_and_text_comes_back_from_both_forms(
     tmp_path_factory, times, values, attributes, ambient_k, sigma
 ):

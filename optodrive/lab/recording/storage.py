@@ -10,6 +10,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted, abbreviate
+from optodrive.core.toml_file import INTEGER_MAX, INTEGER_MIN, KEY_MAX
 from optodrive.core.types.arrays import FloatArray
 
 Attributes = dict[str, str | float]
@@ -49,7 +50,6 @@ TEXT_BYTES_MAX = 2**20
 ATTRIBUTES_MAX = 1000
 """Maximum number of attributes of a recording, run or signal."""
 NAME_BYTES_MAX = 200
-_INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**64 - 1
 
 
 class RecordingTree(Protocol):
@@ -158,7 +158,7 @@ def normalize_attribute(value: Any) -> str | float | None:
     if isinstance(value, str):
         return _decode_text(value.encode("utf-8", "replace"))
     if isinstance(value, bool | np.bool_ | int | np.integer):
-        return int(value) if _INTEGER_MIN <= int(value) <= _INTEGER_MAX else None
+        return int(value) if INTEGER_MIN <= int(value) <= INTEGER_MAX else None
     if isinstance(value, float | np.floating):
         return float(value)
     if isinstance(value, datetime.date | datetime.time):
@@ -173,7 +173,11 @@ def _decode_text(value: bytes) -> str:
 
 def normalize_attributes(values: dict[str, Any]) -> Attributes:
     """Return those attributes that are text or numbers."""
-    converted = {name: normalize_attribute(value) for name, value in values.items() if name and name.isprintable()}
+    converted = {
+        name: normalize_attribute(value)
+        for name, value in values.items()
+        if 0 < len(name) <= KEY_MAX and name.isprintable()
+    }
     return {name: value for name, value in converted.items() if value is not None}
 
 

@@ -55,6 +55,8 @@ CASES = {
     "an open string": ('a = 1\nb = "x\n', ", line 2, column 7: got Illegal character"),
     "no UTF-8": (b"a = 1\nb = '\xff'\n", r", line 2: got b'\\xff', expected TOML in UTF-8"),
     "digits": (f"a = {'1' * 5000}", "got an integer of more digits, expected integers of 64 bits"),
+    "65 bits": (f"a = {2**64}", "got an integer of more digits, expected integers of 64 bits"),
+    "65 bits with a sign": (f"a = {-(2**63) - 1}", "got an integer of more digits, expected integers of 64 bits"),
     "hexadecimal digits": (f"a = {{ b = [0x{'f' * 5000}] }}", r"a\.b\[0\]: got an integer of more digits"),
     "lists": (f"a = {'[' * 5000}", "got deeper nesting"),
     "deep lists": ("a = " + "[" * DEPTH_MAX + "]" * DEPTH_MAX, "got deeper nesting"),
@@ -81,10 +83,10 @@ def test_files_within_the_bounds_are_read(tmp_path):
     path = tmp_path / "file.toml"
     depth = DEPTH_MAX - 1
     secret = ".".join("a" * 100)
-    path.write_text(f"\ufeffa = {'[' * depth}{2**63 - 1}{']' * depth}\nsecret = '{secret}'\n", encoding="utf-8")
+    path.write_text(f"\ufeffa = {'[' * depth}{2**64 - 1}{']' * depth}\nsecret = '{secret}'\n", encoding="utf-8")
     table = read_toml(path)
     assert table["secret"] == secret
-    assert str(table["a"]).strip("[]") == str(2**63 - 1)
+    assert str(table["a"]).strip("[]") == str(2**64 - 1)
 
 
 def test_a_pipe_that_takes_the_name_before_it_is_opened_is_not_waited_for(tmp_path, monkeypatch):
