@@ -6,10 +6,10 @@ from typing import get_args
 from pydantic.json_schema import models_json_schema
 
 from optodrive.core.types.policy import Policy
+from optodrive.daemon.api.openapi_bodies import LIVE_FRAME_SCHEMA
 from optodrive.daemon.responses.hold import HoldReport
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.responses.telemetry import EVENTS
-from optodrive.daemon.web.openapi_bodies import LIVE_FRAME_SCHEMA
 
 REF_TEMPLATE = "#/components/schemas/{model}"
 BINARY_FRAME = "ODF1, a u32 frame number, and one u16 height per pixel in 0.1 µm, little-endian"

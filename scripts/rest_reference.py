@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from optodrive.core.toml_model import Section
+from optodrive.daemon.api.app import build_app
+from optodrive.daemon.api.daemon_client import DaemonClient
+from optodrive.daemon.api.openapi import ERROR_RESPONSES
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.daemon.web.api import build_app
-from optodrive.daemon.web.daemon_client import DaemonClient
-from optodrive.daemon.web.openapi import ERROR_RESPONSES
 from optodrive.device import config_sections
 from optodrive.device.config_file import load_config
 from optodrive.planning import effective_config

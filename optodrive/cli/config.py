@@ -100,7 +100,7 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
 
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Check a configuration file and the files that it names. Tokens are checked only for the daemon's user."""
-    from optodrive.daemon.web.tokens import read_private_tokens
+    from optodrive.daemon.api.tokens import read_private_tokens
     from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
 

@@ -18,7 +18,7 @@ from optodrive.cli.redaction import Redaction
 from optodrive.cli.service_files import CONFIG_PATH, UNIT_PATH
 from optodrive.core.errors import OptodriveError
 from optodrive.core.files import read_last_lines
-from optodrive.daemon.web.tokens import (
+from optodrive.daemon.api.tokens import (
     ENVIRONMENT_VARIABLE,
     FILE_ENVIRONMENT_VARIABLE,
     SERVICE_TOKENS,

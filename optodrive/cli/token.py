@@ -43,8 +43,8 @@ def add(
     """Add a token with a random secret, which is shown once on the terminal or written to a file for its holder."""
     from optodrive.core.errors import suggest_nearest
     from optodrive.core.files import check_output
-    from optodrive.daemon.web.roles import ROLES
-    from optodrive.daemon.web.token_file import add_token, create_token, write_holder_file
+    from optodrive.daemon.api.roles import ROLES
+    from optodrive.daemon.api.token_file import add_token, create_token, write_holder_file
 
     known = {each: each for each in ROLES}
     if role not in known:
@@ -73,7 +73,7 @@ def add(
 
 def list_tokens(file: FileOption = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """List names and roles, without secrets."""
-    from optodrive.daemon.web.tokens import read_private_tokens
+    from optodrive.daemon.api.tokens import read_private_tokens
 
     tokens = read_private_tokens(_locate(file, config)).all
     if json:
@@ -85,7 +85,7 @@ def list_tokens(file: FileOption = None, config: ConfigOption = None, json: Json
 
 def revoke(name: NameArgument, file: FileOption = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Remove a token. A reload ends everything begun with it at once, also while the board is armed."""
-    from optodrive.daemon.web.token_file import remove_token
+    from optodrive.daemon.api.token_file import remove_token
 
     path = _locate(file, config)
     token = remove_token(path, name)
@@ -95,7 +95,7 @@ def revoke(name: NameArgument, file: FileOption = None, config: ConfigOption = N
 
 
 def _locate(file: Path | None, config: str | None) -> Path:
-    from optodrive.daemon.web.tokens import SERVICE_TOKENS
+    from optodrive.daemon.api.tokens import SERVICE_TOKENS
     from optodrive.device.config_file import load_config
 
     if file is not None:

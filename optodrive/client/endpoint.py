@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from optodrive.core.errors import InputError, LinkError
-from optodrive.daemon.web.tokens import read_token
+from optodrive.daemon.api.tokens import read_token
 
 DEFAULT_URL = "http://127.0.0.1:8450"
 URL_ENVIRONMENT_VARIABLE = "OPTODRIVE_URL"

@@ -15,8 +15,8 @@ from optodrive.core.errors import (
     RefusedError,
     StoppedError,
 )
+from optodrive.daemon.api.tokens import ENVIRONMENT_VARIABLE
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.web.tokens import ENVIRONMENT_VARIABLE
 
 INPUT_ERROR_STATUSES = (400, 404, 413, 422)
 ERROR_BY_CODE: dict[str, type[OptodriveError]] = {

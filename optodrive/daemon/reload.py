@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from optodrive.core.errors import NotReadyError
-from optodrive.daemon.web.tokens import Token, Tokens, read_private_tokens
+from optodrive.daemon.api.tokens import Token, Tokens, read_private_tokens
 from optodrive.device.config import Config
 from optodrive.device.config_sections import DaemonSection
 from optodrive.link.protocol.states import LEASED_STATES

@@ -25,8 +25,8 @@ def load():
     import optodrive.cli.main
     import optodrive.daemon.engine.planner_process
     import optodrive.daemon.preview.process
+    import optodrive.daemon.server.web_process
     import optodrive.daemon.supervisor.daemon
-    import optodrive.daemon.web.web_process
     import optodrive.link.simulator.board_process  # noqa: F401
     from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel

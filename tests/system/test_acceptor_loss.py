@@ -10,14 +10,14 @@ import pytest
 from optodrive.core.beat import BeatWriter
 from optodrive.core.ipc import IpcError, MessageSocket
 from optodrive.core.unix_listener import open_unix_listener
+from optodrive.daemon.api.access_policy import AccessPolicy
+from optodrive.daemon.api.daemon_client import DaemonClient
+from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.daemon.web import acceptor_client
-from optodrive.daemon.web.acceptor_client import AcceptorClient
-from optodrive.daemon.web.acceptor_protocol import BEAT
-from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.daemon_client import DaemonClient
-from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.daemon.web.web_process import WebProcess
+from optodrive.daemon.server import acceptor_client
+from optodrive.daemon.server.acceptor_client import AcceptorClient
+from optodrive.daemon.server.acceptor_protocol import BEAT
+from optodrive.daemon.server.web_process import WebProcess
 from optodrive.device.config_file import load_config
 from optodrive.device.config_sections import DaemonSection
 from optodrive.planning.display_model import DisplayModel

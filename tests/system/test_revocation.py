@@ -8,7 +8,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from optodrive.cli.main import run
-from optodrive.daemon.web.tokens import read_private_tokens
+from optodrive.daemon.api.tokens import read_private_tokens
 from rig import TOKEN, long_train, wait_for
 from service_manager import Manager, reload
 

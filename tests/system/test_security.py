@@ -17,14 +17,14 @@ from websockets.sync.client import connect
 from forked_process import run_process
 from optodrive.client import AsyncDisplay, Display
 from optodrive.core.errors import NotReadyError, RefusedError
+from optodrive.daemon.api.access_policy import AccessPolicy
+from optodrive.daemon.api.app import build_app
+from optodrive.daemon.api.daemon_client import DaemonClient
+from optodrive.daemon.api.roles import ROLES
+from optodrive.daemon.api.route_table import ARMING, STOP, RouteTable
+from optodrive.daemon.api.static_files import LOGIN_PATHS, is_page_request
+from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.api import build_app
-from optodrive.daemon.web.daemon_client import DaemonClient
-from optodrive.daemon.web.roles import ROLES
-from optodrive.daemon.web.route_table import ARMING, STOP, RouteTable
-from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
-from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, read_role_tokens, wait_for

@@ -12,15 +12,15 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from optodrive.core.beat import BeatWriter
-from optodrive.daemon.web import bounded_websocket, connections
-from optodrive.daemon.web.acceptor import Acceptor
-from optodrive.daemon.web.acceptor_client import AcceptorClient
-from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.listeners import open_tcp_listener
-from optodrive.daemon.web.request_head import peek_head
-from optodrive.daemon.web.server_state import ARRIVED_S, CALLER, EARLIEST_S
-from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
-from optodrive.daemon.web.web_server import Server
+from optodrive.daemon.api.access_policy import AccessPolicy
+from optodrive.daemon.api.scope_keys import ARRIVED_S, CALLER, EARLIEST_S
+from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
+from optodrive.daemon.server import bounded_websocket, connections
+from optodrive.daemon.server.acceptor import Acceptor
+from optodrive.daemon.server.acceptor_client import AcceptorClient
+from optodrive.daemon.server.listeners import open_tcp_listener
+from optodrive.daemon.server.request_head import peek_head
+from optodrive.daemon.server.web_server import Server
 from optodrive.device.config_sections import DaemonSection
 from rig import wait_for
 

@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
 from optodrive.core.unix_listener import open_unix_listener
+from optodrive.daemon.api.roles import PERMISSIONS, ROLES
+from optodrive.daemon.api.tokens import Tokens, load_daemon_tokens
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.priority import raise_priority
 from optodrive.daemon.reload import ConfigReloader
 from optodrive.daemon.runtime_folder import SHARED_LINK_MODE, RuntimeFolder, open_runtime_folder
+from optodrive.daemon.server.listeners import BACKLOG, build_local_url, open_tcp_listener
 from optodrive.daemon.supervisor.child import Child
 from optodrive.daemon.supervisor.forking import execute_module, fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.reload_handler import ReloadHandler
 from optodrive.daemon.supervisor.supervisor import Supervisor
-from optodrive.daemon.web.listeners import BACKLOG, build_local_url, open_tcp_listener
-from optodrive.daemon.web.roles import PERMISSIONS, ROLES
-from optodrive.daemon.web.tokens import Tokens, load_daemon_tokens
 from optodrive.device.config import Config
 from optodrive.device.config_sections import DaemonSection
 from optodrive.link.board_setup import build_port_settings
@@ -146,8 +146,8 @@ def _build_starts(
     from optodrive.daemon.engine.planner_process import run_planner
     from optodrive.daemon.engine.thermal_memory import ThermalMemory
     from optodrive.daemon.preview.process import run_preview
-    from optodrive.daemon.web.acceptor import run_acceptor
-    from optodrive.daemon.web.web_process import run_web
+    from optodrive.daemon.server.acceptor import run_acceptor
+    from optodrive.daemon.server.web_process import run_web
 
     memory = ThermalMemory()
 

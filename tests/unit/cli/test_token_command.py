@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.daemon.web.tokens import read_private_tokens
+from optodrive.daemon.api.tokens import read_private_tokens
 
 TEXT = """# tokens of the laboratory
 format = "optodrive-tokens"

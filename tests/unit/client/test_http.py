@@ -31,9 +31,9 @@ from optodrive.core.errors import (
     OverBudgetError,
     RefusedError,
 )
+from optodrive.daemon.api.error_handlers import build_error_problem
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.problem import build_problem
-from optodrive.daemon.web.error_handlers import build_error_problem
 
 HEALTH = ApiRequest("GET", "/v1/health", HealthReport, idempotent=True)
 PUSH = build_push_request({}, "trim", "as_is", dry_run=False)

@@ -1,0 +1,198 @@
+"""The access policy: which Host, Origin, token, role, rate and body size a request needs.
+
+The checks run in that order, before any route. STOP needs a token of any role; its rate and body are not checked.
+"""
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from optodrive.daemon.api.audit import AuditLog
+from optodrive.daemon.api.rate_limit import RateLimiter
+from optodrive.daemon.api.refusal_audit import RefusalAudit
+from optodrive.daemon.api.revocation import RequestsInProgress
+from optodrive.daemon.api.roles import is_role_sufficient
+from optodrive.daemon.api.route_table import STOP, Route, RouteTable
+from optodrive.daemon.api.socket_token import is_websocket_request, read_subprotocol_token
+from optodrive.daemon.api.static_files import is_page_request, read_cookie_token
+from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
+from optodrive.daemon.responses.problem import Problem, build_problem
+from optodrive.device.config_sections import DaemonSection
+
+LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
+DEFAULT_PORTS = {"http": "80", "https": "443"}
+AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:/?#@\s]+)(?::([0-9]{0,5}))?")
+TEXT_MAX = 100
+
+
+@dataclass
+class RequestContext:
+    """A request as far as the policy has identified it: its headers, address, token and route."""
+
+    method: str
+    path: str
+    headers: dict[str, str]
+    address: str
+    token: Token = ANONYMOUS
+    route: Route | None = None
+
+    @property
+    def audit_fields(self) -> dict[str, object]:
+        """Fields for the audit log: the caller, its address and the call."""
+        return {
+            "name": self.token.name,
+            "role": self.token.role if self.token.secret else None,
+            "address": self.address,
+            "call": f"{self.method} {self.path[:200]}",
+        }
+
+    @property
+    def provenance(self) -> dict[str, object]:
+        """Fields for the audit log of a refusal: the Host and Origin that the request states, if it does."""
+        return {name: self.headers[name][:TEXT_MAX] for name in ("host", "origin") if name in self.headers}
+
+
+class AccessPolicy:
+    """The tokens and limits that requests are checked against, and the audit log.
+
+    Tokens and limits may be replaced at run time. now_s: monotonic clock; in_progress: requests that were accepted.
+    """
+
+    def __init__(
+        self,
+        tokens: Tokens,
+        daemon: DaemonSection,
+        audit: AuditLog | None = None,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.audit = audit
+        self.refusals = RefusalAudit(audit, now_s)
+        self.in_progress = RequestsInProgress()
+        self.tokens = Tokens(())
+        self._now_s = now_s
+        self.update(tokens, daemon)
+
+    def update(self, tokens: Tokens, daemon: DaemonSection) -> tuple[Token, ...]:
+        """Replace the tokens and limits. Every caller's rate limit starts anew. Return the tokens that are revoked."""
+        revoked, self.tokens = self.tokens.find_revoked(tokens), tokens
+        self.body_max_bytes = daemon.body_max_bytes
+        self._hosts = {*LOOPBACK_NAMES, *daemon.hosts}
+        self._rate_limiter = RateLimiter(daemon.requests_per_s, daemon.requests_burst)
+        return revoked
+
+    def is_revoked(self, token: Token) -> bool:
+        """Return whether a token that was accepted is no longer valid."""
+        return token is not ANONYMOUS and token not in self.tokens.all
+
+    def check(self, request: RequestContext, table: RouteTable) -> Problem | None:
+        """Identify token and route of a request. Return why it is refused, or None if it is accepted."""
+        problem = self._check_host_and_origin(request)
+        if problem is not None:
+            return problem
+        route = table.find(request.method, request.path)
+        is_stop = route is not None and route.key == STOP
+        if route is None or route.min_role is not None:
+            token = self.find_token(request)
+            if token is None:
+                rate_problem = None if is_stop else self._check_rate(request)
+                return rate_problem or build_problem(
+                    401, "bad_token", "Not authorised", "a bearer token is required; the daemon wrote it to a file"
+                )
+            request.token = token
+        request.route = route
+        if is_stop:
+            return None
+        return self._check_rate(request) or self._check_route(request, table) or self._check_size(request)
+
+    def find_token(self, request: RequestContext) -> Token | None:
+        """Return the valid token that a request presents, None if there is none."""
+        return self.tokens.find(_read_presented_token(request))
+
+    def permits_stop(self, request: RequestContext) -> bool:
+        """Return whether `check` accepts this request if it is for STOP, which needs a token of any role."""
+        return self._check_host_and_origin(request) is None and self.find_token(request) is not None
+
+    def acquire_frame(self, request: RequestContext) -> float:
+        """Count one streamed frame against the caller's rate, and return the time to wait first, s."""
+        return self._rate_limiter.acquire((request.token.name, request.address, "frames"), self._now_s())
+
+    def _check_host_and_origin(self, request: RequestContext) -> Problem | None:
+        host = request.headers.get("host", "")
+        own = _parse_authority(host)
+        if own is None or own.name not in self._hosts:
+            detail = (
+                f"this daemon does not answer to host {host[:TEXT_MAX]!r}: "
+                "its names besides loopback are those in daemon.hosts of the configuration"
+            )
+            return build_problem(421, "host_not_allowed", "Misdirected request", detail)
+        origin = request.headers.get("origin")
+        if origin is not None and not _is_same_origin(origin, own):
+            detail = f"requests from origin {origin[:TEXT_MAX]!r} are not answered"
+            return build_problem(403, "origin_not_allowed", "Origin not allowed", detail)
+        return None
+
+    def _check_rate(self, request: RequestContext) -> Problem | None:
+        wait_s = self._rate_limiter.acquire((request.token.name, request.address), self._now_s())
+        if wait_s <= 0.0:
+            return None
+        detail = f"this caller exceeds its request rate; retry in {wait_s:.3f} s"
+        return build_problem(429, "too_many_requests", "Too many requests", detail, retry_after_s=round(wait_s, 3))
+
+    def _check_route(self, request: RequestContext, table: RouteTable) -> Problem | None:
+        method_and_path = f"{request.method} {request.path}"
+        if request.route is None:
+            methods = table.find_methods(request.path)
+            if methods:
+                return build_problem(
+                    405, "method_not_allowed", "Method Not Allowed", method_and_path, allow=", ".join(methods)
+                )
+            return build_problem(404, "route_not_found", "Not Found", method_and_path)
+        token, min_role = request.token, request.route.min_role
+        if min_role is not None and not is_role_sufficient(token.role, min_role):
+            detail = (
+                f"{method_and_path} requires a token of role {min_role}; token {token.name!r} has role {token.role}"
+            )
+            return build_problem(403, "insufficient_role", "Forbidden", detail, role=token.role, required_role=min_role)
+        return None
+
+    def _check_size(self, request: RequestContext) -> Problem | None:
+        length = request.headers.get("content-length", "0")
+        limit = self.body_max_bytes
+        if length.isdigit() and int(length) <= limit:
+            return None
+        detail = f"content-length: got {length[:20]}, expected at most {limit} bytes"
+        return build_problem(413, "body_too_large", "Body too large", detail)
+
+
+def _read_presented_token(request: RequestContext) -> str:
+    scheme, _, credentials = request.headers.get("authorization", "").partition(" ")
+    if not scheme and is_page_request(request.method, request.path):
+        return read_cookie_token(request.headers)
+    if not scheme and is_websocket_request(request.headers):
+        return read_subprotocol_token(request.headers)
+    return credentials.strip() if scheme.lower() == "bearer" else ""
+
+
+class _Authority(NamedTuple):
+    name: str
+    port: str
+
+
+def _parse_authority(text: str) -> _Authority | None:
+    match = AUTHORITY.fullmatch(text.strip().lower())
+    return None if match is None else _Authority(match[1], match[2] or "")
+
+
+def _is_same_origin(origin: str, own: _Authority) -> bool:
+    """Return whether an Origin is the one at which the browser found this daemon, as its Host header states.
+
+    https is possible only behind a proxy, for one of the configured names.
+    """
+    scheme, _, text = origin.strip().lower().partition("://")
+    authority = _parse_authority(text)
+    if authority is None or scheme not in DEFAULT_PORTS or (scheme == "https" and own.name in LOOPBACK_NAMES):
+        return False
+    default = DEFAULT_PORTS[scheme]
+    return authority.name == own.name and (authority.port or default) == (own.port or default)

@@ -1,0 +1,52 @@
+"""Problem documents for errors that routes and the framework raise."""
+
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from starlette.exceptions import HTTPException
+
+from optodrive.core.errors import BusyError, OptodriveError
+from optodrive.daemon.api.request_limits import BodyTooLargeError
+from optodrive.daemon.responses.error_problem import build_error_problem
+from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
+
+
+def add_error_handlers(app: FastAPI) -> None:
+    """Answer every error with a problem document."""
+
+    def handles(kind: type[Exception]) -> Callable[[Callable[[Request, Any], Awaitable[Response]]], None]:
+        return lambda handler: app.add_exception_handler(kind, handler)
+
+    @handles(OptodriveError)
+    async def handle_optodrive_error(request: Request, error: OptodriveError) -> Response:
+        return _build_response(build_error_problem(error))
+
+    @handles(RequestValidationError)
+    async def handle_validation_error(request: Request, error: RequestValidationError) -> Response:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        return _build_response(build_problem(422, "bad_input", "Bad input", f"{where}: {first['msg']}", where=where))
+
+    @handles(HTTPException)
+    async def handle_http_error(request: Request, error: HTTPException) -> Response:
+        code = {404: "route_not_found", 405: "method_not_allowed"}.get(error.status_code, "http_error")
+        detail = f"{request.method} {request.url.path}"
+        return _build_response(build_problem(error.status_code, code, str(error.detail), detail))
+
+    @handles(BodyTooLargeError)
+    async def handle_body_too_large(request: Request, error: BodyTooLargeError) -> Response:
+        detail = "the body exceeds the maximum size"
+        response = _build_response(build_problem(413, "body_too_large", "Body too large", detail))
+        response.headers["Connection"] = "close"  # the rest of its body may follow
+        return response
+
+    @handles(MemoryError)
+    async def handle_memory_error(request: Request, error: MemoryError) -> Response:
+        return _build_response(build_error_problem(BusyError("not enough memory for this request; try again later")))
+
+
+def _build_response(problem: Problem) -> Response:
+    return Response(problem.to_json(), status_code=problem.status, media_type=MEDIA_TYPE)

@@ -1,0 +1,180 @@
+"""Streamed frames over a WebSocket: the newest frame wins, and the client gets the result of every frame."""
+
+import asyncio
+from typing import NamedTuple
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from optodrive.core.errors import BusyError, OptodriveError
+from optodrive.core.ipc import Message
+from optodrive.core.types.policy import Policy
+from optodrive.daemon.api.daemon_client import DaemonClient, PushFields
+from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
+from optodrive.daemon.api.socket_token import select_subprotocol
+from optodrive.daemon.responses.error_problem import build_error_problem
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.problem import Problem
+from optodrive.daemon.responses.stream import FrameResult
+from optodrive.planning.stimuli.sequence_codec import encode_sequence
+from optodrive.planning.stimuli.streamed_frame import parse_live_frame
+
+OUTBOX_MAX = 1000
+"""A client with this number of unread results is disconnected."""
+CLOSE_SLOW_READER = 1013
+FRAME_AGE_MAX_S = 2.0
+"""Longest time for which a frame may have waited in the socket: a backlog would light after its client has stopped."""
+
+
+class _Frame(NamedTuple):
+    number: int
+    sequence: bytes
+    arrived_s: float
+    epoch: int
+
+
+class LiveStream:
+    """Stream of one client. A new frame replaces one that waits for the planner, and all unsent pulses.
+
+    caller: name of the client's token
+    """
+
+    def __init__(self, daemon: DaemonClient, socket: WebSocket, policy: Policy, caller: str) -> None:
+        self._daemon = daemon
+        self._socket = socket
+        self._policy = policy
+        self._caller = caller
+        self._pixels = len(daemon.display.layout)
+        self._next_number = 0
+        self._pending: _Frame | None = None
+        self._arrived = asyncio.Event()
+        self._outbox: asyncio.Queue[FrameResult] = asyncio.Queue(OUTBOX_MAX)
+        self._watchers: set[asyncio.Task[None]] = set()
+        self._last_watcher: asyncio.Task[None] | None = None
+        self._last_epoch = 0
+
+    async def run(self) -> None:
+        """Serve until the client disconnects. Then drop the unsent pulses of the last frame."""
+        await self._socket.accept(select_subprotocol(self._socket.scope))
+        tasks = [asyncio.create_task(work()) for work in (self._read, self._plan, self._write)]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            if self._last_watcher is not None and not self._last_watcher.done():
+                # First, because this coroutine may be cancelled at its next await.
+                self._daemon.planner.end_stream(self._last_epoch, self._caller)
+            for task in (*tasks, *self._watchers):
+                task.cancel()
+            await asyncio.gather(*tasks, *self._watchers, return_exceptions=True)
+
+    async def _read(self) -> None:
+        while True:
+            message = await self._socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            data: str | bytes = message.get("text") or message.get("bytes") or b""
+            try:
+                self._require_recent(message[EARLIEST_S])
+                epoch = self._daemon.link.require_epoch_at(message[EARLIEST_S])
+                number, sequence = parse_live_frame(data, self._next_number, self._pixels)
+                frame = _Frame(number, encode_sequence(sequence), message[ARRIVED_S], epoch)
+            except OptodriveError as error:
+                self._publish(FrameResult(frame=None, status="refused", problem=build_error_problem(error)))
+                continue
+            if self._pending is not None:
+                self._publish(
+                    FrameResult(frame=self._pending.number, status=PlanStatus.SUPERSEDED, superseded_by=number)
+                )
+            self._pending, self._next_number = frame, number + 1
+            self._arrived.set()
+
+    def _require_recent(self, earliest_s: float) -> None:
+        """Raise BusyError for a frame that may have arrived earlier than permitted."""
+        age_s = asyncio.get_running_loop().time() - earliest_s
+        if age_s > FRAME_AGE_MAX_S:
+            raise BusyError(f"the frame may have waited for {age_s:.3g} s, expected at most {FRAME_AGE_MAX_S:g} s")
+
+    async def _plan(self) -> None:
+        while True:
+            await self._arrived.wait()
+            self._arrived.clear()
+            assert self._pending is not None  # noqa: S101 - set before the event
+            frame, self._pending = self._pending, None
+            push = PushFields(
+                name=f"frame {frame.number}",
+                policy=self._policy,
+                fit="as_is",
+                streamed=True,
+                arrived_s=frame.arrived_s,
+                epoch=frame.epoch,
+                caller=self._caller,
+                lists_pulses=False,
+            )
+            try:
+                result = await self._daemon.planner.submit(frame.sequence, push)
+            except OptodriveError as error:
+                self._refuse(frame.number, build_error_problem(error))
+                continue
+            if result.fields["status"] >= 400:
+                self._refuse(frame.number, Problem.model_validate_json(result.payload))
+                continue
+            self._follow(frame, result)
+
+    def _refuse(self, number: int, problem: Problem) -> None:
+        self._publish(FrameResult(frame=number, status="refused", problem=problem))
+
+    def _follow(self, frame: _Frame, result: Message) -> None:
+        """Publish that a frame is planned, and its end when that comes."""
+        report = PlanReport.model_validate_json(result.payload)
+        self._publish(_report_planned(frame.number, report))
+        watcher = asyncio.create_task(self._watch(frame.number, report.plan))
+        self._last_watcher, self._last_epoch = watcher, frame.epoch
+        self._watchers.add(watcher)
+        watcher.add_done_callback(self._watchers.discard)
+
+    async def _watch(self, number: int, plan: str) -> None:
+        try:
+            report = await self._daemon.planner.wait_for_end(plan)
+        except OptodriveError as error:
+            self._publish(FrameResult(frame=number, status=PlanStatus.FAILED, plan=plan, error=str(error)))
+            return
+        self._publish(_report_ended(number, report))
+
+    def _publish(self, result: FrameResult) -> None:
+        try:
+            self._outbox.put_nowait(result)
+        except asyncio.QueueFull:
+            self._arrived.clear()
+            raise WebSocketDisconnect(CLOSE_SLOW_READER) from None
+
+    async def _write(self) -> None:
+        while True:
+            await self._socket.send_text((await self._outbox.get()).to_json())
+
+
+def _report_planned(number: int, report: PlanReport) -> FrameResult:
+    return FrameResult(
+        frame=number,
+        status=PlanStatus.PLANNED,
+        plan=report.plan,
+        pulses=report.planned,
+        skipped=len(report.summary.skipped),
+        trimmed=report.summary.trimmed.pulses,
+        starts_in_s=report.starts_in_s,
+        duration_s=report.summary.duration_s,
+        latency=report.latency,
+    )
+
+
+def _report_ended(number: int, report: PlanReport) -> FrameResult:
+    return FrameResult(
+        frame=number,
+        status=report.status,
+        plan=report.plan,
+        error=report.error,
+        planned=report.planned,
+        executed=report.executed,
+        dropped=report.dropped,
+        simulated_max_um=report.simulated_max_um,
+        latency=report.latency,
+    )

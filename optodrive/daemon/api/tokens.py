@@ -1,0 +1,176 @@
+"""The tokens of a daemon, one or more per role: read from a file, or created in a file that only its user can read."""
+
+import json
+import os
+import re
+import secrets
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from optodrive.core.errors import InputError
+from optodrive.core.toml_file import read_toml
+from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.daemon.api.roles import PERMISSIONS, ROLES, Role
+
+ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
+FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"
+ALLOWED_PATTERN = r"^[!-~]{16,200}$"
+NAME_PATTERN = r"^[\w.@ -]{1,40}$"
+EXPECTED_VALUES = {
+    "name": "1 to 40 letters, digits, spaces or any of . _ @ -",
+    "role": f"one of {', '.join(ROLES)}",
+    "secret": "16 to 200 letters, digits or signs, no spaces",
+}
+"""What each key of a token holds."""
+SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
+FORMAT = "optodrive-tokens"
+VERSION = 1
+FILE_MAX_BYTES = 64_000
+"""Largest size of a file of tokens, bytes: several hundred, which one message to the web process holds."""
+
+
+@dataclass(frozen=True)
+class Token:
+    """A secret with the name of its holder and its role."""
+
+    name: str
+    role: Role
+    secret: str = field(repr=False)
+
+
+ANONYMOUS = Token("", "viewer", "")
+"""In place of a token, of a request that presents none."""
+
+
+class Tokens:
+    """The tokens of a daemon."""
+
+    def __init__(self, tokens: Iterable[Token]) -> None:
+        self.all = tuple(tokens)
+        self._secrets = [(token.secret.encode(), token) for token in self.all]
+
+    def find(self, presented: str) -> Token | None:
+        """Return the presented token, None if it is unknown. The time does not depend on which token matches."""
+        presented_bytes = presented.encode()
+        found = None
+        for secret, token in self._secrets:
+            if secrets.compare_digest(presented_bytes, secret):
+                found = token
+        return found
+
+    def find_revoked(self, new: "Tokens") -> tuple[Token, ...]:
+        """Return the tokens that new ones lack: removed, or with another name, role or secret."""
+        return tuple(token for token in self.all if token not in new.all)
+
+    @property
+    def highest_role(self) -> Token:
+        """The token with the highest role."""
+        return max(self.all, key=lambda token: ROLES.index(token.role))
+
+
+class _TokenEntry(Section):
+    name: Annotated[str, Field(pattern=NAME_PATTERN)]
+    role: Role
+    secret: Annotated[str, Field(pattern=ALLOWED_PATTERN)]
+
+
+class _TokensFile(Section):
+    format: Literal["optodrive-tokens"]
+    version: Literal[1]
+    token: Annotated[tuple[_TokenEntry, ...], Field(min_length=1)]
+
+
+def build_tokens_path(port: int) -> Path:
+    """Build the default path of the tokens of the daemon on a TCP port."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
+    return Path(runtime) / "optodrive" / f"token-{port}"
+
+
+def read_tokens(path: Path, *, private: bool = False) -> Tokens:
+    """Read the tokens of a file.
+
+    Raise InputError, which never contains a secret, if the file is unreadable or invalid.
+    private: refuse a file that others than its owner can read
+    """
+    table = read_toml(path, FILE_MAX_BYTES, private=private)
+    check_format(path, table, FORMAT, VERSION)
+    try:
+        entries = _TokensFile.model_validate(table).token
+    except ValidationError as error:
+        named = build_input_error(error, str(path), _TokensFile)
+        if named.value is None or named.code == "unknown_key":
+            raise named from None
+        expected = EXPECTED_VALUES.get(named.where.rpartition(".")[2], named.expected)
+        raise InputError(named.where, "a value that is not shown", expected) from None
+    for key in ("name", "secret"):
+        if len({getattr(entry, key) for entry in entries}) < len(entries):
+            raise InputError(f"{path}: token", f"a {key} twice", "each once")
+    return Tokens(Token(entry.name, entry.role, entry.secret) for entry in entries)
+
+
+def read_private_tokens(path: Path) -> Tokens:
+    """Read a daemon's own tokens. Raise InputError if others than the file's owner can read them."""
+    return read_tokens(path, private=True)
+
+
+def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
+    """Create a random token per role in a new file of mode 0600.
+
+    armer_secret: the armer's secret, random if None or empty. InputError if it is invalid (its text is not shown) or
+    the file cannot be created.
+    """
+    if armer_secret and not re.fullmatch(ALLOWED_PATTERN, armer_secret):
+        raise InputError(ENVIRONMENT_VARIABLE, "a value that is not shown", EXPECTED_VALUES["secret"])
+    tokens = Tokens(
+        Token(role, role, armer_secret if armer_secret and role == "armer" else secrets.token_urlsafe(32))
+        for role in ROLES
+    )
+    lines = [f'format = "{FORMAT}"\nversion = {VERSION}\n']
+    lines += [
+        f'\n[[token]] # {PERMISSIONS[t.role]}\nname = "{t.name}"\nrole = "{t.role}"\nsecret = {json.dumps(t.secret)}\n'
+        for t in tokens.all
+    ]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        path.unlink(missing_ok=True)
+        path.touch(mode=0o600, exist_ok=False)
+        path.write_text("".join(lines), encoding="utf-8")
+    except OSError as error:
+        raise InputError(str(path), error.strerror, "a writable path for the daemon's tokens") from None
+    return tokens
+
+
+def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
+    """Load a daemon's tokens and return them with the path of their file.
+
+    tokens_file: a file that persists, created if it does not exist; if empty, the daemon gets new tokens in the default
+    file.
+    """
+    if tokens_file:
+        path = Path(tokens_file)
+        return (read_private_tokens(path) if os.path.lexists(path) else create_tokens(path)), path
+    path = build_tokens_path(port)
+    return create_tokens(path, os.environ.get(ENVIRONMENT_VARIABLE)), path
+
+
+def read_token(port: int | None) -> str:
+    """Read the token with the highest role for a daemon on a TCP port. Raise InputError if none is readable.
+
+    port: None for a daemon on a Unix socket
+    """
+    secret = os.environ.get(ENVIRONMENT_VARIABLE)
+    if secret:
+        return secret
+    file_name = os.environ.get(FILE_ENVIRONMENT_VARIABLE)
+    own_paths = [] if port is None else [build_tokens_path(port)]
+    candidates = [Path(file_name)] if file_name else [*own_paths, SERVICE_TOKENS]
+    for path in candidates:
+        if os.access(path, os.R_OK):
+            return read_tokens(path).highest_role.secret
+    listed = " or ".join(str(path) for path in candidates)
+    expected = f"a token: set it, name a file of tokens by {FILE_ENVIRONMENT_VARIABLE}, or make {listed} readable"
+    raise InputError(ENVIRONMENT_VARIABLE, None, expected)

@@ -1,0 +1,276 @@
+"""The acceptor process: accepts connections, sends STOP to the link process at once, and hands over to the web process.
+
+It works for no caller: it accepts, looks at the heads of requests and orders them, a bounded number per turn. So it may
+run in real time, and STOP reaches the board no matter what the web process does. The web process then serves the same
+request as any other: it answers, and writes the audit log.
+"""
+
+import os
+import select
+import signal
+import socket
+import time
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.ipc import IpcError, Message, MessageSocket
+from optodrive.core.scheduling import LIGHT, set_realtime_priority
+from optodrive.core.unix_listener import open_unix_listener
+from optodrive.daemon.api.access_policy import AccessPolicy
+from optodrive.daemon.api.reload_message import apply_reload
+from optodrive.daemon.api.tokens import Tokens
+from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.daemon.server.acceptor_protocol import BEAT, decode_permission, send_connection
+from optodrive.daemon.server.listeners import raise_descriptor_limit
+from optodrive.daemon.server.request_head import Rank, parse_head, peek_head, rank_request
+from optodrive.daemon.server.waiting_room import Waiting, WaitingRoom
+from optodrive.device.config_sections import DaemonSection
+
+TURN_MAX_S = 0.05
+"""Interval of the beats, and longest wait of the loop."""
+BUSY_PAUSE_S = 0.003
+"""Pause after a turn that left something to accept: real-time work must leave time for the other processes."""
+RETRY_S = 0.1
+NICE = -15
+"""Priority where real-time scheduling is not permitted."""
+
+
+def run_acceptor(
+    folder: RuntimeFolder, beat: BeatWriter, listeners: list[socket.socket], tokens: Tokens, daemon: DaemonSection
+) -> None:
+    """Keep the acceptor until SIGTERM or the end of the supervisor. listeners: sockets that listen already."""
+    with suppress(OSError):  # not permitted to every user
+        os.setpriority(os.PRIO_PROCESS, 0, NICE)
+    set_realtime_priority(LIGHT)
+    raise_descriptor_limit()
+    acceptor = Acceptor(
+        listeners, AccessPolicy(tokens, daemon), daemon, folder.acceptor_socket, folder.link_socket, beat
+    )
+    signal.signal(signal.SIGTERM, lambda number, frame: acceptor.end())
+    try:
+        acceptor.run()
+    finally:
+        acceptor.close()
+
+
+class StopSender:
+    """Connection to the link process, for STOP only. It connects again when it is due."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._connection: MessageSocket | None = None
+        self._connect_at_s = 0.0
+        self._number = 0
+
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when `receive` has something to do, −1 without a connection."""
+        return -1 if self._connection is None else self._connection.fileno()
+
+    def send(self) -> None:
+        """Send STOP, if the link process runs."""
+        self._number += 1
+        try:
+            if self._connection is not None:
+                self._connection.send(Message("stop", {"id": self._number}))
+        except IpcError:
+            self.close()
+
+    def receive(self) -> None:
+        """Discard the messages that have arrived."""
+        try:
+            if self._connection is not None:
+                self._connection.receive()
+        except IpcError:
+            self.close()
+
+    def connect(self, now_s: float) -> None:
+        """Connect if there is no connection."""
+        if self._connection is not None or now_s < self._connect_at_s:
+            return
+        self._connect_at_s = now_s + RETRY_S
+        with suppress(OSError, IpcError):
+            connection = MessageSocket.connect(self._path)
+            connection.send(Message("hello", {"role": "acceptor"}))
+            self._connection = connection
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+
+class Acceptor:
+    """Loop over the listening sockets, the waiting connections, the web process, the link process and the supervisor.
+
+    path: of the socket for the web process; link_path: of the link process's socket
+    """
+
+    def __init__(
+        self,
+        listeners: list[socket.socket],
+        policy: AccessPolicy,
+        daemon: DaemonSection,
+        path: Path,
+        link_path: Path,
+        beat: BeatWriter,
+    ) -> None:
+        self._policy = policy
+        self._daemon = daemon
+        self._beat = beat
+        self._link = StopSender(link_path)
+        self._room = WaitingRoom(listeners, self._rank, time.monotonic)
+        self._room.on_unserved = self._report_unserved
+        self._listener = open_unix_listener(path, 0o600, 1, "socket of the acceptor process", socket.SOCK_SEQPACKET)
+        self._listener.setblocking(False)
+        self._web: socket.socket | None = None
+        self._permitted: Counter[Rank] = Counter()
+        self._unopened: dict[int, Waiting] = {}  # handed over; another web process gets them if this one ends before
+        self._handed_over = 0
+        self._beat_at_s = self._room_at_s = 0.0
+        self._is_ending = False
+
+    def end(self) -> None:
+        """Let `run` return."""
+        self._is_ending = True
+
+    def run(self) -> None:
+        """Serve until `end` or the end of the supervisor."""
+        self._link.connect(time.monotonic())
+        self._beat.report_ready()
+        while not self._is_ending:
+            try:
+                self._step()
+            except SupervisorGoneError:
+                return
+
+    def close(self) -> None:
+        """Close everything but the listening sockets."""
+        self._lose_web()
+        self._room.close()
+        self._listener.close()
+        self._link.close()
+
+    def _step(self) -> None:
+        now_s = time.monotonic()
+        ready = self._wait(now_s)
+        now_s = time.monotonic()
+        if self._room.fileno() in ready and self._room.receive():
+            self._room_at_s = now_s + BUSY_PAUSE_S
+        if self._link.fileno() in ready:
+            self._link.receive()
+        if self._listener.fileno() in ready:
+            self._accept_web()
+        if self._web is not None and self._web.fileno() in ready:
+            self._receive_permission(self._web)
+        self._hand_over()
+        if now_s >= self._beat_at_s:
+            self._beat_at_s = now_s + TURN_MAX_S
+            self._link.connect(now_s)
+            self._room.close_expired()
+            self._send_beats()
+        if self._beat.fileno() in ready:
+            for fields in self._beat.receive():
+                if fields["kind"] == "reload":
+                    self._daemon, _ = apply_reload(self._policy, self._daemon, fields)
+
+    def _wait(self, now_s: float) -> set[int]:
+        is_room_due = now_s >= self._room_at_s
+        poll = select.poll()
+        for descriptor in (
+            self._beat.fileno(),
+            self._listener.fileno(),
+            self._link.fileno(),
+            self._room.fileno() if is_room_due else -1,
+            -1 if self._web is None else self._web.fileno(),
+        ):
+            if descriptor >= 0:
+                poll.register(descriptor, select.POLLIN)
+        due_s = self._beat_at_s if is_room_due else min(self._beat_at_s, self._room_at_s)
+        return {descriptor for descriptor, _ in poll.poll(max(0.0, due_s - now_s) * 1e3)}
+
+    def _rank(self, head: bytes) -> Rank:
+        """Rank a request. A permitted STOP goes to the link process before anything else happens."""
+        rank = rank_request(parse_head(head), self._policy)
+        if rank is Rank.STOP:
+            self._link.send()
+        return rank
+
+    # --- supervisor -------------------------------------------------------------------------------------------------
+
+    def _send_beats(self) -> None:
+        self._beat.beat()
+        if self._web is not None:
+            try:
+                self._web.send(BEAT)
+            except BlockingIOError:  # it hangs
+                pass
+            except OSError:
+                self._lose_web()
+
+    def _report_unserved(self, waiting: Waiting) -> None:
+        """Have a STOP audited that took effect, but that no web process has answered."""
+        request = parse_head(peek_head(waiting.sock) or b"")
+        if waiting.rank is Rank.STOP and request is not None:
+            request.token = self._policy.find_token(request) or request.token
+            fields: dict[str, Any] = request.audit_fields | {"event": "unanswered"}
+            self._beat.send({"kind": "audit", "fields": fields})
+
+    # --- web --------------------------------------------------------------------------------------------------------
+
+    def _accept_web(self) -> None:
+        try:
+            web, _ = self._listener.accept()
+        except OSError:  # it has left, or there is no descriptor
+            time.sleep(BUSY_PAUSE_S)
+            return
+        self._lose_web()
+        web.setblocking(False)
+        self._web = web
+
+    def _lose_web(self) -> None:
+        self._permitted.clear()
+        while self._unopened:
+            self._room.put_back(self._unopened.popitem()[1])
+        if self._web is not None:
+            self._web.close()
+            self._web = None
+
+    def _receive_permission(self, web: socket.socket) -> None:
+        try:
+            data = web.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._lose_web()
+            return
+        rank, number = decode_permission(data)
+        self._permitted[rank] += 1
+        if number in self._unopened:
+            self._unopened.pop(number).sock.close()
+
+    def _hand_over(self) -> None:
+        """Hand over the connections that the web process accepts, the highest rank first."""
+        for rank in Rank:
+            while self._web is not None and self._permitted[rank] and self._room.count(rank):
+                if not self._send(self._web, self._room.take(rank)):
+                    return
+                self._permitted[rank] -= 1
+
+    def _send(self, web: socket.socket, waiting: Waiting) -> bool:
+        self._handed_over += 1
+        waiting = waiting._replace(number=self._handed_over)
+        try:
+            send_connection(web, waiting)
+        except OSError as error:
+            self._room.put_back(waiting)
+            if not isinstance(error, BlockingIOError):
+                self._lose_web()
+            return False
+        self._unopened[waiting.number] = waiting
+        return True

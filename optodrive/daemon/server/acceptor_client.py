@@ -1,0 +1,112 @@
+"""The web process's connection to the acceptor, from which it gets the connections of its callers."""
+
+import asyncio
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from optodrive.daemon.server.acceptor_protocol import NO_CONNECTION, encode_permission, receive_packet
+from optodrive.daemon.server.request_head import Rank
+from optodrive.daemon.server.waiting_room import Waiting
+
+RETRY_S = 0.05
+BEAT_AGE_MAX_S = 1.0
+"""Age of the acceptor's last beat beyond which it counts as stalled."""
+STALL_S = 0.5
+"""A loop that was away for longer was stalled itself, and judges nobody by the time that has passed."""
+PACKETS_MAX = 16
+"""Packets taken per turn of the loop."""
+PERMITTED = {Rank.STOP: 16, Rank.TOKEN: 2, Rank.OTHER: 1}
+"""Connections that the acceptor may hand over before the first of them is opened."""
+
+
+class AcceptorClient:
+    """Connection to the acceptor, which connects again after its end. The event loop's thread calls everything.
+
+    on_connection: receives each connection, and owns it; it calls `permit` when the next may come
+    on_connected: called before the first connection may come; on_lost: after the end of the acceptor's process
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.on_connection: Callable[[Waiting], None] = lambda waiting: waiting.sock.close()
+        self.on_connected: Callable[[], None] = lambda: None
+        self.on_lost: Callable[[], None] = lambda: None
+        self._path = path
+        self._socket: socket.socket | None = None
+        self._retry: asyncio.TimerHandle | None = None
+        self._beaten_s = self._checked_s = -float("inf")
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the connection is up."""
+        return self._socket is not None
+
+    def check_beats(self) -> bool:
+        """Return whether the acceptor's loop runs, so that a new caller could stop. Call it at every beat."""
+        now_s = time.monotonic()
+        if now_s - self._checked_s > STALL_S:
+            self._beaten_s = now_s
+        self._checked_s = now_s
+        return self._socket is not None and now_s - self._beaten_s <= BEAT_AGE_MAX_S
+
+    def start(self) -> None:
+        """Connect, and keep connecting until `close`."""
+        self._retry = None
+        loop = asyncio.get_running_loop()
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        link.setblocking(False)
+        try:
+            link.connect(str(self._path))
+        except OSError:
+            link.close()
+            self._retry = loop.call_later(RETRY_S, self.start)
+            return
+        self._socket, self._beaten_s = link, time.monotonic()
+        loop.add_reader(link, self._receive, link)
+        self.on_connected()
+        for rank, count in PERMITTED.items():
+            for _ in range(count):
+                self.permit(rank)
+
+    def permit(self, rank: Rank, opened: int = NO_CONNECTION) -> None:
+        """Permit one more connection of a rank. opened: number of the connection that has been opened or closed."""
+        if self._socket is not None:
+            try:
+                self._socket.send(encode_permission(rank, opened))
+            except OSError:
+                self._lose()
+
+    def close(self) -> None:
+        """End the connection permanently."""
+        if self._retry is not None:
+            self._retry.cancel()
+        self._forget()
+
+    def _receive(self, link: socket.socket) -> None:
+        for _ in range(PACKETS_MAX):
+            try:
+                packet = receive_packet(link)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            if not packet:
+                self._lose()
+                return
+            self._beaten_s = time.monotonic()
+            if isinstance(packet, Waiting):
+                self.on_connection(packet)
+
+    def _lose(self) -> None:
+        if self._socket is None:
+            return
+        self._forget()
+        self.on_lost()
+        self._retry = asyncio.get_running_loop().call_later(RETRY_S, self.start)
+
+    def _forget(self) -> None:
+        if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None

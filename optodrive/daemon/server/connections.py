@@ -1,0 +1,139 @@
+"""The open connections of the web server: their number, and how long each may stay in one phase."""
+
+import asyncio
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+from optodrive.daemon.api.tokens import ANONYMOUS, Token
+from optodrive.daemon.server.request_head import Rank
+
+CONNECTIONS_MAX = 256
+STOP_RESERVE = 64
+"""Connections beyond CONNECTIONS_MAX, only for those that begin with a request for STOP and a valid token."""
+Phase = Literal["headers", "idle", "drain", "body", "stalled", "answer", "stream"]
+PHASE_MAX_S: dict[Phase, float] = {"headers": 5.0, "idle": 15.0, "drain": 5.0, "body": 30.0, "stalled": 30.0}
+"""The longest time of a phase: a request's header, between requests, the rest of a body that nobody reads, a body, a
+client that does not read its answer. An answer and a stream have no limit."""
+IDLE_PHASES: tuple[Phase, ...] = ("headers", "idle", "drain")
+SLOW_BODY_S = 5.0
+"""A connection in one of these phases may be closed in favour of a new one; within a body after this time."""
+
+
+class PhaseOfRequest(NamedTuple):
+    """The phase of a connection and the request to which it belongs."""
+
+    phase: Phase
+    request: object = None
+
+
+class ClientProtocol(Protocol):
+    """The protocol of a connection."""
+
+    def get_phase(self) -> PhaseOfRequest:
+        """Return the present phase."""
+
+    def get_caller(self) -> Token:
+        """Return the token of the last request, ANONYMOUS without one."""
+
+
+@dataclass
+class _Entry:
+    client: ClientProtocol
+    phase: PhaseOfRequest
+    since_s: float
+
+
+class Connections:
+    """The open connections.
+
+    now_s: monotonic clock; opening: number of those that are about to be added
+    """
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._entries: dict[asyncio.Transport, _Entry] = {}
+        self.opening = 0
+
+    def __len__(self) -> int:
+        return len(self._entries) + self.opening
+
+    def add(self, transport: asyncio.Transport, client: ClientProtocol) -> None:
+        """Add a connection that has been opened, or replace its protocol."""
+        if transport not in self._entries:
+            self.opening -= 1
+        self._entries[transport] = _Entry(client, client.get_phase(), self._now_s())
+
+    def remove(self, transport: asyncio.Transport) -> None:
+        """Remove a connection that is closed."""
+        self._entries.pop(transport, None)
+
+    def update_phase(self, transport: asyncio.Transport) -> None:
+        """Begin a new phase of a connection now."""
+        entry = self._entries.get(transport)
+        if entry is not None:
+            entry.phase, entry.since_s = entry.client.get_phase(), self._now_s()
+
+    def make_room(self, rank: Rank) -> bool:
+        """Return whether a new connection may be opened. Close those that have been idle longest if need be.
+
+        One without a token takes no place from one with a token.
+        """
+        while len(self) >= CONNECTIONS_MAX and self.close_longest_idle(spares_trusted=rank is Rank.OTHER):
+            pass
+        return len(self) < CONNECTIONS_MAX + (STOP_RESERVE if rank is Rank.STOP else 0)
+
+    def close_longest_idle(self, spares_trusted: bool = False) -> bool:
+        """Close the connection that has been idle longest, one with a valid token last. Return whether there is one."""
+        now_s = self._update_phases()
+        idle = [
+            item
+            for item in self._entries.items()
+            if _is_replaceable(item[1], now_s) and not (spares_trusted and _is_trusted(item[1]))
+        ]
+        if not idle:
+            return False
+        self._abort(min(idle, key=lambda item: (_is_trusted(item[1]), item[1].since_s))[0])
+        return True
+
+    def close_expired(self) -> None:
+        """Close the connections that exceed the time of their phase."""
+        now_s = self._update_phases()
+        for transport, entry in list(self._entries.items()):
+            limit_s = PHASE_MAX_S.get(entry.phase.phase)
+            if limit_s is not None and now_s - entry.since_s > limit_s:
+                self._abort(transport)
+
+    def close_revoked(self, tokens: Iterable[Token], is_final: bool) -> None:
+        """Close the connections of some tokens that are between requests.
+
+        Requests that are being answered end first; they may be STOP.
+        is_final: close those in a stream, too
+        """
+        revoked = set(tokens)
+        for transport, entry in list(self._entries.items()):
+            phase = entry.client.get_phase().phase
+            if entry.client.get_caller() in revoked and phase != "answer" and (is_final or phase in IDLE_PHASES):
+                self.remove(transport)
+                transport.abort() if is_final else transport.close()
+
+    def _update_phases(self) -> float:
+        now_s = self._now_s()
+        for entry in self._entries.values():
+            phase = entry.client.get_phase()
+            if phase != entry.phase:
+                entry.phase, entry.since_s = phase, now_s
+        return now_s
+
+    def _abort(self, transport: asyncio.Transport) -> None:
+        self.remove(transport)
+        transport.abort()
+
+
+def _is_trusted(entry: _Entry) -> bool:
+    return entry.client.get_caller() is not ANONYMOUS
+
+
+def _is_replaceable(entry: _Entry, now_s: float) -> bool:
+    is_slow_body = entry.phase.phase == "body" and now_s - entry.since_s > SLOW_BODY_S
+    return is_slow_body or entry.phase.phase in IDLE_PHASES

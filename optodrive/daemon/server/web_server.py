@@ -1,0 +1,96 @@
+"""The web server: uvicorn with bounded connections, STOP first, and signal handling left to the daemon."""
+
+import asyncio
+import socket
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+
+import uvicorn
+
+from optodrive.daemon.api.access_policy import AccessPolicy
+from optodrive.daemon.api.request_limits import App
+from optodrive.daemon.api.tokens import Token
+from optodrive.daemon.server.acceptor_client import AcceptorClient
+from optodrive.daemon.server.bounded_http import BoundedHttp
+from optodrive.daemon.server.bounded_websocket import MESSAGE_MAX_BYTES, BoundedWebSocket
+from optodrive.daemon.server.connection_opener import ConnectionOpener
+from optodrive.daemon.server.connections import PHASE_MAX_S, Connections
+from optodrive.daemon.server.listeners import raise_descriptor_limit
+from optodrive.daemon.server.request_head import Rank, parse_head, rank_request
+from optodrive.daemon.server.server_state import ServerState
+from optodrive.daemon.server.stop_first_selector import StopFirstSelector
+
+SHUTDOWN_GRACE_S = 2
+REVOKED_MAX_S = 1.0
+
+
+class Server(uvicorn.Server):
+    """Captures no signals: uvicorn would raise them again and end the process before the board receives ABORT.
+
+    acceptor: hands over the connections; policy: decides which requests for STOP precede others
+    """
+
+    on_ready: Callable[[], None] = staticmethod(lambda: None)
+    loop: asyncio.AbstractEventLoop | None = None
+
+    def __init__(self, app: App, acceptor: AcceptorClient, policy: AccessPolicy) -> None:
+        super().__init__(
+            uvicorn.Config(
+                app,
+                http=BoundedHttp,
+                ws=BoundedWebSocket,
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,  # a client must not set its own address
+                timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
+                timeout_keep_alive=round(PHASE_MAX_S["idle"]),
+                ws_max_size=MESSAGE_MAX_BYTES,
+                ws_per_message_deflate=False,  # a small frame could need any amount of memory
+            )
+        )
+        self._acceptor = acceptor
+        self._selector = StopFirstSelector(lambda head: rank_request(parse_head(head), policy) is Rank.STOP)
+        self._connections = Connections(time.monotonic)
+        self.server_state: ServerState = ServerState(self._connections, self._selector)
+        self._opener: ConnectionOpener | None = None
+
+    def run(self, sockets: list[socket.socket] | None = None) -> None:
+        """Serve the connections that the acceptor hands over until `should_exit`."""
+        raise_descriptor_limit()
+        with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(self._selector)) as runner:
+            runner.run(self.serve(sockets=sockets))
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture no signals."""
+        yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to accept requests."""
+        await super().startup(sockets=[])
+        self.loop = asyncio.get_running_loop()
+        self._opener = ConnectionOpener(self._acceptor, self._selector, self._connections, self._create_protocol)
+        self._acceptor.start()
+        self.on_ready()
+
+    async def close_revoked(self, tokens: Collection[Token]) -> None:
+        """Close the kept connections of some tokens, and cut those whose clients do not follow within a second."""
+        self._connections.close_revoked(tokens, is_final=False)
+        await asyncio.sleep(REVOKED_MAX_S)
+        self._connections.close_revoked(tokens, is_final=True)
+
+    def _create_protocol(self) -> asyncio.Protocol:
+        return BoundedHttp(self.config, self.server_state, self.lifespan.state)
+
+    async def on_tick(self, counter: int) -> bool:
+        """Close connections that take too long. Return whether the server must end."""
+        self._connections.close_expired()
+        return await super().on_tick(counter)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End all connections."""
+        if self._opener is not None:
+            self._opener.close()
+        await super().shutdown(sockets)

@@ -1,1 +1,0 @@
-"""The REST, WebSocket and page interface of the daemon, and its access control."""
