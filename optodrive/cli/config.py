@@ -47,7 +47,6 @@ def new(
     from optodrive.planning.display_model import DisplayModel
 
     check_output("FILE", file, ".toml")
-    check_new("FILE", file)
     display = NewDisplay(
         name=file.stem,
         rows=_ask("--rows", rows, "Rows of pixels", 4),
@@ -126,7 +125,6 @@ def migrate(
     from optodrive.device.config_migration import migrate_config
 
     check_output("--out", out, ".toml")
-    check_new("--out", out)
     migration = migrate_config(file)
     if json:
         print_json(migration._asdict() | {"out": None if migration.by_hand or out is None else str(out)})
@@ -143,9 +141,3 @@ def migrate(
     if not json:
         done = ", ".join(f"renamed {each}" for each in migration.renamed) or "no key renamed"
         print(f"optodrive: version {migration.version}: {done}", file=sys.stderr)
-
-
-def check_new(where: str, path: Path | None) -> None:
-    """Raise InputError for a file that exists: no configuration is overwritten."""
-    if path is not None and path.exists():
-        raise InputError(where, str(path), "a new file; this one exists")

@@ -80,7 +80,7 @@ def diagnose(
         if len(runs.pixels) > MAX_JOINT_PIXELS:
             output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers, provenance)
         else:
-            output = _diagnose_jointly(recordings, title, seed, settings, provenance)
+            output = _diagnose_jointly(recordings, out, title, seed, settings, provenance)
         _write_output(output, out, json)
 
 
@@ -96,12 +96,18 @@ def _capture_provenance(context: typer.Context, recordings: list[str], config: "
 
 
 def _diagnose_jointly(
-    recordings: list[Path], title: str, seed: int, config: "Config | None", provenance: "Provenance"
+    recordings: list[Path],
+    out: Path | None,
+    title: str,
+    seed: int,
+    config: "Config | None",
+    provenance: "Provenance",
 ) -> _DiagnosisOutput:
     """Diagnose one pixel, or a few pixels with common parameters."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
     from optodrive.lab.diagnosis.model_file import build_model_toml
     from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+    from optodrive.lab.diagnosis.next_steps import OUT
     from optodrive.lab.diagnosis.priors import build_prior
     from optodrive.lab.diagnosis.report import build_report
 
@@ -114,7 +120,7 @@ def _diagnose_jointly(
     return _DiagnosisOutput(
         build_answer(diagnosis) | {"provenance": provenance.to_dict()},
         build_narrative(diagnosis),
-        build_report(diagnosis, title, provenance),
+        build_report(diagnosis, title, provenance, [str(path) for path in recordings], str(out or OUT)),
         model,
     )
 
@@ -162,8 +168,6 @@ def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) 
         _write_text(out / "diagnosis.json", _dump_json(output.document))
         if output.model_toml is not None:
             _write_text(out / "model.toml", output.model_toml)
-        else:  # a model.toml of an earlier diagnosis would be mistaken for this one's
-            (out / "model.toml").unlink(missing_ok=True)
     if json == STDOUT:
         print_json(output.document)
         return
@@ -181,7 +185,7 @@ def _require_scipy() -> None:
 
 
 def _check_output_paths(json: str | None, out: Path | None) -> None:
-    """Reject outputs that cannot be written, or that would overwrite a recording."""
+    """Reject outputs that cannot be written, or that would overwrite anything."""
     from optodrive.core.files import check_output
 
     if json is not None and json != STDOUT:

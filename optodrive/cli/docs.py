@@ -39,8 +39,6 @@ def docs(
         if page is not None:
             raise InputError("PAGE", page, "no page together with --out, which copies all")
         check_output("--out", out, folder=True)
-        if out.exists() and any(out.iterdir()):
-            raise InputError("--out", str(out), "a new or empty folder")
         for name, root in roots.items():
             _copy_tree(root, out / name)
         print_json({"out": str(out)}) if json else print(f"written          {out}: {', '.join(FOLDERS)}")

@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from optodrive.cli.options import DEFAULT_URL, ConfigOption, UrlOption
-from optodrive.core.errors import InputError
 from optodrive.core.files import atomic_write, check_output
 
 
@@ -31,8 +30,6 @@ def support(
 
     path = out or Path(f"optodrive-support-{datetime.now(UTC):%Y%m%d-%H%M%S}.tar.gz")
     check_output("--out", path, ".gz")
-    if path.exists():
-        raise InputError("--out", str(path), "a name that is free: nothing is overwritten")
     entries = collect_entries(config, url, log or [])
     archive = build_archive(entries)
     with atomic_write(path) as temporary:

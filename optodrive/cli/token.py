@@ -52,8 +52,6 @@ def add(
     if out is None and (json or not sys.stdout.isatty()):
         raise InputError("--out", None, "--out FILE: a secret is shown on a terminal only, never in a pipe or a log")
     check_output("--out", out)
-    if out is not None and out.exists():
-        raise InputError("--out", str(out), "a name that is free: nothing is overwritten")
     path = _locate(file, config)
     token = create_token(name, known[role])
     if out is not None:

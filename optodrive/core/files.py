@@ -33,11 +33,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def check_output(option: str, path: Path | None, *suffixes: str, folder: bool = False) -> None:
-    """Raise InputError unless an output can be written at this path, before anything is computed for it.
+def check_output(option: str, path: Path | None, *suffixes: str, folder: bool = False, may_exist: bool = False) -> None:
+    """Raise InputError unless a new output can be written at this path, before anything is computed for it.
 
     suffixes: those that a file may have, lower case; none: any. folder: a folder may be written instead, or only a
-    folder where no suffixes are given; a name with the suffix of a file is none.
+    folder where no suffixes are given; a name with the suffix of a file is none. may_exist: a folder may hold files,
+    those of an interrupted run that goes on. No other output replaces what is there.
     """
     if path is None:
         return
@@ -58,6 +59,17 @@ def check_output(option: str, path: Path | None, *suffixes: str, folder: bool = 
         raise InputError(option, str(path), f"a path in a folder; {parent} is none")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(option, str(path), f"a path in a folder that can be written; {parent} cannot")
+    if not may_exist:
+        _require_new(option, path)
+
+
+def _require_new(option: str, path: Path) -> None:
+    if path.is_dir():
+        with os.scandir(path) as entries:
+            if any(entries):
+                raise InputError(option, str(path), "a new or empty folder")
+    elif os.path.lexists(path):
+        raise InputError(option, str(path), "a new file; this one exists")
 
 
 def create_folder(path: Path) -> None:

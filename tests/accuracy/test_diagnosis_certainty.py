@@ -222,7 +222,8 @@ def list_commands(found, *recordings):
 
 def test_the_report_says_what_to_run_next_and_the_commands_run(leak, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "model.toml").write_text(build_model_toml(leak, "orifice", WIDTH_M))
+    (tmp_path / "answer").mkdir()
+    (tmp_path / "answer" / "model.toml").write_text(build_model_toml(leak, "orifice", WIDTH_M))
     frames = {"frames": [{"show_at_s": 0.0, "duration_s": 0.3, "target_um": {"3": 100}}]}
     (tmp_path / "frames.json").write_text(json.dumps(frames))
     commands = list_commands(leak)
@@ -255,6 +256,18 @@ def test_every_finding_has_its_next_command_whose_options_exist(leak, capsys, ch
         capsys.readouterr()
         assert run([*command[1:], "--help"]) == 0  # refuses an option that does not exist
     assert ("Run next" in build_report(found, "my rec.h5")) == bool(expected)
+
+
+def test_commands_name_recordings_and_model_by_their_folders(leak):
+    found = replace(leak, verdict="ambiguous")
+    report = build_report(found, "a.h5", recordings=("day 1/a.h5",), out="answers/leak/")
+    for expected in (
+        "optodrive diagnose &#x27;day 1/a.h5&#x27; more.h5 --out answers/leak-2<",
+        "optodrive plan frames.json --model answers/leak/model.toml<",
+        "in which <code>diagnose</code> was run",
+        "not those of a parameter set",
+    ):
+        assert expected in report
 
 
 def test_a_late_clock_is_corrected_in_the_merge(late):

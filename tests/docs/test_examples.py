@@ -44,7 +44,7 @@ ELSEWHERE = {
     "optodrive token": "tests/unit/cli/test_token_command.py",
     "optodrive plan frames.json --pixel-map": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive simulate sweep/": "tests/accuracy/test_calibrate_pixels.py",
-    "optodrive diagnose film.h5 --out answer/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
+    "optodrive diagnose film.h5 --out cluster/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
 }
 """Beginnings of examples that are not run here, and where they are."""
 

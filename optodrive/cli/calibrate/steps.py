@@ -33,8 +33,6 @@ def steps(
     from optodrive.lab.commissioning.mirror_steps import LEAD_IN_S, plan_step_runs, play_step_runs
 
     check_output("--out", out, folder=True)
-    if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise InputError("--out", str(out), "a new or empty folder")
     if not 0.0 <= pause_s <= PAUSE_MAX_S:
         raise InputError("--pause", pause_s, f"0 to {PAUSE_MAX_S:g} s")
     played: list[tuple[StepRun, FloatArray]] = []

@@ -37,7 +37,7 @@ def sweep(
     from optodrive.lab.commissioning.sweep_player import plan_aims, play_aims
     from optodrive.lab.recording import write_recording
 
-    check_output("--out", out, folder=True)
+    check_output("--out", out, folder=True, may_exist=True)
     if not 0.0 <= rest_s <= REST_MAX_S:
         raise InputError("--rest", rest_s, f"0 to {REST_MAX_S:g} s")
     if (out / RECORDING).exists():

@@ -2,27 +2,31 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from shlex import join
 
 from optodrive.core.types.discrepancy import Discrepancy
 from optodrive.physics.terms import discover_terms
 
-MODEL, FRAMES = "model.toml", "frames.json"
+FRAMES = "frames.json"
+OUT = "answer"
+"""Folder of the answer, where no other is named."""
 
 
 @dataclass(frozen=True)
 class NextStep:
-    """A reason, and the command to run for it, from the folder that holds report and recordings."""
+    """A reason, and the command to run for it, from the folder in which the diagnosis was run."""
 
     reason: str
     command: str
 
 
-def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str]) -> list[NextStep]:
+def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str], out: str = OUT) -> list[NextStep]:
     """Return the steps in their order.
 
-    recordings: names of those that were diagnosed
+    recordings, out: paths of those that were diagnosed and of the answer's folder, as the command named them
     """
+    model = str(Path(out) / "model.toml")
     steps = [_inspect_term(label) for label in discrepancy.failures]
     if discrepancy.verdict == "unexplained":
         show = ("recording", "show", recordings[0], "--out", "signals.png")
@@ -31,7 +35,7 @@ def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str]) -> list
         again = (
             "Record the proposed experiment" if discrepancy.next_experiment else "Record each experiment three times"
         )
-        more = ("diagnose", *recordings, "more.h5", "--out", "answer")
+        more = ("diagnose", *recordings, "more.h5", "--out", f"{out.rstrip('/')}-2")
         steps.append(_step(f"{again}, and diagnose it together with these runs.", *more))
     if "mirror_lag" in discrepancy.causes:
         steps.append(_step("Identify the mirrors' servos from steps.", "calibrate", "steps", "--out", "steps"))
@@ -51,12 +55,12 @@ def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str]) -> list
         steps.append(_step("Correct the instrument's times when session and measurement are merged.", *merge))
     changes_plans = any(_changes_plans(key) for key in discrepancy.causes)
     if discrepancy.base and discrepancy.verdict != "unexplained" and (changes_plans or discrepancy.verdict == "none"):
-        steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", MODEL))
+        steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", model))
         if changes_plans:
             steps.append(
-                _step("See what the effect does to heights planned without it.", "simulate", FRAMES, "--truth", MODEL)
+                _step("See what the effect does to heights planned without it.", "simulate", FRAMES, "--truth", model)
             )
-        steps.append(_step("Serve the display with it.", "serve", "--model", MODEL))
+        steps.append(_step("Serve the display with it.", "serve", "--model", model))
     return steps
 
 

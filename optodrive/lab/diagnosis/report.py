@@ -1,6 +1,6 @@
 """Diagnosis report: one self-contained HTML file built from the same data as the answer."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from math import isfinite
 
@@ -10,25 +10,35 @@ from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.types.discrepancy import Discrepancy, ResidualTrace
 from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
 from optodrive.lab.diagnosis.narrative import build_narrative
-from optodrive.lab.diagnosis.next_steps import NextStep, list_next_steps
+from optodrive.lab.diagnosis.next_steps import OUT, NextStep, list_next_steps
 from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_residuals
 
 MAX_TRACES = 12
 NAMED = ("identified", "indistinguishable")
 MEASURED = "<span class='key measured'>measured</span>"
-NOMINAL, EXTENDED = "<span class='key nominal'>nominal model</span>", "<span class='key extended'>extended model</span>"
+NOMINAL = "<span class='key nominal'>nominal model, refitted</span>"
+EXTENDED = "<span class='key extended'>extended model</span>"
 
 
-def build_report(discrepancy: Discrepancy, title: str, provenance: Provenance | None = None) -> str:
-    """Return the report as HTML."""
+def build_report(
+    discrepancy: Discrepancy,
+    title: str,
+    provenance: Provenance | None = None,
+    recordings: Sequence[str] = ("recording.h5",),
+    out: str = OUT,
+) -> str:
+    """Return the report as HTML.
+
+    recordings, out: paths of those that were diagnosed and of the report's folder, as the command named them
+    """
     has_extension = bool(discrepancy.terms)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
-    recordings = ("recording.h5",) if provenance is None or not provenance.recordings else provenance.recordings
     parts = [
-        *_build_next_steps(list_next_steps(discrepancy, recordings)),
+        *_build_next_steps(list_next_steps(discrepancy, recordings, out)),
         "<h2>Measured against model</h2>",
-        f"<p>{MEASURED}, {models}. Of each signal the run in which the nominal model is worst, and the median one; "
-        "below, measured minus model. The band is the noise of one sample, ± σ.</p>",
+        f"<p>{MEASURED}, {models}. The nominal model has the R, C, τ<sub>g</sub>, κ and φ that fit these data best, "
+        "not those of a parameter set. Of each signal the run in which it is worst, and the median one; below, "
+        "measured minus model. The band is the noise of one sample, ± σ.</p>",
         "<div class='grid'>",
         *(draw_example(example, has_extension) for example in discrepancy.example_traces),
         "</div>",
@@ -55,7 +65,7 @@ def _build_next_steps(steps: list[NextStep]) -> Iterator[str]:
     if not steps:
         return
     yield "<h2>Run next</h2>"
-    yield "<p>From the folder with this report, model.toml, the recordings and your frames.json.</p>"
+    yield "<p>From the folder in which <code>diagnose</code> was run; frames.json and more recordings are your own.</p>"
     rows = ((escape(step.reason), f"<code>{escape(step.command)}</code>") for step in steps)
     yield render_table(("why", "command"), rows, label="Run next")
 

@@ -57,6 +57,25 @@ def test_another_suffix_is_refused_before_the_input_is_read(name, tmp_path, caps
         assert not path.exists()
 
 
+@pytest.mark.parametrize("name", WRITERS)
+def test_nothing_is_overwritten(name, tmp_path, capsys):
+    arguments, suffix = WRITERS[name]
+    path = tmp_path / f"out{suffix or ''}"
+    kept = path if suffix is not None else path / "report.html"
+    kept.parent.mkdir(exist_ok=True)
+    kept.write_text("mine")
+    expected = "a new or empty folder" if suffix is None else "a new file; this one exists"
+    assert _error(capsys, [*arguments, str(path)]).endswith(expected)
+    assert kept.read_text() == "mine"
+
+
+def test_an_interrupted_run_may_continue_in_its_folder(tmp_path):
+    (tmp_path / "pulses.csv").write_text("")
+    check_output("--out", tmp_path, folder=True, may_exist=True)
+    with pytest.raises(InputError, match="a new or empty folder"):
+        check_output("--out", tmp_path, folder=True)
+
+
 def test_forms_of_an_output(tmp_path):
     check_output("--out", None, ".csv")
     check_output("--out", tmp_path / "a.CSV", ".csv")
@@ -65,10 +84,12 @@ def test_forms_of_an_output(tmp_path):
     check_output("--out", tmp_path / "a.h5", ".h5", folder=True)
     check_output("--out", tmp_path / "day.2026", ".h5", folder=True)
     (tmp_path / "kept.csv").mkdir()
+    (tmp_path / "link.csv").symlink_to("nowhere")
     check_output("--out", tmp_path / "kept.csv", ".h5", folder=True)
     for path, suffixes, folder in (
         (tmp_path / "a.csv", (".h5", ".hdf5"), True),
         (tmp_path / "kept.csv", (".csv",), False),
+        (tmp_path / "link.csv", (".csv",), False),
         (tmp_path, (), False),
         (tmp_path / "no" / "a.csv", (".csv",), False),
         (tmp_path / "no" / "recording", (".h5",), True),

@@ -24,7 +24,7 @@ def test_a_written_pattern_is_the_pattern_of_that_display(tmp_path, capsys):
 def test_the_policy_of_an_experiment_is_told(tmp_path, capsys):
     assert run(["patterns", "experiment-4", "level=9", "--out", str(tmp_path / "e.json")]) == 0
     assert "its policy is refuse: --policy refuse" in capsys.readouterr().out
-    assert run(["patterns", "experiment-4", "--out", str(tmp_path / "e.json"), "--json"]) == 0
+    assert run(["patterns", "experiment-4", "--out", str(tmp_path / "f.json"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["policy"] == "refuse"
 
 
