@@ -1,12 +1,10 @@
-"""Blind benchmark of the diagnosis: sample hidden effects from seeds, diagnose them, score and print the table.
+"""The diagnosis, blind: sample hidden effects from seeds, diagnose them, score and print the table.
 
 Development seeds start at 9,000,000, report seeds at 3,000,000; nothing is tuned on the latter.
 """
 
-import argparse
 import json
 import os
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +12,19 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests" / "blind"))
+
+import measuring  # noqa: F401 - the folder of the tests
 
 FIRST_SEEDS = {"dev": 9_000_000, "report": 3_000_000}
+OPTIONS = {
+    "--seeds": {"choices": tuple(FIRST_SEEDS), "default": "dev"},
+    "--nulls": {"type": int, "default": 24},
+    "--cases": {"type": int, "default": 18, "help": "cases of each other block"},
+    "--thin": {"type": int, "help": "run this many cases of one cause instead, with two groups of runs each"},
+    "--skip": {"type": int, "default": 0, "help": "seeds of each block to skip"},
+    "--workers": {"type": int, "default": os.cpu_count() or 1},
+    "--save": {"type": Path, "help": "folder for the answers"},
+}
 SAMPLES = 30_000
 REDUCED_GROUPS = 2
 """Groups of runs in a reduced recording."""
@@ -127,45 +134,25 @@ def format_comparison(done: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    """Run the benchmark and print the table. --save writes every answer to a folder."""
+def measure(seeds, nulls, cases, thin, skip, workers, save):
+    """Yield the tables as text."""
     from rich.console import Console
     from rich.progress import track
 
     from blind_score import format_table
 
-    parser = argparse.ArgumentParser(prog="scripts/bench blind")
-    parser.add_argument("--seeds", choices=tuple(FIRST_SEEDS), default="dev")
-    parser.add_argument("--nulls", type=int, default=24)
-    parser.add_argument("--cases", type=int, default=18, help="cases of each other block")
-    parser.add_argument(
-        "--thin", type=int, help="run this many cases of one cause instead, with two groups of runs each"
-    )
-    parser.add_argument("--skip", type=int, default=0, help="seeds of each block to skip")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--save", type=Path, help="folder for the answers")
-    options = parser.parse_args()
-    first = FIRST_SEEDS[options.seeds] + options.skip
-    counts = {"none": options.nulls, "single": options.cases, "unknown": options.cases, "pair": options.cases}
-    if options.thin:
-        counts = {"thin": options.thin}
+    counts = {"thin": thin} if thin else {"none": nulls, "single": cases, "unknown": cases, "pair": cases}
+    first = FIRST_SEEDS[seeds] + skip
     tasks = [(block, first + row) for block, count in counts.items() for row in range(count)]
-    with ProcessPoolExecutor(options.workers) as pool:
-        done = list(
-            track(pool.map(run_case, tasks), total=len(tasks), console=Console(stderr=True), description="blind")
-        )
-    if options.save is not None:
-        options.save.mkdir(parents=True, exist_ok=True)
-        for (block, seed), item in zip(tasks, done, strict=True):
-            if "answer" in item:
-                (options.save / f"{block}-{seed}.json").write_text(json.dumps(item["answer"], indent=1))
-    for item in done:
+    with ProcessPoolExecutor(workers) as pool:
+        answers = pool.map(run_case, tasks)
+        done = list(track(answers, total=len(tasks), console=Console(stderr=True), description="blind"))
+    for (block, seed), item in zip(tasks, done, strict=True):
         if "skipped" in item:
-            print(f"not sampled: {item['block']} {item['seed']}: {item['skipped']}", file=sys.stderr)
+            yield f"not sampled: {block} {seed}: {item['skipped']}"
+        elif save is not None:
+            save.mkdir(parents=True, exist_ok=True)
+            (save / f"{block}-{seed}.json").write_text(json.dumps(item["answer"], indent=1))
     scored = [item for item in done if "score" in item]
-    print(format_table(item["score"] for item in scored))
-    print(format_comparison(scored))
-
-
-if __name__ == "__main__":
-    main()
+    yield format_table(item["score"] for item in scored)
+    yield format_comparison(scored)

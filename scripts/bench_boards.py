@@ -1,4 +1,4 @@
-"""Benchmark of several simulated boards whose clocks drift and wander: skew of their gate edges, and time to STOP.
+"""Several simulated boards whose clocks drift and wander: skew of their gate edges, and time to STOP.
 
 Full frames are drawn over and over by four board processes. Each board's own log and the known error of its clock give
 the true time of every pulse; its skew is the deviation from the plan beside the median of the plan. The time that the
@@ -6,27 +6,28 @@ daemon reports of it divides the skew: what the host knows to be off the plan is
 know is that of the exchanges, through pseudo-terminal and scheduler.
 """
 
-import argparse
 import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+from measuring import Row, to_ms
 
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_scales
 from optodrive.link.simulator.board_clock import BoardClock
 from optodrive.planning.display_model import DisplayModel
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "system"))
-from rig import Board, Daemon, long_train, wait_for
+from rig import Board, Daemon, long_train, wait_for  # of the tests
 
 CLOCKS = (BoardClock(50e-6), BoardClock(-50e-6, 10e-6), BoardClock(20e-6, 20e-6), BoardClock(-30e-6, 15e-6))
 """Drift and wander of the boards, of which the first ones are used."""
 DISPLAY = "display-437"
-STOPS = 100
+OPTIONS = {
+    "--boards": {"type": int, "nargs": "+", "default": [4], "choices": range(1, 5), "help": "numbers of boards"},
+    "--minutes": {"type": float, "default": 10.0, "help": "time of drawing frames"},
+    "--stops": {"type": int, "default": 100, "help": "number of STOPs; each arms for two seconds first"},
+}
 FIRST_TRAIN_PIXEL = 50
 STAGE = """
 [[stages]]
@@ -46,6 +47,7 @@ class Bench:
             options = ("--clock-ppm", str(1e6 * clock.drift), "--clock-wander-ppm", str(1e6 * clock.wander))
             program = (sys.executable, "-m", "optodrive.link.simulator.board_process", *options)
             self.boards.append(Board(own, program=program))
+        self.began_s = [wait_for(lambda: board.of("clock"), "its clock")[0]["monotonic_s"] for board in self.boards]
         several = count > 1
         stages = [STAGE.format(number=number, port=board.port) for number, board in enumerate(self.boards)]
         self.daemon = Daemon(folder, self.boards[0].port, DISPLAY, lease_s=0.3, stages="".join(stages) * several)
@@ -86,10 +88,6 @@ class Bench:
         errors_s = np.array(errors_s)
         return errors_s - np.median(errors_s, axis=0)
 
-    def read_starts(self):
-        """Read when each board's clock began."""
-        self.began_s = [board.of("clock")[0]["monotonic_s"] for board in self.boards]
-
     def start_trains(self):
         """Let a long train run on every board."""
         trains = [long_train(FIRST_TRAIN_PIXEL + 60 * k)["trains"][0] for k in range(len(self.boards))]
@@ -99,7 +97,8 @@ class Bench:
         wait_for(lambda: all(len(board.of("pulse")) > 2 for board in self.boards), "light on all boards")
 
     def measure_stop_s(self):
-        """Return the time from a STOP until the gates of all boards are off, by the log, s."""
+        """Arm, and return the time from a STOP until the gates of all boards are off, by the log, s."""
+        self.arm()
         self.start_trains()
         time.sleep(np.random.default_rng().uniform(0.0, 0.02))
         stopped_s = time.monotonic()
@@ -112,55 +111,28 @@ class Bench:
         return max(0.0, max(last_s) - stopped_s)
 
 
-def print_skew(what, skews_us):
-    """Print the distribution of deviations, µs."""
-    p50, p99 = np.percentile(np.abs(skews_us), [50, 99])
-    print(f"{what}: {p50:.1f} µs median, {p99:.1f} µs p99, {np.abs(skews_us).max():.1f} µs at most")
-
-
-def run(count, minutes, stops):
-    """Print the figures of one number of boards."""
-    with tempfile.TemporaryDirectory() as name:
-        bench = Bench(Path(name), count)
-        try:
-            bench.read_starts()
-            bench.arm()
-            time.sleep(5.0)  # until the rates of the clocks are known
-            skews_s, frames, end_s = [], 0, time.monotonic() + 60.0 * minutes
-            while time.monotonic() < end_s:
-                skews_s.append(bench.draw_frame())
-                frames += 1
-            if frames:
-                true_us, reported_us = 1e6 * np.concatenate(skews_s).T
-                print(f"{count} boards: {len(true_us)} pulses in {frames} frames", flush=True)
-                print_skew("skew of gate edges", true_us)
-                print_skew("  of it the driver's, as the daemon reports it", reported_us)
-                print_skew("  of it unknown to the host: exchanges through pseudo-terminals", true_us - reported_us)
-                print(f"underruns {bench.daemon.state()['board']['underruns']}", flush=True)
-            times_s = []
-            for _ in range(stops):
+def measure(boards=(4,), minutes=10.0, stops=100):
+    for count in boards:
+        with tempfile.TemporaryDirectory() as name:
+            bench = Bench(Path(name), count)
+            try:
                 bench.arm()
-                times_s.append(bench.measure_stop_s())
-            if stops:
-                p50, p99 = 1e3 * np.percentile(times_s, [50, 99])
-                print(
-                    f"{count} boards: STOP to all gates off {p50:.1f} ms median, {p99:.1f} ms p99 of {stops}",
-                    flush=True,
-                )
-        finally:
-            bench.stop()
-
-
-def main():
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--boards", type=int, nargs="+", default=[4], choices=range(1, 5), help="numbers of boards")
-    parser.add_argument("--minutes", type=float, default=10.0, help="time of drawing frames")
-    parser.add_argument("--stops", type=int, default=STOPS, help="number of STOPs; each arms for two seconds first")
-    options = parser.parse_args()
-    for count in options.boards:
-        run(count, options.minutes, options.stops)
-
-
-if __name__ == "__main__":
-    main()
+                time.sleep(5.0)  # until the rates of the clocks are known
+                skews_s, end_s = [], time.monotonic() + 60.0 * minutes
+                while time.monotonic() < end_s:
+                    skews_s.append(bench.draw_frame())
+                if skews_s:
+                    true_us, reported_us = 1e6 * np.concatenate(skews_s).T
+                    for what, skew_us in (
+                        ("skew of gate edges", true_us),
+                        ("of it the driver's, as the daemon reports it", reported_us),
+                        ("of it unknown to the host: exchanges through pseudo-terminals", true_us - reported_us),
+                    ):
+                        yield Row(f"{count} boards: {what}", np.abs(skew_us).tolist(), "µs")
+                    yield f"{count} boards: frames", len(skews_s), "1"
+                    yield f"{count} boards: underruns", bench.daemon.state()["board"]["underruns"], "1"
+                times_s = [bench.measure_stop_s() for _ in range(stops)]
+                if times_s:
+                    yield Row(f"{count} boards: STOP to all gates off", to_ms(times_s))
+            finally:
+                bench.stop()

@@ -1,28 +1,21 @@
-"""Benchmark of periodic trains and simultaneous frames: targets, results of an independent integrator, energy.
+"""Periodic trains and simultaneous frames: targets, results of an independent integrator, energy.
 
 Every number is a calculation on the shipped display-437; nothing is measured on hardware.
 """
 
-import sys
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from measuring import build_display, build_frames
 
 from optodrive.core.errors import InputError
-from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.device.config_file import load_config
-from optodrive.planning.display_model import DisplayModel
+from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler import scheduler
 from optodrive.planning.scheduler.periodic_pulses import limit_pulse_width, solve_steady_state
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from reference_models.nominal_pixel import height_um
+from reference_models.nominal_pixel import height_um  # of the tests
 
 PIXELS = (200, 201, 222, 221)
 SECONDS, CYCLES = 0.6, 12
@@ -63,73 +56,39 @@ def compute_beam_time_us(display, count, period_s):
 
 
 def measure_train(display, count, rate_hz, target_um):
-    """Return one row of the table of cycles."""
-    period_s = 1.0 / rate_hz
-    cold_heat, drive = (
-        display.build_cold_heat(),
-        limit_pulse_width(display.scan_head.drive, compute_beam_time_us(display, count, period_s)),
-    )
+    """Yield the rows of trains by height, and of trains whose pulses are planned from the cold state."""
+    name, period_s = f"{count} pixels, {rate_hz} Hz, {target_um} µm", 1.0 / rate_hz
+    cold_heat = display.build_cold_heat()
+    drive = limit_pulse_width(display.scan_head.drive, compute_beam_time_us(display, count, period_s))
     duration_s = max(SECONDS, CYCLES * period_s)
     first = HeightTrain(PIXELS[0], 0.0, duration_s, period_s, target_um * 1e-6)
-    row_start = (str(count), f"{rate_hz:g}", f"{target_um:g}")
-    min_periods = next(
-        (
-            n
-            for n in range(1, drive.max_periods + 1)
-            if solve_steady_state(first, cold_heat, drive, n).peak_m > 0.9999e-6 * target_um
-        ),
-        None,
-    )
-    if min_periods is None:
-        return (
-            *row_start,
-            f"unreachable: max {1e6 * solve_steady_state(first, cold_heat, drive, drive.max_periods).peak_m:.0f}",
-        )
-    peak_to_peak_max_m, peak_to_peak_min_m = (
-        solve_steady_state(first, cold_heat, drive, n).peak_to_peak_m for n in (min_periods, drive.max_periods)
-    )
-    peak_to_peak_m = peak_to_peak_min_m + PEAK_TO_PEAK_SHARE * (peak_to_peak_max_m - peak_to_peak_min_m)
+    steady = [solve_steady_state(first, cold_heat, drive, n) for n in range(1, drive.max_periods + 1)]
+    reaching = [state for state in steady if state.peak_m > 0.9999e-6 * target_um]
+    if not reaching:
+        yield f"{name}: unreachable, at most", 1e6 * steady[-1].peak_m, "µm"
+        return
+    max_m, min_m = reaching[0].peak_to_peak_m, steady[-1].peak_to_peak_m
+    peak_to_peak_m = min_m + PEAK_TO_PEAK_SHARE * (max_m - min_m)
     trains = tuple(
         replace(first, pixel=PIXELS[k], start_s=round(k * period_s / count, 6), peak_to_peak_m=peak_to_peak_m)
         for k in range(count)
     )
     result = plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state())
-    peak_um, simulated_peak_to_peak_um, train_j = measure_last_cycles(display, result, trains[0], period_s)
+    peak_um, simulated_um, train_j = measure_last_cycles(display, result, trains[0], period_s)
     width_s = result.plan.width_s[result.plan.pixel == PIXELS[0]][-1]
     periods, duty = cold_heat.solve_pulse(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
-    cold = tuple(
-        PulseTrain(
-            item.pixel, item.start_s, duration_s, periods * drive.period_s,
-            period_s - periods * drive.period_s, duty * drive.max_power_w,
-        )
-        for item in trains
-    )  # fmt: skip
+    on_s, power_w = periods * drive.period_s, duty * drive.max_power_w
+    cold = tuple(PulseTrain(item.pixel, item.start_s, duration_s, on_s, period_s - on_s, power_w) for item in trains)
     cold_result = plan_sequence(display, FrameSequence(trains=cold), *display.build_cold_state())
     cold_um, _, cold_j = measure_last_cycles(display, cold_result, trains[0], period_s)
-    trimmed = "" if not cold_result.plan.trimmed_j.any() else ", trimmed"
-    return (
-        *row_start,
-        f"{peak_um:.1f} ({100 * (peak_um / target_um - 1):+.2f} %)",
-        f"{1e6 * peak_to_peak_m:.1f}",
-        f"{simulated_peak_to_peak_um:.1f} ({100 * (simulated_peak_to_peak_um / peak_to_peak_m / 1e6 - 1):+.1f} %)",
-        f"{1e3 * train_j:.2f}",
-        f"{1e3 * cold_j:.2f}",
-        f"{100 * (1 - train_j / cold_j):.0f} %",
-        f"{cold_um:.0f}{trimmed}",
-    )
-
-
-def build_cycles_table(display):
-    """Compare trains by height with trains whose pulses are planned from the cold state."""
-    columns = ("pixels", "Hz", "peak µm", "simulated", "peak-to-peak µm", "simulated")
-    energy_columns = ("mJ/cycle", "cold plan", "saved", "peak of cold plan")
-    table = Table(*columns, *energy_columns, title="trains by height")
-    for count, rate_hz, target_um in product((1, 4), (10, 25, 50), (100, 300)):
-        try:
-            table.add_row(*measure_train(display, count, rate_hz, target_um))
-        except InputError as error:
-            table.add_row(str(count), f"{rate_hz:g}", f"{target_um:g}", str(error))
-    return table
+    yield f"{name}: peak", peak_um, "µm"
+    yield f"{name}: error of the peak", 100 * (peak_um / target_um - 1), "%"
+    yield f"{name}: peak-to-peak", simulated_um, "µm"
+    yield f"{name}: error of peak-to-peak", 100 * (simulated_um / peak_to_peak_m / 1e6 - 1), "%"
+    yield f"{name}: energy per cycle", 1e3 * train_j, "mJ"
+    yield f"{name}: saved against the cold plan", 100 * (1 - train_j / cold_j), "%"
+    trimmed = ", trimmed" if cold_result.plan.trimmed_j.any() else ""
+    yield f"{name}: peak of the cold plan{trimmed}", cold_um, "µm"
 
 
 @contextmanager
@@ -143,56 +102,49 @@ def record_candidates():
         scheduler.select_schedule = original
 
 
-def plan_frame(display, heights_um):
+def plan_simultaneously(display, heights_um):
     """Plan a simultaneous frame of heights by pixel, with time for any number of interleaved sub-pulses."""
     target_m = np.zeros(len(display.layout))
     target_m[list(heights_um)] = np.array(list(heights_um.values())) * 1e-6
-    frame = TactileFrame("f", 0.0, 20.0, target_m, simultaneous=True)
-    return plan_sequence(display, FrameSequence((frame,)), *display.build_cold_state())
+    (frame,) = build_frames([target_m], 20.0).frames
+    sequence = FrameSequence((replace(frame, simultaneous=True),))
+    return plan_sequence(display, sequence, *display.build_cold_state())
 
 
-def build_simultaneous_table(display):
-    """Return simultaneity and duration of squares of pixels by number of interleaved rounds."""
-    table = Table("pixels", "µm", "rounds", "simultaneity", "end ms", "added ms", "", title="simultaneous frames")
+def measure_rounds(display):
+    """Yield simultaneity and duration of squares of pixels by number of interleaved rounds."""
     for side, target_um in ((2, 100), (2, 300), (3, 50), (3, 100), (3, 200), (6, 50)):
         square = [200 + 21 * row + column for row in range(side) for column in range(side)]
         with record_candidates() as recorded:
-            (report,) = plan_frame(display, dict.fromkeys(square, target_um)).simultaneous
+            (report,) = plan_simultaneously(display, dict.fromkeys(square, target_um)).simultaneous
         for item in recorded[0]:
-            longer_ms = 1e3 * (item.end_s - recorded[0][0].end_s)
-            table.add_row(
-                f"{side * side}",
-                f"{target_um}",
-                f"{item.rounds}",
-                f"{item.simultaneity:.3f}",
-                f"{1e3 * item.end_s:.1f}",
-                f"{longer_ms:+.1f}",
-                "selected" if item.rounds == report.interleaved_rounds else "",
-            )
-    return table
+            selected = ", selected" if item.rounds == report.interleaved_rounds else ""
+            name = f"{side * side} simultaneous pixels, {target_um} µm, {item.rounds} rounds{selected}"
+            yield f"{name}: simultaneity", item.simultaneity, "1"
+            yield f"{name}: end", 1e3 * item.end_s, "ms"
+            yield f"{name}: later than with one round", 1e3 * (item.end_s - recorded[0][0].end_s), "ms"
 
 
 def measure_shortening(display):
-    """Count the random frames that interleaving shortens. Return one line."""
+    """Yield how many random frames interleaving shortens."""
     generator = np.random.default_rng(1)
     with record_candidates() as recorded:
         for _ in range(FRAMES):
-            pixels = generator.choice(len(display.layout), generator.integers(2, 30), replace=False)
-            plan_frame(display, dict(zip(pixels.tolist(), generator.uniform(5.0, 400.0, len(pixels)), strict=True)))
+            pixels = generator.choice(len(display.layout), generator.integers(2, 30), replace=False).tolist()
+            plan_simultaneously(display, dict(zip(pixels, generator.uniform(5.0, 400.0, len(pixels)), strict=True)))
     longer_s = np.array([item.end_s - items[0].end_s for items in recorded for item in items[1:]])
-    return (
-        f"{FRAMES} random frames, {len(longer_s)} interleaved schedules: {np.count_nonzero(longer_s < 0)} end earlier "
-        f"than a single pulse per pixel, minimum added duration {1e3 * longer_s.min():.1f} ms"
-    )
+    name = f"interleaved schedules of {FRAMES} random frames"
+    yield name, len(longer_s), "1"
+    yield f"{name}: end earlier than with single pulses", np.count_nonzero(longer_s < 0), "1"
+    yield f"{name}: minimum added duration", 1e3 * longer_s.min(), "ms"
 
 
-def main() -> int:
-    display, console = DisplayModel.from_config(load_config("display-437")), Console(width=150)
-    console.print(build_cycles_table(display))
-    console.print(build_simultaneous_table(display))
-    console.print(measure_shortening(display))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def measure():
+    display = build_display("display-437")
+    for count, rate_hz, target_um in product((1, 4), (10, 25, 50), (100, 300)):
+        try:
+            yield from measure_train(display, count, rate_hz, target_um)
+        except InputError as error:
+            yield f"{count} pixels, {rate_hz} Hz, {target_um} µm: {error}"
+    yield from measure_rounds(display)
+    yield from measure_shortening(display)

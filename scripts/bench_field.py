@@ -1,12 +1,11 @@
-"""Benchmark of the calibrated field: error on hidden geometries, and duration of conversions."""
+"""The calibrated field: error on hidden geometries, and duration of conversions."""
 
 import subprocess
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
-from measuring import measure_median_cpu_s
+from measuring import measure_median_cpu_s, measure_times_s
 
 from optodrive.core.numeric_tables import write_columns
 from optodrive.device.config import build_pixel_layout
@@ -59,36 +58,32 @@ class HiddenGeometryLab:
 
 def measure_command_s(*arguments):
     """Return the wall time of a command, s."""
-    begin_s = time.perf_counter()
-    subprocess.run(["optodrive", *arguments], check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - begin_s
+    command = ["optodrive", "field", *arguments]
+    return measure_times_s(lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL), 1)
 
 
-def bench_field():
-    """Return the rows of the table."""
-    lab, rows = HiddenGeometryLab(), []
+def measure():
+    lab = HiddenGeometryLab()
     for side in (17, 5, 3):
         rms_um, max_um, covered = lab.measure_errors(side).T
-        rows.append(
-            (f"{side**2} spots: rms position error, median of {GEOMETRIES} hidden geometries", np.median(rms_um), "µm")
-        )
-        rows.append((f"{side**2} spots: rms position error, worst geometry", rms_um.max(), "µm"))
-        rows.append((f"{side**2} spots: maximum position error", max_um.max(), "µm"))
-        rows.append((f"{side**2} spots: fraction within two sigma", covered.mean(), "1"))
+        spots = f"{side**2} spots"
+        yield f"{spots}: rms position error, median of {GEOMETRIES} hidden geometries", np.median(rms_um), "µm"
+        yield f"{spots}: rms position error, worst geometry", rms_um.max(), "µm"
+        yield f"{spots}: maximum position error", max_um.max(), "µm"
+        yield f"{spots}: fraction within two sigma", covered.mean(), "1"
     _, fit = lab.fit_spots(0, 17)
     field, targets = fit.field, lab.sample_positions(POINTS)
     codes = field.codes(*targets)
-    rows.append(("1,000,000 positions to codes", measure_median_cpu_s(lambda: field.codes(*targets)), "s CPU"))
-    rows.append(("1,000,000 codes to positions", measure_median_cpu_s(lambda: field.position_m(*codes)), "s CPU"))
+    yield "1,000,000 positions to codes", measure_median_cpu_s(lambda: field.codes(*targets)), "s CPU"
+    yield "1,000,000 codes to positions", measure_median_cpu_s(lambda: field.position_m(*codes)), "s CPU"
     round_trip = np.abs(np.subtract(field.codes(*field.position_m(*codes)), codes)).max()
-    rows.append(("round trip to metres and back, maximum error", float(round_trip), "codes"))
+    yield "round trip to metres and back, maximum error", round_trip, "codes"
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        write_field(folder / "field.toml", fit)
-        write_columns(folder / "points.csv", ("x_m", "y_m"), targets.T, ("%.9f", "%.9f"))
-        common = ["field", "--calibration", f"{folder}/field.toml", "--points"]
-        there_s = measure_command_s(*common, f"{folder}/points.csv", "--out", f"{folder}/codes.csv")
-        back_s = measure_command_s(*common, f"{folder}/codes.csv", "--inverse", "--out", f"{folder}/back.csv")
-    rows.append(("optodrive field, 1,000,000 lines to codes, whole command", there_s, "s"))
-    rows.append(("optodrive field --inverse, 1,000,000 lines, whole command", back_s, "s"))
-    return rows
+        points, coded, back = (f"{name}/{file}.csv" for file in ("points", "codes", "back"))
+        write_field(Path(name) / "field.toml", fit)
+        write_columns(Path(points), ("x_m", "y_m"), targets.T, ("%.9f", "%.9f"))
+        common = ["--calibration", f"{name}/field.toml", "--points"]
+        there_s = measure_command_s(*common, points, "--out", coded)
+        yield "optodrive field, 1,000,000 lines to codes, whole command", there_s, "s"
+        back_s = measure_command_s(*common, coded, "--inverse", "--out", back)
+        yield "optodrive field --inverse, 1,000,000 lines, whole command", back_s, "s"

@@ -4,7 +4,6 @@ Beside each row stands how late the computer woke a process that only sleeps, at
 the ratio to a reference of the same run. Daemon, board, callers and this benchmark share the computer.
 """
 
-import argparse
 import asyncio
 import fcntl
 import json
@@ -16,9 +15,8 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
@@ -29,32 +27,28 @@ import pytest
 from bench_boards import Bench as SeveralBoards
 from bench_latency import RATES_HZ, WAYS, measure_errors, run_daemon
 from bench_stop import run_flood
-from bench_stream import start_bare_server, stream_under_load
-from measured_rows import Row, print_table, report_lateness, to_ms
-from measuring import Sleeper, realtime_priority, time_limit
+from bench_stream import bare_server, stream_under_load
+from measuring import LEASE_S, Row, Sleeper, measure_times_s, realtime_priority, running_daemon, time_limit, to_ms
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / part) for part in ("system", "")]
-from floods import Target, abandon_dry_run, build_full_frames, build_refused_bodies  # noqa: E402 - of the tests
-from optodrive.client import Display  # noqa: E402
-from optodrive.core.clock import MonotonicClock  # noqa: E402
-from optodrive.core.types.stimuli import PulseTrain  # noqa: E402
-from optodrive.daemon.supervisor.supervisor import END_GRACE_S  # noqa: E402
-from optodrive.device.config_file import load_config  # noqa: E402
-from optodrive.link.board_setup import build_board_requirements  # noqa: E402
-from optodrive.link.session.session import BoardSession  # noqa: E402
-from optodrive.link.transport.serial_port import SerialPort  # noqa: E402
-from optodrive.planning.stimuli.sequence_file import parse_sequence  # noqa: E402
-from optodrive.planning.stimuli.train_json import check_trains  # noqa: E402
-from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, read_role_tokens, wait_for  # noqa: E402
-from service_manager import Manager, reload  # noqa: E402
-from stop_rig import PIXELS, StopRig, build_http_sender, is_gate_on, is_unarmed  # noqa: E402
+from floods import Target, abandon_dry_run, build_full_frames, build_refused_bodies
+from optodrive.client import Display
+from optodrive.core.clock import MonotonicClock
+from optodrive.core.types.stimuli import PulseTrain
+from optodrive.daemon.supervisor.supervisor import END_GRACE_S
+from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.session.session import BoardSession
+from optodrive.link.transport.serial_port import SerialPort
+from optodrive.planning.stimuli.sequence_file import parse_sequence
+from optodrive.planning.stimuli.train_json import check_trains
+from rig import OPTODRIVE, TOKEN, Board, long_train, read_role_tokens, wait_for
+from service_manager import Manager, reload  # of the tests
+from stop_rig import PIXELS, StopRig, build_http_sender, is_gate_on, is_unarmed
 
 LIMIT_S = 90.0
 """Longest time of one measurement, after which it counts as failed."""
-LEASE_S = 0.1
-"""The shipped lease."""
 STOP_MAX_MS = 50.0
 FLOODS = ("rest", "refused bodies of 8 MB", "valid previews", "pings", "idle connections", "connection churn")
 FLOOD_S, STREAM_S = 3.0, 4.0
@@ -62,15 +56,12 @@ BARE = "a bare FastAPI's answer"
 
 
 class Bench:
-    """Boards and daemons that measurements share, started when they are first needed.
+    """A rig and a server that measurements share, started when they are first needed, until the benchmark ends."""
 
-    They end with the benchmark.
-    """
-
-    def __init__(self, stack: ExitStack) -> None:
+    def __init__(self, stack):
         self._stack = stack
 
-    def make_folder(self) -> Path:
+    def make_folder(self):
         return Path(self._stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
 
     @cached_property
@@ -81,66 +72,37 @@ class Bench:
 
     @cached_property
     def bare_url(self):
-        process, url = start_bare_server(self.make_folder(), 8458)
-        self._stack.callback(process.wait)
-        self._stack.callback(process.terminate)
-        return httpx.URL(url)
-
-    @contextmanager
-    def daemon(self, text="", name="display-437") -> Iterator[tuple[Board, Daemon]]:
-        """Run a daemon on a board of its own.
-
-        text: of its section [daemon]
-        """
-        folder = self.make_folder()
-        board = Board(folder, limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
-        try:
-            lease = f"lease_s = {LEASE_S}"
-            section = [(lease, f"{lease}\n[daemon]\n{text}\n#")] if text else []
-            daemon = Daemon(folder, board.port, name, section, lease_s=LEASE_S)
-            try:
-                yield board, daemon
-            finally:
-                daemon.stop()
-        finally:
-            board.stop()
+        return httpx.URL(self._stack.enter_context(bare_server(8458)))
 
 
-Measurement = Callable[[Bench], list[Row]]
-MEASUREMENTS: dict[str, Measurement] = {}
+MEASUREMENTS = {}
 
 
-def measurement(name: str) -> Callable[[Measurement], Measurement]:
-    def register(measure: Measurement) -> Measurement:
-        MEASUREMENTS[name] = measure
-        return measure
+def measurement(name):
+    """Decorate a function that yields the rows of one measurement."""
+    return partial(MEASUREMENTS.setdefault, name)
 
-    return register
+
+def run_quietly(*command, **environment):
+    """Run a command, and return its duration, s."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": {**os.environ, **environment}}
+    return measure_times_s(lambda: subprocess.run(command, check=True, **quiet), 1)[0]
 
 
 # --- STOP ------------------------------------------------------------------------------------------------------------
 
 
-def measure_stop(name: str, bench: Bench) -> list[Row]:
-    rows = []
+def measure_stop(name, bench):
     send_bare = build_http_sender(bench.bare_url, "GET", "/v1/state")
-
-    def measure_bare():
-        begin_s = time.monotonic()
-        return send_bare() - begin_s
-
     with realtime_priority():  # the times must not include the wait of this process for a core
         for path, way in (("http", "over HTTP"), ("socket", "at the link's socket")):
-            result = run_flood(bench.stop_rig, name, 100, FLOOD_S, path=path, measure_reference=measure_bare)
-            notes = [f"{len(result.darkened)} dark before"] if result.darkened else []
-            notes += [
-                f"{count} {what}" for count, what in ((result.relit, "relit"), (result.not_begun, "no show")) if count
-            ]
+            measure_bare = {"measure_reference": lambda: measure_times_s(send_bare, 1)[0]}
+            result = run_flood(bench.stop_rig, name, 100, FLOOD_S, path=path, **measure_bare)
+            counts = ((len(result.darkened), "dark before"), (result.relit, "relit"), (result.not_begun, "no show"))
+            note = ", ".join(f"{count} {what}" for count, what in counts if count)
             for what, values_s in (("gate off", result.gate_off_s), ("its answer", result.answered_s)):
-                quantity = f"STOP {way} to {what}, {name}"
-                rows.append(Row(quantity, STOP_MAX_MS, to_ms(values_s), note=", ".join(notes)))
-                rows[-1].reference, rows[-1].reference_values = BARE, to_ms(result.reference_s)
-    return rows
+                reference = BARE, to_ms(result.reference_s), note
+                yield Row(f"STOP {way} to {what}, {name}", to_ms(values_s), "ms", STOP_MAX_MS, *reference)
 
 
 for flood in FLOODS:
@@ -151,21 +113,13 @@ for flood in FLOODS:
 def measure_command(bench):
     rig, gate_off_s, ended_s, empty_s = bench.stop_rig, [], [], []
     for _ in range(5):
-        begin_s = time.monotonic()
-        subprocess.run([sys.executable, "-c", "pass"], check=True)
-        empty_s.append(time.monotonic() - begin_s)
-        begin = rig.start_show()
-        environment = {**os.environ, "XDG_RUNTIME_DIR": str(rig.daemon.config.parent)}
-        begin_s = time.monotonic()
-        command = [OPTODRIVE, "stop", "--url", rig.daemon.url]
-        subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        ended_s.append(time.monotonic() - begin_s)
+        empty_s.append(run_quietly(sys.executable, "-c", "pass"))
+        begin, begin_s = rig.start_show(), time.monotonic()
+        runtime = str(rig.daemon.config.parent)
+        ended_s.append(run_quietly(OPTODRIVE, "stop", "--url", rig.daemon.url, XDG_RUNTIME_DIR=runtime))
         gate_off_s.append(rig.to_host_s(rig.tail.find(is_unarmed, begin, "dark")) - begin_s)
-    reference = {"reference": "`python -c pass`", "reference_values": to_ms(empty_s)}
-    return [
-        Row("`optodrive stop` to gate off", None, to_ms(gate_off_s), **reference),
-        Row("`optodrive stop` to its end", None, to_ms(ended_s), **reference),
-    ]
+    for what, values_s in (("gate off", gate_off_s), ("its end", ended_s)):
+        yield Row(f"`optodrive stop` to {what}", to_ms(values_s), "ms", None, "`python -c pass`", to_ms(empty_s))
 
 
 @measurement("audit")
@@ -175,30 +129,21 @@ def measure_audit(bench):
     os.mkfifo(fifo)
     reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
     fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096)
-
-    def stop(times):
-        values_s = []
-        for _ in range(times):
-            begin_s = time.monotonic()
-            daemon.call("POST", "/v1/stop")
-            values_s.append(time.monotonic() - begin_s)
-        return to_ms(values_s)
-
     try:
-        with bench.daemon(f'audit = "{fifo}"') as (_, daemon):
-            free = stop(10)
-            stop(60)  # more lines than the pipe holds
-            stuck = stop(30)
-            begin_s = time.monotonic()
-            daemon.process.terminate()
-            daemon.process.wait()
-            ended_s = time.monotonic() - begin_s
+        with running_daemon(text=f'[daemon]\naudit = "{fifo}"') as (_, daemon):
+            # The 60 write more lines than the pipe holds.
+            free, _, stuck = (to_ms(measure_times_s(lambda: daemon.call("POST", "/v1/stop"), n)) for n in (10, 60, 30))
+            ended_s = end(daemon)
     finally:
         os.close(reader)
-    return [
-        Row("STOP over HTTP behind an audit path that hangs", 500.0, stuck, "ms", "with a path that is free", free),
-        Row("end of that daemon after SIGTERM", 10e3, [1e3 * ended_s]),
-    ]
+    name = "STOP over HTTP behind an audit path that hangs"
+    yield Row(name, stuck, "ms", 500.0, "with a path that is free", free)
+    yield Row("end of that daemon after SIGTERM", 1e3 * ended_s, aim=10e3)
+
+
+def end(daemon):
+    """End a daemon by SIGTERM, and return the time that it takes, s."""
+    return measure_times_s(lambda: (daemon.process.terminate(), daemon.process.wait()), 1)[0]
 
 
 # --- frames ----------------------------------------------------------------------------------------------------------
@@ -207,11 +152,9 @@ def measure_audit(bench):
 def measure_stream(load_hz, bench):
     streaming = stream_under_load(load_hz, seconds=STREAM_S)
     beside = f"beside {streaming.rate_hz:.0f} requests/s" if load_hz else "at rest"
-    bare = to_ms(streaming.bare_trips_s)
-    return [
-        Row(f"push to {what}, {beside}", aim, to_ms(latency[key] for latency in streaming.latencies), "ms", BARE, bare)
-        for what, key, aim in (("first byte", "first_byte_s", None), ("first light", "first_light_s", 1000.0))
-    ]
+    for what, key, aim in (("first byte", "first_byte_s", None), ("first light", "first_light_s", 1000.0)):
+        values = to_ms(latency[key] for latency in streaming.latencies)
+        yield Row(f"push to {what}, {beside}", values, "ms", aim, BARE, to_ms(streaming.bare_trips_s))
 
 
 measurement("stream-rest")(partial(measure_stream, None))
@@ -221,19 +164,17 @@ measurement("stream-load")(partial(measure_stream, 300.0))
 @measurement("latency")
 def measure_latency(bench):
     """Reported latencies at 5 to 60 frames/s against the instants of caller and board."""
-    rows = []
     with run_daemon(bench.make_folder()) as (board, daemon):
         for way in WAYS:
             errors_s = [error_s for rate_hz in RATES_HZ for error_s in measure_errors(board, daemon, way, rate_hz, 6)]
-            rows.append(Row(f"error of a reported latency, {way}, 5 to 60 frames/s", 1.0, to_ms(errors_s)))
-    return rows
+            yield Row(f"error of a reported latency, {way}, 5 to 60 frames/s", to_ms(errors_s), aim=1.0)
 
 
 @measurement("onset")
 def measure_onset(bench):
     train = {"pixel": 17, "start_s": 0.3, "duration_s": 0.1, "pulse_width_s": 0.01, "gap_s": 0.03, "power_w": 1.0}
     errors_s = []
-    with bench.daemon() as (board, daemon):
+    with running_daemon() as (board, daemon):
         daemon.arm()
         zero_s = float(Path(f"{board.port}.clock").read_text())
         for _ in range(8):
@@ -242,26 +183,19 @@ def measure_onset(bench):
             ended = daemon.finished(announced["plan"])
             gate_on_s = zero_s + 1e-6 * next(event["t_us"] for event in board.of("gate") if event["on"])
             errors_s.append(abs(announced["onset"]["monotonic_s"] + ended["delay_s"] - gate_on_s))
-    return [Row("error of an announced onset", 1000.0, [1e6 * error_s for error_s in errors_s], "µs")]
+    yield Row("error of an announced onset", [1e6 * error_s for error_s in errors_s], "µs", 1000.0)
 
 
 @measurement("parsing")
 def measure_parsing(bench):
-    def measure(work, runs):
-        values_s = []
-        for _ in range(runs):
-            begin_s = time.process_time()
-            work()
-            values_s.append(time.process_time() - begin_s)
-        return to_ms(values_s)
-
     frame = {"show_at_s": 0, "duration_s": 1, "target_um": {str(k): 50.0 for k in range(1511)}}
     text, config = json.dumps({"frames": [frame]}), load_config("display-1511")
     trains = [PulseTrain(k, 0.0005 * k, 50.0, 0.0002, 0.0018, 1.0) for k in range(4)]
-    return [
-        Row("a frame of 1,511 pixels read, CPU time", 20.0, measure(lambda: parse_sequence(text, config, "f"), 30)),
-        Row("100,000 pulses checked, CPU time", 500.0, measure(lambda: check_trains(trains, "trains", config), 5)),
-    ]
+    for what, work, runs, aim in (
+        ("a frame of 1,511 pixels read", lambda: parse_sequence(text, config, "f"), 30, 20.0),
+        ("100,000 pulses checked", lambda: check_trains(trains, "trains", config), 5, 500.0),
+    ):
+        yield Row(f"{what}, CPU time", to_ms(measure_times_s(work, runs, time.process_time)), aim=aim)
 
 
 # --- other callers ---------------------------------------------------------------------------------------------------
@@ -275,9 +209,11 @@ def post(rig, body, role="operator", **params):
 @measurement("gap")
 def measure_gap(bench):
     """Longest time without light while another caller's request is under way."""
-    rig, rows = bench.stop_rig, []
-
-    def measure(bodies, **params):
+    rig, previews = bench.stop_rig, [build_full_frames(300, PIXELS)] * 3
+    for what, bodies, params in (
+        ("refused body of 8 MB", build_refused_bodies(PIXELS), {}),
+        ("preview of 300 frames", previews, {"dry_run": True}),
+    ):
         gaps_s = []
         with rig.running_show() as begin:
             for body in bodies:
@@ -286,12 +222,7 @@ def measure_gap(bench):
                 rig.tail.read()
                 on_s = [rig.to_host_s(event) for event in rig.tail.events[begin:] if is_gate_on(event)]
                 gaps_s.append(max(b - a for a, b in pairwise([on_s[0], *on_s]) if b >= begin_s))
-        return to_ms(gaps_s)
-
-    rows.append(Row("gap of light beside a refused body of 8 MB", 500.0, measure(build_refused_bodies(PIXELS))))
-    previews = [build_full_frames(300, PIXELS)] * 3
-    rows.append(Row("gap of light beside a preview of 300 frames", 500.0, measure(previews, dry_run=True)))
-    return rows
+        yield Row(f"gap of light beside a {what}", to_ms(gaps_s), aim=500.0)
 
 
 @measurement("dry-runs")
@@ -304,27 +235,21 @@ def measure_dry_runs(bench):
         rig.arm()
         for _ in range(5):
             asyncio.run(abandon_dry_run(target, 730))
-        begin_s = time.monotonic()
-        post(rig, small, role="armer").raise_for_status()
-        pushed_s.append(time.monotonic() - begin_s)
+        pushed_s += measure_times_s(lambda: post(rig, small, role="armer").raise_for_status(), 1)
         rig.client.post("/v1/stop")
+        dropped_s += measure_times_s(lambda: post(rig, small, dry_run=True).raise_for_status(), 1)
+    body, refused_s = build_full_frames(100, PIXELS), []
+
+    def push(_):
         begin_s = time.monotonic()
-        post(rig, small, dry_run=True).raise_for_status()
-        dropped_s.append(time.monotonic() - begin_s)
-    body = build_full_frames(100, PIXELS)
+        if post(rig, body, dry_run=True).status_code in (429, 503):
+            refused_s.append(time.monotonic() - begin_s)
+
     with ThreadPoolExecutor(24) as pool:
-
-        def run(_):
-            begin_s = time.monotonic()
-            status = post(rig, body, dry_run=True).status_code
-            return status, time.monotonic() - begin_s
-
-        refused_s = [took_s for status, took_s in pool.map(run, range(24)) if status in (429, 503)]
-    return [
-        Row("small push behind five abandoned dry runs", 1000.0, to_ms(pushed_s)),
-        Row("small dry run behind five abandoned ones", 8000.0, to_ms(dropped_s)),
-        Row("refusal of dry runs beyond those that may wait", 5000.0, to_ms(refused_s)),
-    ]
+        list(pool.map(push, range(24)))
+    yield Row("small push behind five abandoned dry runs", to_ms(pushed_s), aim=1000.0)
+    yield Row("small dry run behind five abandoned ones", to_ms(dropped_s), aim=8000.0)
+    yield Row("refusal of dry runs beyond those that may wait", to_ms(refused_s), aim=5000.0)
 
 
 @measurement("revocation")
@@ -341,7 +266,7 @@ def measure_revocation(bench):
     write("rig")
     with pytest.MonkeyPatch.context() as patch:
         manager = Manager(folder, patch)
-        with bench.daemon(f'tokens = "{tokens}"') as (_, daemon):
+        with running_daemon(text=f'[daemon]\ntokens = "{tokens}"') as (_, daemon):
             for _ in range(4):
                 write("rig", "ben")
                 reload(daemon, manager, lambda text: text)
@@ -363,13 +288,13 @@ def measure_revocation(bench):
                     thread.join()
                 values_s.append(ended[0] - begin_s)
         manager.close()
-    return [Row("token removed to the end of its connection", 500.0, to_ms(values_s))]
+    yield Row("token removed to the end of its connection", to_ms(values_s), aim=500.0)
 
 
 @measurement("hold")
 def measure_hold(bench):
     values_s = []
-    with bench.daemon() as (board, daemon):
+    with running_daemon() as (board, daemon):
         for _ in range(8):
             board.forget()
             display = Display(daemon.url, TOKEN)
@@ -379,7 +304,7 @@ def measure_hold(bench):
             released_us = board.now_us()
             display.close()
             values_s.append(1e-6 * (wait_for_dark_us(board) - released_us))
-    return [Row("release of a hold to dark", 500.0, to_ms(values_s))]
+    yield Row("release of a hold to dark", to_ms(values_s), aim=500.0)
 
 
 def wait_for_dark_us(board):
@@ -401,13 +326,11 @@ def light(board, daemon):
 
 @measurement("restart")
 def measure_restart(bench):
-    rows = []
-    with bench.daemon() as (board, daemon):
+    with running_daemon() as (board, daemon):
         for name in ("planner", "web", "link"):
             dark_s, served_s = zip(*(kill_and_await(board, daemon, name) for _ in range(2)), strict=True)
-            rows.append(Row(f"SIGKILL of {name} to dark", 100.0, to_ms(dark_s)))
-            rows.append(Row(f"SIGKILL of {name} to the next one's service", 3000.0, to_ms(served_s)))
-    return rows
+            yield Row(f"SIGKILL of {name} to dark", to_ms(dark_s), aim=100.0)
+            yield Row(f"SIGKILL of {name} to the next one's service", to_ms(served_s), aim=3000.0)
 
 
 def kill_and_await(board, daemon, name):
@@ -448,18 +371,16 @@ def find_dark_s(board, since_us):
 @measurement("loss")
 def measure_loss(bench):
     """All processes of the daemon are killed or suspended while `optodrive push` shows a train."""
-    rows = []
-    with bench.daemon() as (board, daemon):
+    with running_daemon() as (board, daemon):
         suspended_s = [lose(bench, board, daemon, signal.SIGSTOP) for _ in range(2)]
     killed_s = []
     for _ in range(2):
-        with bench.daemon() as (board, daemon):
+        with running_daemon() as (board, daemon):
             killed_s.append(lose(bench, board, daemon, signal.SIGKILL))
     for what, times_s in (("killed", killed_s), ("suspended", suspended_s)):
         dark_s, ended_s = zip(*times_s, strict=True)
-        rows.append(Row(f"every process {what} to dark, with a lease of 100 ms", 101.0, to_ms(dark_s)))
-        rows.append(Row(f"every process {what} to the end of `optodrive push`", 5000.0, to_ms(ended_s)))
-    return rows
+        yield Row(f"every process {what} to dark, with a lease of 100 ms", to_ms(dark_s), aim=101.0)
+        yield Row(f"every process {what} to the end of `optodrive push`", to_ms(ended_s), aim=5000.0)
 
 
 def lose(bench, board, daemon, number):
@@ -492,13 +413,11 @@ def lose(bench, board, daemon, number):
 def measure_end(bench):
     values_s = []
     for _ in range(2):
-        with bench.daemon() as (_, daemon):
+        with running_daemon() as (_, daemon):
             os.kill(daemon.find_process("planner"), signal.SIGSTOP)
-            begin_s = time.monotonic()
-            daemon.process.terminate()
-            daemon.process.wait()
-            values_s.append(time.monotonic() - begin_s)
-    return [Row("SIGTERM to the end of a daemon with a suspended planner", 1e3 * END_GRACE_S, to_ms(values_s))]
+            values_s.append(end(daemon))
+    name = "SIGTERM to the end of a daemon with a suspended planner"
+    yield Row(name, to_ms(values_s), aim=1e3 * END_GRACE_S)
 
 
 # --- boards ----------------------------------------------------------------------------------------------------------
@@ -520,21 +439,17 @@ def measure_board(bench):
         session.close()
     finally:
         board.stop()
-    return [Row("round trip to a board on a pseudo-terminal", 50.0, to_ms(trips_s))]
+    yield Row("round trip to a board on a pseudo-terminal", to_ms(trips_s), aim=50.0)
 
 
 @measurement("boards")
 def measure_boards(bench):
     boards = SeveralBoards(bench.make_folder(), 2)
     try:
-        boards.read_starts()
         boards.arm()
         time.sleep(5.0)  # until the rates of the clocks are known
         skews_s = np.concatenate([boards.draw_frame() for _ in range(4)])[:, 0]
-        stops_s = []
-        for _ in range(4):
-            boards.arm()
-            stops_s.append(boards.measure_stop_s())
+        stops_s = [boards.measure_stop_s() for _ in range(4)]
         boards.arm()
         boards.start_trains()
         lost, left = boards.boards
@@ -545,49 +460,28 @@ def measure_boards(bench):
     finally:
         boards.stop()
     skew_max_us = 1e6 * load_config("display-437").limits.stage_skew_max_s
-    return [
-        Row("skew of gate edges of two boards", skew_max_us, (1e6 * np.abs(skews_s)).tolist(), "µs"),
-        Row("STOP to dark of two boards", STOP_MAX_MS, to_ms(stops_s)),
-        Row("loss of one board to dark of the other, with a lease of 300 ms", 320.0, [1e3 * dark_s]),
-    ]
+    yield Row("skew of gate edges of two boards", (1e6 * np.abs(skews_s)).tolist(), "µs", skew_max_us)
+    yield Row("STOP to dark of two boards", to_ms(stops_s), aim=STOP_MAX_MS)
+    name = "loss of one board to dark of the other, with a lease of 300 ms"
+    yield Row(name, 1e3 * dark_s, aim=320.0)
 
 
-# --- table -----------------------------------------------------------------------------------------------------------
+OPTIONS = {"--only": {"action": "append", "choices": tuple(MEASUREMENTS), "help": "a measurement; may be repeated"}}
 
 
-def run(names):
-    """Run measurements. Yield their names and rows."""
+def measure(only=None):
     with ExitStack() as stack:
         bench = Bench(stack)
-        for name in names:
+        for name in only or MEASUREMENTS:
             sleeper, begin_s = Sleeper(), time.monotonic()
             try:
                 with time_limit(LIMIT_S):
-                    rows = [row.report() for row in MEASUREMENTS[name](bench)]
+                    rows = list(MEASUREMENTS[name](bench))
             except Exception as error:
                 traceback.print_exc()
-                rows = [Row(name, None, [], note=f"failed: {type(error).__name__}: {error}").report()]
-            lateness = report_lateness(sleeper.finish())
+                rows = [Row(name, [], note=f"failed: {type(error).__name__}: {error}")]
+            late_s = sleeper.finish()
             print(f"{time.monotonic() - begin_s:5.1f} s  {name}", file=sys.stderr, flush=True)
             for row in rows:
-                yield {"name": name, **row, **lateness}
-
-
-def main():
-    parser = argparse.ArgumentParser(prog="scripts/bench gate", description=__doc__)
-    parser.add_argument("--only", action="append", metavar="NAME", help=f"one of {', '.join(MEASUREMENTS)}")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
-    options = parser.parse_args()
-    unknown = [name for name in options.only or () if name not in MEASUREMENTS]
-    if unknown:
-        parser.error(f"--only: got {unknown[0]!r}, expected one of {', '.join(MEASUREMENTS)}")
-    rows = list(run(options.only or MEASUREMENTS))
-    if options.json:
-        print(json.dumps(rows, indent=1))
-    else:
-        print_table(rows)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+                row.name, row.late_s = name, late_s
+                yield row

@@ -1,15 +1,13 @@
-"""Benchmark of the reported latency: its error against the caller's instants and the board's own log.
+"""The reported latency: its error against the caller's instants and the board's own log.
 
 Frames go to the daemon at 5 to 60 per second over REST, the WebSocket, the Python client and the page in Chromium. Its
 true latency counts to the light, by the board's log, from an instant between those before and after it was sent.
 """
 
-import argparse
 import http.client
 import json
 import re
 import socket
-import sys
 import tempfile
 import threading
 import time
@@ -17,17 +15,17 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from measuring import compute_percentile
+from measuring import Row, to_ms
 from websockets.sync.client import connect
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / part) for part in ("system", "browser")]
-from optodrive.client import Display  # noqa: E402
-from rig import PATIENT_LEAD_S, TOKEN, running, wait_for  # noqa: E402 - of the tests
-from window import PageVisit, launch_chromium  # noqa: E402
+from optodrive.client import Display
+from rig import PATIENT_LEAD_S, TOKEN, running, wait_for  # of the tests
+from window import PageVisit, launch_chromium
 
 RATES_HZ = (5, 10, 20, 30, 60)
 FRAMES, PIXELS, HEIGHT_UM = 20, 40, 60
 """Frames per rate, and what each shows: more than fits between two of them, so that one follows the other's light."""
+OPTIONS = {"--frames": {"type": int, "default": FRAMES, "help": "frames per rate and way"}}
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 PAGE_SCRIPT = """async ([bodies, periodMs]) => {
     const { call } = await import("/page/api.js");
@@ -197,19 +195,9 @@ def read_gate_on(board):
     return [event["t_us"] for event in board.of("gate") if event["on"]]
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="scripts/bench latency", description=__doc__)
-    parser.add_argument("--frames", type=int, default=FRAMES, help="frames per rate and way")
-    options = parser.parse_args()
-    print("way, frames/s: frames that gave light, error in ms: median, largest")
+def measure(frames=FRAMES):
     with tempfile.TemporaryDirectory() as folder, run_daemon(Path(folder)) as (board, daemon):
         for way in WAYS:
             for rate_hz in RATES_HZ:
-                errors_ms = [1e3 * error_s for error_s in measure_errors(board, daemon, way, rate_hz, options.frames)]
-                median, largest = compute_percentile(errors_ms, 0.5), max(errors_ms)
-                print(f"{way:13} {rate_hz:3}: {len(errors_ms):4} {median:7.3f} {largest:7.3f}", flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+                errors_s = measure_errors(board, daemon, way, rate_hz, frames)
+                yield Row(f"error of a reported latency, {way}, {rate_hz} frames/s", to_ms(errors_s))

@@ -1,4 +1,4 @@
-"""Benchmark of the scheduler: its order, a naive order, a solver's order, and the lower bound set by the optics.
+"""The scheduler: its order, a naive order, a solver's order, and the lower bound set by the optics.
 
 Every order starts cold and uses the same pulse rule: each pulse is the shortest that reaches its target from the
 residual heat at its start. The naive order visits the pixels row by row; each of its moves takes 0.4 ms plus the
@@ -10,10 +10,8 @@ import time
 
 import elkai
 import numpy as np
+from measuring import build_display, build_frames
 
-from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.device.config_file import load_config
-from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 from optodrive.planning.stimuli.pattern_registry import build_pattern
@@ -29,7 +27,7 @@ class OrderBenchmark:
     """A cold display with its scan head and settling times."""
 
     def __init__(self, name):
-        self.display = DisplayModel.from_config(load_config(name))
+        self.display = build_display(name)
         scan_head = self.display.scan_head
         self.layout, self.settling, self.drive = scan_head.layout, scan_head.settling, scan_head.drive
         self.x_rad, self.y_rad = scan_head.field.angles_rad(self.layout.x_m, self.layout.y_m)
@@ -48,8 +46,6 @@ class OrderBenchmark:
             return self.settling.lead_in_us
         distance_rad = max(abs(self.x_rad[pixel] - self.x_rad[origin]), abs(self.y_rad[pixel] - self.y_rad[origin]))
         return 1e6 * (NAIVE_SETTLE_S + distance_rad / self.display.config.scanner.slew_rad_per_s)
-
-    # --- orders -------------------------------------------------------------------------------------------------
 
     def order_by_row(self, active, _origin):
         """Return the pixels row by row."""
@@ -80,13 +76,11 @@ class OrderBenchmark:
         path = nodes[np.array(tour[begin + 1 :] + tour[:begin]) - 1]
         return path if origin is None else path[1:]
 
-    # --- planning -----------------------------------------------------------------------------------------------
-
     def plan_order(self, frames, order_of, move_us):
         """Return the total time, the beam-on time with and without rounding to PWM periods, s, and the pulse count."""
         heat = self.display.build_cold_heat()
         now_us, pixel_before, dwell_us = 0, None, LONG_DWELL_US
-        light_us, exact_us, moves_us, count = 0, 0.0, 0, 0
+        light_us, exact_us, count = 0, 0.0, 0
         for target_m in frames:
             for pixel in order_of(np.flatnonzero(target_m > 0), pixel_before).tolist():
                 move = move_us(pixel_before, pixel, dwell_us)
@@ -98,7 +92,7 @@ class OrderBenchmark:
                 start_s = np.array([(now_us + move) * 1e-6])
                 heat.apply_pulses(np.array([pixel]), start_s, np.array([width_us * 1e-6]), np.array([power_w]))
                 now_us += move + width_us
-                moves_us, light_us, count = moves_us + move, light_us + width_us, count + 1
+                light_us, count = light_us + width_us, count + 1
                 exact_us += (pulse[0] - 1 + pulse[1]) * self.drive.period_s * 1e6
                 pixel_before, dwell_us = pixel, width_us
         return {"total_s": now_us * 1e-6, "light_s": light_us * 1e-6, "exact_s": exact_us * 1e-6, "count": count}
@@ -127,42 +121,30 @@ def build_cases(bench):
 
 def measure_case(bench, name, frames):
     """Yield the rows of one case."""
-    naive = bench.plan_order(frames, bench.order_by_row, bench.compute_naive_move_us)
     begin_s = time.process_time()
-    solver_result = bench.plan_order(frames, bench.order_by_solver, bench.compute_move_us)
+    solver = bench.plan_order(frames, bench.order_by_solver, bench.compute_move_us)
     solver_s = time.process_time() - begin_s
-    scheduler_result = bench.plan_order(frames, bench.order_by_scheduler, bench.compute_move_us)
-    lower_bound_s = bench.plan_order(frames, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
-    excess_s = scheduler_result["total_s"] - lower_bound_s
-    moves, rounding = (
-        scheduler_result["total_s"] - scheduler_result["light_s"],
-        scheduler_result["light_s"] - scheduler_result["exact_s"],
-    )
-    yield f"{name}: pixels shown", scheduler_result["count"], "1"
-    yield f"{name}: pixels per second, naive", naive["count"] / naive["total_s"], "1/s"
-    yield f"{name}: pixels per second, scheduler", scheduler_result["count"] / scheduler_result["total_s"], "1/s"
-    yield f"{name}: beam-on fraction, naive", naive["light_s"] / naive["total_s"], "1"
-    yield f"{name}: beam-on fraction, solver", solver_result["light_s"] / solver_result["total_s"], "1"
-    yield f"{name}: beam-on fraction, scheduler", scheduler_result["light_s"] / scheduler_result["total_s"], "1"
-    yield f"{name}: time over lower bound, naive", naive["total_s"] / lower_bound_s, "×"
-    yield f"{name}: time over lower bound, solver", solver_result["total_s"] / lower_bound_s, "×"
-    yield f"{name}: time over lower bound, scheduler", scheduler_result["total_s"] / lower_bound_s, "×"
-    yield f"{name}: scheduler over solver", scheduler_result["total_s"] / solver_result["total_s"], "×"
-    yield f"{name}: excess over lower bound, fraction by moves", moves / excess_s, "1"
-    yield f"{name}: excess over lower bound, fraction by whole PWM periods", rounding / excess_s, "1"
-    yield (
-        f"{name}: excess over lower bound, fraction by heat lost meanwhile",
-        (scheduler_result["exact_s"] - lower_bound_s) / excess_s,
-        "1",
-    )
+    ours = bench.plan_order(frames, bench.order_by_scheduler, bench.compute_move_us)
+    naive = bench.plan_order(frames, bench.order_by_row, bench.compute_naive_move_us)
+    floor_s = bench.plan_order(frames, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
+    yield f"{name}: pixels shown", ours["count"], "1"
+    for who, result in (("naive", naive), ("solver", solver), ("scheduler", ours)):
+        yield f"{name}: pixels per second, {who}", result["count"] / result["total_s"], "1/s"
+        yield f"{name}: beam-on fraction, {who}", result["light_s"] / result["total_s"], "1"
+        yield f"{name}: time over lower bound, {who}", result["total_s"] / floor_s, "×"
+    yield f"{name}: scheduler over solver", ours["total_s"] / solver["total_s"], "×"
+    excess_s = ours["total_s"] - floor_s
+    for part, part_s in (
+        ("moves", ours["total_s"] - ours["light_s"]),
+        ("whole PWM periods", ours["light_s"] - ours["exact_s"]),
+        ("heat lost meanwhile", ours["exact_s"] - floor_s),
+    ):
+        yield f"{name}: excess over lower bound, fraction by {part}", part_s / excess_s, "1"
     yield f"{name}: CPU time of the solver", solver_s, "s CPU"
     if len(frames) == 1:
-        sequence = FrameSequence((TactileFrame("f", 0.0, 3600.0, frames[0]),))
-        planned_sequence = plan_sequence(bench.display, sequence, *bench.display.build_cold_state())
-        assert (
-            abs(planned_sequence.duration_s - scheduler_result["total_s"]) < 1e-6
-            or planned_sequence.shortfall is not None
-        ), "the order differs from the plan"
+        planned = plan_sequence(bench.display, build_frames(frames, 3600.0), *bench.display.build_cold_state())
+        is_same = abs(planned.duration_s - ours["total_s"]) < 1e-6 or planned.shortfall is not None
+        assert is_same, "the order differs from the plan"
 
 
 def measure_experiment(bench, name):
@@ -185,9 +167,10 @@ def measure_experiment(bench, name):
     yield f"{name}: maximum lateness of a pulse, scheduler", 1e3 * planned_sequence.train_lateness_max_s, "ms"
 
 
-def bench_order():
-    """Return the rows of the table."""
+def measure():
     bench = OrderBenchmark("display-1511")
-    rows = [row for name, frames in build_cases(bench) for row in measure_case(bench, name, frames)]
+    for name, frames in build_cases(bench):
+        yield from measure_case(bench, name, frames)
     perceived = OrderBenchmark("display-437")
-    return [*rows, *(row for name in EXPERIMENTS for row in measure_experiment(perceived, name))]
+    for name in EXPERIMENTS:
+        yield from measure_experiment(perceived, name)

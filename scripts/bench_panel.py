@@ -1,16 +1,14 @@
-"""Benchmark of the panel's cost: pixels raised to their height per second over an hour, at two room temperatures.
+"""The panel's cost: pixels raised to their height per second over an hour, at two room temperatures.
 
 Frames follow each other without a pause in virtual time, trimmed by the limiter where they must be. "without": a panel
 that stays at the room's temperature.
 """
 
-import argparse
-import sys
 from dataclasses import replace
 
 import numpy as np
+from measuring import build_frames
 
-from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import shift_state
@@ -23,6 +21,12 @@ FULL_SHARE = 0.9
 WAIT_S = 0.01
 COLD_PANEL = {"resistance_k_per_w": 1e-3, "capacity_j_per_k": 1e5}
 FINGERTIP = [700 + 39 * row + column for row in range(5) for column in range(5)]
+OPTIONS = {
+    "--hours": {"type": float, "default": 1.0, "help": "time that is simulated"},
+    "--display": {"help": "only cases of this display"},
+    "--rooms": {"type": float, "nargs": "+", "default": ROOMS_C, "help": "temperatures of the room, °C"},
+    "--warm": {"action": "store_true", "help": "begin with the panel as warm as full power makes it"},
+}
 CASES = (
     ("display-1511", "all pixels", None, 50.0),
     ("display-1511", "all pixels", None, 100.0),
@@ -42,14 +46,14 @@ def build_display(name, room_c, has_panel):
     return DisplayModel.from_config(config)
 
 
-def measure(display, pixels, height_um, duration_s, is_warm):
+def measure_rate(display, pixels, height_um, duration_s, is_warm):
     """Show one frame after the other. Return the raised pixels per second, and the panel's bound at the end, K.
 
     is_warm: begin with the panel as warm as permanent light of full power makes its bound
     """
     target_m = np.zeros(len(display.pixels))
     target_m[slice(None) if pixels is None else pixels] = height_um * 1e-6
-    sequence = FrameSequence((TactileFrame("f", 0.0, duration_s, target_m),))
+    sequence = build_frames([target_m], duration_s)
     heat, budget = display.build_cold_state()
     if is_warm:
         bound = display.budget.heat
@@ -65,22 +69,13 @@ def measure(display, pixels, height_um, duration_s, is_warm):
     return raised / now_s, compute_panel_k(budget, display.budget, budget.at_s)
 
 
-def main():
-    parser = argparse.ArgumentParser(prog="scripts/bench panel", description=__doc__)
-    parser.add_argument("--hours", type=float, default=1.0, help="time that is simulated")
-    parser.add_argument("--display", help="only cases of this display")
-    parser.add_argument("--rooms", type=float, nargs="+", default=ROOMS_C, help="temperatures of the room, °C")
-    parser.add_argument("--warm", action="store_true", help="begin with the panel as warm as full power makes it")
-    options = parser.parse_args()
+def measure(hours=1.0, display=None, rooms=ROOMS_C, warm=False):
     for name, what, pixels, height_um in CASES:
-        for room_c in options.rooms if options.display in (None, name) else ():
-            frames = pixels, height_um, 3600.0 * options.hours
-            without, _ = measure(build_display(name, room_c, False), *frames, False)
-            rate, panel_k = measure(build_display(name, room_c, True), *frames, options.warm)
+        for room_c in rooms if display in (None, name) else ():
+            frames = pixels, height_um, 3600.0 * hours
+            without, _ = measure_rate(build_display(name, room_c, False), *frames, False)
+            rate, panel_k = measure_rate(build_display(name, room_c, True), *frames, warm)
             case = f"{name}, {what} to {height_um:g} µm, room at {room_c:g} °C"
-            print(f"{case}: {without:.1f} → {rate:.1f} pixels/s, panel up to {panel_k:.1f} K", flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            yield f"{case}: pixels per second without a panel", without, "1/s"
+            yield f"{case}: pixels per second", rate, "1/s"
+            yield f"{case}: panel up to", panel_k, "K"

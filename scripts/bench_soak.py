@@ -5,7 +5,6 @@ repeated and reordered pulses. Two records are checked: the board's log, read by
 that the session receives. Exit status 1 where a pulse is missing or the board underran.
 """
 
-import argparse
 import json
 import os
 import re
@@ -16,9 +15,8 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import measuring  # noqa: F401 - the folder of the tests
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import OptodriveError
@@ -28,6 +26,7 @@ from optodrive.link.protocol.quantisation import CENTRE_CODE, WirePoints
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
+from process_memory import read_memory_mib  # of the tests
 
 HOST_PORT = Path(__file__).parents[1] / "firmware_protocol" / "ports" / "host"
 BAUD = 4_000_000
@@ -42,6 +41,7 @@ PERIOD_US, WIDTH_US, WIDTHS, POSITIONS, POSITION_CODES, DUTY = 200, 50, 16, 4, 1
 PLAN_PULSES = 20_000
 """Pulses per plan; plans follow each other without a pause."""
 LEAD_S = 0.5
+OPTIONS = {"--pulses": {"type": int, "default": 2_000_000}}
 STEP_S = 0.005
 MEMORY_SAMPLES = 20
 """Number of memory samples."""
@@ -71,9 +71,6 @@ def build_requirements(baud):
     return build_board_requirements(config.model_copy(update={"scanner": scanner, "limits": limits, "board": board}))
 
 
-# --- the board process, and the process that checks its log ----------------------------------------------------------
-
-
 def check_log(log):
     """Read the log to its end, and print the counts of pulses, pulses out of order, HOLDs and faults as JSON."""
     pulses = out_of_order = holds = faults = 0
@@ -98,9 +95,7 @@ class SoakBoard:
         self.port, log, limits = folder / "tty", folder / "log", folder / "limits.toml"
         limits.write_text(LIMITS)
         os.mkfifo(log)
-        self._log_checker = subprocess.Popen(
-            [sys.executable, __file__, "--check-log", log], stdout=subprocess.PIPE, text=True
-        )
+        self._log_checker = subprocess.Popen([sys.executable, __file__, log], stdout=subprocess.PIPE, text=True)
         options = ["--pty", self.port, "--log", log, "--limits", limits, "--baud", str(BAUD)]
         self.board = subprocess.Popen([folder / "board", *options])
         while not self.port.exists() and self.board.poll() is None:
@@ -120,12 +115,6 @@ class SoakBoard:
             if process.poll() is None:
                 process.kill()
                 process.wait()
-
-
-def read_memory_mib(process):
-    """Return the resident memory of a process, MiB."""
-    status = Path(f"/proc/{process}/status").read_text()
-    return int(re.search(r"VmRSS:\s+(\d+) kB", status)[1]) / 1024
 
 
 # --- the host --------------------------------------------------------------------------------------------------------
@@ -176,7 +165,11 @@ class SoakRun:
         self._submitted += count
 
     def run(self):
-        """Stream until every pulse is reported, or the board is no longer armed."""
+        """Arm, and stream until every pulse is reported, or the board is no longer armed."""
+        self._session.connect()
+        self._session.arm()
+        while self._session.board.state != BoardState.ARMED:
+            self._session.step(STEP_S, renew_lease=True)
         samples = 0
         while self._submitted < self._total or self._jobs:
             if self._submitted < self._total:
@@ -188,30 +181,22 @@ class SoakRun:
                 return
             done = self._session.board.done_index
             if done >= samples * self._total / MEMORY_SAMPLES:
-                self._on_progress(done / self._total)
+                self._on_progress()
                 samples += 1
 
 
-def connect_and_arm(session):
-    """Connect, and wait until the board is armed."""
-    session.connect()
-    session.arm()
-    while session.board.state != BoardState.ARMED:
-        session.step(STEP_S, renew_lease=True)
-
-
 def run_soak(total, lead_s=LEAD_S):
-    """Run the test. Return the rows of the table and the failures.
+    """Run the test. Return the rows and the failures.
 
     lead_s: time from the first point to the start
     """
-    memory = []
+    memory = {"host": [], "board": []}
     with tempfile.TemporaryDirectory() as folder, SoakBoard(Path(folder)) as board_process:
         session = BoardSession(SerialPort(str(board_process.port), BAUD), MonotonicClock(), build_requirements(BAUD))
-        connect_and_arm(session)
 
-        def sample_memory(share):
-            memory.append((share, read_memory_mib(os.getpid()), read_memory_mib(board_process.board.pid)))
+        def sample_memory():
+            memory["host"].append(read_memory_mib("self")[1])
+            memory["board"].append(read_memory_mib(board_process.board.pid)[1])
 
         run = SoakRun(session, total, lead_s, sample_memory)
         start_s, start_cpu_s = time.monotonic(), time.process_time()
@@ -220,65 +205,47 @@ def run_soak(total, lead_s=LEAD_S):
         except OptodriveError as error:
             print(error, file=sys.stderr)
         duration_s, cpu_s = time.monotonic() - start_s, time.process_time() - start_cpu_s
-        board, stats = session.board, session.collect_link_stats()
+        board, stats, reports = session.board, session.collect_link_stats(), run.reports
         session.close()
         log_result = board_process.finish()
     rows = [
-        ("pulses requested", total),
-        ("pulses in the board's log", log_result["pulses"]),
-        ("  out of order, or of wrong width", log_result["out_of_order"]),
-        ("pulses reported to the session", run.reports.pulses),
-        ("  overlapping, or of wrong width", run.reports.out_of_order),
-        ("underruns; HOLDs in the log; faults", f"{board.underruns}; {log_result['holds']}; {log_result['faults']}"),
-        (
-            "retransmissions; NAKs; bad frames",
-            f"{stats['retransmitted']}; {stats['naks']}; {_count_bad_frames(stats)}",
-        ),
-        ("longest stall of the host, ms", f"{stats['longest_stall_ms']:.0f}"),
-        ("duration, s; pulses per second", f"{duration_s:.0f}; {run.reports.pulses / duration_s:.0f}"),
-        ("host's CPU time per 1,000 pulses, s", f"{1000 * cpu_s / max(1, run.reports.pulses):.3f}"),
+        ("pulses requested", total, "1"),
+        ("pulses in the board's log", log_result["pulses"], "1"),
+        ("of them out of order, or of wrong width", log_result["out_of_order"], "1"),
+        ("pulses reported to the session", reports.pulses, "1"),
+        ("of them overlapping, or of wrong width", reports.out_of_order, "1"),
+        ("underruns", board.underruns, "1"),
+        ("HOLDs in the log", log_result["holds"], "1"),
+        ("faults", log_result["faults"], "1"),
+        ("retransmissions", stats["retransmitted"], "1"),
+        ("NAKs", stats["naks"], "1"),
+        ("bad frames", stats["host_bad_frames"] + stats["board_bad_frames"], "1"),
+        ("longest stall of the host", stats["longest_stall_ms"], "ms"),
+        ("duration", duration_s, "s"),
+        ("pulses per second", reports.pulses / duration_s, "1/s"),
+        ("host's CPU time per 1,000 pulses", 1000 * cpu_s / max(1, reports.pulses), "s CPU"),
     ]
-    for name, column in (("host", 1), ("board", 2)):
-        rows.append((f"resident memory of the {name} at 5, 50, 100 %, MiB", _format_memory(memory, column)))
+    for name, samples_mib in memory.items():
+        for share in (0.05, 0.5, 1.0) if samples_mib else ():
+            sample_mib = samples_mib[round(share * (len(samples_mib) - 1))]
+            rows.append((f"resident memory of the {name} at {share:.0%}", sample_mib, "MiB"))
     failures = {
-        "pulses are missing": {log_result["pulses"], run.reports.pulses} != {total},
-        "pulses are out of order, or not as requested": log_result["out_of_order"] or run.reports.out_of_order,
+        "pulses are missing": {log_result["pulses"], reports.pulses} != {total},
+        "pulses are out of order, or not as requested": log_result["out_of_order"] or reports.out_of_order,
         "the board underran": board.underruns or log_result["holds"],
         "the board was in FAULT": log_result["faults"],
     }
     return rows, [message for message, failed in failures.items() if failed]
 
 
-def _count_bad_frames(stats):
-    return stats["host_bad_frames"] + stats["board_bad_frames"]
-
-
-def _format_memory(memory, column):
-    if not memory:
-        return ""
-    samples = [min(memory, key=lambda sample: abs(sample[0] - share)) for share in (0.05, 0.5, 1.0)]
-    return ", ".join(f"{sample[column]:.1f}" for sample in samples)
-
-
-def main():
-    parser = argparse.ArgumentParser(prog="scripts/bench soak")
-    parser.add_argument("--pulses", type=int, default=2_000_000)
-    parser.add_argument("--check-log", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.check_log:
-        check_log(options.check_log)
-        return 0
-    if options.pulses < 1:
-        parser.error(f"--pulses: got {options.pulses}, expected at least 1")
-    rows, failures = run_soak(options.pulses)
-    table = Table("soak", "")
-    for name, value in rows:
-        table.add_row(name, str(value))
-    Console(width=120).print(table)
-    for message in failures:
-        print(f"FAILED: {message}", file=sys.stderr)
-    return 1 if failures else 0
+def measure(pulses):
+    if pulses < 1:
+        raise SystemExit(f"--pulses: got {pulses}, expected at least 1")
+    rows, failures = run_soak(pulses)
+    yield from rows
+    if failures:
+        raise SystemExit(f"FAILED: {', '.join(failures)}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    check_log(sys.argv[1])

@@ -1,19 +1,16 @@
-"""Benchmark of several stages over one display: the time of a plan against light ÷ stages + moves, and planning time.
+"""Several stages over one display: the time of a plan against light ÷ stages + moves, and planning time.
 
 Beside it the bound that no plan can undercut in which each pixel keeps its stage: its pulses are not divided. Moves are
 the settling times of the plan, per stage; light is the beam-on time of its pulses. The caps are those of the shipped
 configurations, and the temperatures are those of an integrator that shares no code with the limiter.
 """
 
-import argparse
 import statistics
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
+from measuring import build_frames, measure_times_s
 
-from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config_file import load_config
 from optodrive.device.config_sections import StageSection
@@ -23,12 +20,12 @@ from optodrive.planning.budget_setup import build_nominal_model, build_nominal_p
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 from reference_models.thermal_display import build_true_display
 
 RUNS = 5
 STAGE_COUNTS = (1, 2, 3, 4)
+DISPLAYS = ("display-1511", "display-437")
+OPTIONS = {"--display": {"choices": DISPLAYS, "help": "only this one"}}
 TEXT = "optodrive draws"
 PAGES = "the quick brown fox jumps over the lazy dog and reads a page of braille with two fingers on a display of light"
 
@@ -85,11 +82,6 @@ def compute_bound(plan, stages):
     return max(1.0, ((np.arange(len(largest_s)) + 1) * largest_s).max() * stages / pixel_s.sum())
 
 
-def build_sequence(targets_m):
-    """Return frames without a pause between them."""
-    return FrameSequence(tuple(TactileFrame(f"f{k}", 1e-3 * k, 100.0, target) for k, target in enumerate(targets_m)))
-
-
 def compute_cap_use(display, plan):
     """Return the largest temperature of absorbers, walls and touch surfaces over its cap, in the integrator."""
     config = display.config
@@ -102,38 +94,27 @@ def compute_cap_use(display, plan):
     return max(absorber_k / caps.absorber_k, wall_k / caps.wall_k, touch_k / caps.touch_k)
 
 
-def measure_plan(display, sequence):
-    """Return the plan, its time over light ÷ stages + moves, that time, and the median CPU time of planning, s."""
-    times_s = []
-    for _ in range(RUNS):
-        begin_s = time.process_time()
-        planned = plan_sequence(display, sequence, *display.build_cold_state())
-        times_s.append(time.process_time() - begin_s)
-    plan, stages = planned.plan, len(display.scan_heads)
-    span_s = float((plan.start_s + plan.width_s).max()) - planned.lead_in_s
-    own_moves_s = float(plan.settling_s.sum()) - stages * planned.lead_in_s
-    floor_s = (float(plan.width_s.sum()) + own_moves_s) / stages
-    return plan, span_s / floor_s, span_s, statistics.median(times_s)
-
-
-def main():
-    parser = argparse.ArgumentParser(prog="scripts/bench stages", description=__doc__)
-    parser.add_argument("--display", choices=("display-1511", "display-437"), help="only this one")
-    options = parser.parse_args()
-    columns = f"{'k':>2}{'pulses':>8}{'time s':>9}{'over floor':>12}{'bound':>8}{'planning':>10}{'caps':>7}"
-    print(f"{'display':<13}{'case':<44}{columns}")
-    for name in (options.display,) if options.display else ("display-1511", "display-437"):
+def measure(display=None):
+    for name in (display,) if display else DISPLAYS:
         displays = [build_display(name, count) for count in STAGE_COUNTS]
         for case, targets_m in build_cases(displays[0]):
-            sequence, single_s = build_sequence(targets_m), None
-            for display in displays:
-                plan, over, span_s, planning_s = measure_plan(display, sequence)
-                single_s = planning_s if single_s is None else single_s
-                stages, used = len(display.scan_heads), compute_cap_use(display, plan)
-                row = f"{stages:>2}{len(plan):>8}{span_s:>9.3f}{over:>12.4f}{compute_bound(plan, stages):>8.4f}"
-                print(f"{name:<13}{case:<44}{row}{planning_s / single_s:>10.2f}{used:>7.2f}", flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            sequence, single_s = build_frames(targets_m, 100.0), None
+            for staged in displays:
+                planned = plan_sequence(staged, sequence, *staged.build_cold_state())
+                plan, stages = planned.plan, len(staged.scan_heads)
+                planning_s = statistics.median(
+                    measure_times_s(
+                        lambda: plan_sequence(staged, sequence, *staged.build_cold_state()), RUNS, time.process_time
+                    )
+                )
+                single_s = single_s or planning_s
+                span_s = float((plan.start_s + plan.width_s).max()) - planned.lead_in_s
+                own_moves_s = float(plan.settling_s.sum()) - stages * planned.lead_in_s
+                floor_s = (float(plan.width_s.sum()) + own_moves_s) / stages
+                what = f"{name}, {case}, {stages} stages"
+                yield f"{what}: pulses", len(plan), "1"
+                yield f"{what}: time of the plan", span_s, "s"
+                yield f"{what}: time over light ÷ stages + moves", span_s / floor_s, "1"
+                yield f"{what}: its bound, of pixels that keep their stage", compute_bound(plan, stages), "1"
+                yield f"{what}: CPU time of planning over that of one stage", planning_s / single_s, "1"
+                yield f"{what}: largest temperature over its cap", compute_cap_use(staged, plan), "1"

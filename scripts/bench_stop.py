@@ -1,11 +1,8 @@
-"""Benchmark of STOP: time from sending it to dark by the board's log, at rest and under each flood of a caller.
+"""STOP: time from sending it to dark by the board's log, at rest and under each flood of a caller.
 
 Show, floods and STOPs share this computer, so each time is an upper bound: part of it is the wait for a core.
 """
 
-import argparse
-import json
-import os
 import sys
 import tempfile
 import time
@@ -14,20 +11,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
-from measuring import Sleeper, compute_percentile, realtime_priority, time_limit
-from rich.console import Console
-from rich.table import Table
+from measuring import Row, Sleeper, realtime_priority, time_limit, to_ms
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / part) for part in ("system", "")]
-from floods import FLOODS  # noqa: E402 - of the tests
-from rig import read_role_tokens  # noqa: E402
-from stop_rig import FloodProcess, StopRig, is_gate_on, is_unarmed  # noqa: E402
+from floods import FLOODS  # of the tests
+from rig import read_role_tokens
+from stop_rig import FloodProcess, StopRig, is_gate_on, is_unarmed
 
 ANSWER_MAX_S = 60.0
 """A STOP without an answer for this time counts as one."""
 BEGIN_MAX_S = 30.0
 """Longest wait for the light of a show. A flood that keeps one from beginning is a result, too."""
 END_MAX_S = 30.0
+OPTIONS = {
+    "floods": {"nargs": "*", "metavar": "FLOOD", "help": f"rest, {', '.join(FLOODS)}; all by default"},
+    "--stops": {"type": int, "default": 40, "help": "STOPs under each flood"},
+    "--seconds": {"type": float, "default": 40.0, "help": "longest time of each flood"},
+    "--watch-s": {"type": float, "default": 6.0, "help": "time of a show without STOP, first"},
+    "--lease-s": {"type": float, "default": 0.1, "help": "lease; the shipped one by default"},
+    "--path": {"default": "http", "choices": ("http", "socket"), "help": "way of STOP"},
+}
 GIVEN_UP = (OSError, AssertionError, httpx.HTTPError)
 
 
@@ -127,79 +129,32 @@ def run_flood(rig, name, stops=20, seconds=60.0, watch_s=0.0, path="http", measu
     return result
 
 
-def format_ms(values, share):
-    """Format the value below which a share of the values lies, ms."""
-    return f"{1e3 * compute_percentile(values, share):.1f}" if values else "-"
-
-
 def count_items(items):
     """Return the number of each distinct item, as text."""
     return ", ".join(f"{items.count(item)} {item}" for item in dict.fromkeys(items)) or "no"
 
 
-def measure_flood(name, options):
-    """Measure one flood on a new board and daemon. Return its FloodResult."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        rig = StopRig(Path(folder), lease_s=options.lease_s)
-        try:
-            with realtime_priority():  # the time of STOP must not include the wait of this process for a core
-                return run_flood(rig, name, options.stops, options.seconds, options.watch_s, options.path)
-        finally:
-            rig.close()
-
-
-def build_row(result):
-    """Return the cells of one flood."""
-    counts = ", ".join(f"{key}: {value}" for key, value in sorted(result.counts.items(), key=lambda item: -item[1])[:4])
-    return (
-        result.name,
-        str(len(result.gate_off_s)),
-        *(format_ms(result.gate_off_s, share) for share in (0.5, 0.99, 1.0)),
-        format_ms(result.answered_s, 0.99),
-        count_items(result.darkened),
-        str(result.not_begun),
-        str(result.relit),
-        counts,
-    )
-
-
-COLUMNS = ("flood", "n", "p50", "p99", "max", "answer p99", "dark?", "no show", "relit", "outcomes", "computer late")
-
-
-def main():
-    parser = argparse.ArgumentParser(prog="scripts/bench stop", description=__doc__)
-    parser.add_argument("floods", nargs="*", metavar="FLOOD", help=f"rest, {', '.join(FLOODS)}; all by default")
-    parser.add_argument("--stops", type=int, default=40, help="STOPs under each flood")
-    parser.add_argument("--seconds", type=float, default=40.0, help="longest time of each flood")
-    parser.add_argument("--watch-s", type=float, default=6.0, help="time of a show without STOP, first")
-    parser.add_argument("--lease-s", type=float, default=0.1, help="lease; the shipped one by default")
-    parser.add_argument("--path", default="http", choices=("http", "socket"), help="way of STOP")
-    parser.add_argument("--json", type=Path, help="file to which each flood's measurements are appended")
-    options = parser.parse_args()
-    unknown = [name for name in options.floods if name not in FLOODS and name != "rest"]
+def measure(floods=(), stops=40, seconds=40.0, watch_s=6.0, lease_s=0.1, path="http"):
+    unknown = [name for name in floods if name not in FLOODS and name != "rest"]
     if unknown:
-        parser.error(f"FLOOD: got {unknown[0]!r}, expected one of rest, {', '.join(FLOODS)}")
-    table = Table(*COLUMNS, title="STOP to dark by the board's log, ms")
-    console = Console(width=190, file=sys.stdout)
-    for name in options.floods or ("rest", *FLOODS):
-        begin_s = time.monotonic()
+        raise SystemExit(f"FLOOD: got {unknown[0]!r}, expected one of rest, {', '.join(FLOODS)}")
+    for name in floods or ("rest", *FLOODS):
         sleeper = Sleeper(is_realtime=True)
         try:
-            result = measure_flood(name, options)
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+                rig = StopRig(Path(folder), lease_s=lease_s)
+                try:
+                    with realtime_priority():  # the time of STOP must not include the wait of this process for a core
+                        result = run_flood(rig, name, stops, seconds, watch_s, path)
+                finally:
+                    rig.close()
         finally:
-            late_s = max(sleeper.finish())
-        row = (*build_row(result), f"{1e3 * late_s:.0f}")
-        table.add_row(*row)
-        print(f"{time.monotonic() - begin_s:5.0f} s  {' | '.join(row)}", file=sys.stderr, flush=True)
+            late_s = sleeper.finish()
+        yield Row(f"STOP to gate off, {name}", to_ms(result.gate_off_s), late_s=late_s)
+        yield Row(f"STOP to its answer, {name}", to_ms(result.answered_s), late_s=late_s)
+        yield f"{name}: shows not begun", result.not_begun, "1"
+        yield f"{name}: pulses after STOP", result.relit, "1"
+        outcomes = sorted(result.counts.items(), key=lambda item: -item[1])[:4]
+        yield f"{name}: {count_items(result.darkened)} darkened; outcomes {dict(outcomes)}"
         if result.darkened:
             print("\n".join(result.log[-10:]), file=sys.stderr, flush=True)
-        if options.json:
-            with options.json.open("a") as file:
-                file.write(json.dumps(vars(result)) + "\n")
-    console.print(table)
-    print(f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, including these processes")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

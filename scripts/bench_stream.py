@@ -1,37 +1,39 @@
-"""Benchmark of streaming: latency from a frame to its plan, its first byte on the link and its first light, under load.
+"""Streaming: latency from a frame to its plan, its first byte on the link and its first light, under load.
 
 A daemon with a simulated board receives frames of 200 pixels at 20 per second, while other clients request the state
 1,250 times per second, or as fast as they are answered. A bare FastAPI application in another process receives the same
 bodies at the same rate under the same load; its latency is the part that the web framework causes.
 """
 
-import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
-import tempfile
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import httpx
 import numpy as np
-from bench_full_frames import measure_full_frames
+from frame_stream import measure_full_frames
+from measuring import LEASE_S, Row, build_display, build_frames, measure_times_s, running_daemon, to_ms
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / "system")]
-from rig import TOKEN, Board, Daemon, read_role_tokens  # noqa: E402 - of the tests
-from stop_rig import FloodProcess  # noqa: E402
+from rig import TOKEN, read_role_tokens  # of the tests
+from stop_rig import FloodProcess
 
 RUNS, SUPERSEDING = 50, 200
-MINUTE_S = 60.0
 PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
 LOAD_HZ = 1250.0
 """Requests of the other clients per second. At 0, the load is what server and clients can do."""
-LEASE_S = 0.1
 LOAD = "kept alive GETs"
 LEAD_S = 0.03
+OPTIONS = {
+    "--minutes": {"type": float, "default": 1.0, "help": "time of the full frames beside busy loops"},
+    "--hours": {"type": float, "help": "the same in hours"},
+    "--load-hz": {"type": float, "default": LOAD_HZ, "help": "requests per second of other clients, 0: no bound"},
+    "--lead-s": {"type": float, "default": LEAD_S, "help": "board.stream_lead_s, for the latency"},
+    "--only": {"choices": ("planning", "latency", "frames"), "help": "one part"},
+}
 UNLIMITED_RATES = "[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000"
 """The daemon must serve the load; its rate limit must not reject it."""
 
@@ -62,66 +64,58 @@ def build_random_frame(rng):
 
 def measure_planning():
     """Measure the CPU time from a frame to verified bytes: plan, limit, predict, quantise, decode, verify."""
-    from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-    from optodrive.device.config_file import load_config
     from optodrive.link.board_setup import build_board_requirements
     from optodrive.link.protocol.quantisation import decode, quantise
-    from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.limiter.limiter import verify
     from optodrive.planning.pipeline import plan_sequence
 
-    display = DisplayModel.from_config(load_config("display-1511"))
+    display, rng = build_display(), np.random.default_rng(5)
     scale = build_board_requirements(display.config).scale
-    rng = np.random.default_rng(5)
     heat, budget = display.build_cold_state()
-    rows, times = [], []
+
+    def plan_frame(sequence):
+        planned = plan_sequence(display, sequence, heat, budget, initial_pixels=(7,))
+        points = quantise(planned.plan, scale)
+        decoded = decode(points.encode_payload(), scale)
+        verify(planned.plan, points.row[decoded.index], decoded, budget, display.budget)
+
     for active in (10, 50, ACTIVE, PIXELS):
-        times.clear()
-        for _ in range(RUNS):
-            target = np.zeros(PIXELS)
-            target[rng.choice(PIXELS, active, replace=False)] = 60e-6
-            sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, target),))
-            begin_s = time.process_time()
-            planned_sequence = plan_sequence(display, sequence, heat, budget, initial_pixels=(7,))
-            points = quantise(planned_sequence.plan, scale)
-            decoded = decode(points.encode_payload(), scale)
-            verify(planned_sequence.plan, points.row[decoded.index], decoded, budget, display.budget)
-            times.append(time.process_time() - begin_s)
-        rows.append(
-            (f"changed frame of {active} pixels: planned, limited, verified", 1e3 * statistics.median(times), "ms")
-        )
-    return rows
+        sequences = iter([draw_frame(rng, active) for _ in range(RUNS)])
+        times_s = measure_times_s(lambda: plan_frame(next(sequences)), RUNS, time.process_time)
+        yield Row(f"changed frame of {active} pixels: planned, limited, verified", to_ms(times_s))
+
+
+def draw_frame(rng, active):
+    """Return a sequence of a frame of random pixels."""
+    target_m = np.zeros(PIXELS)
+    target_m[rng.choice(PIXELS, active, replace=False)] = 60e-6
+    return build_frames([target_m], 60.0)
 
 
 def measure_superseding():
     """Measure the CPU time of planning a stream's frame that truncates the one before it, mirrors near their cap."""
-    from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
     from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
     from optodrive.daemon.engine.request_body import BuiltRequest
     from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-    from optodrive.device.config_file import load_config
     from optodrive.link.board_setup import build_scales
-    from optodrive.planning.display_model import DisplayModel
 
-    display = DisplayModel.from_config(load_config("display-1511"))
+    display = build_display()
     scales = build_scales(display.config)
     thermal = ThermalEstimate(*display.build_cold_state())
     snapshot = PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
     rng, times = np.random.default_rng(7), []
     for number in range(SUPERSEDING):
-        target = np.zeros(PIXELS)
-        target[rng.choice(PIXELS, ACTIVE, replace=False)] = 60e-6
-        built = BuiltRequest(FrameSequence((TactileFrame("f", 0.0, 60.0, target),)))
-        request = PlanningRequest(lambda: built, "bench", streamed=True)  # noqa: B023 - not called later
+        built = BuiltRequest(draw_frame(rng, ACTIVE))
+        request = PlanningRequest(lambda: built, "bench", streamed=True)
         begin_s = time.process_time()
         plan = make_plan(display, scales, request, built, snapshot, f"p{number}", lambda fraction: None)
         planned_s = time.process_time()
         snapshot = build_cut_snapshot(plan, thermal, (number + 1) / RATE_HZ, display.budget, scales[0].tick_s)
         times.append((planned_s - begin_s, time.process_time() - planned_s))
-    name = f"frame of {ACTIVE} pixels that truncates the one before it"
-    make_s, cut_s = np.array(times[10:]).T
-    return [*format_percentiles(f"{name}: plan", make_s), *format_percentiles(f"{name}: state at the cut", cut_s)]
+    for what, times_s in zip(("plan", "state at the cut"), np.transpose(times[10:]), strict=True):
+        name = f"frame of {ACTIVE} pixels that truncates the one before it: {what}"
+        yield Row(name, to_ms(times_s.tolist()))
 
 
 def push_frames(url, seconds):
@@ -153,17 +147,21 @@ def push_frames(url, seconds):
         )
 
 
-def start_bare_server(folder, port):
-    """Start the bare FastAPI application. Return its process and its URL."""
-    script, url = Path(folder) / "bare.py", f"http://127.0.0.1:{port}"
-    script.write_text(BARE_SERVER)
-    process = subprocess.Popen([sys.executable, script, str(port)])
-    while True:
-        try:
-            httpx.get(f"{url}/v1/state")
-            return process, url
-        except httpx.ConnectError:
-            time.sleep(0.05)
+@contextmanager
+def bare_server(port):
+    """Run the bare FastAPI application, and yield its URL."""
+    process, url = subprocess.Popen([sys.executable, "-c", BARE_SERVER, str(port)]), f"http://127.0.0.1:{port}"
+    try:
+        while True:
+            try:
+                httpx.get(f"{url}/v1/state")
+                break
+            except httpx.ConnectError:
+                time.sleep(0.05)
+        yield url
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def push_frames_under_load(url, tokens, load_hz, seconds):
@@ -181,14 +179,6 @@ def push_frames_under_load(url, tokens, load_hz, seconds):
         duration_s = time.monotonic() - begin_s
         counts = load.finish()
     return results, counts["200"] / duration_s
-
-
-def format_percentiles(name, values, unit="ms"):
-    """Return the rows of the median and the 99th percentile."""
-    return [
-        (f"{name}, {label}", 1e3 * float(np.percentile(values, at)), unit)
-        for label, at in (("median", 50), ("p99", 99))
-    ]
 
 
 @dataclass
@@ -213,86 +203,45 @@ class Streaming:
 
 def stream_under_load(load_hz=LOAD_HZ, lead_s=LEAD_S, seconds=SECONDS):
     """Push frames over REST under load, to a bare FastAPI and to the daemon. load_hz: None for no load."""
-    with tempfile.TemporaryDirectory() as folder:
-        bare_server, url = start_bare_server(folder, 8459)
-        try:
-            (bare_trips, *_), bare_rate = push_frames_under_load(url, {"viewer": TOKEN}, load_hz, seconds)
-        finally:
-            bare_server.terminate()
-            bare_server.wait()
-        board = Board(Path(folder), limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
-        lease = f"lease_s = {LEASE_S}"
-        keys = [(lease, f"{lease}\nstream_lead_s = {lead_s}\n{UNLIMITED_RATES}\n#")]
-        try:
-            daemon = Daemon(Path(folder), board.port, "display-1511", keys, lease_s=LEASE_S)
-            try:
-                daemon.arm()
-                (trips, _, state, plans), rate = push_frames_under_load(
-                    daemon.url, read_role_tokens(daemon), load_hz, seconds
-                )
-            finally:
-                daemon.stop()
-        finally:
-            board.stop()
+    with bare_server(8459) as url:
+        (bare_trips, *_), bare_rate = push_frames_under_load(url, {"viewer": TOKEN}, load_hz, seconds)
+    with running_daemon("display-1511", LEASE_S, f"stream_lead_s = {lead_s}\n{UNLIMITED_RATES}") as (_, daemon):
+        daemon.arm()
+        tokens = read_role_tokens(daemon)
+        (trips, _, state, plans), rate = push_frames_under_load(daemon.url, tokens, load_hz, seconds)
     return Streaming(rate, bare_rate, trips, bare_trips, plans, state)
 
 
 def measure_latency(load_hz=LOAD_HZ, lead_s=LEAD_S):
-    """Measure frames over REST under load, at the daemon and at a bare FastAPI. Return the rows of the table."""
+    """Measure frames over REST under load, at the daemon and at a bare FastAPI. Yield the rows."""
     measured = stream_under_load(load_hz, lead_s)
-    finished, plans = measured.latencies, measured.plans
-    first_byte_s = [latency["first_byte_s"] for latency in finished]
-    rows = [
-        ("other clients, requests answered per second", measured.rate_hz, "1/s"),
-        ("other clients of a bare FastAPI, requests answered per second", measured.bare_rate_hz, "1/s"),
-        *format_percentiles("round trip of a frame over REST", measured.trips_s),
-        *format_percentiles("round trip of a frame to a bare FastAPI", measured.bare_trips_s),
-    ]
+    latencies, plans = measured.latencies, measured.plans
+    yield "other clients, requests answered per second", measured.rate_hz, "1/s"
+    yield "other clients of a bare FastAPI, requests answered per second", measured.bare_rate_hz, "1/s"
+    yield Row("round trip of a frame over REST", to_ms(measured.trips_s))
+    yield Row("round trip of a frame to a bare FastAPI", to_ms(measured.bare_trips_s))
     for key, name in (
         ("planned_s", "arrival to plan accepted"),
         ("first_byte_s", "arrival to first byte to the board"),
         ("first_light_s", "arrival to first light"),
     ):
-        rows += format_percentiles(name, [latency[key] for latency in finished])
-    lead_s = [latency["first_light_s"] - latency["first_byte_s"] for latency in finished]
-    ratio = float(np.percentile(first_byte_s, 99) / np.percentile(measured.bare_trips_s, 99))
+        yield Row(name, to_ms(latency[key] for latency in latencies))
+    first_byte_s = np.array([latency["first_byte_s"] for latency in latencies])
+    lead_s = np.array([latency["first_light_s"] for latency in latencies]) - first_byte_s
+    yield Row("lead of first byte over light", to_ms(lead_s.tolist()))
+    ratio = np.percentile(first_byte_s, 99) / np.percentile(measured.bare_trips_s, 99)
+    yield "p99 to the first byte over p99 round trip to a bare FastAPI", ratio, "1"
     superseded = sum(plan["status"] == "superseded" for plan in plans)
-    return [
-        *rows,
-        ("lead of first byte over light, median", 1e3 * statistics.median(lead_s), "ms"),
-        ("p99 to the first byte over p99 round trip to a bare FastAPI", ratio, "1"),
-        ("fraction of frames superseded by a newer one", superseded / len(plans), "1"),
-        ("underruns", measured.state["board"]["underruns"], "1"),
-        ("load average, including this benchmark", os.getloadavg()[0], "1"),
-    ]
+    yield "fraction of frames superseded by a newer one", superseded / len(plans), "1"
+    yield "underruns", measured.state["board"]["underruns"], "1"
+    yield "load average, including this benchmark", os.getloadavg()[0], "1"
 
 
-def bench_stream(duration_s=MINUTE_S):
-    """Return the rows of the table. duration_s: time of the full frames."""
-    return measure_planning() + measure_superseding() + measure_latency() + measure_full_frames(duration_s)
-
-
-def main():
-    parser = argparse.ArgumentParser(prog="scripts/bench stream", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=1.0, help="time of the full frames beside busy loops")
-    parser.add_argument("--hours", type=float, help="the same in hours")
-    parser.add_argument(
-        "--load-hz", type=float, default=LOAD_HZ, help="requests per second of other clients, 0: no bound"
-    )
-    parser.add_argument("--lead-s", type=float, default=LEAD_S, help="board.stream_lead_s, for the latency")
-    parser.add_argument("--only", choices=("planning", "latency", "frames"), help="one part")
-    options = parser.parse_args()
-    duration_s = MINUTE_S * (options.minutes if options.hours is None else 60 * options.hours)
-    parts = {
-        "planning": lambda: measure_planning() + measure_superseding(),
-        "latency": lambda: measure_latency(options.load_hz, options.lead_s),
-        "frames": lambda: measure_full_frames(duration_s),
-    }
-    for name, measure in parts.items():
-        for what, value, unit in measure() if options.only in (None, name) else ():
-            print(f"{value:12,.3f} {unit:4} {what}", flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def measure(minutes=1.0, hours=None, load_hz=LOAD_HZ, lead_s=LEAD_S, only=None):
+    if only in (None, "planning"):
+        yield from measure_planning()
+        yield from measure_superseding()
+    if only in (None, "latency"):
+        yield from measure_latency(load_hz, lead_s)
+    if only in (None, "frames"):
+        yield from measure_full_frames(60.0 * minutes if hours is None else 3600.0 * hours)

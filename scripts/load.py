@@ -14,69 +14,20 @@ import re
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
-from pathlib import Path
 
 import httpx
-from measuring import Sleeper, compute_percentile
+from measuring import Sleeper, compute_percentile, running_daemon
 
-TOKEN = "a-token-for-a-load"
+from process_memory import read_memory_mib  # of the tests
+from rig import TOKEN
+
 HEADERS = {"Authorization": f"Bearer {TOKEN}"}
 STOP_EVERY_S = 3.0
 GROWTH_MAX_MB = 30.0
 """Growth of memory from the first third to the last that counts as a leak; records of plans are bounded."""
 STOP_P99_MAX_S = 0.05
-
-
-class LoadRig:
-    """A board process and a daemon process."""
-
-    def __init__(self, folder, config):
-        from optodrive.device.config_file import locate_shipped
-
-        self.log = folder / "board.jsonl"
-        port = folder / "tty"
-        self.board = subprocess.Popen(
-            [sys.executable, "-m", "optodrive.link.simulator.board_process", "--pty", port, "--log", self.log]
-        )
-        while not port.exists():
-            time.sleep(0.01)
-        text = locate_shipped(f"{config}.toml").read_text()
-        path = folder / "config.toml"
-        path.write_text(re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text))
-        self.daemon = subprocess.Popen(
-            [Path(sys.executable).with_name("optodrive"), "serve", "--config", path, "--port", "0"],
-            env={**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(folder)},
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        line = self.daemon.stdout.readline()
-        if "http" not in line:
-            raise SystemExit("scripts/load: the daemon did not start; its message above gives the reason")
-        self.url = re.search(r"http://[\d.:]+", line)[0]
-        self._read_bytes = 0
-
-    def read_memory_mb(self):
-        """Return the resident memory of the daemon, MB."""
-        status = Path(f"/proc/{self.daemon.pid}/status").read_text()
-        return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
-
-    def read_new_events(self):
-        """Return the events that the board has logged since the last call."""
-        with self.log.open() as file:
-            file.seek(self._read_bytes)
-            text = file.read()
-        whole = text[: text.rfind("\n") + 1]
-        self._read_bytes += len(whole.encode())
-        return [json.loads(line) for line in whole.splitlines()]
-
-    def close(self):
-        for process in (self.daemon, self.board):
-            process.terminate()
-            process.wait()
-        self.daemon.stdout.close()
 
 
 class HttpClient:
@@ -165,10 +116,9 @@ class ClientPool:
 class StopTest:
     """The STOP requests, sent from this process, and the measurements."""
 
-    def __init__(self, rig, options):
-        self._rig = rig
+    def __init__(self, board, daemon, options):
+        self._board, self._daemon, self._client = board, daemon, daemon.client
         self._end_s = time.monotonic() + 60 * options.minutes
-        self._client = httpx.Client(base_url=rig.url, headers=HEADERS, timeout=None)
         self.stop_s, self.gate_off_s, self.memory_mb, self.wake_delays_s = [], [], [], []
         self.underruns = self.faults = self.stall_ms = 0
         arguments = [
@@ -177,7 +127,7 @@ class StopTest:
         self._client.post("/v1/arm").raise_for_status()
         self._sleeper = Sleeper()
         self._client_process = subprocess.Popen(
-            [sys.executable, __file__, *arguments, f"--client-url={rig.url}"], stdout=subprocess.PIPE, text=True
+            [sys.executable, __file__, *arguments, f"--client-url={daemon.url}"], stdout=subprocess.PIPE, text=True
         )
 
     def run(self):
@@ -187,7 +137,7 @@ class StopTest:
             self._client.post("/v1/plans", json={"trains": [train]})
             time.sleep(random.uniform(0.1, 1.0) * STOP_EVERY_S)
             self._stop()
-            self.memory_mb.append(self._rig.read_memory_mb())
+            self.memory_mb.append(read_memory_mib(self._daemon.process.pid)[1])
             state = self._client.get("/v1/state").json()
             self.underruns = state["board"]["underruns"]
             self.stall_ms = state["link"]["longest_stall_ms"]
@@ -205,7 +155,7 @@ class StopTest:
         response = self._client.post("/v1/stop")
         self.stop_s.append(time.monotonic() - begin_s)
         response.raise_for_status()
-        edges = [event for event in self._rig.read_new_events() if event["event"] == "gate"]
+        edges = self._board.of("gate")
         if edges and edges[-1]["on"]:
             raise SystemExit("scripts/load: the gate is on after the response to STOP")
         if edges and sent_us is not None:
@@ -213,17 +163,15 @@ class StopTest:
 
     def _wait_for_gate_edge_us(self):
         """Wait for an edge of the gate and return its time on the board's clock, µs, or None if the gate stays off."""
-        self._rig.read_new_events()
+        self._board.forget()
         end_s = time.monotonic() + 0.3
         while time.monotonic() < end_s:
-            edges = [event for event in self._rig.read_new_events() if event["event"] == "gate"]
-            if edges:
+            if edges := self._board.of("gate"):
                 return edges[-1]["t_us"]
             time.sleep(0.0005)
         return None
 
     def close(self):
-        self._client.close()
         process = self._client_process
         if process.poll() is None:
             process.terminate()
@@ -280,17 +228,13 @@ def main():
     if options.client_url:
         asyncio.run(ClientPool(options).run())
         return 0
-    with tempfile.TemporaryDirectory() as folder:
-        rig = LoadRig(Path(folder), options.config)
+    with running_daemon(options.config) as (board, daemon):
+        stop_test = StopTest(board, daemon, options)
         try:
-            stop_test = StopTest(rig, options)
-            try:
-                stop_test.run()
-            finally:
-                stop_test.close()
-            failures = print_report(stop_test, 60 * options.minutes)
+            stop_test.run()
         finally:
-            rig.close()
+            stop_test.close()
+    failures = print_report(stop_test, 60 * options.minutes)
     p99_s = compute_percentile(stop_test.stop_s, 0.99)
     if p99_s >= STOP_P99_MAX_S:
         print(f"slow       STOP answered p99 {1e3 * p99_s:.0f} ms, expected below {1e3 * STOP_P99_MAX_S:.0f} ms")

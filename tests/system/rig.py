@@ -266,7 +266,7 @@ def read_role_tokens(daemon):
 
 
 @contextmanager
-def running(folder, replace=(), **options):
+def running(folder, replace=(), name="display-437", lease_s=PATIENT_LEASE_S, **options):
     """Run a board and a daemon on it.
 
     replace: changes of the configuration
@@ -274,7 +274,7 @@ def running(folder, replace=(), **options):
     """
     board = Board(folder, **options)
     try:
-        daemon = Daemon(folder, board.port, replace=replace)
+        daemon = Daemon(folder, board.port, name, replace, lease_s=lease_s)
         try:
             yield board, daemon
         finally:

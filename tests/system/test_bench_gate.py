@@ -5,12 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "bench_gate.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "bench.py"
 NUMBERS = ("median", "p99", "max", "late_p99_ms", "late_max_ms")
 
 
 def run(*arguments):
-    return subprocess.run([sys.executable, SCRIPT, *arguments], capture_output=True, text=True)
+    return subprocess.run([sys.executable, SCRIPT, "gate", *arguments], capture_output=True, text=True)
 
 
 def test_rows_are_printed_as_JSON_and_judge_nothing():
@@ -29,4 +29,6 @@ def test_an_unknown_measurement_is_refused_by_name():
     done = run("--only", "speed")
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr.splitlines()[-1].startswith("scripts/bench gate: error: --only: got 'speed', expected one of ")
+    assert done.stderr.splitlines()[-1].startswith(
+        "scripts/bench gate: error: argument --only: invalid choice: 'speed'"
+    )

@@ -13,7 +13,8 @@ from rig import Board, Daemon, wait_for
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 sys.path.append(str(SCRIPTS))
 
-from bench_full_frames import LEASE_S, NAME, FrameStream  # noqa: E402 - a script
+from frame_stream import NAME, FrameStream  # noqa: E402 - a script
+from measuring import LEASE_S  # noqa: E402
 
 ALL_MAX_MIB = 260.0
 GROWTH_MAX_MIB = 6.0

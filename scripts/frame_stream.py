@@ -9,23 +9,21 @@ import os
 import struct
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections import Counter
 from contextlib import suppress
-from pathlib import Path
 
 import httpx
 import numpy as np
+from measuring import Row, running_daemon, to_ms
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / "system")]
-from process_memory import list_processes, read_memory_mib  # noqa: E402 - of the tests
-from rig import TOKEN, Board, Daemon  # noqa: E402
+from process_memory import list_processes, read_memory_mib  # of the tests
+from rig import TOKEN
 
-NAME, PIXELS, FULL_HZ, LEASE_S = "display-1511", 1511, 16.0, 0.1
+NAME, PIXELS, FULL_HZ = "display-1511", 1511, 16.0
 BUSY_LOOPS = 2
 MEMORY_SETTLING_S = 30.0
 """Time after which the memory at the start is read: buffers and records have their usual size then."""
@@ -117,52 +115,42 @@ def read_memory(daemon):
 
 
 def measure_full_frames(duration_s):
-    """Stream full frames for a time beside busy loops. Return the rows of the table."""
-    with tempfile.TemporaryDirectory() as folder:
-        folder = Path(folder)
-        log = LogCounter(folder / "board.jsonl")
-        board = Board(folder, limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
+    """Stream full frames for a time beside busy loops. Yield the rows."""
+    logs, loops = [], []
+    with running_daemon(NAME, prepare=lambda path: logs.append(LogCounter(path))) as (_, daemon):
+        stream = FrameStream(daemon, duration_s)
         try:
-            daemon = Daemon(folder, board.port, NAME, lease_s=LEASE_S)
-            loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY_LOOPS)]
-            try:
-                stream = FrameStream(daemon, duration_s)
-                thread = threading.Thread(target=stream.run)
-                thread.start()
-                time.sleep(min(MEMORY_SETTLING_S, 0.2 * duration_s))
-                memory = [read_memory(daemon)]
-                thread.join()
-                state = daemon.state()
-                memory.append(read_memory(daemon))
-            finally:
-                for loop in loops:
-                    loop.kill()
-                    loop.wait()
-                daemon.stop()
+            loops += [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY_LOOPS)]
+            thread = threading.Thread(target=stream.run)
+            thread.start()
+            time.sleep(min(MEMORY_SETTLING_S, 0.2 * duration_s))
+            memory = {"start": read_memory(daemon)}
+            thread.join()
+            state = daemon.state()
+            memory["end"] = read_memory(daemon)
         finally:
-            board.stop()
-    return build_rows(stream, log.counts, state, memory, duration_s)
-
-
-def build_rows(stream, events, state, memory, duration_s):
-    """Return the rows of the table."""
-    name = f"full frames, {FULL_HZ:g}/s for {duration_s / 60:g} min beside {BUSY_LOOPS} busy loops"
-    rows = [(f"{name}: frames answered", sum(stream.statuses.values()) - stream.statuses["planned"], "1")]
-    rows += [(f"{name}: frames {key}", count, "1") for key, count in stream.statuses.items() if key != "planned"]
-    rows += [(f"{name}: connections lost, {key}", count, "1") for key, count in stream.errors.items()]
-    for key, values in (("first byte", stream.first_byte_s), ("first light", stream.first_light_s)):
-        for label, at in (("median", 50), ("p99", 99), ("maximum", 100)):
-            rows.append((f"{name}: arrival to {key}, {label}", 1e3 * float(np.percentile(values, at)), "ms"))
-    rows.append((f"{name}: lead of first byte over light, median", 1e3 * float(np.median(stream.lead_s)), "ms"))
+            for loop in loops:
+                loop.kill()
+                loop.wait()
+    name, events = (
+        f"full frames, {FULL_HZ:g}/s for {duration_s / 60:g} min beside {BUSY_LOOPS} busy loops",
+        logs[0].counts,
+    )
+    yield f"{name}: frames answered", sum(stream.statuses.values()) - stream.statuses["planned"], "1"
+    for key, count in stream.statuses.items():
+        yield f"{name}: frames {key}", count, "1"
+    for key, count in stream.errors.items():
+        yield f"{name}: connections lost, {key}", count, "1"
+    yield Row(f"{name}: arrival to first byte", to_ms(stream.first_byte_s))
+    yield Row(f"{name}: arrival to first light", to_ms(stream.first_light_s))
+    yield Row(f"{name}: lead of first byte over light", to_ms(stream.lead_s))
     faults = {key: count for key, count in events.items() if key.startswith("fault")}
-    rows += [
-        (f"{name}: pulses in the board's log", events["pulse"], "1"),
-        (f"{name}: underruns", events["HOLD"], "1"),
-        (f"{name}: lapses of the lease", faults.pop("fault LINK", 0), "1"),
-        (f"{name}: other faults", sum(faults.values()), "1"),
-        (f"{name}: longest stall of the link", state["link"]["longest_stall_ms"], "ms"),
-    ]
-    for when, values in zip(("start", "end"), memory, strict=True):
-        rows += [(f"{name}: memory of {key} at the {when}", mib, "MiB") for key, mib in values.items()]
-        rows.append((f"{name}: memory of all at the {when}", sum(values.values()), "MiB"))
-    return rows
+    yield f"{name}: pulses in the board's log", events["pulse"], "1"
+    yield f"{name}: underruns", events["HOLD"], "1"
+    yield f"{name}: lapses of the lease", faults.pop("fault LINK", 0), "1"
+    yield f"{name}: other faults", sum(faults.values()), "1"
+    yield f"{name}: longest stall of the link", state["link"]["longest_stall_ms"], "ms"
+    for when, values in memory.items():
+        for key, mib in values.items():
+            yield f"{name}: memory of {key} at the {when}", mib, "MiB"
+        yield f"{name}: memory of all at the {when}", sum(values.values()), "MiB"
