@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 from optodrive.cli.output import announce_compilation
-from optodrive.core.errors import InputError, LinkError
+from optodrive.core.errors import MISSING, InputError, LinkError
 
 if TYPE_CHECKING:
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
@@ -26,7 +26,7 @@ def confirm_emission(confirmed: bool, action: str) -> None:
     if confirmed:
         return
     if not sys.stdin.isatty():
-        raise InputError("--yes", None, f"--yes, because without a terminal nobody can confirm: {action}")
+        raise InputError("--yes", MISSING, f"--yes, because without a terminal nobody can confirm: {action}")
     typer.confirm(f"optodrive: {action}. Continue?", abort=True, err=True)
 
 
@@ -65,7 +65,7 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
     transport, sensor_port = build_bench_transport(build_port_settings(loaded), config or DEFAULT_CONFIG, stage)
     for signal_number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(signal_number, signal.default_int_handler)
-    with ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:
+    with loaded.name_file(), ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:
         spot_reader = None
         if loaded.sensor is not None or sensor_port:
             port, baud = (loaded.sensor.port, loaded.sensor.baud) if loaded.sensor else (sensor_port, SENSOR_BAUD)

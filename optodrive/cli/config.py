@@ -9,7 +9,7 @@ import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_json
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 
 Answer = TypeVar("Answer", int, float, str)
 
@@ -69,7 +69,7 @@ def _ask(option: str, value: Answer | None, question: str, default: Answer) -> A
     if value is not None:
         return value
     if not sys.stdin.isatty():
-        raise InputError(option, None, f"{option}, because without a terminal nobody can answer: {question}")
+        raise InputError(option, MISSING, f"{option}, because without a terminal nobody can answer: {question}")
     answer: Answer = typer.prompt(question, default=default, type=type(default), err=True)
     return answer
 

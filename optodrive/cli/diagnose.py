@@ -9,7 +9,7 @@ import typer
 from optodrive.cli.options import ConfigOption
 from optodrive.cli.output import announce_compilation, print_json, show_step
 from optodrive.cli.signals import end_as_interrupted
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 
 if TYPE_CHECKING:
     from optodrive.core.provenance import Provenance
@@ -181,7 +181,7 @@ def _require_scipy() -> None:
     from importlib.util import find_spec
 
     if find_spec("scipy") is None:
-        raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
+        raise InputError("scipy", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
 
 
 def _check_output_paths(json: str | None, out: Path | None) -> None:

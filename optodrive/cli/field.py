@@ -7,7 +7,7 @@ import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_json
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import FloatArray
@@ -75,7 +75,7 @@ def field(
 
 def _require_option(option: str, path: Path | None) -> Path:
     if path is None:
-        raise InputError(option, None, "a file")
+        raise InputError(option, MISSING, "a file")
     return path
 
 

@@ -9,7 +9,7 @@ import typer
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_json
 from optodrive.cli.pattern_parameters import parse_parameters
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 
 if TYPE_CHECKING:
     from optodrive.planning.stimuli.pattern import PatternDescription, PatternParameter
@@ -36,11 +36,11 @@ def patterns(
 
     if out is not None:
         if pattern is None:
-            raise InputError("PATTERN", None, "the name of a pattern, for --out")
+            raise InputError("PATTERN", MISSING, "the name of a pattern, for --out")
         _write_pattern(pattern, values or [], out, config, json)
         return
     if values:
-        raise InputError("--out", None, f"--out FRAMES.json for {values[0]}")
+        raise InputError("--out", MISSING, f"--out FRAMES.json for {values[0]}")
     name = None if pattern is None else find_pattern(pattern).name
     descriptions = [item for item in describe_patterns() if name in (None, item.name)]
     if json:

@@ -50,4 +50,5 @@ def serve(
 
     first = load()
     announce_compilation()
-    run(first, capture, load, record_session)
+    with first.name_file():
+        run(first, capture, load, record_session)

@@ -8,7 +8,7 @@ import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_json
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the holder; it appears in the audit file.")]
 FileOption = Annotated[
@@ -50,7 +50,7 @@ def add(
     if role not in known:
         raise InputError("--role", role, f"a role, {suggest_nearest(role, list(ROLES))}")
     if out is None and (json or not sys.stdout.isatty()):
-        raise InputError("--out", None, "--out FILE: a secret is shown on a terminal only, never in a pipe or a log")
+        raise InputError("--out", MISSING, "--out FILE: a secret is shown on a terminal only, never in a pipe or a log")
     check_output("--out", out)
     path = _locate(file, config)
     token = create_token(name, known[role])

@@ -27,7 +27,7 @@ def _restore_error(kind: type[OptodriveError], args: tuple[object, ...], fields:
 
 
 class InputError(OptodriveError):
-    """Invalid input. The message states place, value and expectation in one line."""
+    """Invalid input. The message states place, value, or that it is `MISSING`, and expectation in one line."""
 
     code = "bad_input"
     exit_status = 2
@@ -37,7 +37,9 @@ class InputError(OptodriveError):
         self.value = value
         self.expected = expected
         self.code = code
-        message = escape_unprintable(f"{where}: got {abbreviate(value)}, expected {expected}")
+        shown = abbreviate(value)
+        found = shown if shown == repr(MISSING) else f"got {shown}"
+        message = escape_unprintable(f"{where}: {found}, expected {expected}")
         super().__init__(message if len(message) <= MESSAGE_MAX else message[: MESSAGE_MAX - 1] + "…")
 
 
@@ -147,3 +149,7 @@ class Unquoted:
 
     def __repr__(self) -> str:
         return self._text
+
+
+MISSING = Unquoted("missing")
+"""The value of invalid input that was not given."""

@@ -1,4 +1,4 @@
-"""CSV tables of numbers with a header line, written in blocks of rows."""
+"""CSV tables of numbers with a header line, which lines of comments may precede, written in blocks of rows."""
 
 from pathlib import Path
 
@@ -10,33 +10,47 @@ from optodrive.core.types.arrays import FloatArray
 
 ROWS_PER_WRITE = 50_000
 """Rows formatted per write."""
+COMMENT = "#"
 
 
 def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
-    """Read a CSV file with exactly this header into a finite array [n, columns].
+    """Read a CSV file with exactly this header, after any comments, into a finite array [n, columns].
 
     Raises InputError that names row, column and value.
     """
+    comments, text = split_comments(path)
+    header, _, body = text.partition("\n")
+    first_row = len(comments) + 2
+    names = tuple(name.strip() for name in header.strip().split(","))
+    if names != columns:
+        place = "first line" if not comments else f"line {first_row - 1}"
+        raise InputError(f"{path}: {place}", header.strip(), f"'{','.join(columns)}'")
+    body = body.strip().replace("\r", "")
+    rows = body.count("\n") + 1 if body else 0
+    table = _parse_all(body, rows, len(columns))
+    if table is None:
+        table = _parse_rows(path, body, columns, first_row)
+    bad = np.argwhere(~np.isfinite(table))
+    if len(bad):
+        row, column = bad[0].tolist()
+        place = f"{path}: row {row + first_row}: {columns[column]}"
+        raise InputError(place, float(table[row, column]), "a finite number")
+    return table
+
+
+def split_comments(path: Path) -> tuple[list[str], str]:
+    """Return the comments before the header of a CSV file, without their mark, and the text that follows them."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(str(path), "not text", "a CSV file, UTF-8") from None
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable file") from None
-    header, _, body = text.partition("\n")
-    names = tuple(name.strip() for name in header.strip().split(","))
-    if names != columns:
-        raise InputError(f"{path}: first line", header.strip(), f"'{','.join(columns)}'")
-    body = body.strip().replace("\r", "")
-    rows = body.count("\n") + 1 if body else 0
-    table = _parse_all(body, rows, len(columns))
-    if table is None:
-        table = _parse_rows(path, body, columns)
-    bad = np.argwhere(~np.isfinite(table))
-    if len(bad):
-        row, column = bad[0].tolist()
-        raise InputError(f"{path}: row {row + 2}: {columns[column]}", float(table[row, column]), "a finite number")
-    return table
+    comments = []
+    while text.startswith(COMMENT):
+        line, _, text = text.partition("\n")
+        comments.append(line.removeprefix(COMMENT).strip())
+    return comments, text
 
 
 def _parse_all(body: str, rows: int, columns: int) -> FloatArray | None:
@@ -50,9 +64,9 @@ def _parse_all(body: str, rows: int, columns: int) -> FloatArray | None:
     return values.reshape(rows, columns) if len(values) == rows * columns else None
 
 
-def _parse_rows(path: Path, body: str, columns: tuple[str, ...]) -> FloatArray:
+def _parse_rows(path: Path, body: str, columns: tuple[str, ...], first_row: int) -> FloatArray:
     rows = []
-    for number, line in enumerate(body.split("\n"), start=2):
+    for number, line in enumerate(body.split("\n"), start=first_row):
         cells = line.split(",")
         if len(cells) != len(columns):
             raise InputError(f"{path}: row {number}", line, f"{len(columns)} numbers: {', '.join(columns)}")
@@ -72,13 +86,16 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def write_columns(path: Path, columns: tuple[str, ...], table: FloatArray, formats: tuple[str, ...]) -> None:
+def write_columns(
+    path: Path, columns: tuple[str, ...], table: FloatArray, formats: tuple[str, ...], comment: str = ""
+) -> None:
     """Write a table [n, columns] atomically.
 
-    formats: one printf format per column, such as %.3f
+    formats: one printf format per column, such as %.3f; comment: one line before the header, none if empty
     """
     line = ",".join(formats) + "\n"
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        file.write(f"{COMMENT} {comment}\n" if comment else "")
         file.write(",".join(columns) + "\n")
         for first in range(0, len(table), ROWS_PER_WRITE):
             block = table[first : first + ROWS_PER_WRITE]

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, suggest_nearest
 
 
 class ConflictError(ValueError):
@@ -53,9 +53,9 @@ Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_requi
 def check_format(path: Path, table: dict[str, Any], expected: str, version: int) -> None:
     """Raise InputError for a file of another format or version."""
     if table.get("format") != expected:
-        raise InputError(f"{path}: format", table.get("format"), f"'{expected}'")
+        raise InputError(f"{path}: format", table.get("format", MISSING), f"'{expected}'")
     if table.get("version") != version or isinstance(table["version"], bool):
-        raise InputError(f"{path}: version", table.get("version"), f"{version}, the one this release reads")
+        raise InputError(f"{path}: version", table.get("version", MISSING), f"{version}, the one this release reads")
 
 
 def build_input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
@@ -72,7 +72,7 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
     if first["type"] == "model_type":
         message = "a table with keys, as in { value = … }" if isinstance(first["input"], int | float) else "a table"
     if first["type"] == "missing":
-        return InputError(label, None, "this key")
+        return InputError(label, MISSING, "this key")
     if first["type"] == "value_error" and not isinstance(first["input"], str):
         conflict = first["ctx"]["error"]
         if isinstance(conflict, ConflictError):

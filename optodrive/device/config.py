@@ -1,13 +1,16 @@
 """The configuration of one display as a model that is checked as a whole."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os.path import realpath
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
-from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.errors import MISSING, InputError, Unquoted
 from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.device.config_sections import (
@@ -62,6 +65,7 @@ class Config(Section):
     """Optical stages, if there are several."""
     daemon: DaemonSection = DaemonSection()
     """The daemon."""
+    _file: str = PrivateAttr("")
 
     @model_validator(mode="before")
     @classmethod
@@ -186,6 +190,22 @@ class Config(Section):
         """Time for which points of a stream are sent ahead, s."""
         return max(stage.board.stream_lead_s for stage in self.list_stage_configs())
 
+    def read_from(self, path: Path) -> Self:
+        """Return the configuration as that of a file, which `name_file` names."""
+        named = self.model_copy()
+        named._file = str(path)
+        return named
+
+    @contextmanager
+    def name_file(self) -> Iterator[None]:
+        """Add the configuration's file to an InputError of the block that names one of its keys."""
+        try:
+            yield
+        except InputError as error:
+            if not self._file or error.where.partition(".")[0] not in type(self).model_fields:
+                raise
+            raise InputError(f"{self._file}: {error.where}", error.value, error.expected, error.code) from None
+
     def select_stage(self, name: str | None) -> "Config":
         """Return the configuration of a stage by name, None for the only one. Raise InputError for an unknown name."""
         if name is None and len(self.stages) < 2:
@@ -194,7 +214,11 @@ class Config(Section):
             if stage.name == name:
                 return config
         names = ", ".join(stage.name for stage in self.stages)
-        raise InputError("--stage", name, f"one of {names}" if names else "none: the display has one stage")
+        raise InputError(
+            "--stage",
+            MISSING if name is None else name,
+            f"one of {names}" if names else "none: the display has one stage",
+        )
 
     @property
     def reach(self) -> BoolArray:

@@ -63,7 +63,7 @@ def build_config(path: Path, table: dict[str, Any]) -> Config:
     for section, key in list_named_files(table):
         section[key] = str(path.parent / section[key])
     try:
-        config = Config.model_validate(table)
+        config = Config.model_validate(table).read_from(path)
     except ValidationError as error:
         raise build_input_error(error, str(path), Config) from None
     return config.list_stage_configs()[0] if len(config.stages) == 1 else config

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 from optodrive.core.toml_file import parse_toml, read_toml
 from optodrive.core.toml_model import Section
 from optodrive.device.config import FORMAT, VERSION, Config
@@ -36,8 +36,8 @@ def migrate_config(path: Path) -> Migration:
     """Migrate a configuration file to the present version. Raises InputError for one that stays invalid."""
     table = read_toml(path)
     if table.get("format") != FORMAT:
-        raise InputError(f"{path}: format", table.get("format"), f"'{FORMAT}'")
-    version = table.get("version")
+        raise InputError(f"{path}: format", table.get("format", MISSING), f"'{FORMAT}'")
+    version = table.get("version", MISSING)
     if type(version) is not int or not 1 <= version <= VERSION:
         raise InputError(f"{path}: version", version, f"1 to {VERSION}")
     text = path.read_text(encoding="utf-8")

@@ -44,6 +44,11 @@ class DisplayModel:
     @classmethod
     def from_config(cls, config: Config) -> "DisplayModel":
         """Load the files that a configuration names and build the models. Raise InputError for unusable values."""
+        with config.name_file():
+            return cls._build(config)
+
+    @classmethod
+    def _build(cls, config: Config) -> "DisplayModel":
         layout, pixel_map = build_pixel_layout(config.display), load_pixel_map(config)
         parameters = load_parameters(config.pixel_model.parameters)
         pixels = build_display_pixels(config, parameters)

@@ -98,7 +98,7 @@ def test_text_units_and_a_display_that_does_not_answer(capsys, tmp_path):
         (["a.h5", "--sweep", "f"], "RECORDING: got 'a.h5', expected no such argument together with --sweep"),
         (["--sweep", "f", "--out", "p.toml"], "--out: got 'p.toml', expected no such argument together with --sweep"),
         (["--sweep", "f", "--model", "m.toml"], "--model: got 'm.toml'"),
-        ([], "RECORDING: got None, expected at least one recording of a sweep, or --sweep FOLDER"),
+        ([], "RECORDING: missing, expected at least one recording of a sweep, or --sweep FOLDER"),
         (["none.h5"], "none.h5: got no file of this name"),
     ],
 )

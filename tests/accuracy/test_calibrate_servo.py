@@ -70,7 +70,7 @@ def test_a_stage_s_servos_are_held_against_its_own_scanner(folder, capsys):
     config.write_text(locate_shipped("display-437.toml").read_text() + "".join(stages))
     arguments = ["calibrate", "servo", f"{folder}/r.h5", "--json", "--config", str(config)]
     assert run(arguments) == 2
-    assert capsys.readouterr().err == "optodrive: --stage: got None, expected one of left, right\n"
+    assert capsys.readouterr().err == "optodrive: --stage: missing, expected one of left, right\n"
     settling_s = []
     for name in ("left", "right"):
         assert run([*arguments, "--stage", name]) == 0

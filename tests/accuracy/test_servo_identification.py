@@ -99,7 +99,7 @@ def test_missing_samples_and_a_position_output_with_an_offset_do_no_harm(measure
 
 def test_no_mirror_signal_is_named(measured):
     bare = altered(measured, lambda run: replace(run, signals={"mirror_y_rad": run.signals["mirror_y_rad"]}))
-    with pytest.raises(InputError, match=r"r\.h5: mirror_x_rad: got None, expected a run with this signal"):
+    with pytest.raises(InputError, match=r"r\.h5: mirror_x_rad: missing, expected a run with this signal"):
         found(bare, 0)
 
 

@@ -185,7 +185,9 @@ def write_calibration(folder):
     write_frames(folder)
     random = np.random.default_rng(1)
     truth = GroundTruthGeometry.sample(1, CONFIG)
-    write_spots(folder / "spots.csv", measure_spots(truth, grid_codes(17), random, outlier_fraction=0.035)[0])
+    write_spots(
+        folder / "spots.csv", measure_spots(truth, grid_codes(17), random, outlier_fraction=0.035)[0], CONFIG.name
+    )
     (folder / "points.csv").write_text("x_m,y_m\n0.0,0.0\n0.01,-0.02\n")
     servo = HiddenServo(900.0, 0.7, 30e-6, 60.0)
     write_recording(folder / "recording.h5", record_servos((servo, servo), random))

@@ -192,5 +192,5 @@ def test_without_an_answer_it_ends(board, start, tmp_path):
 def test_without_a_sensor_it_requests_one(board, start, tmp_path):
     status, _, errors = start(board, "calibrate", "board", "--yes", "--out", tmp_path / "field.toml").ended()
     assert status == 2
-    assert "sensor.port: got None" in errors
+    assert "sensor.port: missing" in errors
     assert errors.count("\n") == 1

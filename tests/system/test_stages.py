@@ -225,4 +225,4 @@ def test_status_shows_the_stages_and_the_commands_select_one(drifting, tmp_path)
     assert "right port" in text
     assert "left port" not in text
     status, text = run("home", "--config", config)
-    assert (status, text) == (2, "optodrive: --stage: got None, expected one of left, right\n")
+    assert (status, text) == (2, "optodrive: --stage: missing, expected one of left, right\n")

@@ -18,7 +18,7 @@ from optodrive.cli.calibrate.field_report import (
     write_calibration,
 )
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 from optodrive.core.units import m_to_um, um_to_m
 
 if TYPE_CHECKING:
@@ -70,7 +70,10 @@ def board(
     json: JsonOption = False,
 ) -> None:
     """Measure spots on the board with a sensor or by eye, and fit the field to them."""
+    from optodrive.core.files import check_output
+
     check_calibration_outputs(out, report)
+    check_output("--out", spots_path_for(out))
     request = BoardCalibrationRequest(manual, target_rms_um, spots_max, readings, spot_power_mw)
     places = f"up to {spots_max} places with a spot of {spot_power_mw:g} mW"
     confirm_emission(yes, f"this arms the board, lights {places}, and writes {out}")
@@ -85,11 +88,16 @@ def calibrate_on_board(
     from optodrive.lab.calibration.spots import write_spots
 
     measured = measure_on_board(config, stage, out, request)
-    path = out.with_suffix(".spots.csv")
-    write_spots(path, measured.fit.spots)
+    path = spots_path_for(out)
+    write_spots(path, measured.fit.spots, measured.fit.prior.display)
     return FieldCalibration(
         measured.fit, path, build_board_stats(measured, request, path), format_board_stats(measured, request, path)
     )
+
+
+def spots_path_for(out: Path) -> Path:
+    """Return the path of an output file's spots."""
+    return out.with_suffix(".spots.csv")
 
 
 def delete_session(out: Path) -> None:
@@ -123,7 +131,7 @@ def measure_on_board(
         session = CalibrationSession.load_or_create(out, exclusive_board.config)
         if not request.manual and spot_reader is None:
             raise InputError(
-                "sensor.port", None, "a spot sensor in the configuration; without one, --manual", "no_port"
+                "sensor.port", MISSING, "a spot sensor in the configuration; without one, --manual", "no_port"
             )
         if session.rows:
             print_status(

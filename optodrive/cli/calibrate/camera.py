@@ -55,13 +55,17 @@ def calibrate_by_camera(folder: Path, config: str | None) -> FieldCalibration:
         raise InputError("FOLDER", str(folder), "a folder with pictures.toml")
     prior = FieldPrior.from_config(load_config(config))
     measured, path = measure_folder(folder), folder / SPOTS_FILE
-    write_spots(path, measured.spots)
+    replaced = path.exists()
+    write_spots(path, measured.spots, prior.display)
     check_spots(str(path), measured.spots, prior)
     fit = fit_field(measured.spots, prior)
     check_fit(str(path), fit)
     outliers = [name for name, is_outlier in zip(measured.names, fit.outlier, strict=True) if is_outlier]
     return FieldCalibration(
-        fit, path, build_camera_stats(measured, outliers, path), format_camera_stats(measured, outliers, path)
+        fit,
+        path,
+        build_camera_stats(measured, outliers, path),
+        format_camera_stats(measured, outliers, path, replaced),
     )
 
 
@@ -79,8 +83,13 @@ def build_camera_stats(measured: "CameraMeasurement", outliers: list[str], spots
     }
 
 
-def format_camera_stats(measured: "CameraMeasurement", outliers: list[str], spots_file: Path) -> tuple[str, ...]:
-    """Format the statistics of the camera as text lines."""
+def format_camera_stats(
+    measured: "CameraMeasurement", outliers: list[str], spots_file: Path, replaced: bool
+) -> tuple[str, ...]:
+    """Format the statistics of the camera as text lines.
+
+    replaced: whether the spots of an earlier measurement were in the file
+    """
     sigma_um = sorted(m_to_um(sigma_m) for sigma_m in measured.sigma_m.tolist())
     lines = [
         f"camera           {m_to_um(measured.pixel_scale_m):.0f} µm per pixel; grid corners "
@@ -97,7 +106,7 @@ def format_camera_stats(measured: "CameraMeasurement", outliers: list[str], spot
         lines.append(
             f"warning          {_join_names(outside)} outside the grid: the camera model is extrapolated there"
         )
-    return (*lines, f"spots written    {spots_file}")
+    return (*lines, f"spots {'replaced' if replaced else 'written '}   {spots_file}")
 
 
 def _select_names(measured: "CameraMeasurement", mask: "BoolArray") -> list[str]:

@@ -30,7 +30,8 @@ def field(
     from optodrive.lab.calibration.spots import read_spots
 
     check_calibration_outputs(out, report)
-    prior, measured = FieldPrior.from_config(load_config(config)), read_spots(spots)
+    prior = FieldPrior.from_config(load_config(config))
+    measured = read_spots(spots, prior.display)
     check_spots(str(spots), measured, prior)
     fit = fit_field(measured, prior)
     check_fit(str(spots), fit)

@@ -18,8 +18,6 @@ ReportOption = Annotated[
     Path | None, typer.Option("--report", metavar="report.html", help="Write an HTML report of the fit.")
 ]
 OUTLIERS_LISTED_MAX = 12
-FIRST_DATA_LINE = 2
-"""Line number of row 0 in a file of spots."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +42,11 @@ def write_calibration(calibration: FieldCalibration, out: Path | None, report: P
     """Write the field and the report where requested, and print the fit's statistics."""
     from optodrive.lab.calibration.field_writer import write_field
     from optodrive.lab.calibration.fit_summary import summarize_fit
+    from optodrive.lab.calibration.spots import find_first_line
 
     source = str(calibration.spots_file)
     stats = summarize_fit(calibration.fit) | calibration.stats
-    lines = [*format_fit(stats), *calibration.report_lines]
+    lines = [*format_fit(stats, find_first_line(calibration.spots_file)), *calibration.report_lines]
     written = {name: path for name, path in (("field", out), ("report", report)) if path is not None}
     if out is not None:
         write_field(out, calibration.fit, source)
@@ -62,12 +61,15 @@ def write_calibration(calibration: FieldCalibration, out: Path | None, report: P
         print(f"written          {path}")
 
 
-def format_fit(stats: dict[str, Any]) -> list[str]:
-    """Format the statistics of a fit as text lines."""
+def format_fit(stats: dict[str, Any], first_line: int) -> list[str]:
+    """Format the statistics of a fit as text lines.
+
+    first_line: number of the line of the first spot in its file
+    """
     outlier_rows = stats["outlier_rows"]
     lines = [f"spots            {stats['spots']}, {len(outlier_rows)} of them outliers"]
     if outlier_rows:
-        listed = ", ".join(str(row + FIRST_DATA_LINE) for row in outlier_rows[:OUTLIERS_LISTED_MAX])
+        listed = ", ".join(str(row + first_line) for row in outlier_rows[:OUTLIERS_LISTED_MAX])
         omitted = len(outlier_rows) - OUTLIERS_LISTED_MAX
         more = f" and {omitted} more" if omitted > 0 else ""
         lines.append(f"outliers         line{'s' if len(outlier_rows) > 1 else ''} {listed}{more}")

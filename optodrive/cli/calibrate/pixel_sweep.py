@@ -69,9 +69,11 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
     pitch_min_m = compute_pitch_min_m(loaded, aims)
     if loaded.display.pitch_m < pitch_min_m:
         expected = f"at least {pitch_min_m:.6g}, so that the focus across an absorber's edge stays in the pixel's cell"
-        raise InputError("display.pitch_m", loaded.display.pitch_m, expected)
+        with loaded.name_file():
+            raise InputError("display.pitch_m", loaded.display.pitch_m, expected)
     create_folder(folder)
-    field = load_scan_field(loaded)
+    with loaded.name_file():
+        field = load_scan_field(loaded)
     reached = [is_reachable(loaded, field, aim) for aim in aims]
     for aim, pixels in zip(aims, reached, strict=True):
         text = dumps(sequence_to_json(FrameSequence((), build_sweep(loaded, aim, pixels)))) + "\n"

@@ -8,7 +8,7 @@ import typer
 from optodrive.cli.calibrate.pixel_sweep import write_sweep
 from optodrive.cli.options import ConfigOption, JsonOption, ModelOption, load_run_config
 from optodrive.cli.output import announce_compilation, print_json, show_progress
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 
 PIXELS_LISTED_MAX = 20
 
@@ -30,7 +30,7 @@ def pixels(
     """Fit the gain and aim offset of every pixel to recordings of a sweep, or write that sweep with --sweep."""
     if sweep is None:
         if not recordings:
-            raise InputError("RECORDING", None, "at least one recording of a sweep, or --sweep FOLDER")
+            raise InputError("RECORDING", MISSING, "at least one recording of a sweep, or --sweep FOLDER")
         fit_pixel_map(recordings, out, config, model, json)
         return
     for name, value in (("RECORDING", recordings[0] if recordings else None), ("--out", out), ("--model", model)):

@@ -8,7 +8,7 @@ import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.cli.output import print_json
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 
 
 def servo(
@@ -20,7 +20,7 @@ def servo(
 ) -> None:
     """Identify both mirror servos from a recording of steps, and compare them with the configuration."""
     if find_spec("scipy") is None:
-        raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
+        raise InputError("scipy", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
     from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.plausible_units import check_recording_units

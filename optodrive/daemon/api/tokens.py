@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES, Role
@@ -102,7 +102,7 @@ def read_tokens(path: Path, *, private: bool = False) -> Tokens:
         entries = _TokensFile.model_validate(table).token
     except ValidationError as error:
         named = build_input_error(error, str(path), _TokensFile)
-        if named.value is None or named.code == "unknown_key":
+        if named.value is MISSING or named.code == "unknown_key":
             raise named from None
         expected = EXPECTED_VALUES.get(named.where.rpartition(".")[2], named.expected)
         raise InputError(named.where, "a value that is not shown", expected) from None
@@ -173,4 +173,4 @@ def read_token(port: int | None) -> str:
             return read_tokens(path).highest_role.secret
     listed = " or ".join(str(path) for path in candidates)
     expected = f"a token: set it, name a file of tokens by {FILE_ENVIRONMENT_VARIABLE}, or make {listed} readable"
-    raise InputError(ENVIRONMENT_VARIABLE, None, expected)
+    raise InputError(ENVIRONMENT_VARIABLE, MISSING, expected)

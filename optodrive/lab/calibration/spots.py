@@ -7,11 +7,13 @@ from typing import Self
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.numeric_tables import read_columns, write_columns
+from optodrive.core.numeric_tables import read_columns, split_comments, write_columns
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.field_geometry import CODE_MAX
 
 COLUMNS = ("x_code", "y_code", "x_m", "y_m")
+ORIGIN = "optodrive spots of "
+"""Beginning of the comment that names the display."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +42,16 @@ class MeasuredSpots:
         return np.column_stack([self.x_code, self.y_code, self.x_m, self.y_m])
 
 
-def read_spots(path: Path) -> MeasuredSpots:
-    """Read spots.csv. Raise InputError with file, row, column, value and expected value."""
+def read_spots(path: Path, display: str = "") -> MeasuredSpots:
+    """Read spots.csv. Raise InputError with file, row, column, value and expected value.
+
+    display: name of the display, of which the spots must be if they name theirs; empty: any
+    """
     table = read_columns(path, COLUMNS)
+    comments, _ = split_comments(path)
+    named = next((line.removeprefix(ORIGIN) for line in comments if line.startswith(ORIGIN)), "")
+    if display and named and named != display:
+        raise InputError(f"{path}: spots", f"those of {named}", f"those of {display}, the configured display")
     if len(table) and np.all(np.abs(table[:, :2]) < 1.0) and np.any(table[:, :2]):
         swapped = np.abs(table[:, 2:]).max() > 100.0
         raise InputError(
@@ -54,10 +63,22 @@ def read_spots(path: Path) -> MeasuredSpots:
     bad = np.argwhere((table[:, :2] < 0) | (table[:, :2] > CODE_MAX))
     if len(bad):
         row, column = bad[0].tolist()
-        raise InputError(f"{path}: row {row + 2}: {COLUMNS[column]}", float(table[row, column]), f"0 to {CODE_MAX}")
+        raise InputError(
+            f"{path}: row {row + find_first_line(path)}: {COLUMNS[column]}",
+            float(table[row, column]),
+            f"0 to {CODE_MAX}",
+        )
     return MeasuredSpots.from_table(table)
 
 
-def write_spots(path: Path, spots: MeasuredSpots) -> None:
-    """Write spots.csv atomically."""
-    write_columns(path, COLUMNS, spots.to_table(), ("%.17g", "%.17g", "%.9g", "%.9g"))
+def find_first_line(path: Path) -> int:
+    """Return the line number of the first spot in a file."""
+    return len(split_comments(path)[0]) + 2
+
+
+def write_spots(path: Path, spots: MeasuredSpots, display: str) -> None:
+    """Write spots.csv atomically.
+
+    display: name of the display that they were measured on
+    """
+    write_columns(path, COLUMNS, spots.to_table(), ("%.17g", "%.17g", "%.9g", "%.9g"), f"{ORIGIN}{display}")

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 from uuid import uuid4
 
-from optodrive.core.errors import InputError, OptodriveError
+from optodrive.core.errors import MISSING, InputError, OptodriveError
 from optodrive.lab.diagnosis.local_workers import LocalWorkers
 
 Task = TypeVar("Task")
@@ -54,7 +54,7 @@ def open_client(
         import dask
         import distributed
     except ImportError:
-        raise InputError("dask", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra") from None
+        raise InputError("dask", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra") from None
     # The answers report a lost worker; Dask's own messages are a page long.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from optodrive.core.errors import InputError, Unquoted, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, Unquoted, suggest_nearest
 from optodrive.core.plausibility import guess_unit
 from optodrive.core.plausible_ranges import RANGES
 from optodrive.core.types.arrays import FloatArray
@@ -34,7 +34,7 @@ def check_format(place: str, head: Attributes) -> None:
     """Check the format name and the version in the root attributes."""
     for field, expected in (("format", FORMAT), ("version", VERSION)):
         if field not in head:
-            raise InputError(f"{place}: {field}", None, f"{expected!r}")
+            raise InputError(f"{place}: {field}", MISSING, f"{expected!r}")
         if head[field] != expected:
             raise InputError(f"{place}: {field}", head[field], f"{expected!r}, the one this release reads")
 
@@ -45,7 +45,7 @@ def pop_ambient_k(place: str, attributes: Attributes) -> float:
     if value is None:
         near = [name for name in attributes if name.lower().startswith("ambient")]
         hint = f" (there is {format_name(near[0])!r})" if near else ""
-        raise InputError(f"{place}: ambient_K", None, f"the ambient temperature in K{hint}")
+        raise InputError(f"{place}: ambient_K", MISSING, f"the ambient temperature in K{hint}")
     if isinstance(value, str) or not AMBIENT.low <= value <= AMBIENT.high:
         unit = None if isinstance(value, str) else guess_unit(value, AMBIENT)
         likely = "" if unit is None else f"; this value is likely in {unit}"
@@ -64,13 +64,13 @@ def select_signals(place: str, members: list[str]) -> list[str]:
                 suggest_nearest(member, list(RUN_MEMBERS)),
             )
     if PULSES not in members:
-        raise InputError(f"{place}/{PULSES}", None, f"one row per pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
+        raise InputError(f"{place}/{PULSES}", MISSING, f"one row per pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
     signals = [name for name in SIGNALS if name in members]
     if not signals:
         raise InputError(place, Unquoted("a run without signals"), f"at least one of {', '.join(SIGNALS)}")
     if COMMANDS not in members and set(signals) & set(MIRROR_SIGNALS):
         raise InputError(
-            f"{place}/{COMMANDS}", None, f"the commanded mirror angles: {', '.join(TABLE_COLUMNS[COMMANDS])}"
+            f"{place}/{COMMANDS}", MISSING, f"the commanded mirror angles: {', '.join(TABLE_COLUMNS[COMMANDS])}"
         )
     return signals
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.errors import MISSING, InputError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run
 from optodrive.lab.recording.storage import (
@@ -37,7 +37,7 @@ def import_h5py() -> Any:
     try:
         import h5py
     except ImportError:
-        raise InputError("h5py", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra") from None
+        raise InputError("h5py", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra") from None
     return h5py
 
 
@@ -208,7 +208,7 @@ class Hdf5Tree:
         with convert_errors(place, expected):
             link = group.get(name, getlink=True)
             if link is None:
-                raise InputError(place, None, expected)
+                raise InputError(place, MISSING, expected)
             # A link may lead to another file or form a cycle; a recording is one file.
             if not isinstance(link, self._h5.HardLink):
                 raise InputError(place, Unquoted("a link"), f"{expected}, stored in this file")

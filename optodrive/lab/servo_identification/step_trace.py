@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.core.types.measurements import Measurement, Run
 from optodrive.lab.servo_identification.step_response import Steps
@@ -66,7 +66,9 @@ def extract_trace(where: str, measurement: Measurement, axis: int) -> StepTrace:
     name = f"mirror_{AXES[axis]}_rad"
     runs = [run for run in measurement.runs if name in run.signals and run.commands is not None and len(run.commands)]
     if not runs:
-        raise InputError(f"{where}: {name}", None, "a run with this signal and commands: the mirror's measured angle")
+        raise InputError(
+            f"{where}: {name}", MISSING, "a run with this signal and commands: the mirror's measured angle"
+        )
     steps_left, segments = STEPS_MAX, []
     for run in runs:
         segment = _extract_segment(run, axis, steps_left)

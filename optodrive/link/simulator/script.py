@@ -21,7 +21,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, suggest_nearest
 from optodrive.core.toml_file import read_toml
 from optodrive.link.protocol.messages import INPUTS
 
@@ -65,14 +65,14 @@ def load_script(path: Path, extra_actions: Collection[str] = ()) -> list[ScriptS
 def _parse_step(where: str, entry: dict[str, Any], actions: tuple[str, ...]) -> ScriptStep:
     kind = "set" if "set" in entry else "do"
     known = INPUTS if kind == "set" else actions
-    name = entry.get(kind)
+    name = entry.get(kind, MISSING)
     if not isinstance(name, str) or name not in known:
         raise InputError(f"{where}: {kind}", name, f"a known one, {suggest_nearest(str(name), list(known))}")
     origin = entry.get("from", "start")
     if origin not in get_args(Origin):
         raise InputError(f"{where}: from", origin, "start, light or signal")
     waits = origin == "signal"
-    at_s = 0.0 if waits else _parse_number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
+    at_s = 0.0 if waits else _parse_number(f"{where}: at_s", entry.get("at_s", MISSING), "a time ≥ 0 in s", inf)
     rate = _parse_number(f"{where}: rate", entry.get("rate", 0.01), "a rate per byte, 0 to 1", 1.0)
     value = entry.get("value", False)
     if not isinstance(value, bool):

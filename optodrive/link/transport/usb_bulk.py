@@ -6,7 +6,7 @@ from typing import Any, Self
 import usb.core
 import usb.util
 
-from optodrive.core.errors import InputError, LinkError
+from optodrive.core.errors import MISSING, InputError, LinkError
 from optodrive.link.transport.base import TransportKind
 from optodrive.link.transport.port_settings import PortSettings
 from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
@@ -36,7 +36,7 @@ class UsbBulk:
     def from_settings(cls, port: PortSettings) -> Self:
         """Build the transport of an address. Raise InputError if it names no device."""
         if port.vendor_id is None or port.product_id is None:
-            raise InputError("board.vendor_id, board.product_id", None, "both, for transport 'usb'")
+            raise InputError("board.vendor_id, board.product_id", MISSING, "both, for transport 'usb'")
         return cls(port.vendor_id, port.product_id, port.serial_number)
 
     def open(self) -> None:

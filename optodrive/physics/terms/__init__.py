@@ -5,7 +5,7 @@ from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, suggest_nearest
 from optodrive.physics.term import Term
 
 
@@ -32,7 +32,7 @@ def find_term(where: str, key: str, given: Collection[str]) -> Term:
         raise InputError(f"{where}.{name}", name, f"a parameter of the term, {suggest_nearest(name, sorted(expected))}")
     for name in required or ([] if names else expected[:1]):
         if name not in names:
-            raise InputError(f"{where}.{name}", None, "a value for this parameter")
+            raise InputError(f"{where}.{name}", MISSING, "a value for this parameter")
     return term
 
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, suggest_nearest
 
 PRIORITY_MAX = 1_000_000
 """Largest absolute priority."""
@@ -60,7 +60,7 @@ def require_object(value: object, where: str, known: Sequence[str], required: Se
             raise InputError(where, key, expected, code="unknown_key")
     for key in required:
         if key not in value:
-            raise InputError(f"{where}.{key}", None, "this required key", code="missing_key")
+            raise InputError(f"{where}.{key}", MISSING, "this required key", code="missing_key")
     return value
 
 

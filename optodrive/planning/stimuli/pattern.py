@@ -7,7 +7,7 @@ from hashlib import sha256
 from math import isfinite
 from typing import Literal
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, suggest_nearest
 from optodrive.core.plausibility import PlausibleRange, guess_unit
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
@@ -102,7 +102,7 @@ class Pattern:
         for name, parameter in known.items():
             place = f"{where}: {name}"
             if name not in given and parameter.required:
-                raise InputError(place, None, f"this parameter ({parameter.description})", code="missing_parameter")
+                raise InputError(place, MISSING, f"this parameter ({parameter.description})", code="missing_parameter")
             value = convert_value(given[name], parameter, place, config) if name in given else parameter.default
             argument, factor = _convert_name(name)
             values[argument] = value * factor if factor != 1.0 and isinstance(value, int | float) else value

@@ -89,7 +89,7 @@ def test_a_sweep_states_the_pitch_that_it_needs(tmp_path, capsys):
     ("changes", "says"),
     [
         ({"lens_mm": 10}, "--lens-mm: got 10.0, expected at least 28.65 mm"),
-        ({"rows": None}, "--rows: got None, expected --rows, because without a terminal nobody can answer"),
+        ({"rows": None}, "--rows: missing, expected --rows, because without a terminal nobody can answer"),
         ({"rows": 0}, "'--rows'"),
         ({"power_w": 1200}, "laser.max_power_w: got 1200"),
         ({"pitch_mm": 0.004}, "display.pitch_m: got 4e-06"),

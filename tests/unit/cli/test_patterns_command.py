@@ -39,8 +39,8 @@ def test_one_pattern_is_described(capsys):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--out", "f.json"], "PATTERN: got None"),
-        (["text", "hello"], "--out: got None, expected --out FRAMES.json for hello"),
+        (["--out", "f.json"], "PATTERN: missing"),
+        (["text", "hello"], "--out: missing, expected --out FRAMES.json for hello"),
         (["texd", "--out", "f.json"], "nearest is 'text'"),
         (["text", "hello", "--out", "f.csv"], "a name that ends in .json"),
         (["text", "hello", "size=3", "--out", "f.json"], "pattern text: got 'size'"),

@@ -44,7 +44,7 @@ def test_a_configuration_whose_keys_were_renamed_plans_as_before(name, tmp_path,
     migrated, today = load_config(new), DISPLAYS["display-437"].config
     # The touch cap and the declared uncertainties are other numbers today, under the same keys.
     kept = {"touch_max_c": migrated.limits.touch_max_c, "uncertainty": migrated.limits.uncertainty}
-    assert migrated == today.model_copy(update={"limits": today.limits.model_copy(update=kept)})
+    assert migrated == today.model_copy(update={"limits": today.limits.model_copy(update=kept)}).read_from(new)
     planned, expected = plan(migrated), plan(today.model_copy(update={"limits": migrated.limits}))
     assert len(planned) > 400
     np.testing.assert_equal(vars(planned), vars(expected))

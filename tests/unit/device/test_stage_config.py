@@ -68,7 +68,7 @@ def test_a_single_stage_is_the_configuration(tmp_path):
         (TWO_STAGES.replace("1.5", "-1.5"), r"stages.1.laser.max_power_w: got -1.5"),
         (TWO_STAGES.replace("max_power_w", "max_power"), r"stages.1.laser.max_power: got 'max_power', expected"),
         (TWO_STAGES.replace("1.5", "1500"), r"stages\[1\].laser.max_power_w: got 1500"),
-        (TWO_STAGES.replace('name = "left"', ""), r"stages.0.name: got None, expected this key"),
+        (TWO_STAGES.replace('name = "left"', ""), r"stages.0.name: missing, expected this key"),
         (TWO_STAGES.replace("[0, 1]", "[1, 0]"), r"stages\[0\].columns: got \[1, 0\], expected .* last of 0 to 3"),
         (TWO_STAGES.replace("[1, 3]", "[0, 99]"), r"stages\[1\].columns: got \[0, 99\]"),
         (TWO_STAGES.replace("[1, 3]", "[-5, 3]"), r"stages\[1\].columns: got \[-5, 3\]"),
@@ -118,14 +118,14 @@ def test_a_file_for_one_scanner_is_refused(tmp_path, option, capsys):
 
 
 @pytest.mark.parametrize("command", ["first-light", "home", "calibrate board"])
-@pytest.mark.parametrize(("stage", "got"), [((), "None"), (("--stage", "top"), "'top'")])
-def test_commands_that_drive_one_board_want_the_name_of_its_stage(tmp_path, command, stage, got, capsys):
+@pytest.mark.parametrize(("stage", "found"), [((), "missing"), (("--stage", "top"), "got 'top'")])
+def test_commands_that_drive_one_board_want_the_name_of_its_stage(tmp_path, command, stage, found, capsys):
     load(tmp_path, TWO_STAGES)
     own = () if command == "home" else ("--yes",)
     out = ("--out", tmp_path / "field.toml") if command == "calibrate board" else ()
     arguments = (*command.split(), *own, *out, *stage, "--config", tmp_path / "display.toml")
     assert run([str(each) for each in arguments]) == 2
-    assert f"--stage: got {got}, expected one of left, right" in capsys.readouterr().err
+    assert f"--stage: {found}, expected one of left, right" in capsys.readouterr().err
 
 
 def test_a_stage_is_selected_by_its_name(tmp_path):

@@ -90,7 +90,7 @@ def test_wrong_files_are_refused_in_one_line(tmp_path, text, old, new, message):
 
 
 def test_a_missing_value_is_named(tmp_path, text):
-    with pytest.raises(InputError, match=r"tau_g: got None"):
+    with pytest.raises(InputError, match=r"tau_g: missing"):
         load_text(tmp_path, text[: text.index("[tau_g]")] + text[text.index("[kappa]") :])
 
 
@@ -112,7 +112,7 @@ WRONG_TERMS = {
     "unknown parameter": (("bridge_conductivity", "exponant", 0.1, "1"), "nearest is 'exponent'"),
     "wrong unit": (("bridge_conductivity", "exponent", 0.1, "K"), "exponent.unit: got 'K', expected '1'"),
     "out of range": (("bridge_conductivity", "exponent", 3.0, "1"), "expected 0 to 1.3 1"),
-    "missing parameter": (("wall_heating", "resistance", 20.0, "K/W"), "capacity: got None"),
+    "missing parameter": (("wall_heating", "resistance", 20.0, "K/W"), "capacity: missing"),
     "negative": (("bridge_conductivity", "exponent", -0.1, "1"), "exponent.value: got -0.1, expected 0 to 1.3"),
 }
 

@@ -86,7 +86,7 @@ def test_the_whole_aperture_at_half_the_rise_is_the_force_of_text_s1():
     [
         ("wall_heeting", {}, "a known term, nearest is 'wall_heating'"),
         ("touch_surface", {"lag": 1.0, "gas_share": 0.3, "wall_sharr": 0.4}, "nearest is 'wall_share'"),
-        ("wall_heating", {"resistance": 20.0}, r"terms\.wall_heating\.capacity: got None"),
+        ("wall_heating", {"resistance": 20.0}, r"terms\.wall_heating\.capacity: missing"),
     ],
 )
 def test_mistaken_values_are_refused_in_one_line(key, values, message):

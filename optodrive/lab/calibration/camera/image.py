@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 from optodrive.lab.calibration.camera.folder import PictureFolder
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -23,7 +23,7 @@ def import_opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise InputError("OpenCV", None, "the extra: pip install 'optodrive[camera]'", "missing_extra") from None
+        raise InputError("OpenCV", MISSING, "the extra: pip install 'optodrive[camera]'", "missing_extra") from None
     return cv2
 
 
@@ -75,7 +75,9 @@ class PictureReader:
             return self(pictures.dark)
         if len(pictures.spot_pictures) < MEDIAN_PICTURES_MIN:
             found = f"{len(pictures.spot_pictures)} spots"
-            raise InputError(f"{pictures.path}: dark", None, f"a picture without the beam, required with only {found}")
+            raise InputError(
+                f"{pictures.path}: dark", MISSING, f"a picture without the beam, required with only {found}"
+            )
         chosen = np.unique(np.linspace(0, len(pictures.spot_pictures) - 1, MEDIAN_PICTURES_MAX).astype(int))
         stack = np.stack([self(pictures.spot_pictures[at].path) for at in chosen])
         background: Image = np.empty_like(stack[0])

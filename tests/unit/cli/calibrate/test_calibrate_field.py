@@ -25,7 +25,7 @@ SPOTS, IS_OUTLIER = measure_spots(TRUTH, grid_codes(17), np.random.default_rng(2
 def folder(tmp_path_factory):
     """A folder with spots.csv and the field.toml fitted to it."""
     at = tmp_path_factory.mktemp("calibrated")
-    write_spots(at / "spots.csv", SPOTS)
+    write_spots(at / "spots.csv", SPOTS, CONFIG.name)
     assert run(["calibrate", "field", f"{at}/spots.csv", "--out", f"{at}/field.toml"]) == 0
     return at
 
@@ -46,7 +46,7 @@ def test_text_names_the_outliers_by_line(folder, capsys):
     output = capsys.readouterr().out
     lines = (folder / "spots.csv").read_text().splitlines()
     named = [int(word) for word in output.splitlines()[1].replace(",", " ").split()[2:]]
-    assert named == (np.flatnonzero(IS_OUTLIER) + 2).tolist()
+    assert named == (np.flatnonzero(IS_OUTLIER) + 3).tolist()
     for line in named:
         x_code, y_code, x_m, y_m = map(float, lines[line - 1].split(","))
         assert np.hypot(*np.subtract(TRUTH.position_m(x_code, y_code), (x_m, y_m))) > 1e-4
@@ -135,7 +135,7 @@ WRONG = {
 @pytest.mark.parametrize("case", sorted(WRONG))
 def test_wrong_spots_end_with_one_line_and_status_2(tmp_path, capsys, case):
     options, spoil, named = WRONG[case]
-    write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(spoil(SPOTS.to_table())))
+    write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(spoil(SPOTS.to_table())), CONFIG.name)
     arguments = ["calibrate", "field", f"{tmp_path}/spots.csv", "--out", f"{tmp_path}/field.toml", *options]
     assert run(arguments) == 2
     captured = capsys.readouterr()

@@ -45,7 +45,7 @@ def test_without_a_terminal_emission_needs_yes(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr("sys.stdin", StringIO("y\n"))
     assert run(["calibrate", "board"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("optodrive: --yes: got None, expected --yes, because without a terminal nobody can confirm")
+    assert error.startswith("optodrive: --yes: missing, expected --yes, because without a terminal nobody can confirm")
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 

@@ -65,7 +65,7 @@ def test_the_environment_gives_the_armers(monkeypatch):
             "token.0.secret: got 'a value that is not shown', expected 16 to",
         ),
         ('name = "anna"', 'name = "a/b"', "token.0.name: got 'a value that is not shown', expected 1 to 40 letters"),
-        ('role = "armer"', "", "token.0.role: got None, expected this key"),
+        ('role = "armer"', "", "token.0.role: missing, expected this key"),
         ('role = "armer"', 'rol = "armer"', "token.0.rol: got 'rol', expected "),
     ],
     ids=str,

@@ -69,6 +69,9 @@ def test_the_cause_of_invalid_spots_is_named(named, table):
         ("x_code,y_code,x_m,y_m\n1,2,0.1,0.2\n1,2,here,0\n", "row 3: x_m: got 'here'"),
         ("x_code,y_code,x_m,y_m\n1,2,nan,0\n", "row 2: x_m"),
         ("x_code,y_code,x_m,y_m\n1,70000,0,0\n", "row 2: y_code"),
+        ("# optodrive spots of mine\nx_code,y_code,x_m,y_m\n1,70000,0,0\n", "row 3: y_code"),
+        ("# a note\n# another\nx_code,y_code,x_m,y_m\n1,x,0,0\n", "row 4: y_code"),
+        ("# a note\nx_code,y_code,x_m\n1,2,0\n", "line 2"),
         ("x_code,y_code,x_m,y_m\n0.01,0.02,32768,32768\n", "exchanged"),
         ("x_code,y_code,x_m,y_m\n0.01,0.02,0.01,0.02\n", "look like metres"),
     ],
@@ -81,5 +84,15 @@ def test_a_file_without_spots_is_refused(tmp_path, text, named):
 
 
 def test_spots_round_trip(tmp_path):
-    write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(MANY))
+    write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(MANY), "mine")
     assert np.allclose(read_spots(tmp_path / "spots.csv").to_table(), MANY, atol=1e-10)
+
+
+def test_spots_of_another_display_are_refused_by_name(tmp_path):
+    path = tmp_path / "spots.csv"
+    write_spots(path, MeasuredSpots.from_table(MANY), "mine")
+    assert len(read_spots(path, "mine")) == len(read_spots(path)) == len(MANY)
+    with pytest.raises(InputError, match="spots: got 'those of mine', expected those of yours"):
+        read_spots(path, "yours")
+    path.write_text(path.read_text().partition("\n")[2])  # a table of a user's own
+    assert len(read_spots(path, "yours")) == len(MANY)

@@ -67,7 +67,7 @@ def test_the_default_is_never_more_than_a_spot(any_display):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ([], "--yes: got None, expected --yes, because without a terminal nobody can confirm: this arms the board"),
+        ([], "--yes: missing, expected --yes, because without a terminal nobody can confirm: this arms the board"),
         (["--power-mw", "51", "--yes"], "--power-mw: got 51 mW, expected more than 0 and at most 50 mW"),
         (["--power-mw", "9999", "--yes"], "--power-mw: got 9999 mW, expected more than 0 and at most 50 mW"),
         (["--pulses", "0", "--yes"], "--pulses: got 0, expected 1 to 100"),

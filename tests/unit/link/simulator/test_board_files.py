@@ -92,14 +92,14 @@ def test_script_is_sorted_and_has_defaults(file):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('[[step]]\nset = "key"', "step 0: at_s: got None"),
+        ('[[step]]\nset = "key"', "step 0: at_s: missing"),
         ('[[step]]\nat_s = -1\nset = "key"', "at_s: got -1"),
         ('[[step]]\nat_s = nan\nset = "key"', "at_s: got nan"),
         ('[[step]]\nat_s = "1"\nset = "key"', "at_s: got '1'"),
         ('[[step]]\nat_s = 1\nset = "interlok"', "nearest is 'interlock'"),
         ('[[step]]\nat_s = 1\ndo = "explode"', "do: got 'explode'"),
         ("[[step]]\nat_s = 1\ndo = [1]", "do: got"),
-        ("[[step]]\nat_s = 1", "do: got None"),
+        ("[[step]]\nat_s = 1", "do: missing"),
         ('[[step]]\nat_s = 1\nset = "key"\nvalue = 1', "true or false"),
         ('[[step]]\nat_s = 1\nset = "key"\nvlaue = true', "nearest is 'value'"),
         ('[[step]]\nat_s = 1\nset = "key"\ndo = "reset"', "got 'do'"),

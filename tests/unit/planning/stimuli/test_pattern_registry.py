@@ -123,8 +123,8 @@ def test_flags_are_true_or_false():
         ),
         ("showcase", {"seconds": 5}, "unknown_parameter", "expected no parameter"),
         ("all", [1], "bad_parameter", "got [1], expected an object"),
-        ("text", {}, "missing_parameter", "pattern text: text: got None"),
-        ("image", {}, "missing_parameter", "pattern image: file: got None"),
+        ("text", {}, "missing_parameter", "pattern text: text: missing"),
+        ("image", {}, "missing_parameter", "pattern image: file: missing"),
         (
             "all",
             {"height_um": -5},

@@ -36,7 +36,7 @@ def test_a_frame_without_a_number_gets_the_next_one():
         ("{", "expected valid JSON"),
         ("[" * 100_000, "nests less deep"),
         ('{"target": {}}', "expected a known key, nearest is 'target_um'"),
-        ("{}", "frame.target_um: got None"),
+        ("{}", "frame.target_um: missing"),
         ('{"frame": -1, "target_um": {}}', "frame.frame: got -1"),
         ('{"frame": true, "target_um": {}}', "frame.frame: got True"),
         ('{"target_um": {"3": 5}}', "frame.target_um: got '3', expected a pixel, 0…2"),
