@@ -5,8 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import DEFAULT_URL, HoldOption, JsonOption, StageOption, UrlOption
+from optodrive.cli.invocation import Invocation
+from optodrive.cli.options import HoldOption, JsonOption, StageOption, UrlOption
 from optodrive.cli.output import print_json
+from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError, NotReadyError, OptodriveError
 from optodrive.core.quantity import format_quantity
 
@@ -118,14 +120,15 @@ def reload(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
         print(report.message)
 
 
-def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
+def stop(context: typer.Context, url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Switch the gate off, drop everything queued, disarm the board.
 
     On the daemon's computer it works even if the daemon hangs.
     """
     from optodrive.cli.direct_stop import stop_directly
 
-    result = stop_directly(url)
+    invocation: Invocation = context.obj
+    result = invocation.stopped or stop_directly(url)
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import READ_STATE, STOP
 

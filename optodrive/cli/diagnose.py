@@ -91,7 +91,7 @@ def _capture_provenance(context: typer.Context, recordings: list[str], config: "
 
     text = None if config is None else dumps(config.model_dump(mode="json"), sort_keys=True, ensure_ascii=False)
     return Provenance.capture(
-        context.obj or (), recordings, None if config is None or text is None else (config.name, text)
+        context.obj.arguments, recordings, None if config is None or text is None else (config.name, text)
     )
 
 

@@ -1,93 +1,19 @@
 """The command line `optodrive`.
 
 An error is one line on stderr; `exit_status.py` states the exit statuses.
+
+STOP leaves first. A command of a few milliseconds is what a person counts on who presses Enter with the laser on, so
+`optodrive stop` imports sockets and JSON, sends, and only then imports the command line and prints the state. What is
+not exactly `stop` with its own options takes the usual way.
 """
 
 import os
 import sys
-from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
-from optodrive.cli import (
-    config,
-    control,
-    diagnose,
-    docs,
-    doctor,
-    field,
-    first_light,
-    helios,
-    home,
-    patterns,
-    plan,
-    play,
-    recording,
-    serve,
-    service,
-    simulate,
-    support,
-    terms,
-    token,
-    validate,
-    wire,
-)
-from optodrive.cli.calibrate import group as calibrate
-from optodrive.cli.exit_status import INTERRUPTED, SUMMARY
+from optodrive.cli.direct_stop import stop_directly
+from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
-
-UsageError: Any = typer.BadParameter.__bases__[0]
-"""Base class of errors about arguments; typer contains its own copy of click or uses the installed one."""
-
-app = typer.Typer(
-    name="optodrive",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-
-
-def _print_version(requested: bool) -> None:
-    if requested:
-        print(f"optodrive {version('optodrive')}")
-        raise typer.Exit
-
-
-@app.callback(epilog=SUMMARY)
-def _select(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    """Drive a tactile display with projected light."""
-
-
-for module in (
-    serve,
-    home,
-    first_light,
-    calibrate,
-    field,
-    service,
-    control,
-    play,
-    patterns,
-    plan,
-    simulate,
-    helios,
-    recording,
-    diagnose,
-    terms,
-    validate,
-    config,
-    token,
-    wire,
-    doctor,
-    support,
-    docs,
-):
-    module.register(app)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -100,29 +26,29 @@ def main(arguments: list[str] | None = None) -> None:
 def run(arguments: list[str]) -> int:
     """Run the command line and return its exit status. Print a known error as one line on stderr."""
     try:
-        status = app(args=arguments, prog_name="optodrive", standalone_mode=False, obj=tuple(arguments))
-        sys.stdout.flush()
-        if status == INTERRUPTED:  # some versions of typer convert Ctrl-C to a status
-            raise KeyboardInterrupt
-        return status if isinstance(status, int) else 0
+        stopped = _stop_first(arguments)
     except OptodriveError as error:
         print(f"optodrive: {error}", file=sys.stderr)
         return error.exit_status
-    except (typer.Abort, KeyboardInterrupt):
-        print("optodrive: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except UsageError as error:
-        message = " ".join(error.format_message().split())
-        if message:  # empty without arguments: typer has printed the help
-            print(f"optodrive: {message}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        # Buffered output cannot be written either; redirecting it prevents a second error at interpreter exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError):
-            return 0  # the reader of stdout has exited
-        print(f"optodrive: {error}", file=sys.stderr)
-        return 1
+    from optodrive.cli.commands import run_command
+
+    return run_command(arguments, stopped)
+
+
+def _stop_first(arguments: list[str]) -> dict[str, Any] | None:
+    """Stop at the link process if this is plainly `stop`. Return its result, or None if nothing was stopped."""
+    if arguments[:1] != ["stop"]:
+        return None
+    url = read_default_url()
+    options = iter(arguments[1:])
+    for option in options:
+        if option == "--url":
+            url = next(options, "")
+        elif option.startswith("--url="):
+            url = option.removeprefix("--url=")
+        elif option != "--json":
+            return None
+    return stop_directly(url)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from optodrive.core.daemon_url import URL_ENVIRONMENT_VARIABLE
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ PixelMapOption = Annotated[
     ),
 ]
 UrlOption = Annotated[
-    str, typer.Option("--url", envvar="OPTODRIVE_URL", help="URL of the daemon, or unix:PATH for its socket.")
+    str, typer.Option("--url", envvar=URL_ENVIRONMENT_VARIABLE, help="URL of the daemon, or unix:PATH for its socket.")
 ]
 HoldOption = Annotated[
     bool,
@@ -57,7 +58,6 @@ FitOption = Annotated[
         "--fit", help="Excess beam time: even lowers all targets, priority omits the pixels of lowest priority."
     ),
 ]
-DEFAULT_URL = "http://127.0.0.1:8450"
 
 
 def check_model_path(path: Path) -> Path:

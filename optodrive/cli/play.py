@@ -11,7 +11,6 @@ import typer
 from optodrive.cli.exit_status import exit_unless_fits
 from optodrive.cli.label_options import LabelOption, add_labels, parse_label_options
 from optodrive.cli.options import (
-    DEFAULT_URL,
     FitOption,
     HoldOption,
     JsonOption,
@@ -23,6 +22,7 @@ from optodrive.cli.options import (
 from optodrive.cli.output import print_json, show_progress
 from optodrive.cli.pattern_parameters import parse_parameters
 from optodrive.cli.plan_text import format_plan_summary
+from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import DEFAULT_URL, ConfigOption, UrlOption
+from optodrive.cli.options import ConfigOption, UrlOption
+from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.files import atomic_write, check_output
 
 

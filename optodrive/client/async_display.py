@@ -7,12 +7,12 @@ from typing import Any, Self
 
 from optodrive.client.async_stream import AsyncStream
 from optodrive.client.display import RECONNECT_TIMEOUT_S
-from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
 from optodrive.client.hold import AsyncHold
 from optodrive.client.http import AsyncDaemonClient
 from optodrive.client.operations import DisplayOperations, LabelsLike
 from optodrive.client.plan import Plan
+from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.state import StateReport

@@ -8,13 +8,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
 from optodrive.client.hold import Hold
 from optodrive.client.http import DaemonClient
 from optodrive.client.operations import DisplayOperations, LabelsLike
 from optodrive.client.plan import Plan
 from optodrive.client.stream import Stream
+from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.state import StateReport

@@ -1,25 +1,18 @@
 """Where the daemon is, and the token that it requires."""
 
-import os
 import socket
 from urllib.parse import urlsplit
 
 import httpx
 
+from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError, LinkError
 from optodrive.daemon.api.tokens import read_token
 
-DEFAULT_URL = "http://127.0.0.1:8450"
-URL_ENVIRONMENT_VARIABLE = "OPTODRIVE_URL"
 PROBE_TIMEOUT_S = 2.0
 STOP_UNANSWERED = (
     "stop was not answered by {url} ({error}): the running plan may go on to its end; use the emergency stop or the key"
 )
-
-
-def read_default_url() -> str:
-    """Return OPTODRIVE_URL, or the address of a daemon with the default port on this computer."""
-    return os.environ.get(URL_ENVIRONMENT_VARIABLE) or DEFAULT_URL
 
 
 class Endpoint:

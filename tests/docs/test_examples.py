@@ -22,7 +22,7 @@ from worlds import (
     write_script,
 )
 
-from optodrive.cli.main import UsageError, app
+from optodrive.cli.commands import UsageError, build_app
 
 ELSEWHERE = {
     "scripts/": "scripts of the checkout, which are run as they are",
@@ -169,7 +169,7 @@ def test_a_difference_is_found(shown, real):
 
 def parse(words):
     """Parse the arguments of a command without running it."""
-    command, name = typer.main.get_command(app), "optodrive"
+    command, name = typer.main.get_command(build_app()), "optodrive"
     parent = None
     while True:
         context = command.make_context(name, list(words), parent=parent, resilient_parsing=False)

@@ -3,10 +3,16 @@
 import json
 import os
 import socket
+import struct
+import subprocess
+import sys
+import sysconfig
 import threading
+from pathlib import Path
 
 import pytest
 
+from optodrive.cli import main
 from optodrive.cli.direct_stop import list_link_sockets, stop_directly
 from optodrive.cli.main import run
 from optodrive.core.ipc import Message, MessageDecoder, encode_message
@@ -22,8 +28,11 @@ def runtime(tmp_path, monkeypatch):
     return tmp_path
 
 
-def serve_once(path, answer):
-    """Answer one STOP in place of the link process. Return the thread and the list of kinds received."""
+def serve_once(path, answer, inspect=lambda connection: None):
+    """Answer one STOP in place of the link process. Return the thread and the list of kinds received.
+
+    inspect: called with the connection on which STOP has come, before the answer
+    """
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
     listener.listen()
@@ -35,6 +44,7 @@ def serve_once(path, answer):
         with connection, listener:
             while "stop" not in kinds:
                 kinds.extend(message.kind for message in decoder.feed(connection.recv(4096)))
+            inspect(connection)
             connection.sendall(encode_message(answer))
 
     thread = threading.Thread(target=serve)
@@ -85,6 +95,33 @@ def test_the_command_stops_although_no_web_process_answers(runtime, capsys):
     printed = capsys.readouterr()
     assert json.loads(printed.out) == {"board": BOARD}
     assert "the board was stopped" in printed.err
+
+
+def test_stop_leaves_before_the_command_line_is_imported(runtime):
+    port = find_free_port()
+    folder = open_runtime_folder(port, None)
+    packages = sysconfig.get_path("purelib")
+    mapped = []
+
+    def inspect(connection):
+        pid, _, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        mapped.append(Path(f"/proc/{pid}/maps").read_text())
+
+    answer = Message("result", {"id": 1, "error": None, "board": BOARD})
+    thread, _ = serve_once(folder.link_socket, answer, inspect)
+    command = [sys.executable, "-m", "optodrive.cli.main", "stop", f"--url=http://127.0.0.1:{port}", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    output, _ = process.communicate()
+    thread.join()
+    assert json.loads(output) == {"board": BOARD}
+    assert packages not in mapped[0]  # pydantic and numpy are libraries there
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("options", [["--help"], ["--url"], ["now"], ["--url=http://127.0.0.1:1", "--jason"]])
+def test_what_is_not_plainly_stop_takes_the_usual_way(runtime, monkeypatch, options):
+    monkeypatch.setattr(main, "stop_directly", lambda url: pytest.fail(f"stopped at {url}") if url else None)
+    assert main.run(["stop", *options]) == (0 if options == ["--help"] else 2)
 
 
 def test_an_error_of_the_link_process_is_the_commands_error(runtime, capsys):

@@ -1,0 +1,99 @@
+"""The commands of the command line. Only the module of the command that runs is imported."""
+
+import os
+import sys
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+
+from optodrive.cli.exit_status import INTERRUPTED, SUMMARY
+from optodrive.cli.invocation import Invocation
+from optodrive.core.errors import OptodriveError
+
+UsageError: Any = typer.BadParameter.__bases__[0]
+"""Base class of errors about arguments; typer contains its own copy of click or uses the installed one."""
+
+MODULES = {
+    "serve": ("serve",),
+    "home": ("home",),
+    "first_light": ("first-light",),
+    "calibrate.group": ("calibrate",),
+    "field": ("field",),
+    "service": ("service",),
+    "control": ("status", "arm", "disarm", "dim", "pause", "resume", "reload", "stop"),
+    "play": ("push", "play"),
+    "patterns": ("patterns",),
+    "plan": ("plan",),
+    "simulate": ("simulate",),
+    "helios": ("helios",),
+    "recording": ("recording",),
+    "diagnose": ("diagnose",),
+    "terms": ("terms",),
+    "validate": ("validate",),
+    "config": ("config",),
+    "token": ("token",),
+    "wire": ("wire",),
+    "doctor": ("doctor",),
+    "support": ("support",),
+    "docs": ("docs",),
+}
+"""Commands by module below `optodrive.cli`, in the order of the help."""
+
+
+def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> int:
+    """Run a command and return its exit status. Print a known error as one line on stderr.
+
+    stopped: result of the link process, if it was stopped already
+    """
+    invocation = Invocation(tuple(arguments), stopped)
+    app = build_app(arguments[0] if arguments else None)
+    try:
+        status = app(args=arguments, prog_name="optodrive", standalone_mode=False, obj=invocation)
+        sys.stdout.flush()
+        if status == INTERRUPTED:  # some versions of typer convert Ctrl-C to a status
+            raise KeyboardInterrupt
+        return status if isinstance(status, int) else 0
+    except OptodriveError as error:
+        print(f"optodrive: {error}", file=sys.stderr)
+        return error.exit_status
+    except (typer.Abort, KeyboardInterrupt):
+        print("optodrive: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except UsageError as error:
+        message = " ".join(error.format_message().split())
+        if message:  # empty without arguments: typer has printed the help
+            print(f"optodrive: {message}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        # Buffered output cannot be written either; redirecting it prevents a second error at interpreter exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return 0  # the reader of stdout has exited
+        print(f"optodrive: {error}", file=sys.stderr)
+        return 1
+
+
+def build_app(command: str | None = None) -> typer.Typer:
+    """Build the command line with one command, or with all of them if there is none of this name."""
+    app = typer.Typer(name="optodrive", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+    app.callback(epilog=SUMMARY)(_select)
+    for module in [name for name, commands in MODULES.items() if command in commands] or MODULES:
+        import_module(f"optodrive.cli.{module}").register(app)
+    return app
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        from importlib.metadata import version
+
+        print(f"optodrive {version('optodrive')}")
+        raise typer.Exit
+
+
+def _select(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Drive a tactile display with projected light."""
