@@ -92,8 +92,10 @@ class StageRig(PlannerRig):
     cores: the board
     """
 
-    def __init__(self, monkeypatch, display, clocks=CLOCKS, link_type=DriftingLink, **options):
-        self.display, self.clocks, self.link_type = display, clocks, link_type
+    def __init__(
+        self, monkeypatch, display, clocks=CLOCKS, link_type=DriftingLink, on_stage_loss="all_dark", **options
+    ):
+        self.display, self.clocks, self.link_type, self.on_stage_loss = display, clocks, link_type, on_stage_loss
         super().__init__(monkeypatch, display=display, **options)
 
     def build_boards(self, _, settings, requirements):
@@ -109,7 +111,8 @@ class StageRig(PlannerRig):
         self.session = sessions[0]
         skew_max_s = self.display.config.limits.stage_skew_max_s
         openers = [partial(self.open_link, link) for link in self.links]
-        return BoardGroup(sessions, self.clock, openers, [board.stage for board in boards], skew_max_s)
+        names = [board.stage for board in boards]
+        return BoardGroup(sessions, self.clock, openers, names, skew_max_s, self.on_stage_loss)
 
     def build_core(self, stage, settings, sink):
         return BoardCore(settings, sink=sink, seed=3 + stage)

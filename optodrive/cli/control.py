@@ -166,6 +166,8 @@ def _format_board(board: "BoardReport") -> str:
 
 
 def _format_stage(stage: "StageReport") -> str:
+    if stage.lost is not None:
+        return f"{stage.name} at {stage.port}: lost, the others go on: {stage.lost}"
     if not stage.connected:
         return f"{stage.name} at {stage.port}: no link: {stage.error}"
     clock = "clock unknown"

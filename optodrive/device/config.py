@@ -120,10 +120,23 @@ class Config(Section):
             boards = [config.board.address for config in self.list_stage_configs()]
             if ("serial", realpath(self.sensor.port)) in boards:
                 raise ConflictError("sensor.port", self.sensor.port, "another port than that of a board")
-        unreached = np.flatnonzero(~np.any([stage.reach for stage in self.list_stage_configs()], axis=0))
+        reach = np.stack([stage.reach for stage in self.list_stage_configs()])
+        unreached = np.flatnonzero(~reach.any(axis=0))
         if len(unreached):
             raise ConflictError("stages", Unquoted(f"none that reaches pixel {unreached[0]}"), "one")
+        if self.daemon.on_stage_loss == "that_stage":
+            self._check_spare_reach(reach)
         return self
+
+    def _check_spare_reach(self, reach: BoolArray) -> None:
+        """Check that each pixel is reached by another stage when one is lost. reach: [k, p]. Raise ConflictError."""
+        alone = np.flatnonzero(np.count_nonzero(reach, axis=0) < 2)
+        if len(alone):
+            expected = "all_dark with one stage"
+            if len(self.stages) > 1:
+                name = self.stages[int(np.argmax(reach[:, alone[0]]))].name
+                expected = f"all_dark while stage {name!r} is the only one that reaches pixel {alone[0]}"
+            raise ConflictError("daemon.on_stage_loss", self.daemon.on_stage_loss, expected)
 
     def check_optics(self) -> None:
         """Check laser, scanner and board of the only stage, and that its beam has pixels. Raise ConflictError."""

@@ -312,3 +312,5 @@ class DaemonSection(Section):
     """Folder for a recording of each session."""
     on_web_loss: Literal["dark", "finish"] = "dark"
     """End of the web process while a plan runs: go dark at once, or finish the plan."""
+    on_stage_loss: Literal["all_dark", "that_stage"] = "all_dark"
+    """Loss of one of several stages while they are armed: all go dark, or the others draw what is left."""

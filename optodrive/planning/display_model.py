@@ -1,6 +1,6 @@
 """A configuration resolved into the models that planning uses."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -60,6 +60,19 @@ class DisplayModel:
             raise InputError("pixel_model.parameters", config.pixel_model.parameters, expected)
         budget = build_budget(config, parameters, pixels)
         return cls(config, layout, parameters, pixels, dead, scan_heads, reach, budget)
+
+    def without_stage(self, lost: int | None) -> "DisplayModel":
+        """Return the display without the beam of a stage that was lost, itself for None."""
+        if lost is None:
+            return self
+        reach = self.reach.copy()
+        reach[lost] = False
+        return replace(self, reach=reach)
+
+    @property
+    def draws(self) -> BoolArray:
+        """Whether each stage draws, [k]: not one that was lost."""
+        return np.asarray(self.reach.any(axis=1))
 
     @property
     def scan_head(self) -> ScanHead:

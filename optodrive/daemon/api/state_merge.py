@@ -83,7 +83,7 @@ def _name_port(board: BoardSection) -> str:
 
 def _list_unknown_stages(config: Config) -> list[dict[str, Any]]:
     """Return each of several stages while the link process does not run."""
-    unknown = {"connected": False, "error": NO_LINK_PROCESS, "board": BoardView().to_dict()}
+    unknown = {"connected": False, "error": NO_LINK_PROCESS, "lost": None, "board": BoardView().to_dict()}
     unknown |= {"clock_error_us": None, "clock_drift_ppm": None}
     stages = config.stages if len(config.stages) > 1 else ()
     return [{"name": stage.name, "port": _name_port(stage.board), **unknown} for stage in stages]

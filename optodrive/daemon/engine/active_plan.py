@@ -1,16 +1,17 @@
 """A plan that waits or runs, with its record, thermal states and points."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses, concatenate_executed
-from optodrive.daemon.engine.plan_record import Execution, PlanRecord
+from optodrive.daemon.engine.plan_record import Execution, LargestTarget, PlanRecord
 from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.planned_sequence import PlannedSequence
 
 
@@ -65,15 +66,19 @@ class ActivePlan:
             rows = np.concatenate([self.executed_rows, rows])
         self.executed, self.executed_rows = executed, rows
 
-    def interrupt(self, off_s: float) -> None:
+    def interrupt(self, off_s: float, emitted: BoolArray | None = None) -> None:
         """Keep the rows behind the last executed one for later. off_s: board time at which the light went off.
 
         The rows before it count as executed, also one that was cut short.
+        emitted: [n] whether each row may have been emitted; the others are then kept instead, behind these
         """
         if self.executed is None or self.executed_rows is None:
             return
-        if len(self.executed_rows):
+        if emitted is not None:
+            self._put_first(emitted, self.executed_rows)
+        elif len(self.executed_rows):
             self.first_row = int(self.executed_rows[-1]) + 1
+        if self.first_row:
             is_complete = len(self.executed_rows) == self.first_row
             self.executed = replace(self.executed, complete=is_complete)
         self._fold_delay()
@@ -81,6 +86,17 @@ class ActivePlan:
         self.origin_s = max(self.zero_s, off_s - self.record.start_s)
         self.record.change_status(PlanStatus.PAUSED)
         self.record.sent = self.executed_before
+
+    def _put_first(self, emitted: BoolArray, executed_rows: IntArray) -> None:
+        """Put rows before all others, each part in order of time."""
+        order = np.argsort(~emitted, kind="stable")
+        plan = self.planned.plan
+        columns = {item.name: getattr(plan, item.name)[order] for item in fields(plan) if item.name != "headroom_k"}
+        self.planned = replace(self.planned, plan=replace(plan, **columns), predicted_m=self.planned.predicted_m[order])
+        self.first_row = int(np.count_nonzero(emitted))
+        self.executed_rows = np.flatnonzero(np.isin(order, executed_rows))
+        self.record.pulses = ListedPulses.from_planned(self.planned)
+        self.record.largest_target = LargestTarget.from_planned(self.planned)
 
     def _fold_delay(self) -> None:
         """Shift the plan's zero by the delay of the executed pulses, so that the remaining rows are as late."""

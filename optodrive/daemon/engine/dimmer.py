@@ -1,4 +1,7 @@
-"""Dimming: a cap on the power of plans, lower than the configured one, that outlives the planner process."""
+"""Dimming: a cap on the power of plans, lower than the configured one, that outlives the planner process.
+
+A stage that was lost is missing from the same display.
+"""
 
 from dataclasses import replace
 
@@ -18,12 +21,14 @@ def dim_display(display: DisplayModel, share: float) -> DisplayModel:
 class Dimmer:
     """The display by which plans are made. Any thread may read `display`, which changes as a whole.
 
+    lost_stage: the stage without which they are made, None for all stages
     memory: keeps the share for a later planner process, so that a restart brightens nothing
     """
 
     def __init__(self, display: DisplayModel, memory: ThermalMemory) -> None:
         self._full = display
         self._memory = memory
+        self.lost_stage: int | None = None
         self.display = dim_display(display, memory.power_share)
 
     @property
@@ -37,4 +42,13 @@ class Dimmer:
         if not 0.0 <= share <= configured:
             raise InputError("share", share, f"a number from 0 to {configured:g}, limits.power_share as configured")
         self._memory.power_share = share
-        self.display = dim_display(self._full, share)
+        self._build_display()
+
+    def set_lost_stage(self, stage: int | None) -> None:
+        """Make the plans from now on without a stage, None for all stages."""
+        if stage != self.lost_stage:
+            self.lost_stage = stage
+            self._build_display()
+
+    def _build_display(self) -> None:
+        self.display = dim_display(self._full.without_stage(self.lost_stage), self._memory.power_share)

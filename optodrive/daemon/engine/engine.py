@@ -40,6 +40,7 @@ from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.link_watch import LinkCause
+from optodrive.link.session.stage_loss import LostStage
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FitMode
 
@@ -102,6 +103,7 @@ class Engine:
         self._restored = False
         self._saved_key: object = None
         self._published_cause: LinkCause | None = None
+        self._published_loss: LostStage | None = None
         self.message_loop.watch(self.commands, lambda: None)
 
     # --- loop ---------------------------------------------------------------------------------------------------
@@ -161,11 +163,20 @@ class Engine:
         self.on_beat()
 
     def _publish_cause(self) -> None:
+        self._publish_loss()
         cause = self._session.likely_cause
         if cause != self._published_cause:
             self._published_cause = cause
             if cause is not None:
                 self.on_warning(f"board at {self._session.port}: {cause.message}")
+
+    def _publish_loss(self) -> None:
+        lost = self._session.lost
+        if lost != self._published_loss:
+            self._published_loss = lost
+            if lost is not None:
+                name = self.display.config.stages[lost.stage].name
+                self.on_warning(f"stage {name} was lost, the others go on: {lost.reason}")
 
     def close(self) -> None:
         """End the threads and close the loop, after run()."""

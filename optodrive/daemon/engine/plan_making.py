@@ -64,7 +64,7 @@ def make_plan(
     """
     planned, feasibility = _plan(display, request, built.sequence, snapshot, on_progress)
     on_progress(1.0)
-    points = StagePoints.from_plan(planned.plan, scales)
+    points = StagePoints.from_plan(planned.plan, scales, display.draws)
     on_progress(1.0)
     payload = points.encode_payload()
     row, decoded = decode_stages(payload, points, scales)

@@ -28,6 +28,9 @@ the third begins behind it without a deadline.
 
 Pauses. The board drops its queue; what was not executed becomes the rest of the same plan, which waits at the front and
 is limited again for the time at which the light returns (decision 37). A stream is dropped, as it shows the present.
+The loss of a stage, where the others go on, interrupts as a pause does. Nobody knows what the lost board emitted: what
+it was sent for the time before it was dark for certain counts, and is not repeated. What is left is planned anew, also
+that of a stream, unless a newer frame waits already (decision 49).
 
 Threads. The loop that owns the session calls everything; the planning thread takes snapshots and reads `is_busy` and
 `must_preempt`. `lock` guards the estimate and both deques between them.
@@ -50,7 +53,7 @@ from optodrive.daemon.engine.planning_snapshot import (
     build_cut_snapshot,
     mark_refreshed,
 )
-from optodrive.daemon.engine.progress import ClockShift, PlanRun
+from optodrive.daemon.engine.progress import ClockShift, PlanRun, find_emitted
 from optodrive.daemon.engine.pulse_accounts import PulseAccounts
 from optodrive.daemon.engine.queue_pause import START_LEAD_S, QueuePause
 from optodrive.daemon.engine.queue_thermal import QueueThermal
@@ -62,6 +65,7 @@ from optodrive.link.protocol.point_cut import PointCut
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.stage_loss import LostStage
 from optodrive.planning.display_model import DisplayModel
 
 STREAM_START_LEAD_S = 0.02
@@ -93,7 +97,7 @@ class PlanQueue:
         self._plan_store = plan_store
         self._executor = executor
         self._thermal = QueueThermal(display, session, lambda: self.on_progress())
-        self.pause = QueuePause(self.lock, self.waiting, self._thermal, session)
+        self.pause = QueuePause(self.lock, self.waiting, self._thermal, session, self.accounts)
         self._refresh_cycle: RefreshCycle | None = None
         self._revoked_callers = RevokedCallers()
 
@@ -117,7 +121,7 @@ class PlanQueue:
         with self.lock:
             thermal = self._thermal.estimate
             start_s = self._earliest_start_s(streamed, planning_time_s)
-            last = self._find_running_stream() if streamed else None
+            last = self._find_running_stream() if streamed and not self.pause.is_held else None
         if last is not None:
             snapshot = self._build_cut_snapshot(last, thermal, planning_time_s)
             if snapshot is not None:
@@ -214,7 +218,7 @@ class PlanQueue:
                 self._thermal.set(self._thermal.estimate_before(self.waiting[0]))
             while self.waiting:
                 self._supersede(self.waiting.popleft())
-            if self.running and not self.running[-1].plan.record.streamed:
+            if self.running and not self.running[-1].plan.record.streamed and not self.pause.is_held:
                 plan, job = self.running[0]
                 plan.record.dropped = plan.record.pulse_count - job.sent_count
                 self._session.flush()
@@ -342,6 +346,9 @@ class PlanQueue:
             while self.running:
                 run = self.running.popleft()
                 self.accounts.count_progress(run)
+                if self._session.lost is not None and self._counts_on(run, self._session.lost.stage):
+                    self._interrupt_by_loss(run, self._session.lost, off_s)
+                    continue
                 plan, record = run.plan, run.plan.record
                 left = record.pulse_count - record.executed_count
                 if record.streamed or not left:
@@ -357,6 +364,32 @@ class PlanQueue:
                 self.waiting.appendleft(plan)
             if streams and not self.waiting:
                 self._thermal.rewind(streams)
+
+    @staticmethod
+    def _counts_on(run: PlanRun, stage: int) -> bool:
+        """Return whether a running plan has points for a stage."""
+        return len(run.plan.points.stages[stage]) > 0
+
+    def _interrupt_by_loss(self, run: PlanRun, lost: LostStage, off_s: float) -> None:
+        """Let the plan that ran last when a stage was lost wait for its rest, unless a newer streamed one waits.
+
+        Its pulses that the lost board may have emitted count as executed.
+        """
+        plan, record = run.plan, run.plan.record
+        self.accounts.collect_executed(run)
+        plan.interrupt(off_s, find_emitted(run, lost))
+        self.accounts.count_executed(run)
+        left = plan.rest_count
+        if left and not self.running and not any(each.record.streamed for each in self.waiting):
+            self.waiting.appendleft(plan)
+            return
+        record.dropped = left
+        if self.waiting and not self.running:
+            first, estimate = self.waiting[0], self._thermal.estimate_before(plan)
+            first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
+        self._end_waiting(
+            plan, PlanStatus.SUPERSEDED if left else PlanStatus.DONE, "replaced by a newer plan" if left else None
+        )
 
     def _conclude(self, run: PlanRun, status: PlanStatus, error: str | None) -> None:
         plan, record = run.plan, run.plan.record

@@ -1,4 +1,7 @@
-"""Plans that go on after a pause: their rows that are left, limited and proven again from the heat that is left."""
+"""Plans that go on after a pause: their rows that are left, limited and proven again from the heat that is left.
+
+What is left of a plan that counts on a stage that was lost is planned anew.
+"""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -6,15 +9,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from optodrive.core.types.plans import BudgetState, LimitedPlan
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import LargestTarget
+from optodrive.daemon.engine.rest_sequence import build_rest_sequence
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.stage_points import StagePoints, decode_stages
+from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.limiter.rest import delay_rest, limit_rest, replace_rest
 from optodrive.planning.listed_pulses import ListedPulses
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.summary_schema import PlanSummary
@@ -40,6 +47,11 @@ class RestartedPlan:
     after: ThermalEstimate
     end_s: float
 
+    @property
+    def added_count(self) -> int:
+        """Number of pulses that the plan has more than before, negative for less."""
+        return len(self.planned.plan) - len(self.plan.planned.plan)
+
     def apply(self, delay_s: float) -> None:
         """Replace the parts of the plan, which begins delay_s later than it was limited for: never warmer."""
         plan, record, planned, zero_s = self.plan, self.plan.record, self.planned, self.zero_s
@@ -51,7 +63,7 @@ class RestartedPlan:
             plan.heat_before, plan.budget_before = self.before.shift_to_plan(self.start_s)
         plan.planned, plan.points, plan.crc, plan.is_interrupted = planned, self.points, self.crc, False
         plan.zero_s = plan.origin_s = zero_s
-        record.duration_s = planned.duration_s
+        record.pulse_count, record.duration_s = len(planned.plan), planned.duration_s
         record.pulses = ListedPulses.from_planned(planned)
         record.largest_target = LargestTarget.from_planned(planned)
         record.summary_json = self.summary_json
@@ -89,8 +101,11 @@ def _restart(
 ) -> RestartedPlan:
     first, planned = plan.first_row, plan.planned
     heat, budget = before.shift_to_plan(start_s)
-    rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)
-    points = StagePoints.from_plan(rest, scales)
+    if display.draws[planned.plan.stage[first:]].all():
+        rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)
+    else:
+        rest, budget_after = _plan_anew(display, plan, heat, budget, on_progress)
+    points = StagePoints.from_plan(rest, scales, display.draws)
     on_progress()
     payload = points.encode_payload()
     row, decoded = decode_stages(payload, points, scales)
@@ -121,6 +136,22 @@ def _restart(
         after=after,
         end_s=end_s,
     )
+
+
+def _plan_anew(
+    display: DisplayModel,
+    plan: ActivePlan,
+    heat: ThermalState,
+    budget: BudgetState,
+    on_progress: Callable[[], None],
+) -> tuple[LimitedPlan, BudgetState]:
+    """Plan the rest of a plan for the present stages. Return its rows and the state after them.
+
+    Pulses above a cap are trimmed, as after a pause, under each policy of the request.
+    """
+    sequence, sources = build_rest_sequence(plan.planned, plan.first_row, plan.origin_s)
+    anew = plan_sequence(display, sequence, heat, budget, "trim", lambda _: on_progress())
+    return replace(anew.plan, source=sources[anew.plan.source]), anew.budget
 
 
 def _find_origin_s(plan: ActivePlan) -> float:

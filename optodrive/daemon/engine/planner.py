@@ -109,7 +109,9 @@ class Planner:
             self._pending_count -= 1
 
     def follow_pause(self) -> None:
-        """Let the queue go on when a pause has ended. The loop calls it in every iteration."""
+        """Let the queue go on when a pause has ended, without a lost stage. The loop calls it in every iteration."""
+        lost = self._session.lost
+        self._dimmer.set_lost_stage(None if lost is None else lost.stage)
         if self._plan_queue.pause.can_restart and (self._restarting is None or self._restarting.done()):
             with self._lock:
                 if self._pending_count == 0:
@@ -128,7 +130,7 @@ class Planner:
             while not self._restart_once(on_progress):
                 pass
         except Exception as error:  # of any kind: what cannot be proven is not played
-            reason = f"what was left after a pause could not be planned again: {error}"
+            reason = f"what was left after an interruption could not be planned again: {error}"
             with suppress(LinkError):
                 self._run_in_loop(lambda: self._plan_queue.fail_all(reason))
         finally:

@@ -55,14 +55,16 @@ def build_cut_snapshot(
     Return None if no pulse would be left, or none would be dropped.
     """
     plan, zero_s = running.planned.plan, running.record.start_s
-    cut = PointCut.find(running.points, (min_start_s - zero_s) / tick_s)
+    cut = PointCut.find(running.points, (min_start_s - zero_s - running.zero_s) / tick_s)
     if not 0 < cut.row < len(plan):
         return None
-    end_s = cut.end_tick * tick_s
+    end_s = running.zero_s + cut.end_tick * tick_s
     kept = slice(cut.row)
     heat = running.heat_before.copy()
     heat.apply_pulses(plan.pixel[kept], plan.start_s[kept], plan.width_s[kept], plan.power_w[kept])
     state = commit_until(plan, float(plan.start_s[cut.row]), running.budget_before, budget)
+    pairs = zip(cut.aim_rows, running.points.stages, strict=True)
+    is_aim_unknown = any(row == -1 and len(points) for row, points in pairs)  # a lost stage has no points
     return PlanningSnapshot(
         thermal=thermal,
         start_s=zero_s + end_s,
@@ -70,7 +72,7 @@ def build_cut_snapshot(
         budget=shift_state(state, -end_s),
         predecessor=running,
         cut=cut,
-        initial_pixels=None if -1 in cut.aim_rows else tuple(plan.pixel[cut.aim_rows].tolist()),
+        initial_pixels=None if is_aim_unknown else tuple(plan.pixel[cut.aim_rows].tolist()),
         refreshed=mark_refreshed(running, cut.row),
     )
 

@@ -3,7 +3,11 @@
 from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+
+from optodrive.core.types.arrays import BoolArray
 from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.link.session.stage_loss import LostStage
 from optodrive.link.session.staged_job import StagedJob
 
 
@@ -12,6 +16,20 @@ class PlanRun(NamedTuple):
 
     plan: ActivePlan
     job: StagedJob
+
+
+def find_emitted(run: PlanRun, lost: LostStage) -> BoolArray:
+    """Return which rows of a plan were executed, or may have been by the board of a lost stage before it was dark, [n].
+
+    Nothing is known of what that board was sent for this time.
+    """
+    plan = run.plan
+    start_s = plan.record.start_s + plan.planned.plan.start_s
+    emitted = np.arange(len(start_s)) < plan.first_row
+    emitted[plan.executed_rows] = True
+    sent = run.job.parts[lost.stage].list_sent_rows()
+    emitted[sent[start_s[sent] <= lost.dark_s]] = True
+    return emitted
 
 
 class PlanProgress(NamedTuple):

@@ -36,6 +36,12 @@ class PulseAccounts:
         self.totals["executed"] += executed - record.executed_count
         record.sent, record.executed_count = sent, executed
 
+    def count_executed(self, run: PlanRun) -> None:
+        """Count all executed pulses of an interrupted plan, also those behind a gap that the lost board has left."""
+        record, executed = run.plan.record, run.plan.executed_before
+        self.totals["executed"] += executed - record.executed_count
+        record.executed_count = executed
+
     def _record_onset(self, progress: PlanProgress) -> None:
         """Convert the time of the first gate on as soon as it is reported: later, the clocks would have drifted."""
         (plan, job), begin, end = progress

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from optodrive.core.errors import NotReadyError
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_restart import RestartedPlan, restart_plans
+from optodrive.daemon.engine.pulse_accounts import PulseAccounts
 from optodrive.daemon.engine.queue_thermal import QueueThermal
 from optodrive.daemon.engine.thermal_estimate import estimate_before_rest
 from optodrive.link.service.remote_session import RemoteSession
@@ -32,9 +33,15 @@ class QueuePause:
     """
 
     def __init__(
-        self, lock: threading.RLock, waiting: deque[ActivePlan], thermal: QueueThermal, session: RemoteSession
+        self,
+        lock: threading.RLock,
+        waiting: deque[ActivePlan],
+        thermal: QueueThermal,
+        session: RemoteSession,
+        accounts: PulseAccounts,
     ) -> None:
         self.off_s: float | None = None
+        self._accounts = accounts
         self._lock = lock
         self._waiting = waiting
         self._thermal = thermal
@@ -51,9 +58,9 @@ class QueuePause:
         return self._session.pause_ends_in_s
 
     def require_no_pause(self) -> None:
-        """Raise NotReadyError while the light is paused."""
+        """Raise NotReadyError while the light is paused. An interruption by a lost stage is over in a moment."""
         self._session.receive()
-        if self.is_held:
+        if self.is_held and not self._session.is_interrupted:
             raise NotReadyError("the light is paused, and a streamed frame shows the present; resume first")
 
     def begin(self, off_s: float) -> None:
@@ -95,6 +102,7 @@ class QueuePause:
                 return False
             delay_s = max(0.0, self._session.board_s() + START_LEAD_S - restart.restarted[0].start_s)
             for plan in restart.restarted:
+                self._accounts.totals["planned"] += plan.added_count
                 plan.apply(delay_s)
             last = restart.restarted[-1]
             self._thermal.set(last.after.with_delay(delay_s), last.end_s + delay_s)

@@ -53,7 +53,7 @@ class QueueThermal:
 
         clock_shift_s: by which the board's clock has jumped since they were queued
         """
-        gate_off_s = self._session.board_s() - clock_shift_s + self._lease_s
+        gate_off_s = max(self._session.board_s() - clock_shift_s + self._lease_s, self._session.dark_s)
         plans = [EndedPlan.from_plan(plan) for plan in ended]
         estimate = rewind_estimate(plans, gate_off_s, self._budget, self._on_progress)
         self.set(estimate, max(gate_off_s, estimate.budget.at_s))

@@ -91,7 +91,8 @@ def rewind_estimate(
         kept_pulses = len(plan) - record.dropped
         if kept_pulses:
             until_s = min(gate_off_s - record.start_s, float(np.nextafter(plan.start_s[kept_pulses - 1], inf)))
-            state = commit_until(plan, until_s, state, budget, on_progress)
+            kept = PulsePlan(**{item.name: getattr(plan, item.name)[:kept_pulses] for item in fields(PulsePlan)})
+            state = commit_until(kept, until_s, state, budget, on_progress)
         if record.executed is not None:
             heat = apply_executed(heat, record.executed)
     return ThermalEstimate.from_plan(heat, state, zero_s)

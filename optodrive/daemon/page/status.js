@@ -66,8 +66,9 @@ export class Status {
   }
 }
 
-// One of several stages: the state of its board, and its clock against the host's; without a link its cause.
-function describeStage({ board, connected, error: cause, clock_error_us: error, clock_drift_ppm: drift }) {
+// One of several stages: the state of its board, and its clock against the host's; lost or without a link its cause.
+function describeStage({ board, connected, error: cause, lost, clock_error_us: error, clock_drift_ppm: drift }) {
+  if (lost !== null) return `lost, the others go on: ${lost}`;
   if (!connected) return `no link: ${cause}`;
   const state = board.fault === null ? board.state : `${board.state} ${board.fault}`;
   return error === null ? `${state}, clock unknown` : `${state}, clock ±${error.toFixed(0)} µs, ${drift > 0 ? "+" : ""}${drift.toFixed(1)} ppm`;

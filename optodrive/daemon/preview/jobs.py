@@ -60,6 +60,6 @@ def plan_dry_run(
     request = PlanningRequest(lambda: built, fields["name"], fields["policy"], fields["fit"])
     thermal = ThermalEstimate(start.heat, start.budget)
     snapshot = PlanningSnapshot(thermal, start.starts_in_s, start.heat, start.budget)
-    dimmed = dim_display(display, start.power_share)
+    dimmed = dim_display(display.without_stage(start.lost_stage), start.power_share)
     plan = make_plan(dimmed, scales, request, built, snapshot, DRY_RUN_PLAN, lambda fraction: None)
     return plan.record.build_report(0.0)

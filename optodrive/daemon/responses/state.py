@@ -56,12 +56,14 @@ class StageReport(JsonModel):
 
     clock_error_us, clock_drift_ppm: None before the clock is known
     connected: whether the link to its board is up; error: why it is not
+    lost: why it counts as lost while the others go on, null while it does not
     """
 
     name: str
     port: str
     connected: bool
     error: str | None
+    lost: str | None
     board: BoardReport
     clock_error_us: float | None
     clock_drift_ppm: float | None

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from optodrive.core.types.arrays import IntArray
+from optodrive.core.types.arrays import BoolArray, IntArray
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.link.protocol.quantisation import DecodedPulses, WirePoints, WireScale, decode, quantise
 
@@ -25,12 +25,18 @@ class StagePoints:
     stages: tuple[WirePoints, ...]
 
     @classmethod
-    def from_plan(cls, plan: LimitedPlan, scales: Sequence[WireScale]) -> Self:
-        """Quantise a plan. scales: of each stage. Raise LocalProtocolError as `quantise` does."""
+    def from_plan(cls, plan: LimitedPlan, scales: Sequence[WireScale], draws: BoolArray | None = None) -> Self:
+        """Quantise a plan. Raise LocalProtocolError as `quantise` does.
+
+        scales: of each stage; draws: whether each takes part, all by default; the others get no points
+        """
         stages = tuple(quantise(plan, scale, stage) for stage, scale in enumerate(scales))
         if len(stages) > 1:
             end_tick = max(int(points.compute_end_ticks()[-1]) if len(points) else 0 for points in stages)
-            stages = tuple(points.extend(end_tick) for points in stages)
+            stages = tuple(
+                points.extend(end_tick) if draws is None or draws[stage] else points
+                for stage, points in enumerate(stages)
+            )
         return cls(stages)
 
     @classmethod

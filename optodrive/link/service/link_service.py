@@ -19,7 +19,8 @@ the web process, because a shell or the key can still stop it; then `UNATTENDED_
 Control. Who armed the board controls it: an arming may be held by a client that must prove its presence (hold-to-run),
 and ends with it. One arming at a time; a second caller is told who arms.
 
-Pauses are numbered and held here, as STOP is, so that they take effect however busy the planner is (decision 37).
+Pauses are numbered and held here, as STOP is, so that they take effect however busy the planner is (decision 37). The
+loss of a stage, where the others go on, is an interruption of the same kind that ends by itself (decision 49).
 
 Order of one `step`: bytes of the board first, then what follows from them (ends of epochs), then status, then the
 answers to commands: a caller that learns from an answer that the board is armed may push at once, and the planner must
@@ -285,12 +286,19 @@ class LinkService:
         stalled = self._clients.find_stalled()
         try:
             self._boards.step(wait_s, renew_lease=not stalled, stalled=stalled)
+            self._interrupt_if_lost()
             self._watch_board()
             self._end_unattended()
             self._end_abandoned()
             self._end_long_pause()
         except (LinkError, InputError):
             self._end_epoch(f"the link to the board was lost: {self._describe_link_error()}")
+
+    def _interrupt_if_lost(self) -> None:
+        """Turn the light of the others off when one was lost alone, until that one is dark for certain."""
+        if self._boards.pop_loss():
+            self.pauses.interrupt(self._boards.board_s())
+            self._handover.pause()
 
     def _watch_board(self) -> None:
         """End the epoch when a board has left its arming, or has a new fault. ABORT goes out in any case.

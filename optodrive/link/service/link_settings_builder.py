@@ -20,6 +20,7 @@ def build_link_settings(config: Config, socket_path: Path, socket_mode: int, cap
         socket_mode=socket_mode,
         capture_path=capture_path,
         on_web_loss=config.daemon.on_web_loss,
+        on_stage_loss=config.daemon.on_stage_loss,
     )
 
 

@@ -1,4 +1,7 @@
-"""Pauses: the gate is off, the board stays armed, and the queue waits in the planner."""
+"""Pauses: the gate is off, the board stays armed, and the queue waits in the planner.
+
+An interruption is one that nobody has requested: a stage was lost.
+"""
 
 from typing import Any
 
@@ -40,6 +43,11 @@ class Pauses:
         self.number += 1
         self.began_s = board_s
         self._since_s = self._clock.now_s()
+
+    def interrupt(self, board_s: float) -> None:
+        """Begin an interruption at a board time, s: a pause that ends when all is reported that was executed."""
+        self.number += 1
+        self.began_s = board_s
 
     def end(self) -> None:
         """End the pause, if there is one."""

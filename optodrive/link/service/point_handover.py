@@ -101,6 +101,7 @@ class PointHandover:
         """Tell the planner, once, that a pause has no more reports."""
         if self._is_draining and not self._boards.is_draining:
             self._is_draining = False
+            self._report_jobs()
             self.clear()
             self._send(Message("drained", {"pause": self._pauses.number, "board_s": self._pauses.began_s}))
 
@@ -198,7 +199,10 @@ class PointHandover:
         is_finished = any(job.is_finished for job in self._jobs.values())
         if not is_finished and now_s - self._reported_s < REPORT_INTERVAL_S:
             return
-        self._reported_s = now_s
+        self._report_jobs()
+
+    def _report_jobs(self) -> None:
+        self._reported_s = self._clock.now_s()
         self._send_executed()
         for number, job in list(self._jobs.items()):
             sent_points = [part.next_to_send - part.first_index for part in job.parts]

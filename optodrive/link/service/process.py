@@ -166,7 +166,8 @@ def build_board_group(settings: LinkSettings, transports: Sequence[Transport], c
     pairs, has_several = zip(transports, settings.boards, strict=True), len(transports) > 1
     sessions = [BoardSession(transport, clock, board.requirements, has_several) for transport, board in pairs]
     openers = [PortOpener(transport) for transport in transports]
-    return BoardGroup(sessions, clock, openers, [board.stage for board in settings.boards], settings.skew_max_s)
+    names = [board.stage for board in settings.boards]
+    return BoardGroup(sessions, clock, openers, names, settings.skew_max_s, settings.on_stage_loss)
 
 
 def read_settings(path: Path) -> LinkSettings:

@@ -27,6 +27,7 @@ from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.lease_renewal import AGE_BUCKETS_S
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.stage_loss import LostStage
 from optodrive.link.session.staged_job import StagedJob
 
 REPLY_TIMEOUT_S = 0.6
@@ -95,6 +96,8 @@ class RemoteSession:
     connected: whether the link process is reached and its link to the board is up
     port: name of the board's port; board: latest reported state of the board; stats: link statistics
     stages: of several, name, port, board and clock of each
+    lost: the stage that was lost while the others go on, None without; dark_s: host time from which every board that
+    was lost so far is dark for certain
     control: who armed the board, None while it is not armed
     pause_ends_in_s: time until the pause ends disarmed, None if the light is not paused
     is_realtime: whether the link process runs before all programs of usual priority
@@ -112,6 +115,8 @@ class RemoteSession:
         self.board = BoardView()
         self.stats: dict[str, Any] = {}
         self.stages: list[dict[str, Any]] = []
+        self.lost: LostStage | None = None
+        self.dark_s = -inf
         self.faults: Counter[str] = Counter()
         self.lease = LeaseStats()
         self.is_acknowledged = self.is_realtime = False
@@ -266,6 +271,7 @@ class RemoteSession:
         board = {name: value for name, value in fields["board"].items() if name != "hint"}
         self.board = BoardView(**{**board, "fault": board["fault"] or ""})
         self.stats, self.faults, self.stages = fields["stats"], Counter(fields["faults"]), fields["stages"]
+        self._take_lost(fields["lost"])
         self.lease.ages.load(fields["lease"]["counts"], fields["lease"]["sum_s"])
         self.lease.slack_s = fields["lease"]["slack_s"]
         self.is_acknowledged, self._reported_ready = fields["is_acknowledged"], fields["is_ready"]
@@ -273,6 +279,11 @@ class RemoteSession:
         self.is_realtime = fields["is_realtime"]
         self.last_event_reason = fields["last_event_reason"]
         self.likely_cause = None if fields["cause"] is None else LinkCause(*fields["cause"])
+
+    def _take_lost(self, fields: dict[str, Any] | None) -> None:
+        self.lost = None if fields is None else LostStage(**fields)
+        if self.lost is not None:
+            self.dark_s = max(self.dark_s, self.lost.dark_s)
 
     def _update_clock(self, sample: list[float] | None, connected: bool) -> None:
         if sample is None or not connected:
@@ -328,6 +339,11 @@ class RemoteSession:
     def is_held(self) -> bool:
         """Whether the light is paused, or reports of pulses emitted before a pause may still arrive."""
         return self.pause_ends_in_s is not None or self._drained_number != self._pause_number
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether the light is held because a stage was lost, and not by a pause."""
+        return self.is_held and self.pause_ends_in_s is None and self.lost is not None
 
     def pop_drained(self) -> float | None:
         """Return and clear the board time at which a pause began, s, when all is reported that was executed before it.

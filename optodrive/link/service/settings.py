@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.session.board_requirements import BoardRequirements, ConfiguredValues
+from optodrive.link.session.stage_loss import OnStageLoss
 from optodrive.link.transport.port_settings import PortSettings
 
 OnWebLoss = Literal["dark", "finish"]
@@ -40,6 +41,7 @@ class LinkSettings:
     boards: of all stages; skew_max_s: largest error of a board's clock with which a plan may start on several
     socket_path, socket_mode: of the socket on which it listens; capture_path: new file for a capture of the link
     on_web_loss: whether the loss of the web process ends the running plan at once, or lets it run to its end
+    on_stage_loss: whether the loss of one of several boards ends the light of all, or the others go on
     """
 
     boards: tuple[BoardSettings, ...]
@@ -48,6 +50,7 @@ class LinkSettings:
     socket_mode: int = 0o600
     capture_path: Path | None = None
     on_web_loss: OnWebLoss = "dark"
+    on_stage_loss: OnStageLoss = "all_dark"
 
     def to_json(self) -> str:
         """Return the settings as JSON."""

@@ -45,7 +45,7 @@ class StatusPublisher:
         pause = pauses.number, pauses.is_paused
         links = boards.connected, None if link_error is None else str(link_error)
         states = tuple(session.board.state for session in boards.sessions)
-        key = (epoch.number, pause, links, states, board.state, board.fault, *causes)
+        key = (epoch.number, pause, links, states, boards.lost, board.state, board.fault, *causes)
         now_s = self._clock.now_s()
         if key == self._published and now_s < self._due_s:
             return None
@@ -76,6 +76,7 @@ class StatusPublisher:
             "commands": commands,
             "stalled": stalled,
             "stages": boards.list_stages(),
+            "lost": None if boards.lost is None else boards.lost.to_dict(),
             "is_realtime": has_realtime_priority(),
         }
         return Message("status", fields)

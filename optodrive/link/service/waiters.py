@@ -63,6 +63,8 @@ class StateWaiters:
 
 def _is_fulfilled(waiter: Waiter, boards: BoardGroup) -> bool:
     has_confirmed = boards.is_acknowledged or (waiter.command == "stop" and boards.abort_confirmed)
+    if waiter.command in ("stop", "disarm") and not boards.has_lost_ended:
+        return False
     return boards.board.state in AWAITED_STATES[waiter.command] and has_confirmed
 
 

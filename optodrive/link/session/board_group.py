@@ -11,6 +11,12 @@ STOP is confirmed by the last one, and a plan begins when the last one is ready.
 without effect if one cannot be armed. A fault, a lost link, or the silence of one for a lease ends the light of all;
 the links of the others are kept, and the status lists each stage with its state and cause.
 
+Lost alone. With `on_stage_loss = "that_stage"` the first board that leaves its arming, or whose link fails, once all
+were armed, is *lost*, and the others go on (`_lose_alone`). It gets ABORT, and neither lease nor points even if it
+answers again, because its arming has ended. Everything here then speaks of the others, except that STOP and disarm wait
+for it while its link is up. The owner pauses them until it is dark for certain (`LostStage.dark_s`). A second loss ends
+the light of all. It counts as lost until all are disarmed.
+
 Time. One board keeps its own: `board_s` is its clock, its points follow each other by durations, and what is late is
 executed late and reported. Several keep the host's: `board_s` is the host's clock, a line is fitted to the exchanges
 with each board (`clock_sync.py`), and each point is shifted by as much as its board has drifted since the one before.
@@ -24,8 +30,7 @@ Late light is not emitted. If one board would execute its next point late, all d
 Streams are cut at one time on all boards, behind every point that may have left; a splice is made on all or, if it is
 too late on one, on none.
 
-Why one process. STOP, epochs and leases would otherwise have to agree across processes. Why no going on without a lost
-stage: its last lease of light is unknown, see decision 42. Decisions: 41, 42.
+Why one process. STOP, epochs and leases would otherwise have to agree across processes. Decisions: 41, 42, 49.
 """
 
 from collections import Counter
@@ -38,14 +43,15 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.stage_points import StagePoints
-from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, BoardState
+from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, LEASED_STATES, BoardState
 from optodrive.link.session.board_connector import BoardConnector
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import DRIFT_MAX, ClockFit
 from optodrive.link.session.lease_renewal import LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause
-from optodrive.link.session.plan_job import PointTiming
+from optodrive.link.session.plan_job import PlanJob, PointTiming
 from optodrive.link.session.session import BoardSession
+from optodrive.link.session.stage_loss import LEASE_TRANSIT_MAX_S, LostStage, OnStageLoss
 from optodrive.link.session.staged_job import StagedJob
 
 SEND_AHEAD_MAX_S = 0.3
@@ -73,6 +79,7 @@ class BoardGroup:
 
     sessions: of each stage; open_ports: as for `BoardConnector`; names: of the stages, '' if there is one
     skew_max_s: largest error of a board's clock with which a plan may start
+    on_stage_loss: whether the others go on when one is lost; lost: that one, None without
     """
 
     def __init__(
@@ -82,8 +89,13 @@ class BoardGroup:
         open_ports: Sequence[Callable[[], bool]],
         names: Sequence[str] = ("",),
         skew_max_s: float = inf,
+        on_stage_loss: OnStageLoss = "all_dark",
     ) -> None:
         self.sessions = tuple(sessions)
+        self.lost: LostStage | None = None
+        self._present = self.sessions
+        self._on_stage_loss = on_stage_loss
+        self._were_armed = self._is_loss_new = False
         self.names = tuple(names)
         pairs = zip(self.sessions, open_ports, strict=True)
         self._connectors = tuple(BoardConnector(session, clock, open_port) for session, open_port in pairs)
@@ -97,6 +109,8 @@ class BoardGroup:
             session.on_executed = partial(self._forward_executed, stage)
 
     def _forward_executed(self, stage: int, message: m.Executed) -> None:
+        if self.sessions[stage] not in self._present:
+            return
         if self.has_several:
             fit, tick_s = self._fit_clock(self.sessions[stage]), self.tick_s
             records = tuple(
@@ -115,7 +129,7 @@ class BoardGroup:
     @property
     def connected(self) -> bool:
         """Whether the links to all boards are up."""
-        return all(session.connected for session in self.sessions)
+        return all(session.connected for session in self._present)
 
     @property
     def port(self) -> str:
@@ -125,7 +139,7 @@ class BoardGroup:
     @property
     def board(self) -> BoardView:
         """Latest reported state of all boards: the sums of their counts, and the state of the one nearest to light."""
-        boards = [session.board for session in self.sessions]
+        boards = [session.board for session in self._present]
         if not self.has_several:
             return boards[0]
         faulty = next((board for board in boards if board.fault), boards[0])
@@ -141,7 +155,7 @@ class BoardGroup:
         if not self.has_several:
             return self.sessions[0].clock_sample
         now_s = self._clock.now_s()
-        return (now_s, now_s) if all(session.clock_sync.is_synchronised for session in self.sessions) else None
+        return (now_s, now_s) if all(session.clock_sync.is_synchronised for session in self._present) else None
 
     def board_s(self) -> float:
         """Return the present time on the clock of the board, or of the host if there are several boards, s."""
@@ -164,7 +178,7 @@ class BoardGroup:
     @property
     def has_arming(self) -> bool:
         """Whether the arming of all boards is present: none has left the state that it had reached."""
-        return all(session.has_arming for session in self.sessions)
+        return all(session.has_arming for session in self._present)
 
     @property
     def is_ready(self) -> bool:
@@ -173,13 +187,13 @@ class BoardGroup:
 
     @property
     def _are_boards_ready(self) -> bool:
-        return all(session.is_ready for session in self.sessions)
+        return all(session.is_ready for session in self._present)
 
     @property
     def _are_clocks_known(self) -> bool:
         """Whether the time of each of several boards is known as exactly as a start needs it."""
         return not self.has_several or all(
-            self._find_clock_error_s(session) <= self._skew_max_s for session in self.sessions
+            self._find_clock_error_s(session) <= self._skew_max_s for session in self._present
         )
 
     @property
@@ -194,29 +208,39 @@ class BoardGroup:
     @property
     def is_acknowledged(self) -> bool:
         """Whether all boards have acknowledged everything sent."""
-        return all(session.is_acknowledged for session in self.sessions)
+        return all(session.is_acknowledged for session in self._present)
 
     @property
     def abort_confirmed(self) -> bool:
         """Whether all boards have confirmed the last ABORT."""
-        return all(session.abort_confirmed for session in self.sessions)
+        return all(session.abort_confirmed for session in self._present)
 
     @property
     def is_draining(self) -> bool:
-        """Whether reports of points that were sent before drain() may still arrive."""
-        return any(session.is_draining for session in self.sessions)
+        """Whether reports of points that were sent before drain() may still arrive, or a lost board may still emit."""
+        may_emit = self.lost is not None and self._clock.now_s() < self.lost.dark_s
+        return may_emit or any(session.is_draining for session in self._present)
+
+    @property
+    def has_lost_ended(self) -> bool:
+        """Whether a lost board has confirmed that it is dark, or cannot because its link is down."""
+        if self.lost is None:
+            return True
+        session = self.sessions[self.lost.stage]
+        has_confirmed = session.is_acknowledged or session.abort_confirmed
+        return not session.connected or (session.board.state in IDLE_STATES and has_confirmed)
 
     @property
     def has_points(self) -> bool:
         """Whether points were handed over whose execution is not yet reported."""
-        return any(session.has_points for session in self.sessions)
+        return any(session.has_points for session in self._present)
 
     @property
     def _worst(self) -> BoardSession:
         """The session to blame: the one that has a fault, or has left the armed states."""
-        suspects = [session for session in self.sessions if session.board.fault]
-        suspects += [session for session in self.sessions if session.board.state not in ARMED_STATES]
-        return suspects[0] if suspects else self.sessions[0]
+        suspects = [session for session in self._present if session.board.fault]
+        suspects += [session for session in self._present if session.board.state not in ARMED_STATES]
+        return suspects[0] if suspects else self._present[0]
 
     @property
     def last_event_reason(self) -> str:
@@ -234,9 +258,8 @@ class BoardGroup:
         if not self.has_several or self.board.state not in ARMED_STATES:
             return ""
         for name, session in zip(self.names, self.sessions, strict=True):
-            board = session.board
-            if board.state not in LEASED_STATES:
-                return f"the board of stage {name!r} went to {board.state} ({board.fault or session.last_event_reason})"
+            if session in self._present and session.board.state not in LEASED_STATES:
+                return f"the board of stage {name!r} {_describe_end(session)}"
         return ""
 
     def _name(self, session: BoardSession) -> str:
@@ -248,7 +271,7 @@ class BoardGroup:
     def link_error(self) -> OptodriveError | None:
         """Why a board is not reached, with the name of its stage, None once all are."""
         for session, connector in zip(self.sessions, self._connectors, strict=True):
-            if connector.error is not None:
+            if connector.error is not None and session in self._present:
                 if not self.has_several:
                     return connector.error
                 error = LinkError(f"{self._name(session)}{connector.error}")
@@ -261,11 +284,6 @@ class BoardGroup:
         for connector in self._connectors:
             connector.step()
 
-    def _lose(self, session: BoardSession, error: OptodriveError) -> None:
-        """Close the link to a board after an error, with ABORT to the others, whose links stay open."""
-        self._connectors[self.sessions.index(session)].lose(error)
-        self.abort()
-
     def close(self) -> None:
         """Send ABORT if possible and close all links permanently."""
         for session in self.sessions:
@@ -274,21 +292,62 @@ class BoardGroup:
     # --- loop ---------------------------------------------------------------------------------------------------
 
     def step(self, wait_s: float, renew_lease: bool, stalled: str = "planner") -> None:
-        """Run one iteration of each session, as `BoardSession.step`. Only the first waits for bytes."""
+        """Run one iteration of each session, as `BoardSession.step`. Only one waits for bytes.
+
+        A board whose link fails is lost alone, or the others, whose links stay open, get ABORT and the error is raised.
+        """
+        self._readmit_lost()
         self._drop_late_points()
         self._seek_clocks()
-        for session in self.sessions:
+        waiting = self._present[0]
+        for session, connector in zip(self.sessions, self._connectors, strict=True):
+            if session not in self._present:
+                connector.step()
+                continue
             try:
-                session.step(wait_s if session is self.sessions[0] else 0.0, renew_lease, stalled)
+                session.step(wait_s if session is waiting else 0.0, renew_lease, stalled)
             except (LinkError, InputError) as error:
-                self._lose(session, error)
-                raise
+                connector.lose(error)
+                if not self._lose_alone(session, str(connector.error)):
+                    self.abort()
+                    raise
+            else:
+                if self._were_armed and not session.has_arming:
+                    self._lose_alone(session, f"the board {_describe_end(session)}")
+        self._were_armed |= self.has_arming and all(one.board.state in ARMED_STATES for one in self._present)
+
+    # --- loss of one --------------------------------------------------------------------------------------------
+
+    def _lose_alone(self, session: BoardSession, reason: str) -> bool:
+        """Go on without a board. Return False if all must go dark: so configured, not all armed, or a second one."""
+        can_go_on = self._on_stage_loss == "that_stage" and self._were_armed and self.lost is None
+        if not can_go_on:
+            return False
+        session.end_arming()
+        if session.connected:
+            session.abort()
+        dark_s = self._clock.now_s() + session.lease_s + LEASE_TRANSIT_MAX_S
+        self.lost = LostStage(self.sessions.index(session), reason, dark_s)
+        self._present = tuple(one for one in self.sessions if one is not session)
+        self._is_loss_new = True
+        return True
+
+    def pop_loss(self) -> bool:
+        """Return whether a board was lost since the last call: the others must be dark until it is so for certain."""
+        is_new, self._is_loss_new = self._is_loss_new, False
+        return is_new
+
+    def _readmit_lost(self) -> None:
+        """Count the lost board again once all others are disarmed, and it too, as far as its link is up."""
+        are_idle = all(session.board.state in IDLE_STATES and session.is_acknowledged for session in self._present)
+        if self.lost is not None and not self.has_arming and are_idle and self.has_lost_ended:
+            self.lost, self._present = None, self.sessions
 
     def _seek_clocks(self) -> None:
         """Compare the clocks more often while they are not known well enough for the start of a plan."""
         if not self.has_several:
             return
-        for session in self.sessions:
+        for session in self._present:
             session.seeks_clock = self._find_clock_error_s(session) > CLOCK_SEEK_SHARE * self._skew_max_s
         if self._are_clocks_known or not self._are_boards_ready:
             self._clocks_awaited_s = self._clock.now_s()
@@ -297,7 +356,7 @@ class BoardGroup:
         """Drop the points of all boards if one would execute its next point late."""
         if not self.has_several or self.is_draining:
             return
-        lateness_s, session = max(((one.find_lateness_s(), one) for one in self.sessions), key=lambda item: item[0])
+        lateness_s, session = max(((one.find_lateness_s(), one) for one in self._present), key=lambda item: item[0])
         if lateness_s > 0.0 and session.board.state in ARMED_STATES:
             self.flush()
             self._refusal = f"{self._name(session)}light would have been {1e3 * lateness_s:.3g} ms late"
@@ -309,7 +368,7 @@ class BoardGroup:
     def pop_refusal(self) -> str | None:
         """Return and clear the reason for which a board, or this group, refused the last command."""
         refusal, self._refusal = self._refusal, None
-        for session in self.sessions:
+        for session in self._present:
             refused = session.pop_refusal()
             if refused is not None:
                 refusal = refusal or f"{self._name(session)}{refused}"
@@ -321,6 +380,9 @@ class BoardGroup:
 
     def arm(self) -> None:
         """Request arming of all boards. Raise NotReadyError, without an effect, if one cannot be armed."""
+        if self.lost is not None:
+            raise NotReadyError(f"stage {self.names[self.lost.stage]!r} was lost; disarm all boards first")
+        self._were_armed = False
         for session in self.sessions:
             session.require_disarmed(self._name(session))
         for session in self.sessions:
@@ -329,7 +391,8 @@ class BoardGroup:
     def disarm(self) -> None:
         """Disarm all boards, or acknowledge their faults."""
         for session in self.sessions:
-            session.disarm()
+            if session.connected:
+                session.disarm()
 
     def abort(self) -> None:
         """Turn all gates off, drop the queues and disarm, before all other queued messages."""
@@ -339,17 +402,18 @@ class BoardGroup:
 
     def end_arming(self) -> None:
         """End the arming of all boards: neither lease nor confirmation, nor points handed over so far."""
+        self._were_armed = self._is_loss_new = False
         for session in self.sessions:
             session.end_arming()
 
     def flush(self) -> None:
         """Turn all gates off and drop the queues. The boards stay armed."""
-        for session in self.sessions:
+        for session in self._present:
             session.flush()
 
     def drain(self) -> None:
         """Turn all gates off, drop the queues and collect the last reports. The boards stay armed."""
-        for session in self.sessions:
+        for session in self._present:
             session.drain()
 
     # --- streaming ----------------------------------------------------------------------------------------------
@@ -364,16 +428,25 @@ class BoardGroup:
         if not self.has_several:
             part = self.sessions[0].begin(points.stages[0], start_s, send_ahead_s)
             return StagedJob([part], part.start_tick)
+        self._require_nothing_lost(points)
         self._require_clocks()
         ahead_s = min(send_ahead_s, SEND_AHEAD_MAX_S)
         parts = []
         for session, one in zip(self.sessions, points.stages, strict=True):
+            if session not in self._present:
+                parts.append(PlanJob(0, one, 0, 0))
+                continue
             timing = PointTiming(zero_tick, partial(self._to_board_tick, session))
             parts.append(session.begin(one, timing.to_board_tick(zero_tick) * self.tick_s, ahead_s, timing))
         return StagedJob(parts, zero_tick)
 
+    def _require_nothing_lost(self, points: StagePoints) -> None:
+        """Raise NotReadyError if a lost board would get points."""
+        if self.lost is not None and len(points.stages[self.lost.stage]):
+            raise NotReadyError(f"stage {self.names[self.lost.stage]!r} was lost: {self.lost.reason}")
+
     def _require_clocks(self) -> None:
-        for session in self.sessions:
+        for session in self._present:
             fit = self._fit_clock(session)
             if fit.uncertainty_s > self._skew_max_s:
                 raise NotReadyError(
@@ -401,11 +474,15 @@ class BoardGroup:
 
         Return None, with nothing changed, if it is too late for that on one board.
         """
+        self._require_nothing_lost(points)
         triples = list(zip(self.sessions, points.stages, kept_points, strict=True))
-        if not all(session.can_splice(kept) for session, _, kept in triples):
+        if not all(session.can_splice(kept) for session, _, kept in triples if session in self._present):
             return None
         parts = []
         for session, one, kept in triples:
+            if session not in self._present:
+                parts.append(PlanJob(0, one, 0, 0))
+                continue
             timing, last = None, session.last_job
             if self.has_several and last is not None:
                 timing = PointTiming(last.find_host_end_tick(kept), partial(self._to_board_tick, session))
@@ -417,7 +494,7 @@ class BoardGroup:
 
     def truncate(self, kept_points: Sequence[int]) -> bool:
         """Truncate the last job to `kept_points` points of each stage. Return False, unchanged, if more were sent."""
-        pairs = list(zip(self.sessions, kept_points, strict=True))
+        pairs = [pair for pair in zip(self.sessions, kept_points, strict=True) if pair[0] in self._present]
         can_truncate = all(session.can_truncate(kept) for session, kept in pairs)
         return can_truncate and all(session.truncate(kept) for session, kept in pairs)
 
@@ -454,12 +531,20 @@ class BoardGroup:
             return []
         now_s = self._clock.now_s()
         stages = []
-        for name, session, connector in zip(self.names, self.sessions, self._connectors, strict=True):
+        for number, (session, connector) in enumerate(zip(self.sessions, self._connectors, strict=True)):
+            lost = self.lost if self.lost is not None and self.lost.stage == number else None
             fit = session.clock_sync.fit(now_s) if session.connected else None
-            stage: dict[str, Any] = {"name": name, "port": session.port, "connected": session.connected}
+            stage: dict[str, Any] = {"name": self.names[number], "port": session.port, "connected": session.connected}
+            stage["lost"] = None if lost is None else lost.reason
             stage["board"] = (session.board if session.connected else session.board.forget_state()).to_dict()
             stage["error"] = None if connector.error is None else str(connector.error)
             stage["clock_error_us"] = None if fit is None else 1e6 * fit.uncertainty_s
             stage["clock_drift_ppm"] = None if fit is None else 1e6 * (fit.rate - 1.0)
             stages.append(stage)
         return stages
+
+
+def _describe_end(session: BoardSession) -> str:
+    """Return to which state a board has left its arming, and why."""
+    board = session.board
+    return f"went to {board.state} ({board.fault or session.last_event_reason})"

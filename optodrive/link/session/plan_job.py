@@ -197,6 +197,10 @@ class PlanJob:
         """First index not yet reported, None if all are."""
         return None if self._reported_count == self._count else self.first_index + self._reported_count
 
+    def list_sent_rows(self) -> IntArray:
+        """Return the plan rows of the pulses sent so far, in order."""
+        return self._row[self._pulse_points[: self.sent_count]]
+
     @property
     def sent_count(self) -> int:
         """Number of pulses sent so far."""

@@ -130,6 +130,11 @@ class BoardSession:
         return self._transport.name
 
     @property
+    def lease_s(self) -> float:
+        """Time after the last lease until the board closes the gate, s."""
+        return self._requirements.lease_s
+
+    @property
     def scale(self) -> WireScale:
         """Scale factors between SI units and this board's integers."""
         return self._requirements.scale

@@ -115,16 +115,17 @@ class StageAssignment:
         frames = self._sequence.frames[: max(2, BALANCED_MAX // len(self.stage_of))]
         target_m = np.array([frame.target_m for frame in frames]).reshape(len(frames), len(self.stage_of))
         is_drawn, is_free, stages = target_m > 0, self.stage_of == NOBODY, len(self._reach)
+        drawing = int(np.count_nonzero(self._reach.any(axis=1)))
         recurring = np.flatnonzero((np.count_nonzero(is_drawn, axis=0) > 1) & is_free)
         if not len(recurring):
             return
         show_at_s = np.array([frame.show_at_s for frame in frames])
-        cost_s = light.compute_frames_s(target_m, show_at_s, stages, self._step_s)
+        cost_s = light.compute_frames_s(target_m, show_at_s, drawing, self._step_s)
         overlap_s = np.append(0.0, cost_s.sum(axis=1) / np.maximum(np.count_nonzero(is_drawn, axis=1), 1))[:-1]
         light_s = FrameLight(np.zeros((len(frames), stages)), np.zeros(len(frames)), show_at_s, overlap_s)
         self._try_by_frame(light_s, cost_s, is_carried=True)
         by_frame_s = find_drawing_s(light_s)
-        if by_frame_s <= (1.0 + GAIN_ENOUGH) * light_s.loads_s.sum() / stages:
+        if by_frame_s <= (1.0 + GAIN_ENOUGH) * light_s.loads_s.sum() / drawing:
             return
         stage = self._try_by_frame(light_s, cost_s, is_carried=False)
         is_free[recurring] = False
@@ -184,8 +185,9 @@ def _cut(cost_s: FloatArray, free_s: FloatArray, reach: BoolArray) -> IntArray:
     """
     if not len(cost_s):
         return np.zeros(0, dtype=np.int64)
-    bounds_s = np.cumsum(_share(cost_s, free_s))
-    nearest = np.minimum(np.searchsorted(bounds_s, np.cumsum(cost_s) - 0.5 * cost_s), len(free_s) - 1)
+    drawing = np.flatnonzero(reach.any(axis=1))
+    bounds_s = np.cumsum(_share(cost_s, free_s[drawing]))
+    nearest = drawing[np.minimum(np.searchsorted(bounds_s, np.cumsum(cost_s) - 0.5 * cost_s), len(drawing) - 1)]
     distance = np.abs(np.arange(len(free_s))[:, None] - nearest[None, :])
     stages: IntArray = np.argmin(np.where(reach, distance, len(free_s)), axis=0)
     return stages
