@@ -5,7 +5,7 @@ from typing import get_args
 
 from pydantic.json_schema import models_json_schema
 
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy
 from optodrive.daemon.api.openapi_bodies import LIVE_FRAME_SCHEMA
 from optodrive.daemon.responses.hold import HoldReport
 from optodrive.daemon.responses.stream import FrameResult

@@ -98,16 +98,17 @@ def measure_superseding():
     from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
     from optodrive.daemon.engine.request_body import BuiltRequest
     from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+    from optodrive.daemon.push import Push
     from optodrive.link.board_setup import build_scales
 
     display = build_display()
     scales = build_scales(display.config)
     thermal = ThermalEstimate(*display.build_cold_state())
     snapshot = PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
-    rng, times = np.random.default_rng(7), []
+    push, rng, times = Push("bench", {}, 0.0, 0, streamed=True), np.random.default_rng(7), []
     for number in range(SUPERSEDING):
         built = BuiltRequest(draw_frame(rng, ACTIVE))
-        request = PlanningRequest(lambda: built, "bench", streamed=True)
+        request = PlanningRequest(lambda: built, push)
         begin_s = time.process_time()
         plan = make_plan(display, scales, request, built, snapshot, f"p{number}", lambda fraction: None)
         planned_s = time.process_time()

@@ -45,7 +45,7 @@ def choose_patterns(client: DaemonClient) -> list[str]:
     chosen = []
     for pattern in PATTERNS:
         try:
-            client.call(build_play_request(pattern, {}, "trim", "as_is", dry_run=True))
+            client.call(build_play_request(pattern, {}, {"policy": "trim"}, dry_run=True))
         except InputError as error:
             print(f"left out: {error}", flush=True)
         else:
@@ -57,7 +57,7 @@ def choose_patterns(client: DaemonClient) -> list[str]:
 
 def play_pattern(client: DaemonClient, pattern: str) -> Plan:
     """Play a pattern to its end. Return its plan."""
-    plan = client.call(build_play_request(pattern, {}, "trim", "as_is", dry_run=False))
+    plan = client.call(build_play_request(pattern, {}, {"policy": "trim"}, dry_run=False))
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -1,7 +1,7 @@
 """The planner in virtual time: its real queue and session over the real link service and a simulated board."""
 
 from concurrent.futures import Executor, Future
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 
@@ -10,12 +10,13 @@ from link_service_rig import PLANNER, ServiceRig
 from optodrive.core.ipc import MessageDecoder, encode_message
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine.dimmer import Dimmer
-from optodrive.daemon.engine.plan_making import PlanningRequest
+from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
+from optodrive.daemon.push import Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.service import remote_session
 from optodrive.link.service.remote_session import RemoteSession
@@ -118,12 +119,11 @@ class PlannerRig(ServiceRig):
         self.planner.follow_pause()
         self.queue.start_next()
 
-    def submit(self, sequence, epoch, streamed=False, caller=""):
+    def submit(self, sequence, epoch, streamed=False, caller="", options=MappingProxyType({}), caller_left=NEVER):
         """Plan a sequence. Return its future."""
-        arrived_s = self.remote.board_s()
-        return self.planner.submit(
-            PlanningRequest(lambda: BuiltRequest(sequence), "push", "trim", "as_is", streamed, arrived_s, epoch, caller)
-        )
+        push = Push("push", options, self.clock.now_s(), epoch, caller, streamed)
+        request = PlanningRequest(lambda: BuiltRequest(sequence), push, self.remote.board_s(), caller_left)
+        return self.planner.submit(request)
 
     def ready(self):
         """Connect, and wait for the planner's view of it."""

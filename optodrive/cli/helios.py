@@ -5,23 +5,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import time as time_of_day
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 import typer
 
 from optodrive.cli.options import (
     ConfigOption,
-    FitOption,
     JsonOption,
     ModelOption,
-    PolicyOption,
-    StrictOption,
     load_run_config,
 )
 from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.cli.plan_text import format_plan_summary
+from optodrive.cli.push_options import add_push_options
 from optodrive.core.errors import OptodriveError
 from optodrive.core.quantity import format_quantity
+from optodrive.core.types.push_options import PushOptions
 
 if TYPE_CHECKING:
     from optodrive.core.clock import Clock
@@ -49,7 +48,7 @@ def register(app: typer.Typer) -> None:
         help="Play on a Helios laser DAC; see docs/how-to/use-a-helios-dac.md first.", no_args_is_help=True
     )
     group.command("info")(info)
-    group.command("play")(play)
+    group.command("play")(add_push_options(play))
     app.add_typer(group, name="helios")
 
 
@@ -79,10 +78,8 @@ def play(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")],
     config: ConfigOption = None,
     model: ModelOption = None,
-    strict: StrictOption = False,
-    policy: PolicyOption = "trim",
-    fit: FitOption = "as_is",
     json: JsonOption = False,
+    **options: Unpack[PushOptions],
 ) -> None:
     """Plan, limit and verify frames, play them on a Helios, report the sent pulses. Ctrl-C switches the light off."""
     from optodrive.core.clock import MonotonicClock
@@ -92,7 +89,6 @@ def play(
     from optodrive.link.helios.verification import encode_verified
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
-    from optodrive.planning.pipeline import resolve_policy
     from optodrive.planning.plan_summary import summarize_plan
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
@@ -112,9 +108,8 @@ def play(
                 sequence,
                 heat,
                 budget,
-                resolve_policy(policy, strict),
                 _combine_progress(raise_if_signalled, on_progress),
-                fit,
+                **options,
             )
         verified = encode_verified(
             planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget

@@ -1,7 +1,7 @@
 """Options that commands share, and the configuration that they select."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -42,21 +42,6 @@ UrlOption = Annotated[
 HoldOption = Annotated[
     bool,
     typer.Option("--hold", help="Arm the board for the time of this command: it disarms with the end of its process."),
-]
-StrictOption = Annotated[bool, typer.Option("--strict", help="Same as --policy refuse.")]
-PolicyOption = Annotated[
-    Literal["trim", "delay", "refuse"],
-    typer.Option("--policy", help="Treatment of a frame that exceeds a cap."),
-]
-PatternPolicyOption = Annotated[
-    Literal["trim", "delay", "refuse"] | None,
-    typer.Option("--policy", help="Treatment of a frame that exceeds a cap; by default that of the pattern."),
-]
-FitOption = Annotated[
-    Literal["as_is", "even", "priority"],
-    typer.Option(
-        "--fit", help="Excess beam time: even lowers all targets, priority omits the pixels of lowest priority."
-    ),
 ]
 
 

@@ -1,7 +1,7 @@
 """`optodrive plan`: plan and limit frames without a daemon."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Unpack
 
 import typer
 
@@ -9,24 +9,23 @@ from optodrive.cli.exit_status import exit_unless_fits
 from optodrive.cli.options import (
     ConfigOption,
     FieldOption,
-    FitOption,
     JsonOption,
     MirrorsOption,
     ModelOption,
     PixelMapOption,
-    PolicyOption,
-    StrictOption,
     load_run_config,
 )
 from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.cli.plan_text import format_plan_summary
+from optodrive.cli.push_options import add_push_options
+from optodrive.core.types.push_options import PushOptions
 
 FramesArgument = Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("plan")(plan)
+    app.command("plan")(add_push_options(plan))
 
 
 def plan(
@@ -42,16 +41,13 @@ def plan(
     field: FieldOption = None,
     mirrors: MirrorsOption = None,
     pixel_map: PixelMapOption = None,
-    strict: StrictOption = False,
-    policy: PolicyOption = "trim",
-    fit: FitOption = "as_is",
     json: JsonOption = False,
+    **options: Unpack[PushOptions],
 ) -> None:
     """Plan and limit frames. Report feasibility, pulses, beam time, trimmed pulses and predicted displacement."""
     from optodrive.core.files import atomic_write, check_output
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
-    from optodrive.planning.pipeline import resolve_policy
     from optodrive.planning.plan_picture import draw_plan
     from optodrive.planning.plan_summary import summarize_plan, write_plan_csv
     from optodrive.planning.stimuli.sequence_file import load_sequence
@@ -62,7 +58,7 @@ def plan(
     announce_compilation()
     with show_progress("planning") as on_progress:
         planned_sequence, feasibility = check_feasibility(
-            display, sequence, *display.build_cold_state(), resolve_policy(policy, strict), on_progress, fit
+            display, sequence, *display.build_cold_state(), on_progress, **options
         )
     if out is not None:
         if out.suffix.lower() == ".svg":

@@ -4,26 +4,24 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Unpack
 
 import typer
 
 from optodrive.cli.exit_status import exit_unless_fits
 from optodrive.cli.label_options import LabelOption, add_labels, parse_label_options
 from optodrive.cli.options import (
-    FitOption,
     HoldOption,
     JsonOption,
-    PatternPolicyOption,
-    PolicyOption,
-    StrictOption,
     UrlOption,
 )
 from optodrive.cli.output import print_json, show_progress
 from optodrive.cli.pattern_parameters import parse_parameters
 from optodrive.cli.plan_text import format_plan_summary
+from optodrive.cli.push_options import add_push_options
 from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError
+from optodrive.core.types.push_options import PushOptions
 
 if TYPE_CHECKING:
     from optodrive.client.http import DaemonClient
@@ -40,20 +38,18 @@ WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until t
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     for command in (push, play):
-        app.command()(command)
+        app.command()(add_push_options(command))
 
 
 def push(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")],
     url: UrlOption = DEFAULT_URL,
     dry_run: DryRunOption = False,
-    strict: StrictOption = False,
-    policy: PolicyOption = "trim",
-    fit: FitOption = "as_is",
     wait: WaitOption = True,
     hold: HoldOption = False,
     label: LabelOption = None,
     json: JsonOption = False,
+    **options: Unpack[PushOptions],
 ) -> None:
     """Plan frames and trains, show them, and report the executed pulses."""
     from optodrive.client.http import DaemonClient
@@ -64,7 +60,7 @@ def push(
     except OSError as error:
         raise InputError(str(frames), error.strerror, "a readable file") from None
     content = add_labels(str(frames), body, label) if label else body
-    request = build_push_request(content, policy, fit, dry_run, strict)
+    request = build_push_request(content, options, dry_run)
     client = DaemonClient(url)
     with _hold_if(hold, client, dry_run, wait):
         with _name_source(frames):
@@ -78,13 +74,11 @@ def play(
     values: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Pattern parameters.")] = None,
     url: UrlOption = DEFAULT_URL,
     dry_run: DryRunOption = False,
-    strict: StrictOption = False,
-    policy: PatternPolicyOption = None,
-    fit: FitOption = "as_is",
     wait: WaitOption = True,
     hold: HoldOption = False,
     label: LabelOption = None,
     json: JsonOption = False,
+    **options: Unpack[PushOptions],
 ) -> None:
     """Play a named pattern, for example: play text "hello" height_um=150."""
     from optodrive.client.http import DaemonClient
@@ -94,7 +88,7 @@ def play(
     if label:
         parameters["labels"] = parse_label_options(label)
     client = DaemonClient(url)
-    request = build_play_request(pattern, parameters, policy, fit, dry_run, strict)
+    request = build_play_request(pattern, parameters, options, dry_run)
     with _hold_if(hold, client, dry_run, wait):
         plan = _follow_plan(client, client.call(request), wait, json)
     exit_unless_fits(plan.summary.feasibility)

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 from optodrive.client.async_stream import AsyncStream
 from optodrive.client.display import RECONNECT_TIMEOUT_S
@@ -14,11 +14,10 @@ from optodrive.client.operations import DisplayOperations, LabelsLike
 from optodrive.client.plan import Plan
 from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy, PushOptions
 from optodrive.daemon.responses.state import StateReport
 from optodrive.device.config import PixelLayout
 from optodrive.planning.effective_config import EffectiveConfig
-from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.stimuli.pattern import PatternDescription
 
 
@@ -103,40 +102,36 @@ class AsyncDisplay:
         duration_s: float = 1.0,
         *,
         simultaneous: bool = False,
-        policy: Policy = "trim",
-        fit: FitMode = "as_is",
         wait: bool = True,
         labels: LabelsLike = None,
+        **options: Unpack[PushOptions],
     ) -> Plan:
         """See `Display.show`."""
-        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, False, wait, labels)
+        operation = self._operations.show(heights_um, duration_s, simultaneous, options, False, wait, labels)
         return await self._client.run(operation)
 
     async def push(
         self,
         sequence: Mapping[str, Any],
         *,
-        policy: Policy = "trim",
-        fit: FitMode = "as_is",
         wait: bool = True,
         labels: LabelsLike = None,
+        **options: Unpack[PushOptions],
     ) -> Plan:
         """See `Display.push`."""
-        return await self._client.run(self._operations.push(sequence, policy, fit, False, wait, labels))
+        return await self._client.run(self._operations.push(sequence, options, False, wait, labels))
 
     async def play(
         self,
         name: str,
         *,
-        policy: Policy | None = None,
-        fit: FitMode = "as_is",
         dry_run: bool = False,
         wait: bool = True,
         labels: LabelsLike = None,
         **parameters: Any,
     ) -> Plan:
         """See `Display.play`."""
-        return await self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait, labels))
+        return await self._client.run(self._operations.play(name, parameters, dry_run, wait, labels))
 
     async def preview(
         self,
@@ -144,11 +139,10 @@ class AsyncDisplay:
         duration_s: float = 1.0,
         *,
         simultaneous: bool = False,
-        policy: Policy = "trim",
-        fit: FitMode = "as_is",
+        **options: Unpack[PushOptions],
     ) -> Plan:
         """See `Display.preview`."""
-        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, True, False)
+        operation = self._operations.show(heights_um, duration_s, simultaneous, options, True, False)
         return await self._client.run(operation)
 
     async def patterns(self) -> list[PatternDescription]:

@@ -25,7 +25,7 @@ from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_fram
 from optodrive.client.http import PROBE, PROBE_PERIOD_S, PROBE_TIMEOUT_S
 from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_async_connection
 from optodrive.core.errors import LinkError
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.device.config import PixelLayout
 

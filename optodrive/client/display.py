@@ -4,7 +4,7 @@ from base64 import b64encode
 from collections.abc import Mapping
 from html import escape
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 import numpy as np
 
@@ -16,11 +16,10 @@ from optodrive.client.plan import Plan
 from optodrive.client.stream import Stream
 from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy, PushOptions
 from optodrive.daemon.responses.state import StateReport
 from optodrive.device.config import PixelLayout
 from optodrive.planning.effective_config import EffectiveConfig
-from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.stimuli.pattern import PatternDescription
 
 RECONNECT_TIMEOUT_S = 2.5
@@ -131,38 +130,35 @@ class Display:
         duration_s: float = 1.0,
         *,
         simultaneous: bool = False,
-        policy: Policy = "trim",
-        fit: FitMode = "as_is",
         wait: bool = True,
         labels: LabelsLike = None,
+        **options: Unpack[PushOptions],
     ) -> Plan:
         """Raise each pixel once to its height within duration_s. Wait until that is done unless `wait` is False.
 
         heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
         positions without a pixel are ignored)
         labels: recorded with the plan: at most 32 of text, numbers and truth values
+        options: `policy` and `fit`, as PushOptions describes them
         """
-        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, False, wait, labels)
+        operation = self._operations.show(heights_um, duration_s, simultaneous, options, False, wait, labels)
         return self._client.run(operation)
 
     def push(
         self,
         sequence: Mapping[str, Any],
         *,
-        policy: Policy = "trim",
-        fit: FitMode = "as_is",
         wait: bool = True,
         labels: LabelsLike = None,
+        **options: Unpack[PushOptions],
     ) -> Plan:
         """Show frames and trains in the form of FRAMES.json."""
-        return self._client.run(self._operations.push(sequence, policy, fit, False, wait, labels))
+        return self._client.run(self._operations.push(sequence, options, False, wait, labels))
 
     def play(
         self,
         name: str,
         *,
-        policy: Policy | None = None,
-        fit: FitMode = "as_is",
         dry_run: bool = False,
         wait: bool = True,
         labels: LabelsLike = None,
@@ -170,9 +166,9 @@ class Display:
     ) -> Plan:
         """Play a named pattern with its parameters by name.
 
-        dry_run: plan only; policy: None for that of the pattern
+        dry_run: plan only; parameters: of the pattern, together with the options of `show`
         """
-        return self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait, labels))
+        return self._client.run(self._operations.play(name, parameters, dry_run, wait, labels))
 
     def preview(
         self,
@@ -180,11 +176,10 @@ class Display:
         duration_s: float = 1.0,
         *,
         simultaneous: bool = False,
-        policy: Policy = "trim",
-        fit: FitMode = "as_is",
+        **options: Unpack[PushOptions],
     ) -> Plan:
         """Plan a frame as `show` would. Nothing moves."""
-        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, True, False)
+        operation = self._operations.show(heights_um, duration_s, simultaneous, options, True, False)
         return self._client.run(operation)
 
     def stream(self, policy: Policy = "trim") -> Stream:

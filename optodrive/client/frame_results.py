@@ -4,7 +4,7 @@ from collections import deque
 
 from optodrive.client.problems import build_error
 from optodrive.core.errors import LinkError, NotReadyError, RefusedError
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy
 from optodrive.daemon.responses.stream import FrameResult
 
 RESULTS_MAX = 1000

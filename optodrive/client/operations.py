@@ -23,11 +23,10 @@ from optodrive.client.requests import (
     build_read_request,
 )
 from optodrive.core.errors import NotReadyError
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import PushOptions, select_push_options
 from optodrive.daemon.responses.state import StateReport
 from optodrive.device.config import PixelLayout, build_pixel_layout
 from optodrive.planning.effective_config import EffectiveConfig
-from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.stimuli.pattern import PatternDescription
 
 POLL_PERIOD_S = 0.03
@@ -106,8 +105,7 @@ class DisplayOperations:
         heights_um: HeightsLike,
         duration_s: float,
         simultaneous: bool,
-        policy: Policy,
-        fit: FitMode,
+        options: PushOptions,
         dry_run: bool,
         wait: bool,
         labels: LabelsLike = None,
@@ -115,34 +113,35 @@ class DisplayOperations:
         """Plan one frame, and show it unless `dry_run`."""
         layout = yield from self.read_layout()
         body = build_frame_body(convert_to_pixels(heights_um, layout), duration_s, simultaneous)
-        return (yield from self.push(body, policy, fit, dry_run, wait, labels))
+        return (yield from self.push(body, options, dry_run, wait, labels))
 
     def push(
         self,
         sequence: Mapping[str, Any],
-        policy: Policy,
-        fit: FitMode,
+        options: PushOptions,
         dry_run: bool,
         wait: bool,
         labels: LabelsLike = None,
     ) -> Exchange[Plan]:
         """Plan frames and trains, and show them unless `dry_run`."""
         body = _add_labels(sequence, labels)
-        return (yield from self._submit(build_push_request(body, policy, fit, dry_run), dry_run, wait))
+        return (yield from self._submit(build_push_request(body, options, dry_run), dry_run, wait))
 
     def play(
         self,
         name: str,
-        parameters: Mapping[str, Any],
-        policy: Policy | None,
-        fit: FitMode,
+        parameters: dict[str, Any],
         dry_run: bool,
         wait: bool,
         labels: LabelsLike = None,
     ) -> Exchange[Plan]:
-        """Plan a named pattern, and show it unless `dry_run`."""
+        """Plan a named pattern, and show it unless `dry_run`.
+
+        parameters: of the pattern, together with the options of the push
+        """
+        options = select_push_options(parameters)
         body = _add_labels(parameters, labels)
-        return (yield from self._submit(build_play_request(name, body, policy, fit, dry_run), dry_run, wait))
+        return (yield from self._submit(build_play_request(name, body, options, dry_run), dry_run, wait))
 
     def read_plan(self, plan: Plan | str) -> Exchange[Plan]:
         """Read a plan."""

@@ -12,12 +12,11 @@ from optodrive.client.heights import encode_json
 from optodrive.client.plan import Plan
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import PushOptions
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.reload import ReloadReport
 from optodrive.daemon.responses.state import StateReport
 from optodrive.planning.effective_config import EffectiveConfig
-from optodrive.planning.feasibility.report import FitMode
 
 Response = TypeVar("Response", bound=BaseModel)
 
@@ -61,22 +60,17 @@ def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bo
     return {"frames": [frame | ({"simultaneous": True} if simultaneous else {})]}
 
 
-def build_push_request(
-    body: Mapping[str, Any] | bytes, policy: Policy, fit: FitMode, dry_run: bool, strict: bool = False
-) -> ApiRequest[Plan]:
+def build_push_request(body: Mapping[str, Any] | bytes, options: PushOptions, dry_run: bool) -> ApiRequest[Plan]:
     """Build the request that plans frames and trains, given as an object or as the bytes of a file."""
-    query = {"policy": policy, "fit": fit, "dry_run": dry_run, "strict": strict}
+    query = {**options, "dry_run": dry_run}
     return ApiRequest("POST", "/v1/plans", Plan, dry_run, encode_body(body) | {"params": query})
 
 
 def build_play_request(
-    name: str, parameters: Mapping[str, Any], policy: Policy | None, fit: FitMode, dry_run: bool, strict: bool = False
+    name: str, parameters: Mapping[str, Any], options: PushOptions, dry_run: bool
 ) -> ApiRequest[Plan]:
-    """Build the request that plays a named pattern.
-
-    policy: None for that of the pattern
-    """
-    query = {"fit": fit, "dry_run": dry_run, "strict": strict} | ({} if policy is None else {"policy": policy})
+    """Build the request that plays a named pattern."""
+    query = {**options, "dry_run": dry_run}
     path = f"/v1/patterns/{quote(name, safe='')}"
     return ApiRequest("POST", path, Plan, dry_run, encode_body(parameters) | {"params": query})
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from optodrive.core.errors import OverBudgetError
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import compute_wait_s, galvo_feasible_prefix, limit
 from optodrive.planning.planned_sequence import Delay, Shortfall

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from optodrive.core.errors import InputError, RefusedError
+from optodrive.core.errors import RefusedError
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.batch_limiter import BatchLimiter
@@ -34,13 +34,6 @@ CONCATENATE_EVERY = 256
 
 Progress = Callable[[float], None]
 """Receives the completed fraction, 0 to 1."""
-
-
-def resolve_policy(policy: Policy, strict: bool) -> Policy:
-    """Return the policy that `strict`, a synonym of "refuse", selects. Raise InputError if the two contradict."""
-    if strict and policy == "delay":
-        raise InputError("strict", True, "either strict or policy 'delay'")
-    return "refuse" if strict else policy
 
 
 def warm_up(display: DisplayModel) -> None:

@@ -17,6 +17,7 @@ from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.preview.jobs import plan_dry_run
+from optodrive.daemon.push import Push
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from planner_rig import DISPLAY, PlannerRig
 
@@ -37,7 +38,7 @@ WEIGHTS = {
 }
 
 
-class Push(NamedTuple):
+class QueuedPush(NamedTuple):
     """A request with the epoch that its caller saw when it arrived."""
 
     epoch: int
@@ -93,7 +94,7 @@ class Interleaving:
             power_w = 1.0 + 0.01 * self.serial  # tells the light of one push from that of another
             sequence = FrameSequence((), (PulseTrain(self.serial % 16, 0.0, 0.3, 0.005, 0.005, power_w),))
         seen = self.epochs[-1 if self.random.random() < 0.8 else self.random.randrange(len(self.epochs))][1]
-        self.waiting.append(Push(seen, sequence, self.random.random() < 0.5))
+        self.waiting.append(QueuedPush(seen, sequence, self.random.random() < 0.5))
 
     def deliver(self):
         """The planner gets a request, not always in order."""
@@ -155,10 +156,12 @@ class Interleaving:
         """Plan without executing. The queue stays as it is."""
         snapshot = self.rig.queue.make_snapshot(False, 0.0)
         before = [record.plan_id for record in self.rig.store.list_recent()]
-        fields = {"name": "dry", "policy": "trim", "fit": "as_is"}
         sequence = build_pattern("all", {"height_um": 20}, DISPLAY.config)
         start = DryRunStart(snapshot.heat, snapshot.budget, 0.1)
-        assert plan_dry_run(DISPLAY, self.rig.remote.scales, BuiltRequest(sequence), start, fields).status == "planned"
+        assert (
+            plan_dry_run(DISPLAY, self.rig.remote.scales, BuiltRequest(sequence), start, Push("dry", {}, 0.0, 0)).status
+            == "planned"
+        )
         assert [record.plan_id for record in self.rig.store.list_recent()] == before
 
     def interfere(self):

@@ -6,6 +6,8 @@ from concurrent.futures import Future
 from link_process_rig import BEAT_INTERVAL_S, Client, LinkProcess
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.engine.request_body import BuiltRequest
+from optodrive.daemon.push import Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.service.results import build_error
@@ -75,6 +77,11 @@ class RiggedEngine(Engine):
         self._thread.start()
         wait_for(lambda: self.is_linked, "the link")
         return self
+
+    def submit_sequence(self, sequence, name="push", streamed=False, **options):
+        """Submit a sequence, or the function that returns it, as if it arrived now."""
+        push = Push(name, options, self._clock.now_s(), self._session.epoch, streamed=streamed)
+        return self.submit(lambda: BuiltRequest(sequence() if callable(sequence) else sequence), push)
 
     def _run_until_end(self):
         try:

@@ -51,7 +51,7 @@ def test_an_operator_lowers_the_power_an_armer_raises_it_and_a_restart_keeps_it(
     assert set(plan["pulses"]["reason"]) == {"dim"}
     assert bright.finished(plan["plan"])["executed"] == 2
     assert 0.19 < find_max_share(board) <= 0.2
-    problem = bright.call("POST", "/v1/plans", 409, params={"strict": True}, json=FRAME)
+    problem = bright.call("POST", "/v1/plans", 409, params={"policy": "refuse"}, json=FRAME)
     assert (problem["code"], problem["cap"]) == ("over_budget", "dim")
     dry_run = bright.call("POST", "/v1/plans", params={"dry_run": True}, json=FRAME)
     assert set(dry_run["pulses"]["reason"]) == {"dim"}

@@ -7,7 +7,6 @@ import pytest
 
 from optodrive.core.errors import InputError, NotReadyError, RefusedError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.engine.request_body import BuiltRequest
 from rig import ended, wait_for
 
 
@@ -23,7 +22,7 @@ def train(seconds):
 
 def test_a_stalled_planner_lets_the_lease_expire(armed, board):
     hang = threading.Event()
-    future = armed.submit(lambda: BuiltRequest(hang.wait() and frame()), "hangs")
+    future = armed.submit_sequence(lambda: hang.wait() and frame(), "hangs")
     wait_for(lambda: armed.board_state == "FAULT", "the lease to expire")
     assert board.of("fault")[-1]["fault"] == "LINK"
     wait_for(lambda: "planner made no progress" in armed.web.status["epoch_reason"], "the cause")
@@ -34,7 +33,7 @@ def test_a_stalled_planner_lets_the_lease_expire(armed, board):
 
 def test_a_busy_planner_keeps_the_lease(armed, board):
     long_one = train(200.0)
-    answers = [armed.submit(lambda: BuiltRequest(long_one), "long") for _ in range(3)]
+    answers = [armed.submit_sequence(long_one, "long") for _ in range(3)]
     for answer in answers:
         assert answer.result().planned == 10_000
     assert armed.board_state == "RUNNING"
@@ -46,9 +45,9 @@ def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
     heated[17] = 300e-6
     lead = frame(100.0, pixel=100, duration_s=1.0).frames[0]  # time to hand over the second, which must not be late
     sequence = FrameSequence((lead, TactileFrame("f", 1.0, 0.05, heated)))
-    first = armed.submit(lambda: BuiltRequest(sequence), "first").result()
-    second = armed.submit(lambda: BuiltRequest(frame(350.0)), "second").result()
-    rest = armed.submit(lambda: BuiltRequest(frame(350.0, pixel=300)), "rest").result()
+    first = armed.submit_sequence(sequence, "first").result()
+    second = armed.submit_sequence(frame(350.0), "second").result()
+    rest = armed.submit_sequence(frame(350.0, pixel=300), "rest").result()
     assert second.pulses.energy_j[0] < 0.99 * rest.pulses.energy_j[0]
     for answer, height_um in ((first, 300.0), (second, 350.0)):
         record = ended(armed, answer)
@@ -58,9 +57,9 @@ def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
 
 
 def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
-    running = armed.submit(lambda: BuiltRequest(train(5.0)), "a").result()  # the last keeps its time after it
-    waiting = armed.submit(lambda: BuiltRequest(train(1.0)), "b").result()
-    last = armed.submit(lambda: BuiltRequest(train(0.1)), "c").result()
+    running = armed.submit_sequence(train(5.0), "a").result()  # the last keeps its time after it
+    waiting = armed.submit_sequence(train(1.0), "b").result()
+    last = armed.submit_sequence(train(0.1), "c").result()
     assert armed.cancel(waiting.plan).result().status == "cancelled"
     assert armed.cancel(running.plan).result().status == "cancelled"
     assert ended(armed, last).status == "done"
@@ -70,25 +69,25 @@ def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
 def test_the_queue_is_bounded_and_ended_plans_are_dropped(armed, monkeypatch):
     monkeypatch.setattr("optodrive.daemon.engine.engine.QUEUE_MAX", 2)
     monkeypatch.setattr("optodrive.daemon.engine.plan_store.RECORDS_MAX", 3)
-    first = armed.submit(lambda: BuiltRequest(train(60.0)), "first").result()
+    first = armed.submit_sequence(train(60.0), "first").result()
     wait_for(lambda: armed.get_plan(first.plan).status == "running", "the first to run")
-    waiting = [armed.submit(lambda: BuiltRequest(train(0.02)), "waiting").result() for _ in range(2)]
+    waiting = [armed.submit_sequence(train(0.02), "waiting").result() for _ in range(2)]
     with pytest.raises(NotReadyError, match="2 plans are already waiting"):
-        armed.submit(lambda: BuiltRequest(train(0.02)), "too many").result()
+        armed.submit_sequence(train(0.02), "too many").result()
     for answer in (first, *waiting):
         assert armed.cancel(answer.plan).result().status == "cancelled"
-    armed.submit(lambda: BuiltRequest(train(0.02)), "one more").result()
+    armed.submit_sequence(train(0.02), "one more").result()
     with pytest.raises(InputError, match="plan"):
         armed.get_plan(first.plan)
 
 
 def test_a_blank_plan_is_done_at_once(armed):
-    answer = armed.submit(lambda: BuiltRequest(frame(0.0)), "blank").result()
+    answer = armed.submit_sequence(frame(0.0), "blank").result()
     assert ended(armed, answer).status == "done"
 
 
 def test_a_crash_of_the_loop_aborts_the_board(armed, board, monkeypatch):
-    armed.submit(lambda: BuiltRequest(train(5.0)), "long").result()
+    armed.submit_sequence(train(5.0), "long").result()
     wait_for(lambda: len(board.of("pulse")) > 10, "pulses")
 
     def crash(*_, **__):
@@ -104,7 +103,7 @@ def test_a_crash_of_the_loop_aborts_the_board(armed, board, monkeypatch):
 
 def test_an_unarmed_board_accepts_no_plans(engine):
     with pytest.raises(NotReadyError, match="arm it first"):
-        engine.submit(lambda: BuiltRequest(frame()), "x").result()
+        engine.submit_sequence(frame(), "x").result()
 
 
 def test_arming_twice_is_refused(armed):
@@ -113,21 +112,21 @@ def test_arming_twice_is_refused(armed):
 
 
 def test_after_a_failed_plan_the_board_can_be_armed_again(armed):
-    answer = armed.submit(lambda: BuiltRequest(train(5.0)), "long").result()
+    answer = armed.submit_sequence(train(5.0), "long").result()
     wait_for(lambda: armed.get_plan(answer.plan).executed > 10, "pulses")
     armed.stop().result()
     record = ended(armed, answer)
     assert record.status == "failed"
     assert len(record.executed_pulses.start_s) < record.planned
     armed.arm().result()
-    again = armed.submit(lambda: BuiltRequest(frame(100.0, pixel=200)), "again").result()
+    again = armed.submit_sequence(frame(100.0, pixel=200), "again").result()
     assert ended(armed, again).status == "done"
 
 
 def test_an_infeasible_plan_is_rejected_by_name(armed):
     with pytest.raises(InputError, match="target_um of pixel 17"):
-        armed.submit(lambda: BuiltRequest(frame(5000.0)), "x").result()
+        armed.submit_sequence(frame(5000.0), "x").result()
     with pytest.raises(RefusedError, match="needs"):
-        armed.submit(lambda: BuiltRequest(frame(500.0, duration_s=0.01)), "x", policy="refuse").result()
+        armed.submit_sequence(frame(500.0, duration_s=0.01), "x", policy="refuse").result()
     with pytest.raises(InputError, match="plan"):
         armed.get_plan("p99")

@@ -101,7 +101,7 @@ def test_the_command_line_reports_it_in_one_line(armed, tmp_path):
     summary = json.loads(run("plan", path, "--json", "--fit", "even").stdout)
     assert summary["late_messages"] == []
     assert summary["feasibility"]["height_factor"] < 1.0
-    refused = run("plan", path, "--strict")
+    refused = run("plan", path, "--policy", "refuse")
     assert refused.returncode == 1
     assert "nearest feasible: " in refused.stderr
     pushed = run("push", path, "--fit", "priority", "--dry-run", "--url", armed.url)

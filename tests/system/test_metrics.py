@@ -4,7 +4,6 @@ import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
 from optodrive.daemon.engine.metrics import PlanCounters
-from optodrive.daemon.engine.request_body import BuiltRequest
 from rig import ended, long_train, wait_for
 
 
@@ -57,7 +56,7 @@ def test_metrics_before_and_after_plans_and_a_stop(board, daemon):
 
 def test_faults_are_counted_once_by_name(armed):
     engine = armed
-    plan = engine.submit(lambda: BuiltRequest(_frames(engine)), "asked").result()
+    plan = engine.submit_sequence(_frames(engine), "asked").result()
     ended(engine, plan)
     engine._planner._progress_at_s = -1e9  # as if it had stalled: no lease from now on
     engine._planner._pending_count = 1

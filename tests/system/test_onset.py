@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
-from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.link.session.clock_sync import CLOCK_SPAN_S, DRIFT_MAX
 from rig import ended, wait_for
 
@@ -27,7 +26,7 @@ def read_gate_on_s(board):
 def test_the_onset_is_that_of_the_board_s_log_as_exactly_as_its_clock_is_known(armed, board):
     board.forget()
     before_s, unix_before_s, error_s = time.monotonic(), time.time(), find_clock_error_s(armed)
-    submitted = armed.submit(lambda: BuiltRequest(LATE), "late").result()
+    submitted = armed.submit_sequence(LATE, "late").result()
     planned = submitted.onset
     assert not planned.executed
     wait_for(lambda: armed.get_plan(submitted.plan).executed, "the first pulse")
@@ -43,6 +42,6 @@ def test_the_onset_is_that_of_the_board_s_log_as_exactly_as_its_clock_is_known(a
 
 
 def test_a_plan_that_ends_before_its_onset_has_none(armed):
-    submitted = armed.submit(lambda: BuiltRequest(LATE), "late").result()
+    submitted = armed.submit_sequence(LATE, "late").result()
     armed.cancel(submitted.plan).result()
     assert ended(armed, submitted).onset is None

@@ -19,6 +19,7 @@ from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.planner_server import PlannerServer
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState
 from optodrive.daemon.responses.telemetry import BudgetEvent, DisplayEvent, PulseBatch
@@ -54,16 +55,16 @@ class Web:
         return request_id
 
     def submit(self, sequence, epoch=None, streamed=False, fit="as_is"):
-        fields = self.fields(epoch, streamed, fit) | {"labels": {}, "parameters": {}}
+        fields = {"push": self.build_push(epoch, streamed, fit), "labels": {}, "parameters": {}}
         return self.request("submit", encode_sequence(sequence), **fields)
 
     def submit_body(self, body):
-        return self.request("submit_body", body, **self.fields(None, True, "as_is"))
+        return self.request("submit_body", body, push=self.build_push(None, True, "as_is"))
 
-    def fields(self, epoch, streamed, fit):
-        fields = {"name": "push", "policy": "trim", "fit": fit, "streamed": streamed, "caller": "token"}
+    def build_push(self, epoch, streamed, fit):
         epoch = self.engine.web.status["epoch"] if epoch is None else epoch
-        return fields | {"lists_pulses": not streamed, "arrived_s": time.monotonic(), "epoch": epoch}
+        push = Push("push", {"fit": fit}, time.monotonic(), epoch, "token", streamed, lists_pulses=not streamed)
+        return push._asdict()
 
     def receive(self):
         self.socket.flush()

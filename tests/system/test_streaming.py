@@ -10,7 +10,6 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import plan_making
 from optodrive.daemon.engine.planner import SPLICE_TRIES
 from optodrive.daemon.engine.planning_time import FACTOR
-from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 
@@ -36,7 +35,7 @@ def wait_for_pulses(armed, answer, count):
 
 
 def stream(armed, sequence):
-    return armed.submit(lambda: BuiltRequest(sequence), "stream", streamed=True).result()
+    return armed.submit_sequence(sequence, "stream", streamed=True).result()
 
 
 @pytest.mark.parametrize("reserved_s", [RESERVED_S, pytest.param(None, marks=pytest.mark.slow)])
@@ -116,8 +115,8 @@ def test_an_empty_frame_ends_the_previous_one(armed, board):
 
 def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
     train = FrameSequence((), (PulseTrain(200, 0.0, 5.0, 0.01, 0.01, 1.0),))
-    running = armed.submit(lambda: BuiltRequest(train), "train").result()
-    waiting = armed.submit(lambda: BuiltRequest(frame(range(50))), "waiting").result()
+    running = armed.submit_sequence(train, "train").result()
+    waiting = armed.submit_sequence(frame(range(50)), "waiting").result()
     wait_for(lambda: armed.get_plan(running.plan).executed >= 3, "a part of the train")
     newest = ended(armed, stream(armed, frame(range(5), 200.0)))
     assert newest.status == "done"
@@ -128,7 +127,7 @@ def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
 
 def test_a_plan_after_a_stream_waits_for_its_end(armed):
     first = stream(armed, frame(range(30)))
-    second = armed.submit(lambda: BuiltRequest(frame(range(30))), "second").result()
+    second = armed.submit_sequence(frame(range(30)), "second").result()
     records = [ended(armed, answer) for answer in (first, second)]
     assert [record.status for record in records] == ["done", "done"]
     for record in records:

@@ -14,10 +14,10 @@ from starlette.requests import ClientDisconnect
 
 from optodrive import __version__
 from optodrive.core.ipc import Message
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy, PushOptions
 from optodrive.daemon.api.access_middleware import AUDIT_FIELDS, AccessMiddleware, read_request
 from optodrive.daemon.api.access_policy import AccessPolicy
-from optodrive.daemon.api.daemon_client import NO_EPOCH, DaemonClient, PushFields
+from optodrive.daemon.api.daemon_client import NO_EPOCH, DaemonClient
 from optodrive.daemon.api.dim_request import DIM_EXAMPLE, DIM_SCHEMA, parse_dim_request
 from optodrive.daemon.api.error_handlers import add_error_handlers
 from optodrive.daemon.api.hold_socket import HoldSocket
@@ -30,6 +30,7 @@ from optodrive.daemon.api.openapi_bodies import (
     SEQUENCE_SCHEMA,
     build_request_body,
 )
+from optodrive.daemon.api.push_options_query import PushOptionsQuery
 from optodrive.daemon.api.roles import is_role_sufficient
 from optodrive.daemon.api.route_table import RoleRoutes, RouteTable
 from optodrive.daemon.api.scope_keys import ARRIVED_S, CALLER
@@ -38,6 +39,7 @@ from optodrive.daemon.api.stop_priority import StopPriorityMiddleware
 from optodrive.daemon.api.telemetry_hub import DEFAULT_RATE_HZ, EventStream
 from optodrive.daemon.api.tokens import Token
 from optodrive.daemon.engine.metrics import CONTENT_TYPE
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.patterns import PatternList
@@ -46,23 +48,16 @@ from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.reload import ReloadReport
 from optodrive.daemon.responses.state import StateReport
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
-from optodrive.planning.feasibility.report import FitMode
-from optodrive.planning.pipeline import resolve_policy
 from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
 
 PlanId = Annotated[str, Path(max_length=40)]
 DryRunQuery = Annotated[bool, Query(description="plan and limit only; nothing moves")]
 NewestQuery = Annotated[bool, Query(description="replace everything that is not yet committed to the board")]
-StrictQuery = Annotated[bool, Query(description="the same as policy=refuse")]
 NameQuery = Annotated[
     str,
     Query(min_length=1, max_length=40, pattern=r"^[\w.-]+( [\w.-]+)*$", description="what the plan is called in lists"),
 ]
 PolicyQuery = Annotated[Policy, Query(description="treatment of a frame that exceeds a cap")]
-PatternPolicyQuery = Annotated[
-    Policy | None, Query(description="treatment of a frame that exceeds a cap; by default that of the pattern")
-]
-FitQuery = Annotated[FitMode, Query(description="treatment of a sequence that does not fit on the beam")]
 PulsesQuery = Annotated[bool, Query(description="list every pulse")]
 DRY_RUN_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"model": PlanReport, "description": "A dry run: the plan is not stored"}
@@ -180,16 +175,13 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     )
     async def submit_plan(
         request: Request,
+        options: PushOptionsQuery,
         dry_run: DryRunQuery = False,
-        strict: StrictQuery = False,
-        policy: PolicyQuery = "trim",
         newest: NewestQuery = False,
-        fit: FitQuery = "as_is",
         name: NameQuery = "push",
     ) -> Response:
         """Plan frames and trains, and show them."""
-        fields = (name, resolve_policy(policy, strict), fit, newest)
-        return await _plan_body(daemon, request, "sequence", _read_push(daemon, request, *fields, dry_run), dry_run)
+        return await _plan_body(daemon, request, "sequence", name, options, newest, dry_run)
 
     @routes.websocket("/v1/stream", "operator")
     async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
@@ -228,14 +220,12 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     async def play_pattern(
         name: Annotated[str, Path(max_length=80, json_schema_extra=PATTERN_NAME_EXAMPLES)],
         request: Request,
+        options: PushOptionsQuery,
         dry_run: DryRunQuery = False,
-        strict: StrictQuery = False,
-        policy: PatternPolicyQuery = None,
-        fit: FitQuery = "as_is",
     ) -> Response:
         """Build a named pattern, plan it, and show it."""
-        fields = (name, resolve_policy(policy or find_pattern(name).policy, strict), fit, False)
-        return await _plan_body(daemon, request, "pattern", _read_push(daemon, request, *fields, dry_run), dry_run)
+        with_default: PushOptions = {"policy": find_pattern(name).policy, **options}
+        return await _plan_body(daemon, request, "pattern", name, with_default, False, dry_run)
 
     @cache
     def encode_openapi() -> bytes:
@@ -255,21 +245,22 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     return app
 
 
-def _read_push(
-    daemon: DaemonClient, request: Request, name: str, policy: Policy, fit: FitMode, streamed: bool, is_dry_run: bool
-) -> PushFields:
-    """Read the fields of a push before its body. Its epoch is that of the arrival: a STOP since then ends it.
+async def _plan_body(
+    daemon: DaemonClient,
+    request: Request,
+    source: str,
+    name: str,
+    options: PushOptions,
+    streamed: bool,
+    is_dry_run: bool,
+) -> Response:
+    """Plan a body. The push's epoch is that of its arrival: a STOP since then ends it.
 
     Raise LinkError without a link process, which a dry run does not need.
     """
     arrived_s = request.scope.get("state", {}).get(ARRIVED_S) or time.monotonic()
     epoch = NO_EPOCH if is_dry_run else daemon.link.require_epoch_at(arrived_s)
-    return PushFields(name, policy, fit, streamed, arrived_s, epoch, request.scope[CALLER].name)
-
-
-async def _plan_body(
-    daemon: DaemonClient, request: Request, source: str, push: PushFields, is_dry_run: bool
-) -> Response:
+    push = Push(name, options, arrived_s, epoch, request.scope[CALLER].name, streamed)
     body = await request.body()
     work = daemon.plan_dry_run(source, body, push) if is_dry_run else daemon.push(source, body, push)
     result = await _finish_unless_left(request, work)

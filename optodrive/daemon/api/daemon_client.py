@@ -8,22 +8,21 @@ import time
 from bisect import bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from optodrive.core.ipc import Message
-from optodrive.core.types.policy import Policy
 from optodrive.daemon.api.peer import Peer
 from optodrive.daemon.api.reload_requests import ReloadRequests
 from optodrive.daemon.api.state_merge import merge_state
 from optodrive.daemon.api.telemetry_hub import TelemetryHub
 from optodrive.daemon.engine.request_body import NO_LABELS, LabelValues, ParameterValues
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.service.results import build_error
 from optodrive.link.session.board_connector import CONNECTING
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.feasibility.report import FitMode
 
 EPOCHS_MAX = 1000
 ENDED_MAX = 1000
@@ -33,23 +32,6 @@ STREAMED_BODY_MAX_BYTES = 32_768
 """Largest body that the planner parses: a frame of 1,511 targets has 20 kB, and no such body takes over 10 ms."""
 NO_EPOCH = 0
 """Epoch without a link process."""
-
-
-class PushFields(NamedTuple):
-    """Fields of a push.
-
-    arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token
-    lists_pulses: whether the answer lists the pulses one by one
-    """
-
-    name: str
-    policy: Policy
-    fit: FitMode
-    streamed: bool
-    arrived_s: float
-    epoch: int
-    caller: str
-    lists_pulses: bool = True
 
 
 class LinkClient:
@@ -169,7 +151,7 @@ class PlannerClient:
     async def submit(
         self,
         sequence: bytes,
-        push: PushFields,
+        push: Push,
         labels: LabelValues = NO_LABELS,
         parameters: ParameterValues = NO_LABELS,
     ) -> Message:
@@ -177,12 +159,12 @@ class PlannerClient:
 
         labels: of the caller; parameters: of the pattern, all
         """
-        fields = push._asdict() | {"labels": dict(labels), "parameters": dict(parameters)}
+        fields = {"push": push._asdict(), "labels": dict(labels), "parameters": dict(parameters)}
         return await self.peer.call(Message("submit", fields, sequence))
 
-    async def submit_body(self, body: bytes, push: PushFields) -> Message:
+    async def submit_body(self, body: bytes, push: Push) -> Message:
         """Parse and plan a streamed FRAMES.json and return the result."""
-        return await self.peer.call(Message("submit_body", push._asdict(), body))
+        return await self.peer.call(Message("submit_body", {"push": push._asdict()}, body))
 
     async def wait_for_end(self, plan: str) -> PlanReport:
         """Return the report of a streamed plan once it has ended."""
@@ -257,33 +239,22 @@ class DaemonClient:
             self._state_json = self.build_state().model_dump_json().encode()
         return self._state_json
 
-    async def build(self, source: str, name: str, body: bytes, caller: str) -> Message:
-        """Build the sequence of a body in the preview process and return its result."""
-        return await self.preview.call(Message("build", {"source": source, "name": name, "caller": caller}, body))
-
-    async def plan_dry_run(self, source: str, body: bytes, push: PushFields) -> Message:
+    async def plan_dry_run(self, source: str, body: bytes, push: Push) -> Message:
         """Plan a body in the preview process from the planner's present state, and return the result."""
         snapshot = await self.planner.call("snapshot")
         if snapshot.fields["status"] != 200:
             return snapshot
-        fields = {
-            "source": source,
-            "name": push.name,
-            "policy": push.policy,
-            "fit": push.fit,
-            "caller": push.caller,
-            "snapshot_bytes": len(snapshot.payload),
-        }
+        fields = {"source": source, "push": push._asdict(), "snapshot_bytes": len(snapshot.payload)}
         return await self.preview.call(Message("dry_run", fields, snapshot.payload + body))
 
-    async def push(self, source: str, body: bytes, push: PushFields) -> Message:
+    async def push(self, source: str, body: bytes, push: Push) -> Message:
         """Build the sequence of a body, then plan it. Return the result of the step that refuses it, or of the plan.
 
         The planner itself parses a small streamed body, because it is there three hand-overs earlier.
         """
         if push.streamed and len(body) <= STREAMED_BODY_MAX_BYTES:
             return await self.planner.submit_body(body, push)
-        built = await self.build(source, push.name, body, push.caller)
+        built = await self.preview.call(Message("build", {"source": source, "push": push._asdict()}, body))
         if built.fields["status"] != 200:
             return built
         return await self.planner.submit(built.payload, push, built.fields["labels"], built.fields["parameters"])

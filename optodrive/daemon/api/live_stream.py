@@ -7,10 +7,11 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.core.ipc import Message
-from optodrive.core.types.policy import Policy
-from optodrive.daemon.api.daemon_client import DaemonClient, PushFields
+from optodrive.core.types.push_options import Policy
+from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.socket_token import select_subprotocol
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.plan_status import PlanStatus
@@ -100,14 +101,13 @@ class LiveStream:
             self._arrived.clear()
             assert self._pending is not None  # noqa: S101 - set before the event
             frame, self._pending = self._pending, None
-            push = PushFields(
+            push = Push(
                 name=f"frame {frame.number}",
-                policy=self._policy,
-                fit="as_is",
-                streamed=True,
+                options={"policy": self._policy},
                 arrived_s=frame.arrived_s,
                 epoch=frame.epoch,
                 caller=self._caller,
+                streamed=True,
                 lists_pulses=False,
             )
             try:

@@ -16,7 +16,6 @@ import numpy as np
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.core.scheduling import use_usual_priority
-from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
@@ -32,6 +31,7 @@ from optodrive.daemon.engine.session_connection import SessionConnection
 from optodrive.daemon.engine.state_report import build_planner_state, build_state_report
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.message_loop import MessageLoop
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.link.protocol.quantisation import WireScale
@@ -42,7 +42,6 @@ from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.stage_loss import LostStage
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.feasibility.report import FitMode
 
 LOOP_WAIT_S = 0.05
 SWITCH_INTERVAL_S = 2e-4
@@ -195,45 +194,17 @@ class Engine:
     # --- plans --------------------------------------------------------------------------------------------------
 
     def submit(
-        self,
-        build: Callable[[], BuiltRequest],
-        name: str,
-        policy: Policy = "trim",
-        fit: FitMode = "as_is",
-        streamed: bool = False,
-        arrived_s: float | None = None,
-        epoch: int | None = None,
-        caller: str = "",
-        caller_left: threading.Event = NEVER,
-        lists_pulses: bool = True,
+        self, build: Callable[[], BuiltRequest], push: Push, caller_left: threading.Event = NEVER
     ) -> "Future[PlanReport]":
         """Plan the sequence that `build` returns, and queue the plan. Raise BusyError if too many requests wait.
 
-        streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
-        arrived_s: host time at which the request arrived; epoch: in which it arrived; both now by default
-        caller: name of the token that submitted it
         caller_left: set when the caller no longer waits, which ends the planning
-        lists_pulses: whether the answer lists the pulses one by one
         """
-        if streamed and fit != "as_is":
+        fit = push.options.get("fit", "as_is")
+        if push.streamed and fit != "as_is":
             raise InputError("fit", fit, "as_is for streamed plans: a stream has no time for a feasibility check")
-        epoch = self._session.epoch if epoch is None else epoch
-        ago_s = 0.0 if arrived_s is None else self._clock.now_s() - arrived_s
-        board_s = self.board_s() - ago_s
-        return self._planner.submit(
-            PlanningRequest(
-                build,
-                name,
-                policy,
-                fit,
-                streamed,
-                board_s,
-                epoch,
-                caller,
-                caller_left,
-                lists_pulses,
-            )
-        )
+        arrived_s = self.board_s() - (self._clock.now_s() - push.arrived_s)
+        return self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left))
 
     def _require_armed(self) -> None:
         """Raise LinkError or NotReadyError if the board accepts no plans."""
@@ -250,16 +221,11 @@ class Engine:
                 f"{QUEUED_PULSES_MAX} pulses are already waiting; wait for a plan to end, or cancel one"
             )
 
-    def end_stream(self, epoch: int | None = None, caller: str = "") -> "Future[PlanReport]":
+    def end_stream(self, epoch: int, caller: str) -> "Future[PlanReport]":
         """Drop the unsent rest of a stream's last plan after its client has disconnected."""
         blank_frame = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
-        return self.submit(
-            lambda: BuiltRequest(FrameSequence((blank_frame,))),
-            "end of stream",
-            streamed=True,
-            epoch=epoch,
-            caller=caller,
-        )
+        push = Push("end of stream", {}, self._clock.now_s(), epoch, caller, streamed=True)
+        return self.submit(lambda: BuiltRequest(FrameSequence((blank_frame,))), push)
 
     def get_plan(self, plan_id: str, pulses: bool = True) -> PlanReport:
         """Report a plan. Raise InputError (plan_not_found) for an unknown plan."""

@@ -5,17 +5,17 @@ import zlib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import LargestTarget, PlanRecord
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.request_body import BuiltRequest
+from optodrive.daemon.push import Push
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.stage_points import StagePoints, decode_stages
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
-from optodrive.planning.feasibility.report import FeasibilityReport, FitMode
+from optodrive.planning.feasibility.report import FeasibilityReport
 from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import plan_sequence
@@ -31,22 +31,13 @@ class PlanningRequest(NamedTuple):
     """Request for a plan.
 
     build: returns the sequence, with labels and parameters for report and recording
-    streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
-    arrived_s: board time of the request's arrival; epoch: in which it arrived
-    caller: name of the token that submitted it; caller_left: set when the caller no longer waits
-    lists_pulses: whether the answer lists the pulses one by one
+    arrived_s: board time of the push's arrival; caller_left: set when the caller no longer waits
     """
 
     build: Callable[[], BuiltRequest]
-    name: str
-    policy: Policy = "trim"
-    fit: FitMode = "as_is"
-    streamed: bool = False
+    push: Push
     arrived_s: float = 0.0
-    epoch: int = 0
-    caller: str = ""
     caller_left: threading.Event = NEVER
-    lists_pulses: bool = True
 
 
 def make_plan(
@@ -62,7 +53,8 @@ def make_plan(
 
     Raises InputError and RefusedError as `plan_sequence` and `check_feasibility` do, and what on_progress raises.
     """
-    planned, feasibility = _plan(display, request, built.sequence, snapshot, on_progress)
+    push = request.push
+    planned, feasibility = _plan(display, push, built.sequence, snapshot, on_progress)
     on_progress(1.0)
     points = StagePoints.from_plan(planned.plan, scales, display.draws)
     on_progress(1.0)
@@ -72,7 +64,7 @@ def make_plan(
     on_progress(1.0)
     record = PlanRecord(
         plan_id=plan_id,
-        name=request.name,
+        name=push.name,
         pulse_count=len(planned.plan),
         duration_s=planned.duration_s,
         summary_json=summarize_plan(planned, feasibility).model_dump_json().encode(),
@@ -80,10 +72,10 @@ def make_plan(
         largest_target=LargestTarget.from_planned(planned),
         start_s=snapshot.start_s,
         arrived_s=request.arrived_s,
-        caller=request.caller,
+        caller=push.caller,
         labels=dict(built.labels),
         parameters=dict(built.parameters),
-        streamed=request.streamed,
+        streamed=push.streamed,
         first_pulse_s=float(decoded.start_s.min()) if len(decoded.start_s) else None,
     )
     return ActivePlan(
@@ -92,7 +84,7 @@ def make_plan(
         points=points,
         heat_before=snapshot.heat,
         budget_before=snapshot.budget,
-        epoch=request.epoch,
+        epoch=push.epoch,
         crc=zlib.crc32(payload),
         refreshed=snapshot.refreshed,
     )
@@ -100,16 +92,16 @@ def make_plan(
 
 def _plan(
     display: DisplayModel,
-    request: PlanningRequest,
+    push: Push,
     sequence: FrameSequence,
     snapshot: PlanningSnapshot,
     on_progress: Callable[[float], None],
 ) -> tuple[PlannedSequence, FeasibilityReport | None]:
     """Plan the sequence, with a feasibility check unless it is streamed."""
     heat, budget = snapshot.heat, snapshot.budget
-    if not request.streamed:
-        return check_feasibility(display, sequence, heat, budget, request.policy, on_progress, request.fit)
+    if not push.streamed:
+        return check_feasibility(display, sequence, heat, budget, on_progress, **push.options)
     if snapshot.refreshed is not None and can_split(sequence):
         sequence = stale_pixels_first(sequence, snapshot.refreshed)
-    pixels = snapshot.initial_pixels
-    return plan_sequence(display, sequence, heat, budget, request.policy, on_progress, initial_pixels=pixels), None
+    policy, pixels = push.options.get("policy", "trim"), snapshot.initial_pixels
+    return plan_sequence(display, sequence, heat, budget, policy, on_progress, initial_pixels=pixels), None

@@ -153,7 +153,7 @@ class Planner:
 
     def _process(self, request: PlanningRequest) -> PlanReport:
         """Plan one request, a streamed one before all programs of usual priority."""
-        if not request.streamed:
+        if not request.push.streamed:
             return self._plan(request)
         set_realtime_priority(PLANNING)
         try:
@@ -168,12 +168,12 @@ class Planner:
             """Record progress, and end the work on a request that nobody waits for or that takes too long."""
             self._progress_at_s = self._clock.now_s()
             used_s = thread_time() - began_s
-            if request.streamed and used_s > REALTIME_MAX_S:
+            if request.push.streamed and used_s > REALTIME_MAX_S:
                 use_usual_priority()
             if used_s > PLANNING_MAX_S:
                 expected = f"a sequence that is planned within {PLANNING_MAX_S:g} s of processor time; send it in parts"
                 raise InputError("body", "a longer computation", expected, "too_slow")
-            self._plan_queue.require_epoch(request.epoch)
+            self._plan_queue.require_epoch(request.push.epoch)
             if request.caller_left.is_set():
                 raise StoppedError("the caller has left")
 
@@ -181,7 +181,7 @@ class Planner:
             check(0.0)
             plan = self._plan_until_committed(request.build(), request, check)
             clocks = self._session.read_clocks()
-            return plan.record.build_report(self._session.board_s(), request.lists_pulses, clocks)
+            return plan.record.build_report(self._session.board_s(), request.push.lists_pulses, clocks)
         finally:
             self._progress_at_s = self._clock.now_s()
 
@@ -192,9 +192,9 @@ class Planner:
         while True:
             check(0.0)
             self._require_armed()
-            if request.streamed and self._plan_queue.pause.is_held:  # unless it was resumed a moment ago
+            if request.push.streamed and self._plan_queue.pause.is_held:  # unless it was resumed a moment ago
                 self._run_in_loop(self._plan_queue.pause.require_no_pause)
-            if request.streamed and self._plan_queue.must_preempt:
+            if request.push.streamed and self._plan_queue.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
             began_s = self._clock.now_s()
             reserved_s = self._compute_reserved_s(request, late_count, took_s)
@@ -204,16 +204,17 @@ class Planner:
             took_s = self._clock.now_s() - began_s
             # The snapshot is stale: a predecessor was late, has sent points beyond the splice, or its heat is gone.
             late_count += 1
-            if request.streamed and late_count == SPLICE_TRIES:
+            if request.push.streamed and late_count == SPLICE_TRIES:
                 self._run_in_loop(self._plan_queue.truncate_stream)
 
     def _compute_reserved_s(self, request: PlanningRequest, late_count: int, took_s: float) -> float:
         """Return the time to reserve for an attempt after late ones, of which the last took took_s."""
-        return self._planning_time.compute_reserved_s(late_count) if request.streamed else FACTOR * late_count * took_s
+        streamed = request.push.streamed
+        return self._planning_time.compute_reserved_s(late_count) if streamed else FACTOR * late_count * took_s
 
     def _preempt(self, request: PlanningRequest) -> None:
         """Make room for a streamed plan, unless its epoch has passed."""
-        self._plan_queue.require_epoch(request.epoch)
+        self._plan_queue.require_epoch(request.push.epoch)
         self._plan_queue.pause.require_no_pause()
         self._plan_queue.preempt()
 
@@ -229,9 +230,9 @@ class Planner:
         """Plan once. Return None if the plan is late, the snapshot stale, or the display was dimmed meanwhile."""
         began_s, display = self._clock.now_s(), self._dimmer.display
         cooling_max_m = COOLING_MAX_M if late_count < LATE_MAX else inf
-        snapshot = self._plan_queue.make_snapshot(request.streamed, reserved_s)
+        snapshot = self._plan_queue.make_snapshot(request.push.streamed, reserved_s)
         plan = make_plan(display, self._session.scales, request, built, snapshot, plan_id, check)
-        if request.streamed:
+        if request.push.streamed:
             self._planning_time.record(self._clock.now_s() - began_s)
 
         def commit() -> bool:

@@ -20,6 +20,7 @@ from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.request_body import BuiltRequest, build_request
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
 from optodrive.daemon.message_loop import MessageServer
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import build_problem
@@ -101,19 +102,8 @@ class PlannerServer:
         self._update_readers()
 
     def _submit(self, connection: MessageSocket, client: _Client, message: Message) -> None:
-        fields, request_id, caller_left = message.fields, message.fields["id"], threading.Event()
-        future = self._engine.submit(
-            partial(self._build, message),
-            fields["name"],
-            fields["policy"],
-            fields["fit"],
-            fields["streamed"],
-            fields["arrived_s"],
-            fields["epoch"],
-            fields["caller"],
-            caller_left,
-            fields["lists_pulses"],
-        )
+        request_id, push, caller_left = message.fields["id"], Push(**message.fields["push"]), threading.Event()
+        future = self._engine.submit(partial(self._build, message, push.name), push, caller_left)
         client.requests[request_id] = caller_left, future
 
         def finish(done: "Future[PlanReport]") -> None:
@@ -124,12 +114,11 @@ class PlannerServer:
 
         future.add_done_callback(finish)
 
-    def _build(self, message: Message) -> BuiltRequest:
+    def _build(self, message: Message, name: str) -> BuiltRequest:
         """Build the sequence of a push: that of a body, or one that the preview process has built."""
-        fields = message.fields
         if message.kind == "submit_body":
-            return build_request(self._engine.display, "sequence", fields["name"], message.payload)
-        return BuiltRequest(decode_sequence(message.payload), fields["labels"], fields["parameters"])
+            return build_request(self._engine.display, "sequence", name, message.payload)
+        return BuiltRequest(decode_sequence(message.payload), message.fields["labels"], message.fields["parameters"])
 
     def _finish(
         self, connection: MessageSocket, client: _Client, request_id: int, status: int, payload: bytes, audit: Any

@@ -26,7 +26,7 @@ class Job(NamedTuple):
     @property
     def caller(self) -> str:
         """Name of the caller, '' if unknown."""
-        return str(self.message.fields.get("caller", ""))
+        return str(self.message.fields["push"]["caller"])
 
 
 class JobQueue:

@@ -2,7 +2,6 @@
 
 import pickle
 from collections.abc import Sequence
-from typing import Any
 
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message
@@ -13,6 +12,7 @@ from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.request_body import BuiltRequest, build_request
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.protocol.quantisation import WireScale
@@ -27,11 +27,12 @@ def run_job(display: DisplayModel, scales: Sequence[WireScale], job: Message) ->
     """Do a job and return its result: status and payload, or the status and the document of a problem."""
     try:
         body, start = _split_payload(job)
-        built = build_request(display, job.fields["source"], job.fields["name"], body)
+        push = Push(**job.fields["push"])
+        built = build_request(display, job.fields["source"], push.name, body)
         if start is None:
             fields = {"status": 200, "labels": dict(built.labels), "parameters": dict(built.parameters)}
             return Message("result", fields, encode_sequence(built.sequence))
-        report = plan_dry_run(display, scales, built, start, job.fields)
+        report = plan_dry_run(display, scales, built, start, push)
         audit = {"plan": report.plan, "pattern": report.name, "pulses": report.planned, "plan_status": report.status}
         return Message("result", {"status": 200, "audit": audit}, b"".join(iterate_json(report)))
     except OptodriveError as error:
@@ -54,10 +55,10 @@ def _split_payload(job: Message) -> tuple[bytes, DryRunStart | None]:
 
 
 def plan_dry_run(
-    display: DisplayModel, scales: Sequence[WireScale], built: BuiltRequest, start: DryRunStart, fields: dict[str, Any]
+    display: DisplayModel, scales: Sequence[WireScale], built: BuiltRequest, start: DryRunStart, push: Push
 ) -> PlanReport:
     """Plan and prove a sequence without executing it. Raise InputError or RefusedError as the planner does."""
-    request = PlanningRequest(lambda: built, fields["name"], fields["policy"], fields["fit"])
+    request = PlanningRequest(lambda: built, push)
     thermal = ThermalEstimate(start.heat, start.budget)
     snapshot = PlanningSnapshot(thermal, start.starts_in_s, start.heat, start.budget)
     dimmed = dim_display(display.without_stage(start.lost_stage), start.power_share)

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 from optodrive.core.errors import OverBudgetError, RefusedError
 from optodrive.core.types.plans import BudgetState
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import FitMode, Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.nearest_feasible import find_height_factor, find_time_factor
 from optodrive.planning.feasibility.order_search import ORDERS_MAX, Orders, OrderSearch, count_orders
 from optodrive.planning.feasibility.reduction import reduce_sequence
-from optodrive.planning.feasibility.report import FeasibilityReport, FitMode, NearestFeasible, Proof
+from optodrive.planning.feasibility.report import FeasibilityReport, NearestFeasible, Proof
 from optodrive.planning.feasibility.report_builder import (
     build_feasible_report,
     build_infeasible_report,
@@ -82,8 +82,9 @@ def check_feasibility(
     sequence: FrameSequence,
     heat: ThermalState,
     budget: BudgetState,
-    policy: Policy = "trim",
     on_progress: Progress | None = None,
+    *,
+    policy: Policy = "trim",
     fit: FitMode = "as_is",
 ) -> tuple[PlannedSequence, FeasibilityReport]:
     """Plan a sequence, or the part of it that fits, and report its feasibility.

@@ -3,8 +3,8 @@
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-FitMode = Literal["as_is", "even", "priority"]
-"""Treatment of an infeasible sequence: unchanged, all heights scaled evenly, or pixels omitted by priority."""
+from optodrive.core.types.push_options import FitMode
+
 Proof = Literal["planned", "searched", "bound", "not found"]
 """Evidence for a report's verdict; see FeasibilityReport."""
 

@@ -1,11 +1,11 @@
 """Build feasibility reports from plans, violations and variants."""
 
+from optodrive.core.types.push_options import FitMode
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.planning.feasibility.bulk_reduction import OmittedPixels
 from optodrive.planning.feasibility.messages import describe_nearest, describe_violation, name_source
 from optodrive.planning.feasibility.report import (
     FeasibilityReport,
-    FitMode,
     NearestFeasible,
     Omission,
     Proof,

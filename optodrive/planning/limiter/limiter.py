@@ -16,7 +16,7 @@ from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedEr
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import EMPTY_PLAN, BudgetState, LimitedPlan, PulsePlan
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.caps import CAPS_BY_KEY, REASONS, WRONG_ORDER
 from optodrive.planning.limiter.galvo_moves import count_galvo_feasible

@@ -9,7 +9,7 @@ from typing import Literal
 
 from optodrive.core.errors import MISSING, InputError, suggest_nearest
 from optodrive.core.plausibility import PlausibleRange, guess_unit
-from optodrive.core.types.policy import Policy
+from optodrive.core.types.push_options import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config, build_pixel_layout
 

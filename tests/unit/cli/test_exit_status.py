@@ -43,7 +43,7 @@ def test_the_files_are_written_all_the_same(frames, tmp_path, capsys):
     assert capsys.readouterr().out.endswith(f"written          {out}\n")
 
 
-@pytest.mark.parametrize(("options", "status"), [(["--fit", "even"], DOES_NOT_FIT), (["--strict"], 1)])
+@pytest.mark.parametrize(("options", "status"), [(["--fit", "even"], DOES_NOT_FIT), (["--policy", "refuse"], 1)])
 def test_a_reduced_variant_does_not_fit_and_a_refusal_fails(frames, options, status, capsys):
     assert run(["plan", frames(LATE), "--config", "display-16", *options]) == status
     shown = capsys.readouterr()
@@ -54,3 +54,8 @@ def test_a_reduced_variant_does_not_fit_and_a_refusal_fails(frames, options, sta
 def test_the_help_lists_the_statuses(capsys):
     assert run(["--help"]) == 0
     assert " ".join(capsys.readouterr().out.split()).endswith(SUMMARY)
+
+
+def test_strict_is_refused_in_favour_of_the_policy(frames, capsys):
+    assert run(["plan", frames(LATE), "--config", "display-16", "--strict"]) == 2
+    assert "expected --policy refuse in its place" in capsys.readouterr().err

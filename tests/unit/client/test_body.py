@@ -21,7 +21,7 @@ def build_body(**labels):
 def test_values_of_numpy_are_sent_as_numbers():
     body = build_body(trial=np.int64(3), gain=np.float32(0.5), odd=np.bool_(True))
     body["frames"][0]["target_um"] = np.array([0.0, 50.0])
-    sent = json.loads(build_push_request(MappingProxyType(body), "trim", "as_is", False).arguments["content"])
+    sent = json.loads(build_push_request(MappingProxyType(body), {}, False).arguments["content"])
     assert sent["labels"] == {"trial": 3, "gain": 0.5, "odd": True}
     assert sent["frames"][0]["target_um"] == [0.0, 50.0]
 
@@ -43,16 +43,16 @@ def test_the_bytes_of_a_file_are_sent_as_they_are():
 )
 def test_a_value_that_json_does_not_have_is_refused_with_its_place(labels, message):
     with pytest.raises(InputError, match=message):
-        build_push_request(build_body(**labels), "trim", "as_is", False)
+        build_push_request(build_body(**labels), {}, False)
     with pytest.raises(InputError, match=message):
-        build_play_request("pixel", {"labels": labels}, None, "as_is", False)
+        build_play_request("pixel", {"labels": labels}, {}, False)
 
 
 def test_a_body_that_contains_itself_is_refused():
     body = build_body()
     body["frames"].append(body)
     with pytest.raises(InputError, match="expected objects and lists at most"):
-        build_push_request(body, "trim", "as_is", False)
+        build_push_request(body, {}, False)
 
 
 @pytest.mark.parametrize("share", ["nan", "inf", "1.5", "50"])

@@ -36,7 +36,7 @@ from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.problem import build_problem
 
 HEALTH = ApiRequest("GET", "/v1/health", HealthReport, idempotent=True)
-PUSH = build_push_request({}, "trim", "as_is", dry_run=False)
+PUSH = build_push_request({}, {}, dry_run=False)
 HEALTHY = 200, b'{"status": "ok", "version": "1", "added later": {}}'
 REFUSED_TOKEN = 401, build_problem(401, "bad_token", "Not authorised", "no").to_json()
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
-from optodrive.core.errors import InputError, OverBudgetError
+from optodrive.core.errors import OverBudgetError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.planning.pipeline import plan_sequence, resolve_policy
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
 
 DISPLAY = DISPLAYS["display-437"]
@@ -78,13 +78,6 @@ def test_a_frame_that_never_fits_is_refused_with_that_reason(policy):
     with pytest.raises(OverBudgetError, match="does not fit at any later time") as caught:
         plan_sequence(with_caps(absorber_k=60.0), frames(1), *DISPLAY.build_cold_state(), policy)
     assert caught.value.cap == "absorber_temperature"
-
-
-def test_strict_selects_refuse_and_contradicts_delay():
-    assert resolve_policy("trim", True) == "refuse"
-    assert resolve_policy("delay", False) == "delay"
-    with pytest.raises(InputError, match="either strict or policy 'delay'"):
-        resolve_policy("delay", True)
 
 
 def test_progress_is_reported_within_a_frame():

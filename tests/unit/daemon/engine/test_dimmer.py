@@ -6,11 +6,10 @@ from link_service_rig import REQUIREMENTS
 from optodrive.core.errors import InputError, OverBudgetError
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.dry_run import DryRunStart
-from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.preview.jobs import plan_dry_run
-from optodrive.planning.pipeline import resolve_policy
+from optodrive.daemon.push import Push
 from planner_rig import DISPLAY, build_frame, build_train
 
 DUTY_MAX = 65535
@@ -67,15 +66,8 @@ def test_without_the_comparison_at_the_commit_it_would_be_bright(rig, monkeypatc
 
 def test_under_refuse_a_dimmed_pulse_is_refused(rig):
     rig.dimmer.set_share(0.1)
-    request = PlanningRequest(
-        lambda: BuiltRequest(build_frame()),
-        "push",
-        resolve_policy("trim", strict=True),
-        arrived_s=rig.remote.board_s(),
-        epoch=rig.remote.epoch,
-    )
     with pytest.raises(OverBudgetError, match="the dim cap allows") as caught:
-        rig.planner.submit(request).result()
+        rig.submit(build_frame(), rig.remote.epoch, options={"policy": "refuse"}).result()
     assert caught.value.cap == "dim"
 
 
@@ -97,7 +89,7 @@ def test_a_later_planner_is_as_dim():
 
 def test_a_dry_run_is_as_dim():
     start = DryRunStart(*DISPLAY.build_cold_state(), 0.0, power_share=0.1)
-    fields = {"name": "dry", "policy": "trim", "fit": "as_is"}
-    report = plan_dry_run(DISPLAY, [REQUIREMENTS.scale], BuiltRequest(build_frame(90.0)), start, fields)
+    built, push = BuiltRequest(build_frame(90.0)), Push("dry", {}, 0.0, 0)
+    report = plan_dry_run(DISPLAY, [REQUIREMENTS.scale], built, start, push)
     assert set(report.pulses.reason) == {"dim"}
     assert max(report.pulses.power_w) <= 0.1 * DISPLAY.config.laser.max_power_w

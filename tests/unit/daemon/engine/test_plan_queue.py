@@ -8,10 +8,8 @@ import pytest
 from link_service_rig import OPERATOR, PLANNER, WEB, ServiceRig
 from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.daemon.engine import planner
-from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
-from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from planner_rig import PlannerRig, build_frame, build_train
 
@@ -191,9 +189,8 @@ def test_a_streamed_request_from_before_stop_preempts_nothing(rig):
 def test_a_request_whose_caller_left_is_not_committed(rig):
     left = threading.Event()
     left.set()
-    request = PlanningRequest(lambda: BuiltRequest(build_frame()), "push", epoch=rig.remote.epoch, caller_left=left)
     with pytest.raises(StoppedError, match="left"):
-        rig.planner.submit(request).result()
+        rig.submit(build_frame(), rig.remote.epoch, caller_left=left).result()
     assert not rig.queue.is_busy
 
 

@@ -9,6 +9,7 @@ from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.daemon.push import Push
 from optodrive.link.board_setup import build_scales
 
 DISPLAY = DISPLAYS["display-1511"]
@@ -23,7 +24,7 @@ def running():
     built = BuiltRequest(sequence)
     thermal = ThermalEstimate(*DISPLAY.build_cold_state())
     snapshot = PlanningSnapshot(thermal, START_S, thermal.heat, thermal.budget)
-    request = PlanningRequest(lambda: built, "f", streamed=True)
+    request = PlanningRequest(lambda: built, Push("f", {}, 0.0, 0, streamed=True))
     return make_plan(DISPLAY, SCALES, request, built, snapshot, "p1", lambda fraction: None)
 
 

@@ -19,6 +19,7 @@ from optodrive.daemon.engine import request_body
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.preview import jobs, worker
 from optodrive.daemon.preview.process import run_preview
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.runtime_folder import open_runtime_folder
 from optodrive.planning.pipeline import warm_up
@@ -59,13 +60,13 @@ class Preview:
     def send(self, kind, job_id, payload=b"", **fields):
         self.socket.send(Message(kind, {"id": job_id, **fields}, payload))
 
-    def build(self, job_id, body, source="sequence", name="push", **fields):
-        self.send("build", job_id, body, source=source, name=name, **fields)
+    def build(self, job_id, body, source="sequence", name="push", caller=""):
+        self.send("build", job_id, body, source=source, push=Push(name, {}, 0.0, 0, caller)._asdict())
 
     def dry_run(self, job_id, body):
         start = pickle.dumps(DryRunStart(*DISPLAY.build_cold_state(), 0.05))
-        fields = {"source": "sequence", "name": "push", "policy": "trim", "fit": "as_is"}
-        self.send("dry_run", job_id, start + body, snapshot_bytes=len(start), **fields)
+        push = Push("push", {}, 0.0, 0)._asdict()
+        self.send("dry_run", job_id, start + body, source="sequence", push=push, snapshot_bytes=len(start))
 
     def results(self, count):
         """Wait for results and return them by id."""

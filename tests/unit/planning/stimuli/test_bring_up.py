@@ -12,7 +12,7 @@ from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 def plan_waveform(display, waveform, **parameters):
     sequence = build_pattern("scope", {"waveform": waveform, "seconds": 1.0, **parameters}, display.config)
-    planned, report = check_feasibility(display, sequence, *display.build_cold_state(), "refuse")
+    planned, report = check_feasibility(display, sequence, *display.build_cold_state(), policy="refuse")
     assert report.fits
     return planned.plan
 
