@@ -112,7 +112,7 @@ class PlannerRig(ServiceRig):
         shift_s = self.remote.pop_clock_shift()
         if self.remote.epoch != self._seen_epoch:
             self._seen_epoch = self.remote.epoch
-            self.queue.fail_all(self.remote.epoch_reason, shift_s or 0.0)
+            self.queue.end_epoch(self.remote.epoch_reason, shift_s or 0.0)
         if shift_s is not None:
             self.queue.on_board_restarted(shift_s)
         self.queue.update_jobs(self.remote.pop_refusal())

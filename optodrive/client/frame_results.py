@@ -71,9 +71,9 @@ def build_timeout_error(frame: int, timeout_s: float) -> LinkError:
 
 
 def raise_if_failed(result: FrameResult) -> FrameResult:
-    """Return the result. Raise its error if the frame was refused or its plan failed."""
+    """Return the result. Raise its error if the frame was refused, or its plan failed or was stopped."""
     if result.problem is not None:
         raise build_error(result.problem)
-    if result.status == "failed":
+    if result.status in ("failed", "stopped"):
         raise RefusedError(f"frame {result.frame}: {result.error}")
     return result

@@ -152,7 +152,7 @@ class DisplayOperations:
         return (yield from self._report(build_cancel_request(_get_plan_id(plan))))
 
     def wait_for_plan(self, plan: Plan | str) -> Exchange[Plan]:
-        """Wait until a plan has ended. Raise RefusedError if it failed."""
+        """Wait until a plan has ended. Raise RefusedError if it failed or was stopped."""
         poll = build_read_request(_get_plan_id(plan), pulses=False)
         while not (yield from self._policy.call(poll)).has_ended:
             yield Pause(POLL_PERIOD_S)

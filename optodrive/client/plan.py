@@ -43,9 +43,9 @@ class Plan(PlanReport):
         return heights_um
 
     def raise_if_failed(self) -> Self:
-        """Return the plan. Raise RefusedError if it failed."""
-        if self.status == "failed":
-            raise RefusedError(f"plan {self.plan} failed: {self.error}")
+        """Return the plan. Raise RefusedError if it failed or was stopped."""
+        if self.status in ("failed", "stopped"):
+            raise RefusedError(f"plan {self.plan} {self.status}: {self.error}")
         return self
 
     def __repr__(self) -> str:

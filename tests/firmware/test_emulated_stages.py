@@ -81,7 +81,7 @@ def test_two_boards_draw_a_frame_and_stop_together(rig):
     rig.run(0.5)
     assert rig.count_pulses() == counts
     assert rig.list_pulses()[:, 1].max() < stopped_s + LATE_MAX_S
-    assert (record.status, record.error) == ("failed", "ended by stop")
+    assert (record.status, record.error) == ("stopped", "ended by stop")
 
 
 def cut(rig, stage):

@@ -23,7 +23,7 @@ PATIENT_LEASE_S, PATIENT_LEAD_S = 1.0, 0.2
 """Maximum lease, and the maximum lead of streams, for tests that are about neither.
 
 A busy machine may stall a host for 0.1 s, and the bytes on a pseudo-terminal for some 10 ms."""
-ENDED = ("done", "superseded", "failed", "cancelled")
+ENDED = ("done", "superseded", "stopped", "failed", "cancelled")
 
 
 def wait_for(condition, what, nap_s=0.005):

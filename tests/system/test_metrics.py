@@ -36,7 +36,7 @@ def test_metrics_before_and_after_plans_and_a_stop(board, daemon):
     wait_for(lambda: len(board.of("pulse")) > 15, "pulses")
     wait_for(lambda: read_metrics()["optodrive_lease_age_seconds_count"] > 10, "leases")
     daemon.call("POST", "/v1/stop")
-    wait_for(lambda: read_metrics()["optodrive_plans_total", "failed"], "the plan's end")
+    wait_for(lambda: read_metrics()["optodrive_plans_total", "stopped"], "the plan's end")
     at_full_power_s = 0.010 * daemon.state()["totals"]["executed"] * 1.0 / 2.45
     wait_for(
         lambda: read_metrics()["optodrive_laser_on_seconds_total"] >= 0.99 * at_full_power_s,
@@ -44,7 +44,7 @@ def test_metrics_before_and_after_plans_and_a_stop(board, daemon):
     )
     assert read_metrics()["optodrive_laser_on_seconds_total"] < 1.2 * at_full_power_s + 0.01
     after = read_metrics()
-    assert after["optodrive_plans_total", "done"] == after["optodrive_plans_total", "failed"] == 1
+    assert after["optodrive_plans_total", "done"] == after["optodrive_plans_total", "stopped"] == 1
     assert after["optodrive_pulses_total", "executed"] == daemon.state()["totals"]["executed"] > 10
     assert after["optodrive_first_light_seconds_bucket", "+Inf"] == after["optodrive_first_light_seconds_count"] == 2
     assert after["optodrive_underruns_total"] == daemon.state()["board"]["underruns"]
@@ -71,7 +71,7 @@ def test_without_a_token_there_are_no_metrics(daemon):
 
 
 def test_the_counters_start_at_zero_for_every_status():
-    assert set(PlanCounters().ended) == {"done", "superseded", "failed", "cancelled"}
+    assert set(PlanCounters().ended) == {"done", "superseded", "stopped", "failed", "cancelled"}
 
 
 def _frames(engine):

@@ -85,7 +85,7 @@ def test_stop_while_pulses_run(board, daemon):
     assert answer["board"]["state"] == "DISARMED"
     assert_off_and_unarmed(board, ("DISARMED",))
     stopped = daemon.finished(plan)
-    assert stopped["status"] == "failed"
+    assert stopped["status"] == "stopped"
     assert stopped["error"] == "ended by stop"
     assert 0 < stopped["executed"] < stopped["planned"]
 

@@ -48,7 +48,7 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
     assert "recording" not in daemon.errors.read_text()
     with h5py.File(path) as file:
         runs, plans = file["runs"], file["plans"]
-        assert [plans[f"p{k}"].attrs["status"] for k in (1, 2, 3)] == ["done", "done", "failed"]
+        assert [plans[f"p{k}"].attrs["status"] for k in (1, 2, 3)] == ["done", "done", "stopped"]
         np.testing.assert_allclose(plans["p1/target_um"][0, [17, 18]], [90, 60])
         assert [json.loads(plans[f"p{k}/labels"][()]) for k in (1, 2, 3)] == [LABELS, LABELS, {}]
         parameters = [json.loads(plans[f"p{k}/parameters"][()]) for k in (1, 2, 3)]
@@ -65,7 +65,7 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
         count = sum(len(runs[name]["pulses"]) for name in runs)
         assert count == sum(answer["executed"] for answer in (*answers, stopped))
     trials = read_trials(path)
-    assert [(trial.status, trial.labels) for trial in trials] == [("done", LABELS), ("done", LABELS), ("failed", {})]
+    assert [(trial.status, trial.labels) for trial in trials] == [("done", LABELS), ("done", LABELS), ("stopped", {})]
     for trial, answer in zip(trials, (*answers, stopped), strict=True):
         assert trial.executed == {name: answer["onset"][name] for name in CLOCKS}
         assert trial.planned_pulses == answer["planned"]
@@ -108,5 +108,5 @@ def test_a_full_disk_ends_the_recording_and_not_the_display(board, make_daemon, 
 
 def test_an_existing_file_is_rejected_at_startup(board, make_daemon, tmp_path):
     (tmp_path / "taken.h5").write_text("dear")
-    with pytest.raises(AssertionError, match="does not exist"):
+    with pytest.raises(AssertionError, match="this one exists"):
         make_daemon(board, options=("--record-session", str(tmp_path / "taken.h5")))

@@ -138,7 +138,7 @@ class Engine:
         clock_shift_s = self._session.pop_clock_shift()
         if self._session.epoch != self._epoch:
             self._epoch = self._session.epoch
-            self._plan_queue.fail_all(self._session.epoch_reason, clock_shift_s or 0.0)
+            self._plan_queue.end_epoch(self._session.epoch_reason, clock_shift_s or 0.0)
         if clock_shift_s is not None:
             self._plan_queue.on_board_restarted(clock_shift_s)
 

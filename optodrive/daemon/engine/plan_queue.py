@@ -63,6 +63,7 @@ from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.protocol.point_cut import PointCut
 from optodrive.link.protocol.states import UNARMED_STATES
+from optodrive.link.service.epoch import DISARM, STOP
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.stage_loss import LostStage
@@ -305,7 +306,7 @@ class PlanQueue:
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
         if self._session.board.state in UNARMED_STATES and self.is_busy:
-            self.fail_all(self._describe_unarmed())
+            self.end_all(PlanStatus.FAILED, self._describe_unarmed())
         off_s = self._session.pop_drained()
         if off_s is not None:
             self._interrupt(off_s)
@@ -397,7 +398,7 @@ class PlanQueue:
         plan.update_execution()
         if record.timing_error is not None:
             self.accounts.timing.add(record.timing_error)
-        if status in (PlanStatus.FAILED, PlanStatus.CANCELLED):
+        if status in (PlanStatus.STOPPED, PlanStatus.FAILED, PlanStatus.CANCELLED):
             plan.end(status, error)
         self._executor.submit(simulate_plan, plan, status, error)
 
@@ -410,7 +411,7 @@ class PlanQueue:
                 run.job.delay(round(delay_s / self._session.tick_s))
 
     def end_running(self, status: PlanStatus, error: str | None, clock_shift_s: float = 0.0) -> None:
-        """End all running plans and record their executed pulses. clock_shift_s: as for fail_all."""
+        """End all running plans and record their executed pulses. clock_shift_s: as for end_all."""
         with self.lock:
             ended = list(self.running)
             self.running.clear()
@@ -422,8 +423,16 @@ class PlanQueue:
             if ended and not self.waiting:
                 self._thermal.rewind([run.plan for run in ended], clock_shift_s)
 
-    def fail_all(self, reason: str, clock_shift_s: float = 0.0) -> None:
-        """Fail all running and waiting plans.
+    def end_epoch(self, reason: str, clock_shift_s: float = 0.0) -> None:
+        """End all plans of an epoch that has ended.
+
+        reason: what ended it; clock_shift_s: as for end_all
+        """
+        status = PlanStatus.STOPPED if reason in (STOP, DISARM) else PlanStatus.FAILED
+        self.end_all(status, reason, clock_shift_s)
+
+    def end_all(self, status: PlanStatus, reason: str, clock_shift_s: float = 0.0) -> None:
+        """End all running and waiting plans.
 
         clock_shift_s: by which the board's clock has jumped since they were queued, see on_board_restarted
         """
@@ -431,11 +440,11 @@ class PlanQueue:
             waiting = list(self.waiting)
             self.waiting.clear()
             if self.running:
-                self.end_running(PlanStatus.FAILED, reason, clock_shift_s)
+                self.end_running(status, reason, clock_shift_s)
             elif waiting:
                 self._thermal.rewind(waiting[:1], clock_shift_s)
         for plan in waiting:
-            self._end_waiting(plan, PlanStatus.FAILED, reason)
+            self._end_waiting(plan, status, reason)
 
     def on_board_restarted(self, delay_s: float) -> None:
         """Shift heat and budget to the restarted clock of the board."""

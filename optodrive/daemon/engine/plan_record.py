@@ -1,4 +1,4 @@
-"""Records of submitted plans, from queued to done, superseded, failed or cancelled."""
+"""Records of submitted plans, from queued to done, superseded, stopped, failed or cancelled."""
 
 from dataclasses import dataclass, field
 from functools import cached_property

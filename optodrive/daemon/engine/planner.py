@@ -19,6 +19,7 @@ from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.planning_time import FACTOR, PlanningTime
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
 
 STALL_TIMEOUT_S = 2.0
@@ -132,7 +133,7 @@ class Planner:
         except Exception as error:  # of any kind: what cannot be proven is not played
             reason = f"what was left after an interruption could not be planned again: {error}"
             with suppress(LinkError):
-                self._run_in_loop(lambda: self._plan_queue.fail_all(reason))
+                self._run_in_loop(lambda: self._plan_queue.end_all(PlanStatus.FAILED, reason))
         finally:
             on_progress()
 

@@ -7,7 +7,7 @@ import { formatQuantity } from "./quantities.js";
 
 const POLL_MS = 400;
 const FRAMES_MAX = 500;
-const FINAL_STATUSES = ["done", "superseded", "failed", "cancelled"];
+const FINAL_STATUSES = ["done", "superseded", "stopped", "failed", "cancelled"];
 
 // Build the frames of a drawing: one, or several at a rate.
 export function buildFrames(heights, rateHz, seconds) {

@@ -4,7 +4,10 @@ from enum import StrEnum
 
 
 class PlanStatus(StrEnum):
-    """The status of a plan. That of a dry run stays `planned`."""
+    """The status of a plan. That of a dry run stays `planned`.
+
+    stopped: STOP or disarm ended it; failed: a fault, a lost link or a lost caller did
+    """
 
     PLANNED = "planned"
     QUEUED = "queued"
@@ -12,6 +15,7 @@ class PlanStatus(StrEnum):
     PAUSED = "paused"
     DONE = "done"
     SUPERSEDED = "superseded"
+    STOPPED = "stopped"
     FAILED = "failed"
     CANCELLED = "cancelled"
 
@@ -25,7 +29,7 @@ class PlanStatus(StrEnum):
         return status in TRANSITIONS[self]
 
 
-ENDS = (PlanStatus.DONE, PlanStatus.SUPERSEDED, PlanStatus.FAILED, PlanStatus.CANCELLED)
+ENDS = (PlanStatus.DONE, PlanStatus.SUPERSEDED, PlanStatus.STOPPED, PlanStatus.FAILED, PlanStatus.CANCELLED)
 TRANSITIONS: dict[PlanStatus, frozenset[PlanStatus]] = {
     PlanStatus.PLANNED: frozenset({PlanStatus.QUEUED, PlanStatus.RUNNING}),  # running at once: spliced behind another
     PlanStatus.QUEUED: frozenset({PlanStatus.RUNNING, *ENDS}),

@@ -1,5 +1,8 @@
 """Epochs: periods between two events that stop the light."""
 
+STOP, DISARM = "ended by stop", "ended by disarm"
+"""Reasons of a caller who wants the light to end, for which a plan is stopped rather than failed."""
+
 
 class Epoch:
     """The present epoch.

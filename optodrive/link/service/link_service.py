@@ -40,7 +40,7 @@ from optodrive.core.ipc import IpcError, Message
 from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES
 from optodrive.link.service.clients import Clients
 from optodrive.link.service.control import Control
-from optodrive.link.service.epoch import Epoch
+from optodrive.link.service.epoch import DISARM, STOP, Epoch
 from optodrive.link.service.pauses import PAUSE_MAX_S, Pauses
 from optodrive.link.service.point_handover import PointHandover
 from optodrive.link.service.results import build_result
@@ -160,9 +160,9 @@ class LinkService:
         command, request_id = message.kind, int(message.fields["id"])
         try:
             if command == "stop":
-                self.go_dark("ended by stop")
+                self.go_dark(STOP)
             elif command == "disarm":
-                self._end_epoch("ended by disarm")
+                self._end_epoch(DISARM)
             self._require_link()
             if command == "disarm":
                 self._boards.disarm()

@@ -106,7 +106,7 @@ def test_stop_ends_running_and_waiting_plans_and_says_so(rig):
     running, waiting = submit(rig, build_train(3.0)), submit(rig, build_frame())
     rig.until(lambda: running.executed_count > 5)
     stop(rig)
-    assert [record.status for record in (running, waiting)] == ["failed", "failed"]
+    assert [record.status for record in (running, waiting)] == ["stopped", "stopped"]
     assert running.error == waiting.error == "ended by stop"
     count = len(rig.list_emitted())
     rig.arm()
@@ -288,7 +288,7 @@ def test_heat_and_budget_follow_a_restart_of_the_board_s_clock(rig):
 def test_a_plan_may_follow_a_new_link_process_at_once(rig):
     record = submit(rig, build_train(3.0))
     rig.until(lambda: record.executed_count > 5)
-    rig.queue.fail_all("the link process has ended")  # up to a lease from now pulses may have started
+    rig.queue.end_epoch("the link process has ended")  # up to a lease from now pulses may have started
     rig.queue.on_board_restarted(0.0)
     assert finish(rig, submit(rig, build_frame(60.0))).status == "done"
 

@@ -160,7 +160,7 @@ def test_stop_ends_the_light_of_all_boards(rig):
     assert list_states(rig) == {BoardState.DISARMED}
     assert rig.list_pulses()[:, 1].max() < stopped_s + 0.002
     rig.run(0.1)
-    assert (record.status, record.error) == ("failed", "ended by stop")
+    assert (record.status, record.error) == ("stopped", "ended by stop")
 
 
 def test_the_result_of_stop_waits_for_the_last_board(rig):
@@ -351,7 +351,7 @@ def test_a_start_that_waits_in_vain_is_refused_and_stop_ends_the_wait(monkeypatc
     assert re.search(r"stage 's1': after 3.\d s of repeated exchanges its clock is known to \d{4} µs", record.error)
     assert rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))["error"] is None
     run(rig, 0.01)
-    assert (second.status, second.error) == ("failed", "ended by stop")
+    assert (second.status, second.error) == ("stopped", "ended by stop")
     assert not len(rig.list_pulses())
 
 
