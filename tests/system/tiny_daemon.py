@@ -14,15 +14,16 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+from optodrive.core import forking
 from optodrive.core.beat import BeatWriter
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
+from optodrive.core.forking import fork_with_beat
 from optodrive.core.ipc import IpcError, Message, MessageSocket
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
-from optodrive.daemon.supervisor import forking, supervisor
+from optodrive.daemon.supervisor import supervisor
 from optodrive.daemon.supervisor.child import Child
-from optodrive.daemon.supervisor.forking import fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.supervisor import Supervisor
 

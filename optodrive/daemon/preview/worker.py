@@ -4,16 +4,17 @@ A job that exceeds its time ends with its worker. Fresh workers have the priorit
 builds that take longer than usual, run at low priority and are the last job of their worker.
 """
 
-import ctypes
 import os
 import resource
 import signal
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from optodrive.core.errors import InputError, OptodriveError
+from optodrive.core.forking import describe_end, fork_child
 from optodrive.core.ipc import Message, MessageDecoder, MessageSocket, encode_message
 from optodrive.daemon.preview.jobs import build_refusal
 
@@ -29,7 +30,6 @@ JOBS_MAX = 200
 """Jobs after which a worker is replaced."""
 LARGE_BYTES = 1_000_000
 """A worker is replaced after a job of this size, because it keeps the memory."""
-PR_SET_PDEATHSIG = 1
 JobRunner = Callable[[Message], Message]
 
 
@@ -54,10 +54,7 @@ class Worker:
     def __init__(self, run_job: JobRunner) -> None:
         """Fork the worker. The calling process must have no other threads."""
         parent_end, child_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        parent = os.getpid()
-        self.pid = os.fork()
-        if self.pid == 0:
-            _run_child(child_end, run_job, parent)
+        self.pid = fork_child(lambda: _serve(child_end, run_job), "opto-worker", [child_end.fileno()])
         child_end.close()
         self.connection = MessageSocket(parent_end)
         self.deadline_s = self._demote_at_s = float("inf")
@@ -109,36 +106,20 @@ class Worker:
             return None
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
             return build_timeout_error(self._kind)
-        how = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"status {os.WEXITSTATUS(status)}"
-        return OptodriveError(f"the process that worked on the request ended with {how}")
+        return OptodriveError(f"the process that worked on the request: {describe_end(status)}")
 
 
-def _run_child(connection: socket.socket, run_job: JobRunner, parent: int) -> None:
-    """Serve jobs until the parent closes the connection. Never return."""
-    try:
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, signal.SIG_DFL)
-        _close_inherited(connection.fileno())
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        base_bytes = _read_data_bytes()
-        decoder = MessageDecoder()
-        while os.getppid() == parent:
-            data = connection.recv(1 << 20)
-            if not data:
-                break
+def _serve(connection: socket.socket, run_job: JobRunner) -> int:
+    """Serve jobs until the parent closes the connection. Return the exit status."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    base_bytes = _read_data_bytes()
+    decoder = MessageDecoder()
+    with suppress(OSError):  # the parent has closed it meanwhile, and no longer waits for the result
+        while data := connection.recv(1 << 20):
             for job in decoder.feed(data):
                 _limit(job.kind, base_bytes)
                 connection.sendall(encode_message(_run_safely(run_job, job)))
-    finally:
-        os._exit(0)
-
-
-def _close_inherited(kept: int) -> None:
-    """Close the descriptors of the parent's other connections, which would hide their end from the peers."""
-    highest = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir())
-    os.closerange(3, kept)
-    os.closerange(kept + 1, highest + 1)
+    return 0
 
 
 def _read_data_bytes() -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 from optodrive.core.beat import BEAT, FAILED, PACKET_MAX_BYTES, READY
 from optodrive.core.clock import Clock
-from optodrive.daemon.supervisor.forking import describe_end
+from optodrive.core.forking import describe_end
 
 HANG_S = 2.0
 """A child counts as hung after this time without a beat."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
+from optodrive.core.forking import execute_module, fork_with_beat
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES
 from optodrive.daemon.api.tokens import Tokens, load_daemon_tokens
@@ -23,7 +24,6 @@ from optodrive.daemon.reload import ConfigReloader
 from optodrive.daemon.runtime_folder import SHARED_LINK_MODE, RuntimeFolder, open_runtime_folder
 from optodrive.daemon.server.listeners import BACKLOG, build_local_url, open_tcp_listener
 from optodrive.daemon.supervisor.child import Child
-from optodrive.daemon.supervisor.forking import execute_module, fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.reload_handler import ReloadHandler
 from optodrive.daemon.supervisor.supervisor import Supervisor

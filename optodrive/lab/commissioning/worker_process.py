@@ -3,10 +3,8 @@
 A thread would share the interpreter's lock, which would delay the lease on a busy machine.
 """
 
-import ctypes
 import multiprocessing as mp
 import os
-import signal
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,13 +13,13 @@ from types import TracebackType
 from typing import Any, Self
 
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
+from optodrive.core.forking import die_with_parent
 from optodrive.core.processes import is_suspended
 
 NICE = 5
 LOOK_PERIOD_S = 0.1
 SUSPENDED_MAX_S = 2.0
 """A worker that a signal has stopped for this time is given up."""
-PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
@@ -95,7 +93,7 @@ class WorkerProcess:
 def _serve(pipe: Connection) -> None:
     # A new session: Ctrl-C at the terminal then reaches only the parent, and Linux schedules the processor by session.
     os.setsid()
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # also while it is suspended
+    die_with_parent()
     os.setpriority(os.PRIO_PROCESS, 0, NICE)
     while True:
         try:

@@ -5,7 +5,6 @@ ends it.
 """
 
 import argparse
-import ctypes
 import gc
 import select
 import signal
@@ -19,6 +18,7 @@ from pathlib import Path
 from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import InputError, OptodriveError
+from optodrive.core.forking import die_with_parent
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.link.service.client_sockets import ClientSockets
 from optodrive.link.service.link_service import LinkService
@@ -31,7 +31,6 @@ from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.link.transport.threaded_transport import ThreadedTransport
 
-PR_SET_PDEATHSIG = 1
 CAPTURES_MAX = 1000
 
 
@@ -133,11 +132,6 @@ class LinkProcess:
         self._wakeup_write.close()
 
 
-def end_with_parent() -> None:
-    """Request SIGTERM when the supervisor dies, besides the end of file on its channel."""
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
 def open_capture(path: Path, clock: Clock, supervisor: BeatWriter) -> LinkCaptureWriter:
     """Open a capture at the path, or with a number after a restart. Raise InputError if it cannot be written."""
 
@@ -184,7 +178,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--settings", type=Path, required=True, help="file of the settings, JSON")
     parser.add_argument("--supervisor", type=int, required=True, help="descriptor of the supervisor's channel")
     options = parser.parse_args(arguments)
-    end_with_parent()
+    die_with_parent(signal.SIGTERM)  # besides the end of file on its channel
     supervisor = BeatWriter(options.supervisor)
     with ExitStack() as exit_stack:
         exit_stack.callback(supervisor.close)

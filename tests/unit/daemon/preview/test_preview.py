@@ -238,7 +238,7 @@ def test_a_worker_that_crashes_costs_only_its_job(start):
     preview.build(1, b"bad")
     status, document = problem(preview.result())
     assert status == 500
-    assert document["detail"] == "the process that worked on the request ended with signal 11"
+    assert document["detail"] == "the process that worked on the request: killed by SIGSEGV"
     assert_serves(preview)
 
 

@@ -1,4 +1,7 @@
-"""Start of child processes: forks of the loaded supervisor, and the link process in a fresh interpreter."""
+"""Start of child processes: forks of a loaded process, and modules in a fresh interpreter.
+
+A child must never outlive the process that watches it: the kernel ends it with its parent, whatever that dies of.
+"""
 
 import ctypes
 import os
@@ -19,6 +22,11 @@ IGNORED_SIGNALS = (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE, signal.SIGXFSZ)
 A write to a closed pipe or beyond the size limit of files is an error of that write, as in every Python program.
 """
 _libc = ctypes.CDLL(None, use_errno=True)
+
+
+def die_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
+    """Let the kernel send this process a signal when its parent dies. SIGKILL ends it even while it is suspended."""
+    _libc.prctl(PR_SET_PDEATHSIG, number, 0, 0, 0)
 
 
 def fork_child(run: Callable[[], int], name: str, kept: Iterable[int]) -> int:
@@ -54,7 +62,7 @@ def fork_child(run: Callable[[], int], name: str, kept: Iterable[int]) -> int:
 
 def _separate(parent: int, name: str, kept: set[int]) -> None:
     """Give up the parent's signal handlers and descriptors, and let this process die with the parent."""
-    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    die_with_parent()
     _libc.prctl(PR_SET_NAME, name.encode(), 0, 0, 0)
     if os.getppid() != parent:  # it died before the signal was requested
         os._exit(1)
