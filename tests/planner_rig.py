@@ -1,6 +1,7 @@
 """The planner in virtual time: its real queue and session over the real link service and a simulated board."""
 
 from concurrent.futures import Executor, Future
+from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.push import Push
 from optodrive.link.board_setup import build_scales
-from optodrive.link.service import remote_session
+from optodrive.link.service import link_connection
 from optodrive.link.service.remote_session import RemoteSession
 
 DISPLAY = DISPLAYS["display-16"]
@@ -68,13 +69,6 @@ class ServiceChannel:
         self._rig.leave(PLANNER)
 
 
-class DirectSession(RemoteSession):
-    """A session on a channel in place of a socket."""
-
-    def attach(self, channel):
-        self._socket = channel
-
-
 class PlannerRig(ServiceRig):
     """Planner, queue and session on a link service with its board, in one thread and in virtual time.
 
@@ -85,10 +79,10 @@ class PlannerRig(ServiceRig):
     def __init__(self, monkeypatch, queue_type=PlanQueue, display=DISPLAY, **options):
         super().__init__(**options)
         # A reply is there as soon as the request has been sent.
-        monkeypatch.setattr(remote_session, "select", SimpleNamespace(select=lambda *_: ([], [], [])))
+        monkeypatch.setattr(link_connection, "select", SimpleNamespace(select=lambda *_: ([], [], [])))
         self.hello_all()
-        self.remote = DirectSession(build_scales(display.config), self.clock)
-        self.remote.attach(ServiceChannel(self))
+        self.remote = RemoteSession(build_scales(display.config), Path("nowhere"), self.clock)
+        self.remote.connection.attach(ServiceChannel(self))
         self.store = PlanStore()
         self.queue = queue_type(display, self.remote, self.store, InlineExecutor())
         self.before_loop_action = lambda: None
@@ -108,7 +102,7 @@ class PlannerRig(ServiceRig):
 
     def loop_once(self):
         """Run one iteration of the engine's loop."""
-        self.remote.receive()
+        self.remote.connection.receive()
         shift_s = self.remote.pop_clock_shift()
         if self.remote.epoch != self._seen_epoch:
             self._seen_epoch = self.remote.epoch

@@ -1,6 +1,6 @@
 """Start of child processes: forks of a loaded process, and modules in a fresh interpreter.
 
-A child must never outlive the process that watches it: the kernel ends it with its parent, whatever that dies of.
+No child outlives the process that watches it: the kernel ends it with its parent, also when that is killed.
 """
 
 import ctypes

@@ -1,10 +1,10 @@
 """Loop of one thread over message connections, and the server that accepts them on a Unix socket."""
 
-import selectors
+import select
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
 from optodrive.core.unix_listener import open_unix_listener
@@ -16,78 +16,81 @@ MessageHandler = Callable[[MessageSocket, Message], None]
 LossHandler = Callable[[MessageSocket], None]
 
 
-class _Connection(NamedTuple):
+class Watched(Protocol):
+    """An object with a descriptor that a loop can wait for."""
+
+    def fileno(self) -> int:
+        """Return the descriptor, negative while there is none."""
+
+
+class _Handlers(NamedTuple):
     on_message: MessageHandler
     on_lost: LossHandler
 
 
 class MessageLoop:
-    """Connections and other descriptors that one thread waits for. That thread calls all methods."""
+    """Connections and other descriptors that one thread waits for. That thread calls all methods.
+
+    Each wait asks anew for the descriptors: one may be closed, and given to another connection, between two waits.
+    """
 
     def __init__(self) -> None:
-        self._selector = selectors.DefaultSelector()
+        self._connections: dict[MessageSocket, _Handlers] = {}
+        self._watched: dict[Watched, Callable[[], object]] = {}
 
     def add(self, connection: MessageSocket, on_message: MessageHandler, on_lost: LossHandler) -> None:
         """Serve a connection until it ends. Call on_lost after its end, unless `remove` ended it."""
-        self._selector.register(connection, selectors.EVENT_READ, _Connection(on_message, on_lost))
+        self._connections[connection] = _Handlers(on_message, on_lost)
 
     def remove(self, connection: MessageSocket) -> None:
         """Close a connection."""
-        with suppress(KeyError):
-            self._selector.unregister(connection)
+        self._connections.pop(connection, None)
         connection.close()
 
-    def watch(self, descriptor: Any, on_readable: Callable[[], object]) -> None:
-        """Call a function whenever a descriptor is readable."""
-        self._selector.register(descriptor, selectors.EVENT_READ, on_readable)
+    def watch(self, watched: Watched, on_ready: Callable[[], object]) -> None:
+        """Call a function whenever a descriptor is readable, or writable if it `wants_write`."""
+        self._watched[watched] = on_ready
 
-    def unwatch(self, descriptor: Any) -> None:
-        """Stop watching a descriptor."""
-        self._selector.unregister(descriptor)
+    def unwatch(self, watched: Watched) -> None:
+        """Stop watching."""
+        del self._watched[watched]
 
     def poll(self, timeout_s: float) -> None:
         """Wait for at most timeout_s, serve the watched descriptors, then process the messages that have arrived."""
-        ready = self._selector.select(max(0.0, timeout_s))
-        for key, events in sorted(ready, key=lambda item: isinstance(item[0].data, _Connection)):
-            if not isinstance(key.data, _Connection):
-                key.data()
-            elif isinstance(key.fileobj, MessageSocket) and not key.fileobj.is_closed:
-                self._serve(key.fileobj, key.data, events)
+        poll = select.poll()
+        for each in (*self._watched, *self._connections):
+            if each.fileno() >= 0:
+                poll.register(each, select.POLLIN | (select.POLLOUT if getattr(each, "wants_write", False) else 0))
+        ready = {descriptor for descriptor, _ in poll.poll(max(0.0, timeout_s) * 1e3)}
+        for watched, on_ready in list(self._watched.items()):
+            if watched.fileno() in ready:
+                on_ready()
+        for connection, handlers in list(self._connections.items()):
+            if connection.fileno() in ready:
+                self._serve(connection, handlers)
 
     def send(self, connection: MessageSocket, message: Message) -> None:
         """Send a message, or nothing to a connection that has ended. A peer that does not read is lost."""
         if connection.is_closed:
             return
-        handlers = self._selector.get_key(connection).data
         try:
             connection.send(message)
         except IpcClosed:
-            self._lose(connection, handlers)
-        else:
-            self._update_interest(connection, handlers)
+            self._lose(connection)
 
-    def close(self) -> None:
-        """Close the loop. Its connections are closed by `remove`."""
-        self._selector.close()
-
-    def _serve(self, connection: MessageSocket, handlers: _Connection, events: int) -> None:
+    def _serve(self, connection: MessageSocket, handlers: _Handlers) -> None:
         try:
-            if events & selectors.EVENT_WRITE:
+            if connection.wants_write:
                 connection.flush()
-                self._update_interest(connection, handlers)
-            messages = connection.receive() if events & selectors.EVENT_READ else []
+            messages = connection.receive()
         except IpcError:
-            self._lose(connection, handlers)
+            self._lose(connection)
             return
         for message in messages:
             handlers.on_message(connection, message)
 
-    def _update_interest(self, connection: MessageSocket, handlers: _Connection) -> None:
-        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if connection.wants_write else 0)
-        if self._selector.get_key(connection).events != events:
-            self._selector.modify(connection, events, handlers)
-
-    def _lose(self, connection: MessageSocket, handlers: _Connection) -> None:
+    def _lose(self, connection: MessageSocket) -> None:
+        handlers = self._connections[connection]
         self.remove(connection)
         handlers.on_lost(connection)
 

@@ -65,8 +65,8 @@ class RiggedEngine(Engine):
     def __init__(self, folder, config, port):
         display = DisplayModel.from_config(config)
         self.link = LinkProcess(folder, port, lease_s=PATIENT_LEASE_S, config=config)
-        session = RemoteSession(build_scales(config), MonotonicClock())
-        super().__init__(display, session, self.link.path, MonotonicClock())
+        session = RemoteSession(build_scales(config), self.link.path, MonotonicClock())
+        super().__init__(display, session, MonotonicClock())
         self.failure = None
         self.web = WebStandIn(self.link.path)
         self._ending = threading.Event()

@@ -52,8 +52,8 @@ class LinkProcess:
         return json.loads(packet) if packet else {"kind": "end"}
 
     def open_planner(self):
-        self.planner = RemoteSession(build_scales(CONFIG), MonotonicClock())
-        self.planner.connect(self.path)
+        self.planner = RemoteSession(build_scales(CONFIG), self.path, MonotonicClock())
+        self.planner.connect_if_due()
         return self.planner
 
     def open_client(self, role):
@@ -68,9 +68,9 @@ class LinkProcess:
             self.planner.beat(True)
             for client in self.clients:
                 client.beat()
-            watched = [item for item in (self.planner, *self.clients) if item.fileno() >= 0]
+            watched = [item for item in (self.planner.connection, *self.clients) if item.fileno() >= 0]
             select.select(watched, [], [], min(BEAT_INTERVAL_S, duration_s))
-            self.planner.receive()
+            self.planner.connection.receive()
             for client in self.clients:
                 client.receive()
 
@@ -84,7 +84,7 @@ class LinkProcess:
         return self.until(lambda: client.results.get(request_id))
 
     def stop(self):
-        for client in (*self.clients, self.planner):
+        for client in (*self.clients, self.planner and self.planner.connection):
             if client is not None:
                 client.close()
         self.supervisor.close()

@@ -102,7 +102,7 @@ def test_a_plan_runs_through_the_planners_view(link, board):
     assert job.first_sent_tick < reported.on_tick[0]
     link.until(lambda: link.planner.is_ready)
     assert link.planner.stats["round_trip_ms"] > 0
-    assert link.planner.lease.ages.sum > 0
+    assert link.planner.lease_ages.sum > 0
 
 
 def test_splice_and_truncation_through_the_planners_view(link, board):
@@ -141,7 +141,7 @@ def test_flush_keeps_the_board_armed(link, board):
 @pytest.mark.parametrize("role", ["planner", "web"])
 def test_the_end_of_planner_or_web_turns_the_gate_off_at_once(link, board, role):
     emit(link, board)
-    link.planner.close() if role == "planner" else link.web.close()
+    link.planner.connection.close() if role == "planner" else link.web.close()
     await_dark(board)
     assert read_state(board) == BoardState.DISARMED
 
@@ -195,7 +195,9 @@ def test_sigterm_ends_it_dark(link, board):
     assert link.process.wait() == 0
     await_dark(board)
     assert not link.path.exists()
-    wait_for(lambda: link.planner.receive() or not link.planner.is_attached, "the end of the connection")
+    wait_for(
+        lambda: link.planner.connection.receive() or not link.planner.connection.is_open, "the end of the connection"
+    )
     assert (link.planner.connected, link.planner.epoch) == (False, 0)
     assert "has ended" in link.planner.link_error
 

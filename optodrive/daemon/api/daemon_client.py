@@ -20,14 +20,13 @@ from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.link.service.link_connection import NO_REQUEST
 from optodrive.link.service.results import build_error
 from optodrive.link.session.board_connector import CONNECTING
 from optodrive.planning.display_model import DisplayModel
 
 EPOCHS_MAX = 1000
 ENDED_MAX = 1000
-NO_REQUEST = 0
-"""Identifier of a request whose result nobody awaits."""
 STREAMED_BODY_MAX_BYTES = 32_768
 """Largest body that the planner parses: a frame of 1,511 targets has 20 kB, and no such body takes over 10 ms."""
 NO_EPOCH = 0

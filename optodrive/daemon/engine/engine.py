@@ -8,7 +8,6 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -27,7 +26,6 @@ from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
 from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.engine.session_connection import SessionConnection
 from optodrive.daemon.engine.state_report import build_planner_state, build_state_report
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.message_loop import MessageLoop
@@ -67,7 +65,6 @@ class Engine:
         self,
         display: DisplayModel,
         session: RemoteSession,
-        link_socket: Path,
         clock: Clock,
         memory: ThermalMemory | None = None,
     ) -> None:
@@ -79,7 +76,6 @@ class Engine:
         self.on_warning: Callable[[str], None] = lambda line: None
         self._clock = clock
         self._session = session
-        self._connection = SessionConnection(session, link_socket, self.message_loop, clock)
         self._plan_store = PlanStore()
         self._plan_counters = PlanCounters()
         self._plan_store.end_callbacks.append(self._plan_counters.record_end)
@@ -104,6 +100,7 @@ class Engine:
         self._published_cause: LinkCause | None = None
         self._published_loss: LostStage | None = None
         self.message_loop.watch(self.commands, lambda: None)
+        self.message_loop.watch(session.connection, session.connection.receive)
 
     # --- loop ---------------------------------------------------------------------------------------------------
 
@@ -119,12 +116,13 @@ class Engine:
                 self.run_once(LOOP_WAIT_S)
                 self.on_loop()
         finally:
-            self._connection.close()
+            self._session.connection.close("the planner has ended its connection to the link process")
 
     def run_once(self, wait_s: float) -> None:
         """Run one loop iteration, which waits at most wait_s for messages and commands."""
         self.commands.run_pending()
-        self._connection.exchange(wait_s)
+        self._session.connect_if_due()
+        self.message_loop.poll(wait_s)
         self._follow_link()
         self._plan_queue.update_jobs(self._session.pop_refusal())
         self._planner.follow_pause()
@@ -158,7 +156,7 @@ class Engine:
 
     def _beat(self) -> None:
         """Prove to the link process and to the supervisor that the loop runs."""
-        self._connection.beat(self._planner.is_alive)
+        self._session.beat(self._planner.is_alive)
         self.on_beat()
 
     def _publish_cause(self) -> None:
@@ -181,7 +179,6 @@ class Engine:
         """End the threads and close the loop, after run()."""
         self._planning_executor.shutdown(wait=False, cancel_futures=True)
         self._simulation_executor.shutdown(wait=False, cancel_futures=True)
-        self.message_loop.close()
         self.commands.close()
 
     def _run_in_loop(self, action: Callable[[], T]) -> T:

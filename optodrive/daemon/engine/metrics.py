@@ -68,9 +68,9 @@ def render_metrics(snapshot: StateReport, counters: PlanCounters, session: Remot
         counters.min_headroom_k,
     )
     page.add_histogram("first_light_seconds", "Time from a plan's arrival to its first emission", counters.first_light)
-    page.add_histogram("lease_age_seconds", "Age of the lease at its renewal", session.lease.ages)
+    page.add_histogram("lease_age_seconds", "Age of the lease at its renewal", session.lease_ages)
     page.add_gauge("lease_seconds", "Age of the lease at which the board turns the gate off", lease_s)
-    page.add_gauge("lease_slack_seconds", "Minimum remaining lease at a renewal", session.lease.slack_s)
+    page.add_gauge("lease_slack_seconds", "Minimum remaining lease at a renewal", session.lease_slack_s)
     return page.render()
 
 

@@ -163,7 +163,7 @@ class PlanQueue:
         displacement meanwhile decreases by more than cooling_max_m, m.
         Raise StoppedError if the epoch of its request has passed, or if the token of its caller was revoked.
         """
-        self._session.receive()  # a STOP that has been answered is known from here on
+        self._session.connection.receive()  # a STOP that has been answered is known from here on
         record = plan.record
         with self.lock:
             self.require_epoch(plan.epoch)

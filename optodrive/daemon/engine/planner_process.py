@@ -36,8 +36,8 @@ def run_planner(
     with ExitStack() as exit_stack:
         log = open_daemon_log()
         exit_stack.callback(log.close)
-        session = RemoteSession(build_scales(display.config), clock)
-        engine = Engine(display, session, folder.link_socket, clock, memory)
+        session = RemoteSession(build_scales(display.config), folder.link_socket, clock)
+        engine = Engine(display, session, clock, memory)
         engine.on_warning = log.warn
         recorder = start_session_recorder(engine, session_path, log)
         if recorder is not None:

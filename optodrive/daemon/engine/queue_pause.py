@@ -59,7 +59,7 @@ class QueuePause:
 
     def require_no_pause(self) -> None:
         """Raise NotReadyError while the light is paused. An interruption by a lost stage is over in a moment."""
-        self._session.receive()
+        self._session.connection.receive()
         if self.is_held and not self._session.is_interrupted:
             raise NotReadyError("the light is paused, and a streamed frame shows the present; resume first")
 
@@ -96,7 +96,7 @@ class QueuePause:
 
     def commit_restart(self, restart: Restart) -> bool:
         """Let the queue go on. Return False if the queue has changed meanwhile, or the light is paused again."""
-        self._session.receive()  # a STOP or a pause that has been answered is known from here on
+        self._session.connection.receive()  # a STOP or a pause that has been answered is known from here on
         with self._lock:
             if not self.can_restart or tuple(self._waiting) != restart.plans or self.off_s != restart.off_s:
                 return False

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from optodrive.core.beat import BeatWriter, SupervisorGoneError
-from optodrive.core.ipc import IpcError, Message, MessageSocket
+from optodrive.core.clock import MonotonicClock
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.api.access_policy import AccessPolicy
@@ -28,12 +28,12 @@ from optodrive.daemon.server.listeners import raise_descriptor_limit
 from optodrive.daemon.server.request_head import Rank, parse_head, peek_head, rank_request
 from optodrive.daemon.server.waiting_room import Waiting, WaitingRoom
 from optodrive.device.config_sections import DaemonSection
+from optodrive.link.service.link_connection import LinkConnection
 
 TURN_MAX_S = 0.05
 """Interval of the beats, and longest wait of the loop."""
 BUSY_PAUSE_S = 0.003
 """Pause after a turn that left something to accept: real-time work must leave time for the other processes."""
-RETRY_S = 0.1
 NICE = -15
 """Priority where real-time scheduling is not permitted."""
 
@@ -56,53 +56,6 @@ def run_acceptor(
         acceptor.close()
 
 
-class StopSender:
-    """Connection to the link process, for STOP only. It connects again when it is due."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._connection: MessageSocket | None = None
-        self._connect_at_s = 0.0
-        self._number = 0
-
-    def fileno(self) -> int:
-        """Return the descriptor that is readable when `receive` has something to do, −1 without a connection."""
-        return -1 if self._connection is None else self._connection.fileno()
-
-    def send(self) -> None:
-        """Send STOP, if the link process runs."""
-        self._number += 1
-        try:
-            if self._connection is not None:
-                self._connection.send(Message("stop", {"id": self._number}))
-        except IpcError:
-            self.close()
-
-    def receive(self) -> None:
-        """Discard the messages that have arrived."""
-        try:
-            if self._connection is not None:
-                self._connection.receive()
-        except IpcError:
-            self.close()
-
-    def connect(self, now_s: float) -> None:
-        """Connect if there is no connection."""
-        if self._connection is not None or now_s < self._connect_at_s:
-            return
-        self._connect_at_s = now_s + RETRY_S
-        with suppress(OSError, IpcError):
-            connection = MessageSocket.connect(self._path)
-            connection.send(Message("hello", {"role": "acceptor"}))
-            self._connection = connection
-
-    def close(self) -> None:
-        """Close the connection."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
-
-
 class Acceptor:
     """Loop over the listening sockets, the waiting connections, the web process, the link process and the supervisor.
 
@@ -121,7 +74,7 @@ class Acceptor:
         self._policy = policy
         self._daemon = daemon
         self._beat = beat
-        self._link = StopSender(link_path)
+        self._link = LinkConnection(link_path, "acceptor", MonotonicClock())
         self._room = WaitingRoom(listeners, self._rank, time.monotonic)
         self._room.on_unserved = self._report_unserved
         self._listener = open_unix_listener(path, 0o600, 1, "socket of the acceptor process", socket.SOCK_SEQPACKET)
@@ -139,7 +92,7 @@ class Acceptor:
 
     def run(self) -> None:
         """Serve until `end` or the end of the supervisor."""
-        self._link.connect(time.monotonic())
+        self._link.connect_if_due()
         self._beat.report_ready()
         while not self._is_ending:
             try:
@@ -169,7 +122,7 @@ class Acceptor:
         self._hand_over()
         if now_s >= self._beat_at_s:
             self._beat_at_s = now_s + TURN_MAX_S
-            self._link.connect(now_s)
+            self._link.connect_if_due()
             self._room.close_expired()
             self._send_beats()
         if self._beat.fileno() in ready:
@@ -196,7 +149,7 @@ class Acceptor:
         """Rank a request. A permitted STOP goes to the link process before anything else happens."""
         rank = rank_request(parse_head(head), self._policy)
         if rank is Rank.STOP:
-            self._link.send()
+            self._link.send_stop()
         return rank
 
     # --- supervisor -------------------------------------------------------------------------------------------------

@@ -1,34 +1,29 @@
 """The supervisor's view of the link process: its last status, and STOP."""
 
-from math import inf
 from pathlib import Path
 from typing import Any
 
 from optodrive.core.clock import Clock
-from optodrive.core.ipc import IpcError, Message, MessageSocket
+from optodrive.core.ipc import Message
+from optodrive.link.service.link_connection import LinkConnection
 from optodrive.link.session.board_connector import CONNECTING
 
 CONNECT_INTERVAL_S = 0.02
 
 
 class LinkView:
-    """Client of the link process, which connects again when it is due.
-
-    status: fields of the last status, empty without a connection; is_stopped: whether the link has answered STOP
-    """
+    """Client of the link process. status: fields of the last status, empty without a connection."""
 
     def __init__(self, path: Path, clock: Clock) -> None:
         self.status: dict[str, Any] = {}
-        self.is_stopped = False
-        self._path = path
-        self._clock = clock
-        self._connection: MessageSocket | None = None
-        self._connect_at_s = -inf
+        self._connection = LinkConnection(path, "supervisor", clock, CONNECT_INTERVAL_S)
+        self._connection.on_message = self._on_message
+        self._connection.on_lost = self._on_lost
 
     @property
     def descriptors(self) -> list[int]:
         """Descriptor that becomes readable for a status, if there is a connection."""
-        return [] if self._connection is None else [self._connection.fileno()]
+        return [self._connection.fileno()] if self._connection.is_open else []
 
     @property
     def board_state(self) -> str:
@@ -44,39 +39,24 @@ class LinkView:
 
     def receive(self) -> None:
         """Process the messages that have arrived, and connect if there is no connection."""
-        try:
-            if self._connection is None:
-                self._connect()
-            for message in [] if self._connection is None else self._connection.receive():
-                if message.kind == "status":
-                    self.status = message.fields
-                elif message.kind == "result":
-                    self.is_stopped = True
-        except IpcError:
-            self.close()
+        self._connection.connect_if_due()
+        self._connection.receive()
 
-    def _connect(self) -> None:
-        now_s = self._clock.now_s()
-        if now_s < self._connect_at_s:
-            return
-        self._connect_at_s = now_s + CONNECT_INTERVAL_S
-        try:
-            self._connection = MessageSocket.connect(self._path)
-        except OSError:
-            return
-        self._connection.send(Message("hello", {"role": "supervisor"}))
+    def _on_message(self, message: Message) -> None:
+        if message.kind == "status":
+            self.status = message.fields
+
+    def _on_lost(self) -> None:
+        self.status = {}
 
     def stop(self) -> None:
-        """Send STOP. It is answered when the board has confirmed it, or at once if there is no board."""
-        self.is_stopped = False
-        try:
-            if self._connection is not None:
-                self._connection.send(Message("stop", {"id": 1}))
-        except IpcError:
-            self.close()
+        """Send STOP."""
+        self._connection.send_stop()
+
+    def stop_and_wait(self, timeout_s: float) -> None:
+        """Send STOP and wait until the board has confirmed it, or there is none, for a limited time."""
+        self._connection.request("stop", {}, timeout_s)
 
     def close(self) -> None:
         """Close the connection and forget the status."""
-        if self._connection is not None:
-            self._connection.close()
-        self._connection, self.status = None, {}
+        self._connection.close()

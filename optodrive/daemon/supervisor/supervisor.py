@@ -130,7 +130,7 @@ class Supervisor:
         """Turn the gate off, then end the children, then kill those that do not end."""
         self._is_loading, self._is_ending = False, True
         self._notifier.send("STOPPING=1")
-        self._stop_board()
+        self.link_view.stop_and_wait(STOP_CONFIRMATION_S)
         self.record_audit({"event": "ended"})
         self.send_to_web({"kind": "end"})
         self._end([child for child in self._children if child is not self._link])
@@ -139,14 +139,6 @@ class Supervisor:
         signal.set_wakeup_fd(-1)
         os.close(self._wakeup_read)
         os.close(self._wakeup_write)
-
-    def _stop_board(self) -> None:
-        """Send STOP and wait until the board has confirmed it, for a limited time."""
-        self.link_view.stop()
-        deadline_s = self._clock.now_s() + STOP_CONFIRMATION_S
-        while self.link_view.descriptors and not self.link_view.is_stopped and self._clock.now_s() < deadline_s:
-            self._wait(self.link_view.descriptors, 0.02)
-            self.link_view.receive()
 
     def _end(self, children: list[Child]) -> None:
         for child in children:

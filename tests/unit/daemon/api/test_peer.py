@@ -39,7 +39,6 @@ class Process:
         self._closing.set()
         self._thread.join()
         self._server.close()
-        self._loop.close()
 
 
 @contextmanager

@@ -264,7 +264,7 @@ def test_the_loss_of_a_process_ends_all_plans(rig, client):
     running = submit(rig, build_train(3.0))
     rig.until(lambda: running.executed_count > 5)
     if client == PLANNER:
-        rig.remote.close()
+        rig.remote.connection.close()
         rig.loop_once()
     else:
         rig.leave(client)

@@ -6,7 +6,7 @@ import pytest
 from link_service_rig import OPERATOR, PLANNER, STEP_S, WEB, ServiceRig
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.pauses import PAUSE_MAX_S
-from optodrive.link.service.remote_session import EXECUTED_RECORD
+from optodrive.link.service.remote_job import EXECUTED_RECORD
 from optodrive.link.session.point_drain import PointDrain
 from optodrive.link.session.session import BoardSession
 from wire_points import build_points

@@ -6,9 +6,10 @@ import pytest
 
 from link_service_rig import PLANNER, SUPERVISOR
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.service import remote_session
+from optodrive.link.service import link_connection
 from optodrive.link.service.clients import BEAT_AGE_MAX_S
-from optodrive.link.service.remote_session import NO_EPOCH, REPLY_TIMEOUT_S
+from optodrive.link.service.link_status import NO_EPOCH
+from optodrive.link.service.remote_session import REPLY_TIMEOUT_S
 from planner_rig import PlannerRig, ServiceChannel, build_train
 
 POLL_S = 0.01
@@ -43,14 +44,14 @@ def rig(monkeypatch):
     rig = PlannerRig(monkeypatch).ready()
     rig.channel = StallingChannel(rig)
     rig.channel._read = len(rig.received[PLANNER])
-    rig.remote.attach(rig.channel)
+    rig.remote.connection.attach(rig.channel)
     rig.arm()
     rig.run(0.01)
     rig.submit(build_train(3.0), rig.remote.epoch).result()
     rig.until(lambda: rig.core.state == BoardState.RUNNING)
     # The planner waits in select(); meanwhile time passes, and nothing else.
     waiting = SimpleNamespace(select=lambda *arguments: rig.clock.sleep(min(POLL_S, arguments[-1])))
-    monkeypatch.setattr(remote_session, "select", waiting)
+    monkeypatch.setattr(link_connection, "select", waiting)
     return rig
 
 
@@ -66,7 +67,7 @@ def truncate_during_a_stall(rig, stall_s):
 def test_a_stall_of_the_link_process_that_is_shorter_is_waited_for(rig, stall_s):
     epoch = rig.remote.epoch
     assert truncate_during_a_stall(rig, stall_s) == pytest.approx(stall_s, abs=1.5 * POLL_S)
-    assert rig.remote.is_attached
+    assert rig.remote.connection.is_open
     assert rig.remote.epoch == epoch
 
 
@@ -74,7 +75,7 @@ def test_a_stall_of_the_link_process_that_is_shorter_is_waited_for(rig, stall_s)
 def test_the_planner_gives_up_a_link_process_that_stalls_for_longer(rig, stall_s):
     waited_s = truncate_during_a_stall(rig, stall_s)
     assert waited_s == pytest.approx(REPLY_TIMEOUT_S, abs=1.5 * POLL_S)
-    assert not rig.remote.is_attached
+    assert not rig.remote.connection.is_open
     assert rig.remote.epoch == NO_EPOCH
     assert f"did not answer truncate within {REPLY_TIMEOUT_S:g} s" in rig.remote.epoch_reason
     rig.service.step()
