@@ -254,7 +254,7 @@ def test_many_idle_operators_keep_nobody_from_stopping(link, board):
     emit(link, board)
     idle = [link.open_client("operator") for _ in range(80)]
     assert stop_board(link.path)["board"]["state"] == BoardState.DISARMED
-    assert link.planner.is_attached
+    assert link.planner.connection.is_open
     assert idle
 
 

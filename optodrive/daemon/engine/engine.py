@@ -116,7 +116,7 @@ class Engine:
                 self.run_once(LOOP_WAIT_S)
                 self.on_loop()
         finally:
-            self._session.connection.close("the planner has ended its connection to the link process")
+            self._session.connection.close()
 
     def run_once(self, wait_s: float) -> None:
         """Run one loop iteration, which waits at most wait_s for messages and commands."""

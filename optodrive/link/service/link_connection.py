@@ -142,7 +142,7 @@ class LinkConnection:
         self._on_result = None
         return results[0] if results else None
 
-    def close(self, reason: str = "the connection was closed") -> None:
+    def close(self, reason: str = "this process has ended its connection to the link process") -> None:
         """End the connection. reason: as an end of a sentence."""
         if self._socket is not None:
             self._socket.close()

@@ -1,4 +1,4 @@
-"""What the link process reports of itself, the board and its clock, as the planner last heard it."""
+"""The planner's view of the link process's status: epoch, board, clock and lease."""
 
 import time
 from collections import Counter

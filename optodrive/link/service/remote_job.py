@@ -52,7 +52,7 @@ class RemoteJob(StagedJob):
         self._send_delay(self.number, ticks)
 
     def record_reports(self, stage: int, first_point: int, payload: bytes) -> None:
-        """Take over what a stage's board reports of points, beginning with one of this job."""
+        """Record the reports of a stage's board. first_point: position in this job of the first reported point."""
         records = tuple(np.frombuffer(payload, EXECUTED_RECORD).tolist())
         part = self.parts[stage]
         part.record_executed(Executed(part.first_index + first_point, records))
