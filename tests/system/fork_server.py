@@ -94,6 +94,8 @@ def serve(control):
                 continue
             packet, descriptors, _, _ = socket.recv_fds(control, REQUEST_MAX_BYTES, 4)
             if not packet:
+                for pid, _ in ends.values():  # of tests that were killed: nobody else would end a daemon or a board
+                    os.kill(pid, signal.SIGTERM)
                 return None
             request, (*standard, status) = json.loads(packet), descriptors
             pid = os.fork()
