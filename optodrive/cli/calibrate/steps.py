@@ -11,9 +11,14 @@ from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import FloatArray
+    from optodrive.core.types.measurements import Signal
+    from optodrive.device.config import Config
     from optodrive.lab.commissioning.mirror_steps import StepRun
+    from optodrive.planning.display_model import DisplayModel
 
 PAUSE_MAX_S = 60.0
+LAST_STEP_S = 0.015
+"""Time for which the last step is recorded."""
 NOTES = "Steps of optodrive calibrate steps. Add mirror_x_rad.csv and mirror_y_rad.csv to each run."
 
 
@@ -50,19 +55,37 @@ def steps(
         board.arm()
         play_step_runs(runs, board, pause_s, report_run)
         board.disarm()
-        ambient_k = board.display.ambient_k
-    _write_commands(out, played, ambient_k)
+        display = board.display
+    is_simulated = display.config.board.transport == "simulated"
+    _write_commands(out, played, display, is_simulated)
     if json:
         print_json({"recording": str(out), "trigger_s": LEAD_IN_S, "runs": [run.name for run, _ in played]})
         return
     print(f"written          {out}; the first step of a run is at {LEAD_IN_S:g} s of its time")
+    if is_simulated:
+        print("simulated        with what a scope would measure on mirrors with the configured servo, to rehearse")
+        print(f"next             optodrive calibrate servo {out}")
 
 
-def _write_commands(out: Path, played: "list[tuple[StepRun, FloatArray]]", ambient_k: float) -> None:
+def _write_commands(
+    out: Path, played: "list[tuple[StepRun, FloatArray]]", display: "DisplayModel", is_simulated: bool
+) -> None:
+    """Write the commands of each run, with the traces of a scope for a simulated board."""
     import numpy as np
 
     from optodrive.core.types.measurements import Measurement, Run
     from optodrive.lab.recording import write_recording
 
-    runs = tuple(Run(run.name, ambient_k, np.zeros((0, 4)), {}, {}, commands) for run, commands in played)
-    write_recording(out, Measurement(runs), NOTES)
+    runs = []
+    for seed, (run, commands) in enumerate(played):
+        signals = _measure(display.config, commands, seed) if is_simulated else {}
+        runs.append(Run(run.name, display.ambient_k, np.zeros((0, 4)), signals, {}, commands))
+    write_recording(out, Measurement(tuple(runs)), "" if is_simulated else NOTES)
+
+
+def _measure(config: "Config", commands: "FloatArray", seed: int) -> "dict[str, Signal]":
+    from optodrive.core.types.measurements import Signal
+    from optodrive.link.simulator.galvos import measure_position_outputs
+
+    t_s, x_rad, y_rad = measure_position_outputs(config, commands, float(commands[-1, 0]) + LAST_STEP_S, seed).T.copy()
+    return {"mirror_x_rad": Signal(0, t_s, x_rad), "mirror_y_rad": Signal(0, t_s, y_rad)}

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config
 from optodrive.device.config_sections import HALF_RANGE_CODES
 from optodrive.device.gate_timing import build_servo
@@ -12,6 +13,8 @@ from optodrive.device.servo import Servo
 
 CENTRE_CODE = HALF_RANGE_CODES + 1
 OUTPUT_NOISE_RAD = 1e-5
+TRACE_PERIOD_S = 20e-6
+"""Time between samples of a recorded output."""
 MOVE_HISTORY_S = 0.5
 """A move this old has settled."""
 
@@ -77,6 +80,23 @@ class SimulatedGalvos:
         sign = -1.0 if self.readback_inverted else 1.0
         x_rad, y_rad = sign * np.array(self.angles_rad(at_us)) + OUTPUT_NOISE_RAD * self._random.standard_normal(2)
         return float(x_rad), float(y_rad)
+
+
+def measure_position_outputs(config: Config, commands: FloatArray, until_s: float, seed: int) -> FloatArray:
+    """Measure the position outputs of mirrors that were commanded, [n, 3] of t_s, x_rad and y_rad from 0 s on.
+
+    commands: [m, 3] t_s, x_rad, y_rad in order; the mirrors rest at the first ones
+    """
+    galvos, outputs, period_us = SimulatedGalvos(config, seed), [], round(1e6 * TRACE_PERIOD_S)
+    codes = np.rint(CENTRE_CODE + commands[:, 1:] / config.scanner.rad_per_code).astype(int).tolist()
+    galvos.move_to(codes[0][0], codes[0][1], round(-1e6 * MOVE_HISTORY_S))
+    steps = list(zip(np.rint(1e6 * commands[1:, 0]).astype(int).tolist(), codes[1:], strict=True))
+    for at_us in range(0, round(1e6 * until_s), period_us):
+        while steps and steps[0][0] <= at_us:
+            due_us, (x_code, y_code) = steps.pop(0)
+            galvos.move_to(x_code, y_code, due_us)
+        outputs.append((at_us * 1e-6, *galvos.position_output_rad(at_us)))
+    return np.array(outputs)
 
 
 def _move_response_rad(servo: Servo, displacement_rad: float, elapsed_s: float) -> float:
