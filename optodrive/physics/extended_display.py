@@ -120,12 +120,7 @@ class ExtendedThermalState:
         min_periods: int = 1,
         peak_after_s: float = 0.0,
     ) -> tuple[int, float] | None:
-        """Return PWM periods and duty of the shortest pulse at start_s whose peak displacement is target_m.
-
-        Returns None if the residual heat already reaches the target, and the longest pulse if none reaches it. The
-        pulse has at least min_periods, within the drive's range. peak_after_s: the peak counts only from this time
-        after the pulse's start, and not before its end. Raises ValueError for a time before the pixel's last event.
-        """
+        """See `ThermalState.solve_pulse`."""
         context, work, off_s = self._advance_copy(pixel, start_s)
         on_states = np.zeros((drive.max_periods + 1, STATE_COUNT))
         span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)

@@ -129,12 +129,7 @@ class NominalThermalState:
         min_periods: int = 1,
         peak_after_s: float = 0.0,
     ) -> tuple[int, float] | None:
-        """Return PWM periods and duty of the shortest pulse at start_s whose peak displacement is target_m.
-
-        Returns None if the residual heat already reaches the target, and the longest pulse if none reaches it. The
-        pulse has at least min_periods, within the drive's range. peak_after_s: the peak counts only from this time
-        after the pulse's start, and not before its end. Raises ValueError for a time before the pixel's last event.
-        """
+        """See `ThermalState.solve_pulse`."""
         if not 0 <= pixel < len(self._at_s):
             raise IndexError(f"pixel {pixel} of {len(self._at_s)}")
         span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)

@@ -45,8 +45,9 @@ class ThermalState(Protocol):
     ) -> tuple[int, float] | None:
         """Return PWM periods and duty of the shortest pulse at start_s whose peak displacement is target_m.
 
-        Returns None if the residual heat already reaches the target. peak_after_s: the peak counts only from this time
-        after the pulse's start, and not before its end.
+        Returns None if the residual heat already reaches the target, and the longest pulse if none reaches it. The
+        pulse has at least min_periods, within the drive's range. peak_after_s: the peak counts only from this time
+        after the pulse's start, and not before its end. Raises ValueError for a time before the pixel's last event.
         """
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:

@@ -25,13 +25,13 @@ from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
+from optodrive.daemon.engine.queue_report import build_queue_report
 from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.engine.state_report import build_planner_state, build_state_report
 from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.message_loop import MessageLoop
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.responses.state import PlannerState, StateReport
+from optodrive.daemon.responses.state import LimitsReport, PlannerReport, PlannerState, PulseTotals
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.states import ARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
@@ -302,13 +302,14 @@ class Engine:
 
     def build_planner_state(self) -> PlannerState:
         """Report queue and planner."""
-        recent, power_share = self._plan_store.list_recent(), self._dimmer.power_share
-        return build_planner_state(self._plan_queue, recent, self._planner, power_share, self.board_s())
-
-    def snapshot(self) -> StateReport:
-        """Report everything that GET /v1/state sends."""
-        return build_state_report(self.display, self._session, self.build_planner_state())
+        accounts = self._plan_queue.accounts
+        return PlannerState(
+            queue=build_queue_report(self._plan_queue, self._plan_store.list_recent(), self.board_s()),
+            totals=PulseTotals(**accounts.totals, timing_error=accounts.timing.worst),
+            planner=PlannerReport(busy=self._planner.is_busy, alive=self._planner.is_alive),
+            limits=LimitsReport(power_share=self._dimmer.power_share),
+        )
 
     def render_metrics(self) -> str:
         """Render the response of GET /metrics."""
-        return render_metrics(self.snapshot(), self._plan_counters, self._session, self.display.config.lease_s)
+        return render_metrics(self.display.config, self._session, self.build_planner_state(), self._plan_counters)

@@ -8,7 +8,8 @@ from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.responses.plan_status import ENDS
-from optodrive.daemon.responses.state import StateReport
+from optodrive.daemon.responses.state import PlannerState
+from optodrive.device.config import Config
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.remote_session import RemoteSession
 
@@ -35,11 +36,11 @@ class PlanCounters:
             self.first_light.add(record.first_light_after_s)
 
 
-def render_metrics(snapshot: StateReport, counters: PlanCounters, session: RemoteSession, lease_s: float) -> str:
-    """Render the metrics from a state report and the counters."""
-    board, link, totals, queue = snapshot.board, snapshot.link, snapshot.totals, snapshot.queue
+def render_metrics(config: Config, session: RemoteSession, state: PlannerState, counters: PlanCounters) -> str:
+    """Render the metrics of link, board and planner. A status of the link process must have arrived."""
+    board, link = session.board if session.connected else session.board.forget_state(), session.stats
     page = _MetricsPage()
-    page.add_gauge("info", "Version and display", [({"version": __version__, "display": snapshot.display}, 1)])
+    page.add_gauge("info", "Version and display", [({"version": __version__, "display": config.name}, 1)])
     page.add_gauge(
         "board_state", "1 for the board's state", [({"state": s}, int(board.state == s)) for s in REPORTED_STATES]
     )
@@ -49,19 +50,23 @@ def render_metrics(snapshot: StateReport, counters: PlanCounters, session: Remot
     page.add_counter("laser_on_seconds_total", "Gate-on time × duty since the board's power-up, s", board.laser_on_s)
     page.add_counter("underruns_total", "Number of times the board ran out of points", board.underruns)
     page.add_gauge("board_temperature_celsius", "The board's temperature", board.temperature_c)
-    page.add_gauge("link_up", "1 while the link to the board is up", int(link.state == "up"))
+    page.add_gauge("link_up", "1 while the link to the board is up", int(session.connected))
     received, sent = {"at": "host"}, {"at": "board"}
-    bad = [(received, link.host_bad_frames), (sent, link.board_bad_frames)]
+    bad = [(received, link["host_bad_frames"]), (sent, link["board_bad_frames"])]
     page.add_counter("link_bad_frames_total", "Damaged frames since the link was opened", bad)
-    page.add_counter("link_retransmitted_total", "Frames retransmitted since the link was opened", link.retransmitted)
-    page.add_counter("link_naks_total", "Frames the board refused since the link was opened", link.naks)
-    page.add_gauge("link_round_trip_seconds", "Shortest recent round trip to the board", _ms_to_s(link.round_trip_ms))
-    page.add_gauge("link_longest_stall_seconds", "Longest iteration of the loop", _ms_to_s(link.longest_stall_ms))
-    pulses = [({"stage": stage}, getattr(totals, stage)) for stage in ("planned", "sent", "executed")]
+    page.add_counter(
+        "link_retransmitted_total", "Frames retransmitted since the link was opened", link["retransmitted"]
+    )
+    page.add_counter("link_naks_total", "Frames the board refused since the link was opened", link["naks"])
+    page.add_gauge(
+        "link_round_trip_seconds", "Shortest recent round trip to the board", _ms_to_s(link["round_trip_ms"])
+    )
+    page.add_gauge("link_longest_stall_seconds", "Longest iteration of the loop", _ms_to_s(link["longest_stall_ms"]))
+    pulses = [({"stage": stage}, getattr(state.totals, stage)) for stage in ("planned", "sent", "executed")]
     page.add_counter("pulses_total", "Pulses planned, sent to the board, executed by it", pulses)
     page.add_counter("plans_total", "Ended plans by status", _label_counts("status", counters.ended))
-    page.add_gauge("plans_waiting", "Plans waiting for the beam", queue.waiting)
-    page.add_gauge("planner_alive", "1 while the planner is idle or makes progress", int(snapshot.planner.alive))
+    page.add_gauge("plans_waiting", "Plans waiting for the beam", state.queue.waiting)
+    page.add_gauge("planner_alive", "1 while the planner is idle or makes progress", int(state.planner.alive))
     page.add_gauge(
         "plan_headroom_kelvin",
         "Minimum distance of an absorber's bound from its cap, last plan",
@@ -69,7 +74,7 @@ def render_metrics(snapshot: StateReport, counters: PlanCounters, session: Remot
     )
     page.add_histogram("first_light_seconds", "Time from a plan's arrival to its first emission", counters.first_light)
     page.add_histogram("lease_age_seconds", "Age of the lease at its renewal", session.lease_ages)
-    page.add_gauge("lease_seconds", "Age of the lease at which the board turns the gate off", lease_s)
+    page.add_gauge("lease_seconds", "Age of the lease at which the board turns the gate off", config.lease_s)
     page.add_gauge("lease_slack_seconds", "Minimum remaining lease at a renewal", session.lease_slack_s)
     return page.render()
 
