@@ -23,8 +23,9 @@ IGNORE_PROPERTIES = ("E:ID_MM_DEVICE_IGNORE=1", "E:ID_MM_PORT_IGNORE=1")
 
 def check_port(board: BoardSection, root: Path = ROOT) -> tuple[list[Finding], bool]:
     """Return the findings, and whether the board can be contacted: the port exists, may be opened and is not in use."""
-    if board.transport == "simulated":
-        return [report_ok("port", "none: the board is simulated")], True
+    if board.transport != "serial":
+        reason = "the board is simulated" if board.transport == "simulated" else f"transport {board.transport}"
+        return [report_ok("port", f"none: {reason}")], True
     port = board.port
     try:
         exists = join_root(root, port).exists()

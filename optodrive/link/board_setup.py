@@ -1,6 +1,6 @@
 """Port settings and board requirements of a configuration, as the plain numbers that the link works with."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from math import ceil
 
 import numpy as np
@@ -38,15 +38,8 @@ def build_port_settings(config: Config) -> PortSettings:
         limits = permit_retiming(requirements.limits)
         own_settings = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
         own_settings["cell_codes"] = min(SIMULATED_CELL_MAX_CODES, requirements.cell_max_codes)
-    return PortSettings(
-        transport=board.transport,
-        port=board.port,
-        baud=board.baud,
-        vendor_id=board.vendor_id,
-        product_id=board.product_id,
-        serial_number=board.serial_number,
-        own_settings=own_settings,
-    )
+    address = {field.name: getattr(board, field.name) for field in fields(PortSettings) if hasattr(board, field.name)}
+    return PortSettings(**address, own_settings=own_settings)
 
 
 def permit_retiming(limits: m.Limits) -> m.Limits:

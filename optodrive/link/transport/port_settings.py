@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class PortSettings:
-    """Address of a board.
+    """Address of a board, of the fields of these names in its section of the configuration.
 
     transport: name of a transport; port: serial device; baud: its bit rate, 1/s
     vendor_id, product_id, serial_number: of a USB device; an empty serial number accepts the only device of its kind

@@ -54,6 +54,11 @@ def port_findings(tree, board=SERIAL):
     return check_port(board, tree)
 
 
+def test_a_board_without_a_serial_port_has_no_port_to_check(tree):
+    board = BoardSection(transport="usb", vendor_id=0x1209, product_id=1)
+    assert [finding.observation for finding in check_port(board, tree)[0]] == ["none: transport usb"]
+
+
 def test_a_port_in_order_may_be_asked_and_is_better_named_by_id(tree):
     findings, free = port_findings(tree)
     assert free
