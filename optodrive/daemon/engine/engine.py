@@ -197,9 +197,9 @@ class Engine:
 
         caller_left: set when the caller no longer waits, which ends the planning
         """
-        fit = push.options.get("fit", "as_is")
-        if push.streamed and fit != "as_is":
-            raise InputError("fit", fit, "as_is for streamed plans: a stream has no time for a feasibility check")
+        for name, value in push.options.items() if push.streamed else ():
+            if name != "policy" and value != "as_is":
+                raise InputError(name, value, "a plan that is not streamed: a stream has no time for more than a policy")
         arrived_s = self.board_s() - (self._clock.now_s() - push.arrived_s)
         return self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left))
 
