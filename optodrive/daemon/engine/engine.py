@@ -199,7 +199,7 @@ class Engine:
         """
         for name, value in push.options.items() if push.streamed else ():
             if name != "policy" and value != "as_is":
-                raise InputError(name, value, "a plan that is not streamed: a stream has no time for more than a policy")
+                raise InputError(name, value, "no such option: a stream has no time for more than a policy")
         arrived_s = self.board_s() - (self._clock.now_s() - push.arrived_s)
         return self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left))
 
