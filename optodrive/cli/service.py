@@ -1,5 +1,6 @@
 """`optodrive service install | remove | show`: manage the files of the systemd service without starting it."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_json
+from optodrive.core.errors import InputError
 
 RootOption = Annotated[
     Path, typer.Option("--root", metavar="DIR", help="Install below this folder instead of /, for packages and tests.")
@@ -38,7 +40,10 @@ def install(
     installed_config = installation.resolve(CONFIG_PATH)
     # An upgrade keeps the installed configuration.
     source = installed_config if config is None and installed_config.exists() else config
-    loaded, files = build_service_files(source, program or Path(sys.executable).with_name("optodrive"))
+    started = program or Path(sys.executable).with_name("optodrive")
+    if root.resolve() == Path("/") and not (started.is_file() and os.access(started, os.X_OK)):
+        raise InputError("--program", str(started), "an executable file; without --root the service starts it here")
+    loaded, files = build_service_files(source, started)
     actions = installation.install(files)
     if json:
         print_json({"files": [{"path": str(path), "action": action} for path, action in actions]})

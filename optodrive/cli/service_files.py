@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Literal
 
 from optodrive.cli.service_program import check_program
 from optodrive.core.errors import InputError, RefusedError
-from optodrive.core.files import atomic_write
+from optodrive.core.files import atomic_write, lock_folder
 from optodrive.core.toml_file import parse_toml
 from optodrive.device.config import Config
 from optodrive.device.config_file import DEFAULT_CONFIG, build_config, list_named_files, load_config, locate_shipped
@@ -131,6 +132,15 @@ class Installation:
         self._root = root
         self._digests = self._load_digests()
 
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Let one command at a time change the files, from the digests that the last one left."""
+        folder = self.resolve(MANIFEST_PATH).parent
+        _make_folder(folder)
+        with lock_folder(folder):
+            self._digests = self._load_digests()
+            yield
+
     def resolve(self, path: Path) -> Path:
         """Return the path of a file of the service below the root."""
         return self._root / path.relative_to("/")
@@ -151,6 +161,10 @@ class Installation:
 
         Raises RefusedError, before writing anything, where an edited file would be overwritten.
         """
+        with self._alone():
+            return self._install(files)
+
+    def _install(self, files: list[ServiceFile]) -> list[tuple[Path, str]]:
         edited = [file for file in files if self.file_status(file.path) == "edited"]
         obstacles = [
             str(self.resolve(file.path)) for file in edited if not (file.preserve_edits or self._is_current(file))
@@ -179,6 +193,12 @@ class Installation:
 
     def remove(self) -> list[tuple[Path, str]]:
         """Remove the installed files that were not edited, and return each path with the action taken."""
+        if not self._digests:
+            return []
+        with self._alone():
+            return self._remove()
+
+    def _remove(self) -> list[tuple[Path, str]]:
         actions = []
         for path in list(self.installed_files()):
             status = self.file_status(path)

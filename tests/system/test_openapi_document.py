@@ -77,6 +77,7 @@ def test_the_document_while_armed(open_daemon, phases):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # thousands of requests: a busy computer needs longer than the limit of a test that hangs
 def test_the_document_for_longer(open_daemon):
     schemathesis(open_daemon, "--exclude-path", TELEMETRY, examples=100)
 

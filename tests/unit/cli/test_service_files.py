@@ -1,12 +1,22 @@
 """`optodrive service install | remove | show` below a temporary root."""
 
+import fcntl
 import json
+import os
 import re
 
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.cli.service_files import CONFIG_PATH, MANIFEST_PATH, RULES_PATH, UNIT_PATH, USERS_PATH
+from optodrive.cli.service_files import (
+    CONFIG_PATH,
+    MANIFEST_PATH,
+    RULES_PATH,
+    UNIT_PATH,
+    USERS_PATH,
+    Installation,
+    ServiceFile,
+)
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.pixel_map import PixelMap, write_pixel_map
 from optodrive.planning.display_model import DisplayModel
@@ -243,3 +253,41 @@ def test_a_root_that_may_not_be_written_is_one_line(install, tmp_path):
     (tmp_path / "root").write_text("a file")
     output = install(status=2).err
     assert output.count("\n") == 1
+
+
+def test_a_program_that_is_absent_here_is_refused_for_the_service_of_this_computer(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(Installation, "install", lambda *arguments: pytest.fail("written"))
+    (tmp_path / "text").write_text("no program")
+    for program in (tmp_path / "absent", tmp_path / "text", tmp_path):
+        assert run(["service", "install", "--program", str(program)]) == 2
+        assert capsys.readouterr().err.startswith(f"optodrive: --program: got '{program}'"[:60])
+
+
+def test_an_installation_knows_what_another_command_wrote_meanwhile(tmp_path):
+    first, second = Installation(tmp_path), Installation(tmp_path)
+    files = [ServiceFile(UNIT_PATH, "first\n"), ServiceFile(USERS_PATH, "users\n")]
+    assert [action for _, action in first.install(files)] == ["written", "written"]
+    later = [ServiceFile(UNIT_PATH, "second\n"), files[1]]
+    assert [action for _, action in second.install(later)] == ["replaced", "unchanged"]
+    assert [action for _, action in first.remove()] == ["removed", "removed"]
+    assert second.install(files)[0][1] == "written"
+
+
+def test_one_command_at_a_time_changes_the_files(tmp_path):
+    """The folder is locked while files are written: who asks for the lock then does not get it."""
+    installation, folder = Installation(tmp_path), tmp_path / MANIFEST_PATH.parent.relative_to("/")
+    refused = []
+
+    def probe(file):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            refused.append(file)
+        finally:
+            os.close(descriptor)
+        return False
+
+    installation._is_current = probe
+    installation.install([ServiceFile(UNIT_PATH, "unit\n")])
+    assert refused
