@@ -70,26 +70,23 @@ def test_a_named_cause_is_not_certain_beside_one_that_diverges(fast_leak):
 def test_a_test_without_a_number_ends_the_diagnosis(monkeypatch):
     """A comparison with a level would take it for no finding."""
 
-    def compute_nothing(*arguments):
-        return [], np.nan
+    def project_nothing(gram, removed, kept):
+        return np.full((len(kept), len(kept)), np.nan)
 
-    monkeypatch.setattr(detection, "_compute_scores", compute_nothing)
+    monkeypatch.setattr(detection, "project_out", project_nothing)
     with pytest.raises(OptodriveError, match="the test of the residuals gave no number"):
         diagnose(lab(11, {}, groups=("middle", "strong"), repeats=2))
 
 
-@pytest.mark.parametrize(("effect", "p"), [(1e4, 0.0), (np.inf, 0.0), (np.nan, np.nan), (0.1, None)])
-def test_an_effect_whose_p_underflows_is_found_and_one_without_a_number_is_not_judged(effect, p):
+@pytest.mark.parametrize(("effect", "ratio"), [(1e4, 1e8), (np.inf, np.inf), (np.nan, np.nan), (-1.0, 0.0)])
+def test_an_effect_of_any_size_has_its_ratio_and_one_without_a_number_none(effect, ratio):
     """A mirror's lag has χ² of 10⁸ against noise that counts as known."""
     leak = discover_terms()["gas_leak"]
     (hypothesis,) = leak.build_hypotheses(RecordingScope(("displacement",), (0,), frozenset({0}), False, 1))
     projected = np.array([[1.0, effect], [effect, 1.0]])
-    independent = np.ones(1)
     with np.errstate(all="ignore"):
-        _, found = detection._compute_scores(
-            ((hypothesis, hypothesis.starts[0]),), projected, np.ones(1), independent, 0, detection.NOISE_KNOWN_DEGREES
-        )
-    assert found > 0.1 if p is None else np.array_equal(found, p, equal_nan=True)
+        (score,) = detection.compute_scores(((hypothesis, hypothesis.starts[0]),), projected, np.ones(1), np.ones(1))
+    assert np.array_equal(score.ratio, ratio, equal_nan=True)
 
 
 def test_a_nominal_model_that_diverges_is_refused():

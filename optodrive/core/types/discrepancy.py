@@ -35,17 +35,50 @@ class HeldOutGain:
 
 
 @dataclass(frozen=True)
+class Probabilities:
+    """Probabilities of all explanations of a recording, which sum to 1.
+
+    causes: by the keys of one cause, or of two that act together, sorted
+    """
+
+    no_effect: float
+    none_of_these: float
+    causes: dict[tuple[str, ...], float]
+
+    def sum_of(self, cause: str) -> float:
+        """Return the probability that a cause acts, alone or with another one."""
+        return sum(probability for keys, probability in self.causes.items() if cause in keys)
+
+    @property
+    def ranked(self) -> list[tuple[tuple[str, ...], float]]:
+        """Sets of causes with their probabilities, most probable first."""
+        return sorted(self.causes.items(), key=lambda item: (-item[1], item[0]))
+
+    def combine(self, other: "Probabilities") -> "Probabilities":
+        """Return the probabilities of two independent subsystems together."""
+        mine = {(): self.no_effect} | self.causes
+        theirs = {(): other.no_effect} | other.causes
+        causes: dict[tuple[str, ...], float] = {}
+        for first, p in mine.items():
+            for second, q in theirs.items():
+                keys = tuple(sorted({*first, *second}))
+                causes[keys] = causes.get(keys, 0.0) + p * q
+        none_of_these = 1.0 - (1.0 - self.none_of_these) * (1.0 - other.none_of_these)
+        return Probabilities(causes.pop(()), none_of_these, causes)
+
+
+@dataclass(frozen=True)
 class CandidateCause:
     """Judgement of one hypothesis.
 
-    statistic: likelihood ratio against the nominal fit; detection_limit: the smallest effect that the data would have
-    shown
+    statistic: likelihood ratio against the nominal fit; probability: that its cause acts, alone or with another one;
+    detection_limit: the smallest effect that the data would have shown
     """
 
     cause: str
     label: str
     statistic: float
-    p_value: float
+    probability: float
     heldout_gain: float | None
     verdict: str
     detection_limit: str
@@ -71,14 +104,16 @@ class NextExperiment:
 class RivalModel:
     """One or two hypotheses, refitted to the runs that are not held out.
 
-    chi2, bic: above those of the best rival; heldout_gain: as `HeldOutGain.reduction`, None if not measured;
+    chi2: above that of the best rival; log_evidence: below that of the best one, in nats; probability: of exactly these
+    causes; heldout_gain: as `HeldOutGain.reduction`, None if not measured;
     parameters: value and unit by name
     """
 
     label: str
     causes: tuple[str, ...]
     chi2: float
-    bic: float
+    log_evidence: float
+    probability: float
     heldout_gain: float | None
     is_chosen: bool
     parameters: dict[str, tuple[float, str]]
@@ -150,7 +185,7 @@ class Discrepancy:
     """Diagnosis of a recording.
 
     verdict: "cause", "none", "unexplained", "ambiguous", or "incomplete" if no error was found but failures prevent
-    "none"; terms: the extension, term → parameter → value; base:
+    "none"; probabilities: of all explanations; terms: the extension, term → parameter → value; base:
     nominal parameters as refitted with it; residual_traces: the first run of every group, with the models fitted to all
     runs; held_out_traces, held_out_errors: with the models fitted to the other runs; explained_fraction: share of the
     detected excess of χ²; doubts: why the size of a named cause is uncertain, a clause by cause; failures: hypotheses
@@ -160,6 +195,7 @@ class Discrepancy:
 
     verdict: str
     causes: tuple[str, ...]
+    probabilities: Probabilities
     hypothesis_labels: tuple[str, ...]
     parameters: dict[str, Estimate]
     base: dict[str, float]

@@ -1,7 +1,6 @@
 """Judgement of every hypothesis, and the numbers of those that were refitted."""
 
 import numpy as np
-from scipy.stats import chi2 as chi_squared
 
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.discrepancy import CandidateCause, RivalModel
@@ -11,6 +10,8 @@ from optodrive.physics.terms import discover_terms
 
 DETECTABLE_RATIO = 30.0
 """Likelihood ratio of an effect that is detected nine times in ten."""
+MAX_RULED_OUT = 1e-4
+"""Probability up to which a cause is ruled out."""
 MIN_INDEPENDENT_FRACTION = 1e-4
 """Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
 
@@ -21,25 +22,26 @@ def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candida
     gains: reduction on held-out runs by label
     """
     chosen = verdict.chosen
-    tests = max(len(verdict.nominal_detection.scores), 1)
     out = []
     for score in verdict.nominal_detection.scores:
         item = score.hypothesis
+        probability = verdict.probabilities.sum_of(item.key)
         if chosen is not None and item.label in {part.label for part in chosen.hypotheses}:
             judgement = "identified" if verdict.verdict == "cause" else "indistinguishable"
         elif item.key in verdict.causes:
             judgement = "indistinguishable" if verdict.verdict == "ambiguous" else "alternative form"
         elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
             judgement = "not observable"
+        elif probability > MAX_RULED_OUT:
+            judgement = "possible"
         else:
             judgement = "not detected" if score.ratio < DETECTABLE_RATIO else "ruled out"
-        p_value = min(1.0, tests * float(chi_squared.sf(score.ratio, len(score.columns))))
         out.append(
             CandidateCause(
                 item.key,
                 item.label,
                 score.ratio,
-                p_value,
+                probability,
                 gains.get(item.label),
                 judgement,
                 _describe_detection_limit(score),
@@ -71,13 +73,16 @@ def list_rivals(verdict: Verdict, gains: dict[str, float]) -> tuple[RivalModel, 
     candidates = verdict.candidates
     if not candidates:
         return ()
-    chi2, bic = candidates[0].fit.chi2, candidates[0].bic
+    chi2 = min(item.chi2 for item in candidates)
+    evidence = max(item.log_evidence for item in candidates)
+    probabilities = verdict.probabilities.causes
     return tuple(
         RivalModel(
             item.label,
             item.causes,
-            item.fit.chi2 - chi2,
-            item.bic - bic,
+            item.chi2 - chi2,
+            item.log_evidence - evidence,
+            probabilities.get(tuple(sorted(item.causes)), 0.0),
             gains.get(item.label),
             item is verdict.chosen,
             {

@@ -1,20 +1,18 @@
 """Detection of model errors: a score per hypothesis and an omnibus test over bins, both under the noise model.
 
 Each start of a hypothesis is a column beside the base fit, at a finite size; its likelihood ratio follows from one
-matrix of all columns. The distribution of the best score is simulated with the same matrix, because bounded parameters
-and time constants that vanish with their effect have no textbook distribution. The noise model is an estimate from a
-finite number of contrasts, so ratios are judged by an F distribution with that many denominator degrees, not by χ².
+matrix of all columns. The noise model is an estimate from a finite number of contrasts, with so many degrees of freedom
+(`count_noise_degrees`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi_squared
-from scipy.stats import f as fisher
 
 from optodrive.core.errors import DivergedError, OptodriveError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
+from optodrive.lab.diagnosis.evidence import compute_form_evidence
 from optodrive.lab.diagnosis.fitting import (
     FitProblem,
     JitterSensitivity,
@@ -23,12 +21,11 @@ from optodrive.lab.diagnosis.fitting import (
     compute_jitter_sensitivity,
 )
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
-from optodrive.lab.diagnosis.omnibus_test import compute_omnibus
+from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.physics.hypothesis import Hypothesis
 
-DRAWS = 4000
 ROUNDING_FRACTION = 1e-12
 """An effect with a smaller share orthogonal to the fitted parameters is known only by rounding errors, and unseen."""
 NOISE_PRIOR_DEGREES, NOISE_KNOWN_DEGREES = 6, 10_000
@@ -54,17 +51,15 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """Scores of all hypotheses, strongest first, with the p values of the best score and of the omnibus test.
+    """Scores of all hypotheses, strongest first, and the omnibus test, both beside a fit.
 
-    residual_chi2: χ² of the residuals of the fit
+    residual_chi2: χ² of the residuals of the fit; form_evidence: gain in log evidence by other forms of its cause
     """
 
     scores: tuple[Score, ...]
-    p_score: float
-    omnibus_chi2: float
-    omnibus_degrees: int
-    p_omnibus: float
+    omnibus: OmnibusStatistic
     residual_chi2: float
+    form_evidence: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,39 +105,44 @@ def simulate_effects(
 
 
 def detect(
-    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, log: SearchLog | None = None
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog | None = None
 ) -> Detection:
     """Score every hypothesis beside a fit, nominal or extended."""
-    return score_effects(problem, base, simulate_effects(problem, base, hypotheses, log or SearchLog()), seed)
+    return score_effects(problem, base, simulate_effects(problem, base, hypotheses, log or SearchLog()))
 
 
 def score_effects(
-    problem: FitProblem, base: ModelFit, simulated: SimulatedEffects, seed: int, extra_columns: FloatArray | None = None
+    problem: FitProblem, base: ModelFit, simulated: SimulatedEffects, forms: FloatArray | None = None
 ) -> Detection:
     """Score the effects beside the fit that they were computed for.
 
-    extra_columns: [m, k], are marginalised too
+    forms: [m, k], other forms of its cause, are marginalised too
     """
     data, sensitivity = problem.data, simulated.sensitivity
     fitted_columns, candidates = simulated.fitted_columns, simulated.effects
-    if extra_columns is not None:
-        fitted_columns = np.column_stack(
-            [fitted_columns, extra_columns / np.abs(extra_columns).max(axis=0, initial=1e-300)]
-        )
+    form_count = 0 if forms is None else forms.shape[1]
+    if forms is not None:
+        fitted_columns = np.column_stack([fitted_columns, forms])
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
     columns = np.column_stack([fitted_columns, candidates / scale, residual])
     total = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total
     width = fitted_columns.shape[1]
     total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] += 1.0 / np.square(problem.prior.sigma)
+    form_evidence = 0.0
+    if form_count:
+        parameters = list(range(width - form_count))
+        beside = project_out(total, parameters, [*range(width - form_count, width), len(total) - 1])
+        form_evidence = compute_form_evidence(beside[:-1, :-1], beside[:-1, -1])
     projected = project_out(total, list(range(width)), list(range(width, len(total))))
     independent = np.diag(projected) / np.maximum(np.diag(total)[width:], 1e-300)
     omnibus = compute_omnibus(problem, np.column_stack([fitted_columns, residual]), sensitivity)
-    scores, p_score = _compute_scores(simulated.starts, projected, scale, independent, seed, count_noise_degrees(data))
+    scores = compute_scores(simulated.starts, projected, scale, independent)
     residual_chi2 = float(projected[-1, -1])
-    if not np.isfinite([p_score, omnibus.p_value, residual_chi2]).all():  # no comparison with a level would reject it
+    numbers = [omnibus.chi2, omnibus.log_evidence, residual_chi2, *(score.ratio for score in scores)]
+    if np.isnan(numbers).any() or not np.isfinite(numbers[:3]).all():  # no comparison with a number would be true
         raise OptodriveError("the test of the residuals gave no number; nothing is concluded from it")
-    return Detection(tuple(scores), p_score, omnibus.chi2, omnibus.degrees, omnibus.p_value, residual_chi2)
+    return Detection(tuple(scores), omnibus, residual_chi2, form_evidence)
 
 
 def count_noise_degrees(data: Dataset) -> int:
@@ -158,14 +158,16 @@ def _select_starts(item: Hypothesis) -> tuple[dict[str, float], ...]:
     return item.starts[:1] if item.fit_every_start else item.starts
 
 
-def _compute_scores(
+def compute_scores(
     trials: tuple[tuple[Hypothesis, dict[str, float]], ...],
     projected: FloatArray,
     scale: FloatArray,
     independent: FloatArray,
-    seed: int,
-    noise_degrees: int,
-) -> tuple[list[Score], float]:
+) -> list[Score]:
+    """Return the best start of each hypothesis, strongest first.
+
+    projected: gram matrix of the columns and the residual; independent: share of each column's that is left
+    """
     column_sets: list[tuple[Hypothesis, dict[str, float], tuple[int, ...]]] = []
     joint: dict[str, list[int]] = {}
     for column, (item, start) in enumerate(trials):
@@ -175,8 +177,6 @@ def _compute_scores(
                 column_sets.append((item, item.starts[0], tuple(joint[item.label])))
         else:
             column_sets.append((item, start, (column,)))
-    if not column_sets:
-        return [], 1.0
     gram, right = projected[:-1, :-1], projected[:-1, -1]
     best: dict[str, Score] = {}
     for item, start, indices in column_sets:
@@ -187,42 +187,9 @@ def _compute_scores(
         start_ratio = float(gram[last, last] * scale[last] ** 2)
         amplitudes = tuple((amplitude / scale[list(indices)]).tolist())
         score = Score(item, start, ratio, amplitudes, indices, start_ratio, float(independent[last]))
-        if item.label not in best or ratio > best[item.label].ratio:
+        if item.label not in best or not ratio <= best[item.label].ratio:
             best[item.label] = score
-    surprisals = [_compute_surprisal(score.ratio, len(score.columns), noise_degrees) for score in best.values()]
-    observed = float(np.max(surprisals))  # no number if one is none
-    generator = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(gram)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    draws = root @ generator.standard_normal((len(gram), DRAWS))
-    max_ratio: dict[int, FloatArray] = {}
-    for item, _, indices in column_sets:
-        rows = list(indices)
-        if independent[rows].min() <= ROUNDING_FRACTION:
-            continue
-        solved = solve(gram[np.ix_(rows, rows)], draws[rows])
-        ratio_drawn = (draws[rows] * solved).sum(axis=0)
-        if not item.is_linear:
-            ratio_drawn = np.where(solved[0] > 0.0, ratio_drawn, 0.0)
-        max_ratio[len(rows)] = np.maximum(max_ratio.get(len(rows), 0.0), ratio_drawn)
-    max_surprisal = np.zeros(DRAWS)
-    for degrees, ratio_drawn in max_ratio.items():  # once per number of degrees, because it takes long
-        max_surprisal = np.maximum(max_surprisal, -chi_squared.logsf(ratio_drawn, degrees))
-    if not np.isfinite(max_surprisal).all() or np.isnan(observed):  # an infinite one rejects: its p underflows to zero
-        return [], np.nan
-    level = float(np.quantile(max_surprisal, 0.99))
-    # Beyond the draws, extrapolate as for the maximum of 1 % × e^level independent scores.
-    exceedance = float((max_surprisal >= observed).mean())
-    p = (
-        max(exceedance, 1.0 / DRAWS)
-        if observed < level
-        else min(exceedance if exceedance > 0 else 1.0, 0.01 * np.exp(level - observed))
-    )
-    return sorted(best.values(), key=lambda score: -score.ratio), float(p)
-
-
-def _compute_surprisal(ratio: float, degrees: int, noise_degrees: int) -> float:
-    return float(-fisher.logsf(ratio / degrees, degrees, noise_degrees))
+    return sorted(best.values(), key=lambda score: -score.ratio)
 
 
 def _compute_likelihood_ratio(

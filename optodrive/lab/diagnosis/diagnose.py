@@ -1,6 +1,7 @@
 """Diagnosis of a recording, separately for pixels and mirrors and then combined."""
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from time import perf_counter
 
 import numpy as np
@@ -14,6 +15,7 @@ from optodrive.core.types.discrepancy import (
     HeldOutError,
     HeldOutGain,
     NextExperiment,
+    Probabilities,
     ResidualTrace,
     RivalModel,
 )
@@ -28,7 +30,6 @@ from optodrive.lab.diagnosis.height_error import compute_height_error
 from optodrive.lab.diagnosis.held_out_gain import compute_held_out_errors, compute_held_out_gain, split_runs
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_selection import (
-    BIC_INDISTINGUISHABLE,
     MAX_INTRA_PULSE_POWER_EXCESS,
     MAX_REPLICATE_EXCESS,
     Verdict,
@@ -47,6 +48,9 @@ from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, igno
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
+
+NEARLY_EXPLAINED = 0.999
+"""Share of the excess that a named cause explains without a remark on the rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +138,7 @@ def diagnose(
     return Discrepancy(
         verdict=verdict,
         causes=causes,
+        probabilities=reduce(Probabilities.combine, (subsystem.verdict.probabilities for subsystem in subsystems)),
         hypothesis_labels=tuple(
             item.label
             for subsystem in subsystems
@@ -181,7 +186,7 @@ def _diagnose_subsystem(
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
     if has_replicate_excess(problem):
         # Jitter sensitivities are those of the true model; a large effect changes them, and repeats seem to differ.
-        best = find_best_candidate(problem, base, hypotheses, seed, log)
+        best = find_best_candidate(problem, base, hypotheses, log)
         if best is not None:
             other = update_noise(problem, best.fit, min_timing_sigma_s)
             other = replace(
@@ -190,7 +195,7 @@ def _diagnose_subsystem(
             )
             if not has_replicate_excess(other):
                 problem, base = other, fit(other, base.point)
-    verdict = select_causes(problem, base, hypotheses, seed, log)
+    verdict = select_causes(problem, base, hypotheses, log)
     gains: dict[str, float] = {}
     for candidate in verdict.candidates:
         candidate_gain = compute_held_out_gain(problem, held_out, base.point, candidate.fit.point, seed)
@@ -205,11 +210,13 @@ def _diagnose_subsystem(
     if all(kind in MIRROR_KINDS for kind in data.kinds):  # judge each point by its own jitter sensitivities
         points = (start.point, final.point)
         final = min((fit(all_data, point, start.free, iterations=1) for point in points), key=lambda item: item.chi2)
-    if verdict.verdict == "none" and held_out_runs:
-        # Only the held-out, hottest runs may show an effect: repeat the selection with all runs.
-        wider = select_causes(all_data, final, hypotheses, seed, log)
+    if verdict.verdict in ("none", "ambiguous") and held_out_runs:
+        # The held-out, hottest runs may show an effect, or which one: repeat the selection with all runs.
+        all_base = final if chosen is None else fit(all_data, base.point, base.free)
+        wider = select_causes(all_data, all_base, hypotheses, log)
         if wider.verdict != "none":
-            problem, base, held_out, verdict = all_data, final, data.select([]), wider
+            gain = None
+            problem, base, held_out, verdict = all_data, all_base, data.select([]), wider
             if wider.chosen is not None:
                 final = wider.chosen.fit
     experiment = _propose_experiment(problem, verdict, log.on_progress)
@@ -275,9 +282,7 @@ def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: Prog
         return None
     best = verdict.candidates[0]
     rivals: list[RefittedCandidate] = [
-        item
-        for item in verdict.candidates[1:]
-        if item.bic - best.bic < BIC_INDISTINGUISHABLE and frozenset(item.causes) != frozenset(best.causes)
+        item for item in verdict.candidates[1:] if set(item.causes) <= set(verdict.causes)
     ]
     if not rivals:
         return None
@@ -306,14 +311,12 @@ def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
                 "Repeats are equal to the last digit, as copies or simulations without noise are: the noise is taken "
                 "from the resolution of the data."
             )
-        if subsystem.verdict.chosen is not None and subsystem.verdict.residual_detection is not None:
-            detection = subsystem.verdict.residual_detection
-            if subsystem.verdict.verdict == "cause" and detection.p_omnibus < 1e-3:
-                causes = " and ".join(subsystem.verdict.causes)
-                out.append(
-                    f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of the excess χ² remains, because the "
-                    "real effect deviates slightly from the form of its term."
-                )
+        if subsystem.verdict.verdict == "cause" and subsystem.verdict.explained_fraction < NEARLY_EXPLAINED:
+            causes = " and ".join(subsystem.verdict.causes)
+            out.append(
+                f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of the excess χ² remains, because the "
+                "real effect deviates slightly from the form of its term."
+            )
         out += _describe_range_limits(subsystem.final)
     return tuple(dict.fromkeys(out))
 

@@ -1,4 +1,4 @@
-"""Selection of the causes: refits ranked by BIC, a verdict, a second cause where one is insufficient, and rivals.
+"""Selection of the causes: refits of the strongest hypotheses, alone and in pairs, and the verdict by probabilities.
 
 Theory of operation
 
@@ -6,91 +6,101 @@ Problem. A recording differs from the model. Which term of the catalogue explain
 can another one do the same? The costly error is a wrong name: it makes somebody repair what is not broken.
 "Unexplained" and "ambiguous" are answers, too.
 
-Detection first. One family of tests asks whether anything is wrong at all: the best candidate's likelihood ratio and an
-omnibus test of the residuals, at 0.1 % together (`FAMILY_ALPHA`), because the noise model is itself an estimate from a
-few repeats. If repeats differ by more than the noise model allows, nothing is named.
+Explanations. Every hypothesis is scored beside the nominal fit. The strongest are refitted with all base parameters
+free (an effect that base parameters imitate is none); the others count by their score. The best ones are also given
+other forms of their own effect and a free mean per bin, and second causes are refitted beside them. A pair may show
+that a search began with the wrong single, whose parts are then refitted alone. `evidence.py` turns all of them into
+probabilities.
 
-Singles. The strongest candidates are refitted with all base parameters free (an effect that base parameters imitate is
-none) and ranked by BIC. The best one is accepted if what remains is noise and it explains most of the excess.
+Verdict. Nothing is named while no effect is likely (`MAX_NO_EFFECT`). Causes are named that each act with a
+probability of `MIN_NAMED`; else the fewest sets that have it together are ambiguous, unless none of these is more
+probable than each.
+If repeats differ by more than the noise model allows, nothing is named at all (decision 8).
 
-Other forms before other causes. Real effects rarely have exactly their term's form: a droop that does not follow the
-power leaves residuals, and a second, false cause would fit them. So the best single is given columns of its own effect
-that grow or decay with power, heat, dose and time, or have another share in each signal (`discrepancy_basis.py`); if
-they take the rest, the one cause is named. Only then are pairs tried, and a pair must gain more than those columns do,
-by BIC. A pair may also show that the search began with the wrong single: it is then restarted from the pair's parts.
-
-Thresholds are shares of the excess that a cause explains. They rise where a false name is easy: a second node behind
-the absorber passes for a wall, another form for a second cause. They were set on recordings made for that purpose
-(decisions 8 and 11).
-
-Rivals. Candidates within `BIC_INDISTINGUISHABLE` of the chosen one make the verdict ambiguous, unless they merely
-imitate it: more parameters, one of them at its bound, and a prediction that is equivalent.
-
-Invariants. Nothing here changes the data or the noise model. The same recording and seed give the same verdict. A
-hypothesis that cannot be computed is recorded in the log with its reason, and never counts as ruled out.
+Invariants. Nothing here changes the data or the noise model. The same recording gives the same verdict. A hypothesis
+that cannot be computed is recorded in the log with its reason.
 """
 
 from dataclasses import dataclass
+from math import log
 
 import numpy as np
 
-from optodrive.lab.diagnosis.detection import Detection, detect, score_effects, simulate_effects
+from optodrive.core.types.discrepancy import Probabilities
+from optodrive.lab.diagnosis.detection import Detection, count_noise_degrees, detect, score_effects, simulate_effects
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
-from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity
-from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
-from optodrive.lab.diagnosis.refitting import (
-    RefittedCandidate,
-    refit_alone,
-    refit_pairs,
-    refit_strongest,
+from optodrive.lab.diagnosis.evidence import (
+    BINS_REST,
+    FORM_REST,
+    OTHER_ODDS,
+    PRIOR_NO_EFFECT,
+    PRIOR_NONE_OF_THESE,
+    PRIOR_ONE_CAUSE,
+    PRIOR_TWO_CAUSES,
+    Explanation,
+    compute_log_evidence,
+    compute_own_share,
+    compute_probabilities,
+    compute_score_evidence,
 )
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
+from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
 from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.physics.hypothesis import Hypothesis
+from optodrive.physics.terms import discover_terms
 
-FAMILY_ALPHA = 0.001
-"""Significance level of the family of tests: keeps false alarms below 1 % although the noise model is an estimate."""
+MAX_NO_EFFECT = 0.05
+"""Largest probability of no effect with which an effect counts as detected."""
+MIN_NAMED = 0.97
+"""Smallest probability of what is named: of one set of causes, or of all sets of an ambiguity."""
+MIN_ALONE = 0.2
+"""Smallest probability of the named causes without another one, which would else be missing in the answer."""
+MAX_AMBIGUOUS = 4
+"""Largest number of sets of causes in an ambiguity; a longer list is no answer."""
+NEAR_CHI2 = 30.0
+"""χ² above the best refit within which another one is always examined."""
+EXAMINED_SINGLES, EXAMINED_PAIRS = 3, 2
+"""Number of the best refits that are examined for other forms and for what they leave."""
+RESTART_GAIN = 1.0
+"""Gain in log evidence of a refit from where a pair ended that begins the search again."""
+PAIR_SCORE = 12.0
+"""Likelihood ratio of a second cause from which pairs are refitted."""
+CERTAIN = 0.995
+"""Probability of none of these where repeats differ by more than noise."""
 MAX_REPLICATE_EXCESS = 6.0
 """Maximum replicate excess, in σ, for runs of one group to count as repeats."""
 MAX_INTRA_PULSE_POWER_EXCESS = 25.0
 """Maximum significance, in σ, of power changes within pulses."""
-BIC_INDISTINGUISHABLE = 10.0
-"""Rivals within this BIC difference of the best cannot be told apart: odds below about 150.
-
-A larger value would keep rivals that imitate the best one with one more parameter, which costs ln samples.
-"""
-CHI2_EQUIVALENT = 9.0
-"""Predictions that differ by less χ² than this are equivalent."""
-MIN_EXPLAINED, MIN_EXPLAINED_BY_TERM = 0.9, 0.5
-"""Share of the excess that a named cause explains; the share that suffices if its discrepancy basis takes the rest."""
-MIN_EXPLAINED_BY_SHARES = 0.93
-"""Share of the excess that a cause explains before its effect may have another share in each signal.
-
-A second node behind the absorber would otherwise pass for a wall that the gas follows in part.
-"""
-MIN_EXPLAINED_OTHER_FORM = 0.985
-"""A cause with significant residuals is still named if it explains this share of the excess."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """Verdict on a subsystem.
 
-    chosen: the model for all later steps; candidates: best first; nominal_detection, residual_detection: beside the
-    nominal fit and beside the chosen model; explained_fraction: share of the detected excess
+    chosen: the model for all later steps; candidates: refits, best first; nominal_detection: beside the nominal fit;
+    explained_fraction: share of the detected excess
     """
 
     verdict: str
     causes: tuple[str, ...]
+    probabilities: Probabilities
     chosen: RefittedCandidate | None
     candidates: tuple[RefittedCandidate, ...]
     nominal_detection: Detection
-    residual_detection: Detection | None
-    explained_fraction: float
+    explained_fraction: float = 0.0
 
 
-def is_rejected(detection: Detection) -> bool:
-    """Return whether the better of the two tests, at half the level each, rejects the fit."""
-    return min(detection.p_score, detection.p_omnibus) < 0.5 * FAMILY_ALPHA
+@dataclass(frozen=True, eq=False)
+class _Examination:
+    """What a refit leaves: detections beside it, without and with other forms of its cause; shares of the excess."""
+
+    detection: Detection
+    with_forms: Detection
+    explained: float
+    explained_with_forms: float
+
+
+_Examined = dict[RefittedCandidate, _Examination]
 
 
 def has_replicate_excess(problem: FitProblem) -> bool:
@@ -102,27 +112,22 @@ def has_replicate_excess(problem: FitProblem) -> bool:
 
 
 def find_best_candidate(
-    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, log: SearchLog
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog
 ) -> RefittedCandidate | None:
     """Return the best refit of the strongest hypotheses, or None if none is promising."""
-    scores = detect(problem, base, hypotheses, seed, log).scores
+    scores = detect(problem, base, hypotheses, log).scores
     return next(iter(refit_strongest(problem, base, (), scores, log)), None)
 
 
-def select_causes(
-    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, log: SearchLog
-) -> Verdict:
+def select_causes(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog) -> Verdict:
     """Return the verdict on one subsystem."""
     log.on_progress("testing the nominal model")
-    nominal_detection = detect(problem, base, hypotheses, seed, log)
+    nominal_detection = detect(problem, base, hypotheses, log)
     if has_replicate_excess(problem):
-        return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
-    if not is_rejected(nominal_detection):
-        return Verdict("none", (), None, (), nominal_detection, None, 0.0)
+        probabilities = Probabilities(1.0 - CERTAIN, CERTAIN, {(item.key,): 0.0 for item in hypotheses})
+        return Verdict("unexplained", (), probabilities, None, (), nominal_detection)
     singles = refit_strongest(problem, base, (), nominal_detection.scores, log)
-    if not singles:
-        return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
-    return select_from(problem, base, hypotheses, nominal_detection, singles, seed, log)
+    return select_from(problem, base, hypotheses, nominal_detection, singles, log)
 
 
 def select_from(
@@ -131,136 +136,145 @@ def select_from(
     hypotheses: list[Hypothesis],
     nominal_detection: Detection,
     singles: list[RefittedCandidate],
-    seed: int,
     log: SearchLog,
+    examined: "_Examined | None" = None,
 ) -> Verdict:
-    """Return the verdict that follows from refitted single causes, best first."""
-    best = singles[0]
-    log.on_progress(f"testing the residuals of {best.label}")
-    others = [item for item in hypotheses if item.key not in best.causes]
-    simulated = simulate_effects(problem, best.fit, others, log)
-    residual_detection = score_effects(problem, best.fit, simulated, seed)
-    single_explained = _compute_explained_fraction(residual_detection, base, best)
-    if not is_rejected(residual_detection) and single_explained >= MIN_EXPLAINED:
-        return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
-    separate = single_explained >= MIN_EXPLAINED_BY_SHARES
-    basis_columns = compute_discrepancy_basis(problem, best.fit, best.hypotheses, hypotheses, separate)
-    basis_detection = score_effects(problem, best.fit, simulated, seed, basis_columns)
-    if (
-        not is_rejected(basis_detection)
-        and single_explained >= MIN_EXPLAINED_BY_TERM
-        and max(single_explained, _compute_explained_fraction(basis_detection, base, best)) >= MIN_EXPLAINED
-    ):
-        return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
-    form_gain = (
-        residual_detection.residual_chi2
-        - basis_detection.residual_chi2
-        - basis_columns.shape[1] * np.log(len(problem.data.value))
+    """Return the verdict that follows from refitted single causes, best first.
+
+    examined: what is known already of some of them
+    """
+    examined = {} if examined is None else examined
+    pairs: list[RefittedCandidate] = []
+    for item in select_near(base, singles)[:EXAMINED_SINGLES]:
+        _examine(problem, base, hypotheses, item, examined, log)
+    if singles:
+        residual_detection = examined[singles[0]].detection
+        if residual_detection.scores and residual_detection.scores[0].ratio > PAIR_SCORE:
+            pairs = refit_pairs(problem, hypotheses, select_near(base, singles), residual_detection, log)
+            restarted = refit_alone(problem, base, pairs[0], singles, log) if pairs else singles
+            if restarted[0].log_evidence > singles[0].log_evidence + RESTART_GAIN:
+                return select_from(problem, base, hypotheses, nominal_detection, restarted, log, examined)
+        for item in select_near(base, pairs)[:EXAMINED_PAIRS]:
+            _examine(problem, base, hypotheses, item, examined, log)
+    explanations = _list_explanations(problem, base, hypotheses, nominal_detection, [*singles, *pairs], examined)
+    probabilities = compute_probabilities(explanations, count_noise_degrees(problem.data))
+    return _build_verdict(problem, nominal_detection, [*singles, *pairs], examined, probabilities)
+
+
+def select_near(base: ModelFit, ranked: list[RefittedCandidate]) -> list[RefittedCandidate]:
+    """Return the refits that leave so little more than the best one that other forms of their effect may explain it."""
+    if not ranked:
+        return []
+    best = min(item.chi2 for item in ranked)
+    limit = best + max(NEAR_CHI2, FORM_REST * (base.chi2 - best))
+    return [item for item in ranked if item.chi2 < limit or item is ranked[0]]
+
+
+def _examine(
+    problem: FitProblem,
+    base: ModelFit,
+    hypotheses: list[Hypothesis],
+    item: RefittedCandidate,
+    examined: _Examined,
+    log: SearchLog,
+) -> None:
+    """Add what a refit leaves, unless it is known."""
+    if item in examined:
+        return
+    log.on_progress(f"testing the residuals of {item.label}")
+    simulated = simulate_effects(
+        problem, item.fit, [other for other in hypotheses if other.key not in item.causes], log
     )
-    candidates = refit_pairs(problem, base, hypotheses, singles, residual_detection, seed, log)
-    pairs = [item for item in candidates if _is_pair_needed(item, singles, form_gain)]
-    if pairs:
-        restarted = refit_alone(problem, base, pairs[0], singles, log)
-        if singles[0].bic - restarted[0].bic > BIC_INDISTINGUISHABLE:
-            return select_from(problem, base, hypotheses, nominal_detection, restarted, seed, log)
-        pair = pairs[0]
-        log.on_progress(f"testing the residuals of {pair.label}")
-        others = [item for item in hypotheses if item.key not in pair.causes]
-        simulated = simulate_effects(problem, pair.fit, others, log)
-        pair_detection = score_effects(problem, pair.fit, simulated, seed)
-        pair_explained = _compute_explained_fraction(pair_detection, base, pair)
-        # A second cause may only correct the first one's form; it is named if the residuals are insignificant.
-        if not is_rejected(pair_detection) or (pair_explained >= MIN_EXPLAINED_OTHER_FORM > single_explained):
-            return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)
-        if pair_explained >= MIN_EXPLAINED and not is_rejected(
-            score_effects(
-                problem,
-                pair.fit,
-                simulated,
-                seed,
-                compute_discrepancy_basis(
-                    problem, pair.fit, pair.hypotheses, hypotheses, pair_explained >= MIN_EXPLAINED_BY_SHARES
-                ),
-            )
-        ):
-            return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)
-    # If only one cause can occur, no other can be confused with it.
-    min_explained = MIN_EXPLAINED_OTHER_FORM if len({item.key for item in hypotheses}) > 1 else MIN_EXPLAINED
-    if (
-        single_explained >= MIN_EXPLAINED
-        and max(single_explained, _compute_explained_fraction(basis_detection, base, best)) >= min_explained
-    ):
-        return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
-    return Verdict("unexplained", (), None, (*pairs, *singles), nominal_detection, residual_detection, single_explained)
+    forms = compute_discrepancy_basis(problem, item.fit, item.hypotheses, hypotheses)
+    detections = score_effects(problem, item.fit, simulated), score_effects(problem, item.fit, simulated, forms)
+    reduction = base.chi2 - item.chi2
+    plain, with_forms = (_compute_explained_fraction(detection, reduction) for detection in detections)
+    examined[item] = _Examination(*detections, plain, max(plain, with_forms))
 
 
-def _compute_excess(detection: Detection) -> float:
-    return max(0.0, detection.omnibus_chi2 - detection.omnibus_degrees)
-
-
-def _compute_explained_fraction(residual_detection: Detection, base: ModelFit, best: RefittedCandidate) -> float:
+def _compute_explained_fraction(detection: Detection, reduction: float) -> float:
     """Return the share of the excess that a candidate explains: its decrease of χ², relative to that plus the rest."""
-    reduction = base.chi2 - best.fit.chi2
-    score = residual_detection.scores[0].ratio if residual_detection.scores else 0.0
-    remaining = max(
-        0.0, _compute_excess(residual_detection) - 2.5 * np.sqrt(2.0 * residual_detection.omnibus_degrees), score - 12.0
-    )
+    score = detection.scores[0].ratio if detection.scores else 0.0
+    degrees = detection.omnibus.degrees
+    remaining = max(0.0, detection.omnibus.chi2 - degrees - 2.5 * np.sqrt(2.0 * degrees), score - 12.0)
     return float(reduction / max(reduction + remaining, 1e-9))
 
 
-def _is_pair_needed(pair: RefittedCandidate, singles: list[RefittedCandidate], form_gain: float) -> bool:
-    """Return whether a pair beats the best single cause by more than the rivals' margin and its discrepancy basis.
-
-    form_gain: decrease of χ² by the basis of the best single cause, minus its BIC penalty
-    """
-    return singles[0].bic - pair.bic > BIC_INDISTINGUISHABLE + max(0.0, form_gain)
-
-
-def _is_imitation(problem: FitProblem, rival: RefittedCandidate, best: RefittedCandidate) -> bool:
-    """Return whether a rival with more parameters, one of them at a limit, predicts the same as the best candidate."""
-    terms = rival.fit.point.terms
-    if len(rival.fit.free) <= len(best.fit.free) or not any(
-        not item.parameter.low < terms[item.key][item.names[0]] < item.parameter.high for item in rival.fit.free
-    ):
-        return False
-    sensitivity = compute_jitter_sensitivity(problem.data, best.fit.point, problem.epsilon, best.fit.prediction)
-    difference = (rival.fit.prediction - best.fit.prediction)[:, None]
-    return (
-        float(
-            compute_normal_equations(
-                problem.data, difference, problem.noise, sensitivity.power, sensitivity.timing
-            ).total[0, 0]
-        )
-        < CHI2_EQUIVALENT
-    )
+def _list_explanations(
+    problem: FitProblem,
+    base: ModelFit,
+    hypotheses: list[Hypothesis],
+    nominal_detection: Detection,
+    refits: list[RefittedCandidate],
+    examined: _Examined,
+) -> list[Explanation]:
+    """Return every explanation of the recording with its prior and its evidence."""
+    nothing = compute_log_evidence(problem, base, base.chi2)
+    something = nothing + nominal_detection.omnibus.log_evidence
+    out = [
+        Explanation((), log(PRIOR_NO_EFFECT), nothing),
+        Explanation((), log(PRIOR_NONE_OF_THESE), something, own_share=0.0),
+    ]
+    keys = {item.key for item in hypotheses}
+    forms_of = {key: sum(item.key == key for item in hypotheses) for key in keys}
+    catalogue = len(discover_terms())  # also of a subsystem that few of them act in
+    pair_count = catalogue * (catalogue - 1) // 2
+    refitted = {item.label for item in refits}
+    for score in nominal_detection.scores:
+        key, label = score.hypothesis.key, score.hypothesis.label
+        if label not in refitted:
+            prior = log(PRIOR_ONE_CAUSE / catalogue / forms_of[key])
+            out.append(Explanation((key,), prior, nothing + compute_score_evidence(score.ratio)))
+    for item in refits:
+        prior = PRIOR_ONE_CAUSE / catalogue if len(item.causes) == 1 else PRIOR_TWO_CAUSES / pair_count
+        prior = log(prior / np.prod([forms_of[key] for key in item.causes]))
+        out.append(Explanation(item.causes, prior, item.log_evidence))
+        rest = examined.get(item)
+        if rest is None:
+            continue
+        prior += log(OTHER_ODDS)
+        forms = item.log_evidence + rest.with_forms.form_evidence
+        own_forms = compute_own_share(1.0 - rest.explained, FORM_REST)
+        own_bins = compute_own_share(1.0 - rest.explained_with_forms, BINS_REST)
+        bins, both = rest.detection.omnibus.log_evidence, rest.with_forms.omnibus.log_evidence
+        out += [
+            Explanation(item.causes, prior, forms, own_forms),
+            Explanation(item.causes, prior, item.log_evidence + bins, own_bins),
+            Explanation(item.causes, prior + log(OTHER_ODDS), forms + both, own_forms * own_bins),
+        ]
+    return out
 
 
 def _build_verdict(
     problem: FitProblem,
-    ranked: list[RefittedCandidate],
     nominal_detection: Detection,
-    residual_detection: Detection,
-    explained_fraction: float,
+    refits: list[RefittedCandidate],
+    examined: _Examined,
+    probabilities: Probabilities,
 ) -> Verdict:
-    best = ranked[0]
-    rivals = [
-        item
-        for item in ranked
-        if item.bic - best.bic < BIC_INDISTINGUISHABLE and not _is_imitation(problem, item, best)
-    ]
-    keys = list(dict.fromkeys(key for item in rivals for key in item.causes))
-    if len({frozenset(item.causes) for item in rivals}) > 1:
-        return Verdict(
-            "ambiguous", tuple(keys), best, tuple(ranked), nominal_detection, residual_detection, explained_fraction
-        )
-    if not problem.noise.from_replicates:
-        return Verdict(
-            "ambiguous",
-            tuple(best.causes),
-            best,
-            tuple(ranked),
-            nominal_detection,
-            residual_detection,
-            explained_fraction,
-        )
-    return Verdict("cause", best.causes, best, tuple(ranked), nominal_detection, residual_detection, explained_fraction)
+    by_causes: dict[tuple[str, ...], RefittedCandidate] = {}
+    for item in sorted(refits, key=lambda candidate: -candidate.log_evidence):
+        by_causes.setdefault(tuple(sorted(item.causes)), item)
+    ranked = [keys for keys, _ in probabilities.ranked if keys in by_causes]
+    candidates = tuple(by_causes[keys] for keys in ranked)
+    if probabilities.no_effect > MAX_NO_EFFECT:
+        return Verdict("none", (), probabilities, None, candidates, nominal_detection)
+    if not candidates or probabilities.none_of_these > probabilities.causes[ranked[0]]:
+        return Verdict("unexplained", (), probabilities, None, candidates, nominal_detection)
+    keys = {key for keys in ranked for key in keys}
+    named = tuple(sorted(key for key in keys if probabilities.sum_of(key) >= MIN_NAMED))
+    if named in by_causes and probabilities.causes[named] >= MIN_ALONE and problem.noise.from_replicates:
+        candidates = (by_causes[named], *(item for item in candidates if item is not by_causes[named]))
+        chosen = [named]
+    else:
+        named, chosen, total = (), list[tuple[str, ...]](), 0.0
+        while len(chosen) < min(MAX_AMBIGUOUS, len(ranked)) and total < MIN_NAMED:
+            total += probabilities.causes[ranked[len(chosen)]]
+            chosen.append(ranked[len(chosen)])
+    best = candidates[0]
+    rest = examined.get(best)
+    explained = 0.0 if rest is None else rest.explained
+    causes = tuple(dict.fromkeys(key for keys in chosen for key in by_causes[keys].causes))
+    return Verdict(
+        "cause" if named else "ambiguous", causes, probabilities, best, candidates, nominal_detection, explained
+    )

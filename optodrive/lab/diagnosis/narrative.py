@@ -6,10 +6,12 @@ from math import isfinite
 from typing import Any
 
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate, HeightError
+from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate, HeightError, Probabilities
 from optodrive.physics.terms import discover_terms
 
 MAX_RULED_OUT = 6
+MIN_SHOWN = 0.01
+"""Smallest probability of a set of causes that the text states."""
 
 
 def _format_interval(item: Estimate) -> str:
@@ -31,6 +33,7 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
             f"  {name} = {_format_interval(item)}" for name, item in discrepancy.parameters.items() if "." in name
         ]
         lines.append("")
+    lines.append(describe_probabilities(discrepancy.probabilities))
     if discrepancy.verdict in ("cause", "ambiguous"):
         lines.append(f"This explains {discrepancy.explained_fraction:.1%} of the excess χ² of the nominal model.")
     lines.append(_describe_height_error(discrepancy))
@@ -45,9 +48,10 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
     else:
         ruled_out = [item for item in discrepancy.candidates if item.verdict == "ruled out"]
         if ruled_out:
-            lines += ["Ruled out, because residuals remain:"]
+            lines += ["Ruled out:"]
             lines += [
-                f"- {item.label} (alone it reduces χ² by {item.statistic:.0f})" for item in ruled_out[:MAX_RULED_OUT]
+                f"- {item.label}, {format_probability(item.probability)} (alone it reduces χ² by {item.statistic:.0f})"
+                for item in ruled_out[:MAX_RULED_OUT]
             ]
         not_observable = [item.label for item in discrepancy.candidates if item.verdict == "not observable"]
         if not_observable:
@@ -65,6 +69,27 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
     return lines
 
 
+def describe_probabilities(probabilities: Probabilities) -> str:
+    """Return the probabilities in one sentence, those of sets of causes above `MIN_SHOWN`."""
+    parts = [
+        f"{' with '.join(keys)} {format_probability(probability)}"
+        for keys, probability in probabilities.ranked
+        if probability >= MIN_SHOWN
+    ]
+    parts += [
+        f"none of these causes {format_probability(probabilities.none_of_these)}",
+        f"no effect {format_probability(probabilities.no_effect)}",
+    ]
+    return f"Probabilities: {', '.join(parts)}."
+
+
+def format_probability(probability: float) -> str:
+    """Return a probability in percent, never as certainty."""
+    if probability < 1e-3:
+        return "< 0.1 %"
+    return "> 99.9 %" if probability > 1.0 - 1e-3 else f"{100.0 * probability:.1f} %"
+
+
 def _build_headline(discrepancy: Discrepancy) -> str:
     names = [discover_terms()[key].label for key in discrepancy.causes]
     if discrepancy.verdict == "none":
@@ -78,10 +103,8 @@ def _build_headline(discrepancy: Discrepancy) -> str:
     if discrepancy.verdict == "cause":
         return f"{wrong} because {' and '.join(names)}{doubts}{others}."
     if discrepancy.verdict == "ambiguous" and len(names) == 1:
-        return (
-            f"The nominal model is wrong, perhaps because {names[0]}{doubts}{others}: not certain, because no run "
-            "repeats another (`group` is missing, or every group has one run)."
-        )
+        probability = format_probability(discrepancy.probabilities.sum_of(discrepancy.causes[0]))
+        return f"The nominal model is wrong, perhaps because {names[0]} ({probability}){doubts}{others}."
     if discrepancy.verdict == "ambiguous" and names:
         causes = "; or ".join(names)
         return f"The nominal model is wrong; this data cannot separate these causes: {causes}{doubts}{others}."
@@ -165,6 +188,14 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
     return {
         "verdict": discrepancy.verdict,
         "causes": list(discrepancy.causes),
+        "probabilities": {
+            "no_effect": discrepancy.probabilities.no_effect,
+            "none_of_these": discrepancy.probabilities.none_of_these,
+            "causes": [
+                {"causes": list(keys), "probability": probability}
+                for keys, probability in discrepancy.probabilities.ranked
+            ],
+        },
         "parameters": {
             name: {"value": item.value, "unit": item.unit, "ci95": None if item.at_limit else [item.low, item.high]}
             for name, item in discrepancy.parameters.items()
@@ -190,7 +221,7 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
                 "cause": item.cause,
                 "hypothesis": item.label,
                 "statistic": item.statistic if isfinite(item.statistic) else None,
-                "p_value": item.p_value,
+                "probability": item.probability,
                 "heldout_gain": item.heldout_gain,
                 "verdict": item.verdict,
                 "detection_limit": item.detection_limit,
@@ -202,7 +233,8 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
                 "causes": list(item.causes),
                 "hypothesis": item.label,
                 "chi2_above_best": item.chi2,
-                "bic_above_best": item.bic,
+                "log_evidence": item.log_evidence,
+                "probability": item.probability,
                 "heldout_gain": item.heldout_gain,
                 "chosen": item.is_chosen,
                 "parameters": {name: {"value": value, "unit": unit} for name, (value, unit) in item.parameters.items()},

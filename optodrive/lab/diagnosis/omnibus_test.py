@@ -8,11 +8,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import chi2 as chi_squared
-from scipy.stats import f as fisher
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import Dataset
+from optodrive.lab.diagnosis.evidence import compute_bin_evidence
 from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity
 from optodrive.lab.diagnosis.noise_model import whiten
 from optodrive.lab.diagnosis.normal_equations import project_out
@@ -28,22 +27,16 @@ _known_bins: "WeakKeyDictionary[Dataset, IntArray]" = WeakKeyDictionary()
 
 @dataclass(frozen=True)
 class OmnibusStatistic:
-    """χ² in bins with its degrees of freedom, and the same of differences between repeats, which hold noise only."""
+    """χ² in bins with its degrees of freedom, and the same of differences between repeats, which hold noise only.
+
+    log_evidence: gain in log evidence by independent means of the bins
+    """
 
     chi2: float
     degrees: int
     noise_chi2: float
     noise_degrees: int
-
-    @property
-    def p_value(self) -> float:
-        """Value of p by an F distribution scaled by the noise between repeats where it exceeds the noise model."""
-        if not self.degrees:
-            return 1.0
-        if not self.noise_degrees:
-            return float(chi_squared.sf(self.chi2, self.degrees))
-        scale = max(1.0, self.noise_chi2 / self.noise_degrees)
-        return float(fisher.sf(self.chi2 / self.degrees / scale, self.degrees, self.noise_degrees))
+    log_evidence: float
 
 
 def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: JitterSensitivity) -> OmnibusStatistic:
@@ -102,19 +95,26 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
         noise_chi2, noise_degrees = noise_chi2 - chi2, noise_degrees - degrees
     removed, last = list(range(width - 1)), width - 1
     projected = project_out(total, removed, [*range(width, width + count), last])
-    chi2, degrees = _compute_quadratic_form(projected[:-1, :-1], projected[:-1, -1])
-    return OmnibusStatistic(chi2, degrees, noise_chi2, noise_degrees)
+    correlation, scaled = _scale_informative(projected[:-1, :-1], projected[:-1, -1])
+    chi2 = float(scaled @ cho_solve(cho_factor(correlation), scaled))
+    evidence = compute_bin_evidence(correlation, scaled, noise_chi2, noise_degrees)
+    return OmnibusStatistic(chi2, len(scaled), noise_chi2, noise_degrees, evidence)
 
 
 def _compute_quadratic_form(gram: FloatArray, right: FloatArray) -> tuple[float, int]:
     """Return rightᵀ gram⁻¹ right and the number of informative bins."""
+    correlation, scaled = _scale_informative(gram, right)
+    return float(scaled @ cho_solve(cho_factor(correlation), scaled)), len(scaled)
+
+
+def _scale_informative(gram: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the correlations of the informative bins, with a ridge, and their means in units of the noise."""
     scale = np.sqrt(np.diag(gram))
     is_informative = scale > 1e-9 * scale.max(initial=0.0)
     informative = np.flatnonzero(is_informative)
     scale = scale[informative]
     correlation = gram[np.ix_(informative, informative)] / scale / scale[:, None] + RIDGE * np.eye(len(informative))
-    scaled = right[informative] / scale
-    return float(scaled @ cho_solve(cho_factor(correlation), scaled)), len(informative)
+    return correlation, right[informative] / scale
 
 
 def compute_omnibus_by_group(problem: FitProblem, residual: FloatArray, sensitivity: JitterSensitivity) -> FloatArray:

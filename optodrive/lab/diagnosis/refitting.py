@@ -1,12 +1,14 @@
-"""Refits of the hypotheses that a detection found strongest, alone and in pairs, ranked by BIC."""
+"""Refits of the hypotheses that a detection found strongest, alone and in pairs, ranked by their evidence."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from optodrive.core.errors import DivergedError
 from optodrive.lab.diagnosis.detection import Detection, Score, detect
+from optodrive.lab.diagnosis.evidence import compute_log_evidence
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
@@ -15,10 +17,16 @@ from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
 CHI2_ABANDON = 300.0
 """A fit that is predicted to stay this far above the best χ² is abandoned."""
+CHI2_UNCONVERGED = 1.0
+"""A fit that ends so far above the χ² of its score has not converged."""
+MIN_RATIO = 6.0
+"""Likelihood ratio from which a hypothesis is refitted."""
 MAX_REFITS = 9
 """Number of the strongest hypotheses that are refitted."""
 MAX_STARTS, MAX_RESTARTS = 6, 6
 """Number of starts refitted of a hypothesis with many, and maximum number of restarts of each."""
+AMPLITUDES = (0.2, 5.0)
+"""Factors on a number with a logarithm within which its effect is proportional to it."""
 MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
 """Number of second causes refitted beside each of the best first causes, and number of those."""
 
@@ -27,12 +35,13 @@ MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
 class RefittedCandidate:
     """One or two hypotheses, refitted.
 
-    bic: χ² plus ln samples per free parameter
+    chi2: of the fit, or by the score where the fit ended above it; log_evidence: of this χ²
     """
 
     hypotheses: tuple[Hypothesis, ...]
     fit: ModelFit
-    bic: float
+    chi2: float
+    log_evidence: float
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -53,9 +62,8 @@ def refit_strongest(
     log: SearchLog,
 ) -> list[RefittedCandidate]:
     """Refit the strongest scores in full, best first."""
-    samples = len(problem.data.value)
     candidates: list[RefittedCandidate] = []
-    promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(6.0, 0.05 * scores[0].ratio)]
+    promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(MIN_RATIO, 0.05 * scores[0].ratio)]
     chi2_abandon = np.inf
     for score in promising:
         log.on_progress(f"fitting {score.hypothesis.label}")
@@ -69,30 +77,57 @@ def refit_strongest(
         except DivergedError as error:
             log.add_failure(score.hypothesis.label, error)
             continue
-        chi2_abandon = min(chi2_abandon, result.chi2 + CHI2_ABANDON)
-        candidates.append(
-            RefittedCandidate((*given, score.hypothesis), result, result.chi2 + len(free) * np.log(samples))
-        )
-    return sorted(candidates, key=lambda item: item.bic)
+        chi2_by_score = base.chi2 - score.ratio if _is_within_ranges(score) else np.inf
+        if result.chi2 > chi2_by_score + CHI2_UNCONVERGED:
+            result = _retry(problem, base, score, free, result)
+        chi2 = min(result.chi2, chi2_by_score)
+        chi2_abandon = min(chi2_abandon, chi2 + CHI2_ABANDON)
+        evidence = compute_log_evidence(problem, result, chi2)
+        candidates.append(RefittedCandidate((*given, score.hypothesis), result, chi2, evidence))
+    return sorted(candidates, key=lambda item: -item.log_evidence)
+
+
+def _retry(
+    problem: FitProblem, base: ModelFit, score: Score, free: Sequence[FreeParameter], result: ModelFit
+) -> ModelFit:
+    """Return the best fit from the score's start, never abandoned, and from every other start of the hypothesis."""
+    points = [_build_start(base.point, score)]
+    if not score.hypothesis.fit_every_start:
+        starts = score.hypothesis.starts
+        points += [ParameterPoint(base.point.base, {**base.point.terms, score.hypothesis.key: s}) for s in starts]
+    for point in points:
+        with suppress(DivergedError):
+            result = min(result, fit(problem, point, free), key=lambda item: item.chi2)
+    return result
+
+
+def _is_within_ranges(score: Score) -> bool:
+    """Return whether the amplitudes of a score, at which it has its likelihood ratio, are within their ranges."""
+    item = score.hypothesis
+    sizes = item.free if item.is_linear else item.free[:1]
+    starts = item.starts if len(score.amplitude) > 1 else (score.start,)
+    return all(
+        free.parameter.low <= amplitude * start[free.names[0]] <= free.parameter.high
+        and (not free.logarithmic or AMPLITUDES[0] <= amplitude <= AMPLITUDES[1])
+        for free, amplitude, start in zip(sizes, score.amplitude, starts, strict=True)
+    )
 
 
 def refit_pairs(
     problem: FitProblem,
-    base: ModelFit,
     hypotheses: list[Hypothesis],
     singles: list[RefittedCandidate],
     residual_detection: Detection,
-    seed: int,
     log: SearchLog,
 ) -> list[RefittedCandidate]:
     """Refit second causes beside each of the best first causes. Return the best pairs first."""
     candidates: list[RefittedCandidate] = []
     for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
         others = [item for item in hypotheses if item.key not in first.causes]
-        detection = residual_detection if row == 0 else detect(problem, first.fit, others, seed, log)
+        detection = residual_detection if row == 0 else detect(problem, first.fit, others, log)
         candidates += refit_strongest(problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], log)
     unique: dict[frozenset[str], RefittedCandidate] = {}
-    for item in sorted(candidates, key=lambda candidate: candidate.bic):
+    for item in sorted(candidates, key=lambda candidate: -candidate.log_evidence):
         unique.setdefault(frozenset(part.label for part in item.hypotheses), item)
     return list(unique.values())
 
@@ -118,9 +153,9 @@ def refit_alone(
         except DivergedError as error:
             log.add_failure(item.label, error)
             continue
-        candidate = RefittedCandidate((item,), result, result.chi2 + len(free) * np.log(len(problem.data.value)))
-        best[item.label] = min(best.get(item.label, candidate), candidate, key=lambda each: each.bic)
-    return sorted(best.values(), key=lambda each: each.bic)
+        candidate = RefittedCandidate((item,), result, result.chi2, compute_log_evidence(problem, result, result.chi2))
+        best[item.label] = max(best.get(item.label, candidate), candidate, key=lambda each: each.log_evidence)
+    return sorted(best.values(), key=lambda each: -each.log_evidence)
 
 
 def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
@@ -134,7 +169,7 @@ def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
             values[free.names[0]] = min(max(number, free.parameter.low), free.parameter.high)
         return ParameterPoint(point.base, {**point.terms, item.key: values})
     free = item.free[0]
-    scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], 0.2, 5.0))
+    scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], *AMPLITUDES))
     value = score.start[free.names[0]] * scale
     return ParameterPoint(point.base, free.with_value(terms, float(np.log(value)) if free.logarithmic else value))
 

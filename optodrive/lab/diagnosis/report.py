@@ -7,11 +7,11 @@ from math import isfinite
 from optodrive.core.html_page import render_page, render_table
 from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_number, format_quantity
-from optodrive.core.types.discrepancy import Discrepancy, ResidualTrace
+from optodrive.core.types.discrepancy import Discrepancy, Probabilities, ResidualTrace
 from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
-from optodrive.lab.diagnosis.narrative import build_narrative
+from optodrive.lab.diagnosis.narrative import MIN_SHOWN, build_narrative, format_probability
 from optodrive.lab.diagnosis.next_steps import OUT, NextStep, list_next_steps
-from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_residuals
+from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_residuals, draw_share
 
 MAX_TRACES = 12
 NAMED = ("identified", "indistinguishable")
@@ -35,6 +35,7 @@ def build_report(
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     parts = [
         *_build_next_steps(list_next_steps(discrepancy, recordings, out)),
+        *_build_probabilities(discrepancy.probabilities),
         "<h2>Measured against model</h2>",
         f"<p>{MEASURED}, {models}. The nominal model has the R, C, τ<sub>g</sub>, κ and φ that fit these data best, "
         "not those of a parameter set. Of each signal the run in which it is worst, and the median one; below, "
@@ -58,6 +59,23 @@ def build_report(
         "</div>",
     ]
     return render_page(title, discrepancy.verdict, build_narrative(discrepancy), parts, provenance)
+
+
+def _build_probabilities(probabilities: Probabilities) -> list[str]:
+    """Return the section with the probability of every explanation above `MIN_SHOWN`, most probable first."""
+    rows = [(" with ".join(keys), value) for keys, value in probabilities.causes.items() if value >= MIN_SHOWN]
+    rows += [("none of these causes", probabilities.none_of_these), ("no effect", probabilities.no_effect)]
+    cells = [
+        (escape(name), draw_share(value), format_probability(value))
+        for name, value in sorted(rows, key=lambda row: -row[1])
+    ]
+    return [
+        "<h2>Probabilities</h2>",
+        "<p>Of each cause alone, of causes that act together, of a cause that is in no catalogue, and of no effect. "
+        "They sum to one; what has less than "
+        f"{format_probability(MIN_SHOWN)} is not listed.</p>",
+        render_table(("explanation", "", "probability"), cells, frozenset({2}), "Probabilities"),
+    ]
 
 
 def _build_next_steps(steps: list[NextStep]) -> Iterator[str]:
@@ -130,14 +148,22 @@ def _build_evidence_table(discrepancy: Discrepancy) -> str:
             escape(item.label),
             draw_bar(min(item.statistic, max_ratio), max_ratio, DETECTABLE_RATIO, item.verdict in NAMED),
             format_number(item.statistic),
-            "< 10⁻³⁰⁰" if item.p_value < 1e-300 else format_number(item.p_value, 2),
+            format_probability(item.probability),
             _format_gain(item.heldout_gain),
             f"<span class='nowrap'>{escape(item.verdict)}</span>",
             f"<span class='nowrap'>{escape(item.detection_limit)}</span>",
         )
         for item in strongest
     )
-    header = ("cause", "likelihood ratio", "ratio", "p", "held-out gain", "verdict", "smallest visible effect")
+    header = (
+        "cause",
+        "likelihood ratio",
+        "ratio",
+        "probability",
+        "held-out gain",
+        "verdict",
+        "smallest visible effect",
+    )
     return render_table(header, rows, frozenset({2, 3, 4}), "Evidence for each cause")
 
 
@@ -148,7 +174,8 @@ def _build_rivals(discrepancy: Discrepancy) -> list[str]:
         (
             escape(item.label),
             f"{item.chi2:+.0f}",
-            f"{item.bic:+.0f}",
+            f"{item.log_evidence:.1f}".replace("-", "−"),
+            format_probability(item.probability),
             _format_gain(item.heldout_gain),
             "<br>".join(
                 f"{escape(name)} = {escape(format_quantity(value, unit))}"
@@ -160,9 +187,14 @@ def _build_rivals(discrepancy: Discrepancy) -> list[str]:
     chosen = frozenset(number for number, item in enumerate(discrepancy.rivals) if item.is_chosen)
     return [
         "<h3>Rivals, refitted</h3>",
-        "<p>χ² and BIC above the best rival's, best first; bold: the model of the later steps.</p>",
+        "<p>χ² above the best rival's, logarithm of the marginal likelihood below the best one's, and the probability "
+        "of exactly these causes, which counts other forms of their effect too; bold: the model of later steps.</p>",
         render_table(
-            ("causes", "χ²", "BIC", "held-out gain", "parameters"), rows, frozenset({1, 2, 3}), "Rivals", chosen
+            ("causes", "χ²", "log evidence", "probability", "held-out gain", "parameters"),
+            rows,
+            frozenset({1, 2, 3, 4}),
+            "Rivals",
+            chosen,
         ),
     ]
 

@@ -69,5 +69,13 @@ def draw_bar(ratio: float, max_ratio: float, threshold: float, is_named: bool) -
     )
 
 
+def draw_share(share: float) -> str:
+    """Draw a share of one as a bar."""
+    return (
+        f"<svg class='bars' viewBox='0 0 {BAR_WIDTH} {BAR_HEIGHT}' style='width:{BAR_WIDTH}px' aria-hidden='true'>"
+        f"<rect class='bar' x='0' y='7' width='{share * BAR_WIDTH:.1f}' height='12'/></svg>"
+    )
+
+
 def _compute_rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))

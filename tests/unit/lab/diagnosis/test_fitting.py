@@ -46,10 +46,10 @@ def test_a_fit_of_the_true_cause_is_no_worse_than_the_truth(key, values, tmp_pat
     problem, base = fit_nominal(data, prior, epsilon)
     hypotheses = build_hypotheses(data)
     (own,) = (item for item in hypotheses if item.key == key)
-    candidate = find_best_candidate(problem, base, [own], 0, SearchLog())
+    candidate = find_best_candidate(problem, base, [own], SearchLog())
     # A fit's χ² depends on the jitter sensitivities at its start, so both points are judged by fits that start there.
     truth = fit(problem, ParameterPoint(prior.mean, {key: values}), candidate.fit.free, iterations=1)
     found = fit(problem, candidate.fit.point, candidate.fit.free, iterations=1)
     assert found.chi2 <= truth.chi2 + TOLERANCE, found.point.terms
-    best = find_best_candidate(problem, base, hypotheses, 0, SearchLog())
+    best = find_best_candidate(problem, base, hypotheses, SearchLog())
     assert best.causes == (key,), best.fit.point.terms

@@ -1,0 +1,159 @@
+"""Marginal likelihoods of the explanations of a recording, and the probabilities that follow from them.
+
+Theory of operation
+
+Explanations. A recording shows no effect, one cause of the catalogue, two of them, or something else. Each but the last
+is a fitted model; its marginal likelihood is Laplace's: χ² at the best fit, and the share of the prior volume that the
+data leave (Occam's factor). Sizes of effects have a prior that is uniform in their logarithm, over two decades: a fit
+that ends at no effect costs nothing and gains nothing.
+
+Something else. A cause outside the catalogue has no model. It is represented by a flexible one: an independent mean in
+every bin of the omnibus test (group, signal, time after an edge), normal, of a size that is integrated over, beside the
+nominal model or beside a fitted cause. A real cause hardly ever has exactly its term's form, so a fitted cause is also
+given columns of its own effect in other forms (`discrepancy_basis.py`), with a prior on their coefficients. What the
+bins take beside a cause belongs to that cause in another form if the cause explains nearly all, and to none of these if
+it explains less; the same holds for its own other forms, with a more lenient share (`compute_own_share`).
+
+Noise. The noise model is an estimate from few repeats, so a difference in evidence is worth less the larger it is: it
+is converted as the likelihood of a Student distribution with the degrees of freedom of the noise (`temper`), relative
+to the best explanation, so that rivals which nearly agree are compared almost as normal ones.
+
+The priors, the two shares and the temperature were set on development seeds of the blind generator (decision 49), whose
+reliability diagram `scripts/bench calibration` draws on others.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import log, log1p
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.discrepancy import Probabilities
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
+from optodrive.physics.hypothesis import FreeParameter
+
+PRIOR_NO_EFFECT, PRIOR_ONE_CAUSE, PRIOR_TWO_CAUSES, PRIOR_NONE_OF_THESE = 0.5, 0.35, 0.05, 0.1
+"""Prior probabilities before any data; those of one and of two causes are shared among all of them."""
+OTHER_ODDS = 0.3
+"""Prior odds that beside a fitted cause there is something else, or that it has another form."""
+SIZE_LOG_SPAN = log(100.0)
+"""Span of the logarithm of an effect's size a priori."""
+FORM_SIGMAS = (0.05, 0.1, 0.2, 0.4)
+"""Prior standard deviations of the coefficients of other forms, relative to the effect; averaged over."""
+BIN_VARIANCES = tuple(np.geomspace(0.1, 1e5, 13).tolist())
+"""Prior variances of the means of bins, in their noise; averaged over."""
+FORM_REST, BINS_REST, REST_POWER = 0.3, 0.03, 3.0
+"""Share of the excess left over at which a rest, taken by other forms or by bins, is as likely another cause's."""
+UNIFORM_VARIANCE = 1.0 / 12.0
+"""Variance of a uniform distribution over a unit range."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A model of the recording.
+
+    causes: none for no effect or for something else; own_share: probability that these causes, rather than something
+    else, are what it describes
+    """
+
+    causes: tuple[str, ...]
+    log_prior: float
+    log_evidence: float
+    own_share: float = 1.0
+
+
+def compute_log_evidence(problem: FitProblem, fitted: ModelFit, chi2: float) -> float:
+    """Return the logarithm of the marginal likelihood of a fit with this χ², up to a constant of the data."""
+    count = len(problem.prior.sigma) + len(fitted.free)
+    hessian = fitted.gram.sum(axis=0)[:count, :count]
+    precision = [1.0 / sigma**2 for sigma in problem.prior.sigma]
+    scale = np.ones(count)
+    for row, free in enumerate(fitted.free, start=len(precision)):
+        if is_size(free):
+            scale[row] = free.read_value(fitted.point.terms)
+            precision.append(1.0 / (UNIFORM_VARIANCE * SIZE_LOG_SPAN**2))
+        else:
+            low, high = free.limits
+            precision.append(1.0 / (UNIFORM_VARIANCE * (high - low) ** 2))
+    root = np.sqrt(precision)
+    relative = np.eye(count) + hessian * np.outer(scale / root, scale / root)
+    return -0.5 * (chi2 + float(np.linalg.slogdet(relative)[1]))
+
+
+def is_size(free: FreeParameter) -> bool:
+    """Return whether a fitted number scales an effect that vanishes with it."""
+    return not free.logarithmic and not free.parameter.is_shape
+
+
+def compute_score_evidence(ratio: float) -> float:
+    """Return the gain in log evidence of an effect of this likelihood ratio that was not refitted."""
+    return 0.5 * (ratio - log1p(ratio * UNIFORM_VARIANCE * SIZE_LOG_SPAN**2))
+
+
+def compute_form_evidence(gram: FloatArray, right: FloatArray) -> float:
+    """Return the gain in log evidence by columns with normal coefficients of `FORM_SIGMAS`, averaged over these.
+
+    gram: [k, k] of the whitened columns, fitted parameters projected out; right: [k] with the residual
+    """
+    values, vectors = np.linalg.eigh(gram)
+    values, projected = np.maximum(values, 0.0), vectors.T @ right
+    gains = []
+    for sigma in FORM_SIGMAS:
+        inflation = 1.0 + sigma**2 * values
+        gains.append(0.5 * float((sigma**2 * projected**2 / inflation - np.log(inflation)).sum()))
+    return average_log(gains)
+
+
+def compute_bin_evidence(gram: FloatArray, right: FloatArray, noise_chi2: float, noise_degrees: int) -> float:
+    """Return the gain in log evidence by independent means of bins, normal with `BIN_VARIANCES`.
+
+    gram: [k, k] correlations of the bins; right: [k] with the residual; noise_chi2, noise_degrees: of the same bins of
+    the differences between repeats, which estimate the scale of the noise
+    """
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > 1e-6 * values.max(initial=1.0)
+    values, squares = values[kept], (vectors.T @ right)[kept] ** 2 / values[kept]
+    degrees = max(noise_degrees, 1)
+    noise = max(degrees, noise_chi2) if noise_degrees else 1e9
+    degrees = degrees if noise_degrees else 10**9
+    half = 0.5 * (degrees + len(values))
+    gains = []
+    for variance in BIN_VARIANCES:
+        inflation = 1.0 + variance * values
+        likelihood = half * (log1p(float(squares.sum()) / noise) - log1p(float((squares / inflation).sum()) / noise))
+        gains.append(likelihood - 0.5 * float(np.log(inflation).sum()))
+    return average_log(gains)
+
+
+def average_log(logs: Sequence[float]) -> float:
+    """Return the logarithm of the mean of exponentials."""
+    return float(np.logaddexp.reduce(logs)) - log(len(logs))
+
+
+def compute_own_share(rest: float, middle: float) -> float:
+    """Return the probability that what is left over, a share of the excess, is the cause's own in another form."""
+    return float(1.0 / (1.0 + (rest / middle) ** REST_POWER))
+
+
+def temper(difference: float, degrees: int) -> float:
+    """Return the logarithm of the odds for a difference of log evidence, with the noise known to some degrees."""
+    return 0.5 * (degrees + 1) * log1p(2.0 * difference / degrees)
+
+
+def compute_probabilities(explanations: Iterable[Explanation], degrees: int) -> Probabilities:
+    """Return the probabilities of all explanations, which sum to 1."""
+    items = list(explanations)
+    best = max(item.log_evidence for item in items)
+    logs = np.array([item.log_prior - temper(best - item.log_evidence, degrees) for item in items])
+    weights = np.exp(logs - np.logaddexp.reduce(logs))
+    no_effect = none_of_these = 0.0
+    causes: dict[tuple[str, ...], float] = {}
+    for item, weight in zip(items, weights.tolist(), strict=True):
+        none_of_these += weight * (1.0 - item.own_share)
+        if item.causes:
+            key = tuple(sorted(item.causes))
+            causes[key] = causes.get(key, 0.0) + weight * item.own_share
+        else:
+            no_effect += weight * item.own_share
+    return Probabilities(no_effect, none_of_these, causes)
