@@ -1,8 +1,7 @@
 """Detection of model errors: a score per hypothesis and an omnibus test over bins, both under the noise model.
 
 Each start of a hypothesis is a column beside the base fit, at a finite size; its likelihood ratio follows from one
-matrix of all columns. The noise model is an estimate from a finite number of contrasts, with so many degrees of freedom
-(`count_noise_degrees`).
+matrix of all columns. The noise model is an estimate from a finite number of contrasts (`count_noise_degrees`).
 """
 
 from dataclasses import dataclass

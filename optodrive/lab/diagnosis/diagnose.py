@@ -23,6 +23,7 @@ from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.candidate_judgement import judge_candidates, list_rivals
 from optodrive.lab.diagnosis.copied_runs import check_copied_runs
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset
+from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
 from optodrive.lab.diagnosis.estimates import compute_estimates, describe_doubts, is_at_limit
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, fit
@@ -33,7 +34,6 @@ from optodrive.lab.diagnosis.model_selection import (
     MAX_INTRA_PULSE_POWER_EXCESS,
     MAX_REPLICATE_EXCESS,
     Verdict,
-    find_best_candidate,
     has_replicate_excess,
     select_causes,
 )
@@ -43,12 +43,16 @@ from optodrive.lab.diagnosis.numeric_limits import check_numeric_limits
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint
-from optodrive.lab.diagnosis.refitting import RefittedCandidate
+from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
 from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, ignore_progress
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
+MIN_CHANGE_RATIO = 16.0
+"""Likelihood ratio of an effect that changes from run to run, from which the noise is estimated beside it too."""
+QUIETER = 0.8
+"""Jitter of the power beside such an effect, relative to that beside none, below which the former counts."""
 NEARLY_EXPLAINED = 0.999
 """Share of the excess that a named cause explains without a remark on the rest."""
 
@@ -184,17 +188,7 @@ def _diagnose_subsystem(
     fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
     log.on_progress("noise and nominal model")
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
-    if has_replicate_excess(problem):
-        # Jitter sensitivities are those of the true model; a large effect changes them, and repeats seem to differ.
-        best = find_best_candidate(problem, base, hypotheses, log)
-        if best is not None:
-            other = update_noise(problem, best.fit, min_timing_sigma_s)
-            other = replace(
-                other,
-                noise=replace(other.noise, intra_pulse_power_excess=compute_intra_pulse_power_excess(other, best.fit)),
-            )
-            if not has_replicate_excess(other):
-                problem, base = other, fit(other, base.point)
+    problem, base = _revise_noise(problem, base, hypotheses, min_timing_sigma_s, log)
     verdict = select_causes(problem, base, hypotheses, log)
     gains: dict[str, float] = {}
     for candidate in verdict.candidates:
@@ -236,6 +230,35 @@ def _diagnose_subsystem(
         experiment,
         log.failures,
     )
+
+
+def _revise_noise(
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], min_timing_sigma_s: float, log: SearchLog
+) -> tuple[FitProblem, ModelFit]:
+    """Return the problem with noise estimated beside the best candidate, where repeats differ by its effect.
+
+    Jitter sensitivities are those of the true model; a large effect changes them, and repeats seem to differ. An effect
+    that changes from run to run makes them differ indeed, and passes for jitter.
+    """
+    scores = detect(problem, base, hypotheses, log).scores
+    changes = bool(scores) and scores[0].ratio > MIN_CHANGE_RATIO and scores[0].hypothesis.key in _list_changing()
+    if not changes and not has_replicate_excess(problem):
+        return problem, base
+    best = next(iter(refit_strongest(problem, base, (), scores, log)), None)
+    if best is None:
+        return problem, base
+    other = update_noise(problem, best.fit, min_timing_sigma_s)
+    excess = compute_intra_pulse_power_excess(other, best.fit)
+    other = replace(other, noise=replace(other.noise, intra_pulse_power_excess=excess))
+    is_quieter = other.noise.power_sigma < QUIETER * problem.noise.power_sigma
+    if has_replicate_excess(other) or not (is_quieter or has_replicate_excess(problem)):
+        return problem, base
+    return other, fit(other, base.point)
+
+
+def _list_changing() -> set[str]:
+    """Return the causes whose effect changes from run to run."""
+    return {key for key, term in discover_terms().items() if term.varies_between_runs}
 
 
 def _trace_held_out(subsystem: _SubsystemFit) -> tuple[ResidualTrace, ...]:

@@ -43,8 +43,11 @@ FORM_SIGMAS = (0.05, 0.1, 0.2, 0.4)
 """Prior standard deviations of the coefficients of other forms, relative to the effect; averaged over."""
 BIN_VARIANCES = tuple(np.geomspace(0.1, 1e5, 13).tolist())
 """Prior variances of the means of bins, in their noise; averaged over."""
-FORM_REST, BINS_REST, REST_POWER = 0.3, 0.03, 3.0
-"""Share of the excess left over at which a rest, taken by other forms or by bins, is as likely another cause's."""
+FORM_REST, BINS_REST, PAIR_REST, REST_POWER = 0.4, 0.03, 0.03, 4.0
+"""Share of the excess left over at which a rest, taken by other forms, by bins, or by a second cause that leaves a rest
+too, is as likely another cause's."""
+MAX_SHARE = 0.95
+"""Largest probability that the second cause of a pair only mends the form of the first one."""
 UNIFORM_VARIANCE = 1.0 / 12.0
 """Variance of a uniform distribution over a unit range."""
 
@@ -132,7 +135,7 @@ def average_log(logs: Sequence[float]) -> float:
 
 
 def compute_own_share(rest: float, middle: float) -> float:
-    """Return the probability that what is left over, a share of the excess, is the cause's own in another form."""
+    """Return the probability that a rest, a share of the excess, is the cause's own in another form."""
     return float(1.0 / (1.0 + (rest / middle) ** REST_POWER))
 
 

@@ -22,7 +22,7 @@ that cannot be computed is recorded in the log with its reason.
 """
 
 from dataclasses import dataclass
-from math import log
+from math import log, log1p
 
 import numpy as np
 
@@ -32,7 +32,9 @@ from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.evidence import (
     BINS_REST,
     FORM_REST,
+    MAX_SHARE,
     OTHER_ODDS,
+    PAIR_REST,
     PRIOR_NO_EFFECT,
     PRIOR_NONE_OF_THESE,
     PRIOR_ONE_CAUSE,
@@ -92,7 +94,7 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class _Examination:
-    """What a refit leaves: detections beside it, without and with other forms of its cause; shares of the excess."""
+    """Detections beside a refit, without and with other forms of its cause, and the shares of the excess it explains."""
 
     detection: Detection
     with_forms: Detection
@@ -109,14 +111,6 @@ def has_replicate_excess(problem: FitProblem) -> bool:
         problem.noise.replicate_excess > MAX_REPLICATE_EXCESS
         or problem.noise.intra_pulse_power_excess > MAX_INTRA_PULSE_POWER_EXCESS
     )
-
-
-def find_best_candidate(
-    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog
-) -> RefittedCandidate | None:
-    """Return the best refit of the strongest hypotheses, or None if none is promising."""
-    scores = detect(problem, base, hypotheses, log).scores
-    return next(iter(refit_strongest(problem, base, (), scores, log)), None)
 
 
 def select_causes(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog) -> Verdict:
@@ -178,7 +172,7 @@ def _examine(
     examined: _Examined,
     log: SearchLog,
 ) -> None:
-    """Add what a refit leaves, unless it is known."""
+    """Examine what a refit leaves."""
     if item in examined:
         return
     log.on_progress(f"testing the residuals of {item.label}")
@@ -237,12 +231,33 @@ def _list_explanations(
         own_forms = compute_own_share(1.0 - rest.explained, FORM_REST)
         own_bins = compute_own_share(1.0 - rest.explained_with_forms, BINS_REST)
         bins, both = rest.detection.omnibus.log_evidence, rest.with_forms.omnibus.log_evidence
-        out += [
-            Explanation(item.causes, prior, forms, own_forms),
-            Explanation(item.causes, prior, item.log_evidence + bins, own_bins),
-            Explanation(item.causes, prior + log(OTHER_ODDS), forms + both, own_forms * own_bins),
-        ]
+        variants = (
+            (prior, forms, own_forms),
+            (prior, item.log_evidence + bins, own_bins),
+            (prior + log(OTHER_ODDS), forms + both, own_forms * own_bins),
+        )
+        single, share = _find_sufficient_single(item, refits, examined)
+        for other_prior, evidence, own in variants:
+            out.append(Explanation(item.causes, other_prior + log1p(-share), evidence, own))
+            if single is not None:
+                out.append(Explanation(single.causes, other_prior + log(share), evidence, own))
     return out
+
+
+def _find_sufficient_single(
+    item: RefittedCandidate, refits: list[RefittedCandidate], examined: _Examined
+) -> tuple[RefittedCandidate | None, float]:
+    """Return the cause of a pair that may explain all in another form, and the probability that it does.
+
+    A pair that leaves a rest is not literally true; its second cause may only mend the form of the first one.
+    """
+    singles = [
+        (other, compute_own_share(1.0 - examined[other].explained_with_forms, PAIR_REST))
+        for other in refits
+        if len(item.causes) == 2 and len(other.causes) == 1 and other.causes[0] in item.causes and other in examined
+    ]
+    best, share = max(singles, key=lambda pair: pair[1], default=(None, 0.0))
+    return (best, min(share, MAX_SHARE)) if share > 0.0 else (None, 0.0)
 
 
 def _build_verdict(

@@ -6,12 +6,13 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.lab.diagnosis.dataset import build_dataset
+from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.fitting import fit
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
-from optodrive.lab.diagnosis.model_selection import find_best_candidate
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.prediction import ParameterPoint
 from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.refitting import refit_strongest
 from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.recording import read_recording
 from truth_file import write_truth
@@ -46,10 +47,10 @@ def test_a_fit_of_the_true_cause_is_no_worse_than_the_truth(key, values, tmp_pat
     problem, base = fit_nominal(data, prior, epsilon)
     hypotheses = build_hypotheses(data)
     (own,) = (item for item in hypotheses if item.key == key)
-    candidate = find_best_candidate(problem, base, [own], SearchLog())
+    (candidate,) = refit_strongest(problem, base, (), detect(problem, base, [own]).scores, SearchLog())
     # A fit's χ² depends on the jitter sensitivities at its start, so both points are judged by fits that start there.
     truth = fit(problem, ParameterPoint(prior.mean, {key: values}), candidate.fit.free, iterations=1)
     found = fit(problem, candidate.fit.point, candidate.fit.free, iterations=1)
     assert found.chi2 <= truth.chi2 + TOLERANCE, found.point.terms
-    best = find_best_candidate(problem, base, hypotheses, SearchLog())
+    best = refit_strongest(problem, base, (), detect(problem, base, hypotheses).scores, SearchLog())[0]
     assert best.causes == (key,), best.fit.point.terms
