@@ -94,7 +94,7 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class _Examination:
-    """Detections beside a refit, without and with other forms of its cause, and the shares of the excess it explains."""
+    """Detections beside a refit, without and with other forms of its cause; the shares of the excess explained."""
 
     detection: Detection
     with_forms: Detection
@@ -172,7 +172,7 @@ def _examine(
     examined: _Examined,
     log: SearchLog,
 ) -> None:
-    """Examine what a refit leaves."""
+    """Add the residual tests of a refit to those known."""
     if item in examined:
         return
     log.on_progress(f"testing the residuals of {item.label}")
