@@ -94,7 +94,10 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class _Examination:
-    """Detections beside a refit, without and with other forms of its cause; the shares of the excess explained."""
+    """Residual tests of a refit, without and with other forms of its cause.
+
+    explained, explained_with_forms: shares of the excess
+    """
 
     detection: Detection
     with_forms: Detection
