@@ -374,11 +374,13 @@ class PlanQueue:
     def _interrupt_by_loss(self, run: PlanRun, lost: LostStage, off_s: float) -> None:
         """Let the plan that ran last when a stage was lost wait for its rest, unless a newer streamed one waits.
 
-        Its pulses that the lost board may have emitted count as executed.
+        Its pulses that the lost board may have emitted count as executed. Time in the dark without a pulse is over.
         """
         plan, record = run.plan, run.plan.record
         self.accounts.collect_executed(run)
-        plan.interrupt(off_s, find_emitted(run, lost))
+        emitted = find_emitted(run, lost)
+        left_s = record.start_s + float(plan.planned.plan.start_s[~emitted].min(initial=inf))
+        plan.interrupt(max(off_s, min(left_s, lost.dark_s)), emitted)
         self.accounts.count_executed(run)
         left = plan.rest_count
         if left and not self.running and not any(each.record.streamed for each in self.waiting):

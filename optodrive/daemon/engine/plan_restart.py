@@ -1,6 +1,6 @@
 """Plans that go on after a pause: their rows that are left, limited and proven again from the heat that is left.
 
-What is left of a plan that counts on a stage that was lost is planned anew.
+Once a stage was lost, what is left of a plan that was made with it is planned anew, and so is each plan not yet begun.
 """
 
 import zlib
@@ -101,7 +101,7 @@ def _restart(
 ) -> RestartedPlan:
     first, planned = plan.first_row, plan.planned
     heat, budget = before.shift_to_plan(start_s)
-    if display.draws[planned.plan.stage[first:]].all():
+    if display.draws.all() or (first and _is_made_for(display, plan)):
         rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)
     else:
         rest, budget_after = _plan_anew(display, plan, heat, budget, on_progress)
@@ -136,6 +136,11 @@ def _restart(
         after=after,
         end_s=end_s,
     )
+
+
+def _is_made_for(display: DisplayModel, plan: ActivePlan) -> bool:
+    """Return whether a plan was made for the stages that draw: a lost one has no points."""
+    return all(drawing or not len(points) for drawing, points in zip(display.draws, plan.points.stages, strict=True))
 
 
 def _plan_anew(

@@ -87,7 +87,7 @@ class LinkService:
         self._handover = PointHandover(boards, clock, self.epoch, self.pauses, self._send_to_planner)
         self._control: Control | None = None
         self._attended_s = 0.0
-        self._seen_fault = ""
+        self._seen_faults: list[str] = []
         self._outgoing: list[Outgoing] = []
 
     # --- clients ------------------------------------------------------------------------------------------------
@@ -305,11 +305,14 @@ class LinkService:
 
         It does not end what has ended; but a report that it has may be false.
         """
-        board = self._boards.board
-        is_new_fault = board.fault and board.fault != self._seen_fault
+        board, seen, lost = self._boards.board, self._seen_faults, self._boards.lost
+        self._seen_faults = self._boards.list_faults()
+        is_new_fault = any(
+            fault and fault not in seen[stage : stage + 1] and (lost is None or stage != lost.stage)
+            for stage, fault in enumerate(self._seen_faults)
+        )
         if is_new_fault or (self._control is not None and not self._boards.has_arming):
             self.go_dark(self._boards.describe_split() or f"the board went to {board.state} ({self._find_reason()})")
-        self._seen_fault = board.fault
 
     def _find_reason(self) -> str:
         fault = self._boards.board.fault

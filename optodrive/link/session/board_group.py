@@ -253,6 +253,10 @@ class BoardGroup:
         causes = [session.likely_cause for session in self.sessions if session.likely_cause is not None]
         return max(causes, key=lambda cause: cause.noticed_s, default=None)
 
+    def list_faults(self) -> list[str]:
+        """Return the fault of each board, '' for none. That of a lost board is known."""
+        return [session.board.fault for session in self.sessions]
+
     def describe_split(self) -> str:
         """Return which board has left the armed states while another is in them, '' if none has."""
         if not self.has_several or self.board.state not in ARMED_STATES:
@@ -301,7 +305,7 @@ class BoardGroup:
         self._seek_clocks()
         waiting = self._present[0]
         for session, connector in zip(self.sessions, self._connectors, strict=True):
-            if session not in self._present:
+            if session not in self._present or not session.connected:
                 connector.step()
                 continue
             try:

@@ -89,6 +89,32 @@ def test_what_does_not_fit_is_one_line(tmp_path, stages, message):
     assert "\n" not in str(refused.value)
 
 
+GOES_ON = '[daemon]\non_stage_loss = "that_stage"\n'
+
+
+def test_the_others_may_go_on_where_two_stages_reach_each_pixel(tmp_path):
+    whole = TWO_STAGES.replace("columns", "#")
+    assert load(tmp_path, whole).daemon.on_stage_loss == "all_dark"
+    assert load(tmp_path, whole + GOES_ON).daemon.on_stage_loss == "that_stage"
+
+
+@pytest.mark.parametrize(
+    ("stages", "expected"),
+    [
+        (TWO_STAGES, "all_dark while stage 'left' is the only one that reaches pixel 0"),
+        (TWO_STAGES.replace("[0, 1]", "[0, 3]"), "all_dark while stage 'left' is the only one that reaches pixel 0"),
+        (TWO_STAGES.replace("[1, 3]", "[0, 3]"), "all_dark while stage 'right' is the only one that reaches pixel 2"),
+        ('[[stages]]\nname = "only"\n', "all_dark with one stage"),
+        ("", "all_dark with one stage"),
+    ],
+)
+def test_a_pixel_that_one_stage_alone_reaches_is_named(tmp_path, stages, expected, capsys):
+    with pytest.raises(InputError, match=f"daemon.on_stage_loss: got 'that_stage', expected {expected}"):
+        load(tmp_path, stages + GOES_ON)
+    assert run(["config", "check", "--config", str(tmp_path / "display.toml")]) == 2
+    assert expected in capsys.readouterr().err
+
+
 def test_stages_are_a_list_of_tables(tmp_path):
     (tmp_path / "display.toml").write_text("stages = 3\n" + locate_shipped("display-16.toml").read_text())
     with pytest.raises(InputError, match="stages: got 3"):
