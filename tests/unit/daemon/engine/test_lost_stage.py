@@ -91,7 +91,7 @@ def test_stop_ends_the_light_of_the_others_and_all_are_needed_to_arm_again(rig, 
     assert list_states(rig)[::2] == [BoardState.DISARMED] * 2
     assert find_last_light_s(rig) < stopped_s + DARK_S
     rig.sleep(0.1)
-    assert (record.status, record.error) == ("failed", "ended by stop")
+    assert (record.status, record.error) == ("stopped", "ended by stop")
     result = rig.await_result(WEB, rig.request(WEB, "arm"))
     assert "stage 's1'" in result["error"]["message"]
     rig.restore(1)
