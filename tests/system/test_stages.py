@@ -19,6 +19,7 @@ LEASE_S = PATIENT_LEASE_S
 SKEW_MAX_S = 0.01
 SKEW = ("[limits]\n", f"[limits]\nstage_skew_max_s = {SKEW_MAX_S}\n")
 """Change of the configuration: on a busy computer an exchange with a board takes milliseconds."""
+GOES_ON = '[daemon]\non_stage_loss = "that_stage"\n'
 LATE = "light would have been"
 """Error of a plan whose points this computer did not hand over in time."""
 CLOCKS = BoardClock(50e-6), BoardClock(-50e-6, 10e-6)
@@ -43,9 +44,9 @@ def build_trains(seconds=5.0):
 
 
 class Bench:
-    """Two boards and a daemon."""
+    """Two boards and a daemon. section: further text of the configuration."""
 
-    def __init__(self, folder, programs):
+    def __init__(self, folder, programs, section=""):
         self.boards = []
         try:
             for name, program in zip(("left", "right"), programs, strict=True):
@@ -56,7 +57,7 @@ class Bench:
                 STAGE.format(name=board.port.parent.name, port=board.port, lease_s=LEASE_S, lead_s=PATIENT_LEAD_S)
                 for board in self.boards
             )
-            self.daemon = Daemon(folder, self.boards[0].port, replace=[SKEW], stages=stages)
+            self.daemon = Daemon(folder, self.boards[0].port, replace=[SKEW], stages=section + stages)
         except BaseException:
             self.stop_boards()
             raise
@@ -74,6 +75,13 @@ class Bench:
         wait_for(lambda: self.daemon.board_state() == "DISARMED", "both boards")
         wait_for(lambda: self.find_clock_error_s() < SKEW_MAX_S, "the boards' clocks")
         self.daemon.arm()
+
+    def run_command(self, *arguments):
+        """Run a command against the daemon and return what it prints."""
+        environment = {**os.environ, "OPTODRIVE_URL": self.daemon.url, "OPTODRIVE_TOKEN": TOKEN}
+        done = subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     def find_clock_error_s(self):
         """Return the largest uncertainty of a board's clock that the daemon states."""
@@ -158,6 +166,33 @@ def test_the_loss_of_one_board_darkens_the_other_within_its_lease(bench):
     assert_dark_within_lease(left)
     state = wait_for(lambda: (s := bench.daemon.state())["link"]["state"] == "down" and s, "the loss")
     assert "stage 'left'" in state["link"]["error"]
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_other_board_draws_what_is_left_where_configured(programs, tmp_path, end):
+    bench = Bench(tmp_path, programs, GOES_ON)
+    lost, left = bench.boards
+    try:
+        bench.arm()
+        plan = bench.begin(build_trains(4.0))
+        before = {(pulse["x"], pulse["y"]) for pulse in left.of("pulse")}
+        assert len(before) == 1
+        lost.process.send_signal(end)
+        stages = wait_for(lambda: (s := bench.daemon.state()["stages"])[0]["lost"] and s, "the loss")
+        assert (stages[0]["connected"], stages[1]["lost"]) == (False, None)
+        assert "stage     left at " in bench.run_command("status")
+        assert ": lost, the others go on: " in bench.run_command("status")
+        answer = bench.daemon.finished(plan)
+        if answer["status"] == "failed":
+            assert LATE in answer["error"]
+        else:
+            assert answer["status"] == "done", answer["error"]
+            assert len({(pulse["x"], pulse["y"]) for pulse in left.of("pulse")}) == 2
+        state = bench.daemon.call("POST", "/v1/stop")
+        assert state["stages"][1]["board"]["state"] == "DISARMED"
+        assert not left.of("gate")[-1]["on"]
+    finally:
+        bench.stop()
 
 
 def test_light_that_would_be_late_is_not_emitted(bench):
