@@ -65,7 +65,7 @@ def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption
         return
     from optodrive.client.hold import Hold
 
-    with Hold(client.policy.endpoint) as held:
+    with Hold(client.endpoint) as held:
         _print_state(client.call(READ_STATE), json)
         sys.stdout.flush()
         raise NotReadyError(f"the board was disarmed: {held.wait()}")

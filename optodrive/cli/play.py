@@ -114,7 +114,7 @@ def _hold_if(hold: bool, client: "DaemonClient", dry_run: bool, wait: bool) -> A
         raise InputError("--hold", other, "a command that shows a plan and waits for its end")
     from optodrive.client.hold import Hold
 
-    return Hold(client.policy.endpoint)
+    return Hold(client.endpoint)
 
 
 def _follow_plan(client: "DaemonClient", plan: "Plan", wait: bool, as_json: bool) -> "Plan":

@@ -23,7 +23,7 @@ from optodrive.client.frame_results import (
 )
 from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
 from optodrive.client.http import PROBE, PROBE_PERIOD_S, PROBE_TIMEOUT_S
-from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_async_connection
+from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_connection
 from optodrive.core.errors import LinkError
 from optodrive.core.types.push_options import Policy
 from optodrive.daemon.responses.stream import FrameResult
@@ -50,7 +50,7 @@ class AsyncStream:
         self._reconnect_timeout_s = reconnect_timeout_s
         self._was_silent = False
         self._is_closed = False
-        self._results_changed = asyncio.Condition()
+        self._results_changed = asyncio.Event()
         self._exit_stack = AsyncExitStack()
         self._connection: ClientConnection | None = None
         self._reader_task: asyncio.Task[None] | None = None
@@ -68,8 +68,9 @@ class AsyncStream:
         """See `Stream.close`."""
         self._is_closed = True
         await self._exit_stack.aclose()
-        if self._reader_task is not None:
-            await asyncio.gather(self._reader_task, return_exceptions=True)
+        reader, self._reader_task = self._reader_task, None
+        if reader is not None:
+            await asyncio.gather(reader, return_exceptions=True)
 
     async def send(self, heights_um: HeightsLike) -> int:
         """See `Stream.send`."""
@@ -100,28 +101,31 @@ class AsyncStream:
 
     async def results(self) -> list[FrameResult]:
         """See `Stream.results`."""
-        async with self._results_changed:
-            return self._results.drain()
+        return self._results.drain()
 
     async def wait(self, frame: int | None = None, timeout_s: float = RESULT_TIMEOUT_S) -> FrameResult:
         """See `Stream.wait`."""
         number = self._next_frame - 1 if frame is None else frame
-        try:
-            async with asyncio.timeout(timeout_s), self._results_changed:
-                while (result := self._results.find_final(number)) is None:
-                    await self._results_changed.wait()
-        except TimeoutError:
-            raise build_timeout_error(number, timeout_s) from None
+        deadline_s = time.monotonic() + timeout_s
+        while (result := self._results.find_final(number)) is None:
+            if self._is_closed:
+                raise build_closed_error()
+            self._results_changed.clear()
+            try:
+                await asyncio.wait_for(self._results_changed.wait(), deadline_s - time.monotonic())
+            except TimeoutError:
+                raise build_timeout_error(number, timeout_s) from None
         return raise_if_failed(result)
 
     async def _connect(self, open_timeout_s: float = OPEN_TIMEOUT_S) -> None:
         await self._exit_stack.aclose()
-        self._connection = await open_async_connection(
+        self._connection = await open_connection(
             self._endpoint, self._path, self._exit_stack, open_timeout_s=min(open_timeout_s, OPEN_TIMEOUT_S)
         )
         self._reader_task = asyncio.create_task(self._read(self._connection))
 
     async def _read(self, connection: ClientConnection) -> None:
+        """Read messages as they arrive: the daemon disconnects a client that leaves too many unread."""
         try:
             while True:
                 try:
@@ -131,18 +135,16 @@ class AsyncStream:
                     if self._results.is_owed(self._next_frame - 1):
                         await self._probe(connection)
                     continue
-                async with self._results_changed:
-                    self._results.add(message)
-                    self._results_changed.notify_all()
+                self._results.add(message)
+                self._results_changed.set()
         except ConnectionClosed:
             pass  # the next `send` detects and repairs this
         finally:
-            async with self._results_changed:
-                self._results.mark_lost_before(self._next_frame)
-                self._results_changed.notify_all()
+            self._results.mark_lost_before(self._next_frame)
+            self._results_changed.set()
 
     async def _probe(self, connection: ClientConnection) -> None:
-        """See `Stream._probe`."""
+        """Break the connection if the daemon, which owes an answer, does not answer others either."""
         try:
             async with self._endpoint.open_async_client(PROBE_TIMEOUT_S) as client:
                 await client.request(**PROBE)

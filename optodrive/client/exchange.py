@@ -1,12 +1,12 @@
-"""Exchanges with a daemon, stated once for both HTTP clients.
+"""Exchanges with a daemon, stated once for blocking and for asynchronous callers.
 
-An exchange is a generator: it yields requests and pauses, receives responses or transport errors, and returns a result.
-A client runs it with blocking or with asynchronous input and output.
+They are coroutines, and `HttpIo` is their input and output. Where that blocks, a coroutine never waits for an event
+loop: `run_blocking` runs it to its end in one step.
 """
 
 import time
-from collections.abc import Generator
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Coroutine
+from typing import Any, Protocol, TypeVar
 
 import httpx
 
@@ -27,26 +27,29 @@ NOT_SENT_ERRORS = (httpx.ConnectError, httpx.ConnectTimeout)
 T = TypeVar("T")
 
 
-class Transmission(NamedTuple):
-    """A request to send.
+class HttpIo(Protocol):
+    """Requests to one daemon. Both kinds raise httpx.TransportError."""
 
-    on_new_connection: on a connection of its own
-    timeout_s: longest wait for the answer to a stop or to a request that only reads, None for the client's
-    """
+    endpoint: Endpoint
 
-    request: ApiRequest[Any]
-    on_new_connection: bool = False
-    timeout_s: float | None = None
+    async def send(self, request: ApiRequest[Any], timeout_s: float | None) -> httpx.Response:
+        """Send a request. timeout_s: longest wait for one that only reads, None for the usual one."""
 
+    async def send_alone(self, request: ApiRequest[Any], timeout_s: float) -> httpx.Response:
+        """Send a request on a connection of its own."""
 
-class Pause(NamedTuple):
-    """A time to wait before the exchange goes on."""
-
-    duration_s: float
+    async def sleep(self, duration_s: float) -> None:
+        """Wait for a time."""
 
 
-Step = Transmission | Pause
-Exchange = Generator[Step, httpx.Response | None, T]
+def run_blocking(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Run a coroutine whose input and output blocks."""
+    try:
+        coroutine.send(None)
+    except StopIteration as end:
+        result: T = end.value
+        return result
+    raise RuntimeError("a blocking coroutine waits for an event loop")
 
 
 class ExchangePolicy:
@@ -55,12 +58,13 @@ class ExchangePolicy:
     reconnect_timeout_s: how long a request that may be sent again is repeated, once the daemon has responded before
     """
 
-    def __init__(self, endpoint: Endpoint, reconnect_timeout_s: float = 0.0) -> None:
-        self.endpoint = endpoint
+    def __init__(self, http: HttpIo, reconnect_timeout_s: float = 0.0) -> None:
+        self.endpoint = http.endpoint
+        self._http = http
         self._reconnect_timeout_s = reconnect_timeout_s
         self._has_responded = False
 
-    def call(self, request: ApiRequest[Response]) -> Exchange[Response]:
+    async def call(self, request: ApiRequest[Response]) -> Response:
         """Send a request and parse its response. Raise the error that a problem document describes.
 
         A request that is not idempotent is repeated only if it was certainly not received.
@@ -69,32 +73,29 @@ class ExchangePolicy:
         timeout_s = None
         while True:
             try:
-                response = yield Transmission(request, timeout_s=timeout_s)
+                response = await self._http.send(request, timeout_s)
             except httpx.TransportError as error:
                 left_s = deadline_s - time.monotonic()
                 if left_s <= 0.0 or not (request.idempotent or isinstance(error, NOT_SENT_ERRORS)):
                     self.endpoint.is_lost = True
                     raise self.endpoint.build_unreachable_error(error) from None
                 timeout_s = max(left_s, RETRY_TIMEOUT_MIN_S)
-                yield Pause(RETRY_S)
+                await self._http.sleep(RETRY_S)
                 continue
             self.endpoint.is_lost = False
-            assert response is not None  # noqa: S101 - the reply to a transmission
             if response.status_code == 401 and self.endpoint.renew_token():
                 continue
             self._has_responded = True
             return parse_response(request, response)
 
-    def stop(self) -> Exchange[StateReport]:
+    async def stop(self) -> StateReport:
         """Stop on new connections, since an open one may be broken unnoticed."""
         error: Exception = LinkError("not attempted")
         for timeout_s in STOP_LOST_TIMEOUTS_S if self.endpoint.is_lost else STOP_TIMEOUTS_S:
             try:
-                response = yield Transmission(STOP, on_new_connection=True, timeout_s=timeout_s)
-                assert response is not None  # noqa: S101 - the reply to a transmission
+                response = await self._http.send_alone(STOP, timeout_s)
                 if response.status_code == 401 and self.endpoint.renew_token():
-                    response = yield Transmission(STOP, on_new_connection=True, timeout_s=timeout_s)
-                    assert response is not None  # noqa: S101 - the reply to a transmission
+                    response = await self._http.send_alone(STOP, timeout_s)
                 return parse_response(STOP, response)
             except httpx.TransportError as transport_error:
                 error = transport_error

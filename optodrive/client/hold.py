@@ -1,16 +1,16 @@
 """Arming that lasts as long as this process: it holds a connection and sends beats."""
 
 import asyncio
-import threading
-from contextlib import AsyncExitStack, ExitStack, suppress
+from contextlib import AsyncExitStack, suppress
 from types import TracebackType
 from typing import Self
 
 from websockets.exceptions import ConnectionClosed
 
 from optodrive.client.endpoint import Endpoint
+from optodrive.client.loop_thread import LoopThread
 from optodrive.client.problems import build_error
-from optodrive.client.socket_connection import open_async_connection, open_connection
+from optodrive.client.socket_connection import open_connection
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.daemon.responses.hold import HoldReport
 
@@ -23,31 +23,81 @@ SILENCE_MAX_S = 2.5
 CONNECTION_LOST = "the connection to the daemon was lost"
 
 
-class HoldState:
-    """State of the arming as the daemon has reported it.
+class AsyncHold:
+    """Arming of the board that ends, dark, with `close`, or with the process. `open` arms.
+
+    A task sends the beats, so that a loop that is blocked for a second lets go, too.
 
     reason: cause of its end, '' while it lasts
     """
 
-    def __init__(self) -> None:
-        self.is_armed = False
+    def __init__(self, endpoint: Endpoint) -> None:
         self.reason = ""
-        self.error: OptodriveError | None = None
+        self._endpoint = endpoint
+        self._is_armed = False
+        self._error: OptodriveError | None = None
+        self._changed = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
 
-    def take(self, text: str | bytes) -> None:
+    async def open(self) -> None:
+        """Arm the board. Raise NotReadyError or BoardFaultError if that is refused."""
+        self._task = asyncio.create_task(self._run())
+        while not self._is_armed and self._error is None:
+            await self._wait_for_change()
+        if self._error is not None:
+            await self.close()
+            raise self._error
+
+    async def wait(self) -> str:
+        """Wait until the arming ends, and return the reason."""
+        while not self.reason:
+            await self._wait_for_change()
+        return self.reason
+
+    async def close(self) -> None:
+        """Let go: the daemon disarms the board."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    async def _wait_for_change(self) -> None:
+        self._changed.clear()
+        await self._changed.wait()
+
+    async def _run(self) -> None:
+        reason = CONNECTION_LOST
+        try:
+            async with AsyncExitStack() as stack:
+                connection = await open_connection(self._endpoint, HOLD_PATH, stack, SILENCE_MAX_S)
+                while True:
+                    with suppress(ConnectionClosed):  # what the daemon has sent before is read first
+                        await connection.send(BEAT)
+                    with suppress(TimeoutError):
+                        self._take(await asyncio.wait_for(connection.recv(), BEAT_INTERVAL_S))
+        except OptodriveError as error:
+            self._error = error
+        except ConnectionClosed as closed:
+            reason = (closed.rcvd.reason if closed.rcvd is not None else "") or reason
+        finally:
+            self._end(reason)
+
+    def _take(self, text: str | bytes) -> None:
         """Take one message of the daemon."""
         report = HoldReport.model_validate_json(text, extra="ignore")
-        self.is_armed = report.status == "armed"
+        self._is_armed = report.status == "armed"
         if report.status == "refused" and report.problem is not None:
-            self.error = build_error(report.problem)
+            self._error = build_error(report.problem)
         elif report.status == "ended":
-            self.end(report.reason or "")
+            self._end(report.reason or "")
+        self._changed.set()
 
-    def end(self, reason: str) -> None:
+    def _end(self, reason: str) -> None:
         """Record the end of the arming, unless it is known."""
-        self.is_armed = False
+        self._is_armed = False
         self.reason = self.reason or reason
-        self.error = self.error or NotReadyError(f"the board is no longer held armed: {self.reason}")
+        self._error = self._error or NotReadyError(f"the board is no longer held armed: {self.reason}")
+        self._changed.set()
 
 
 class Hold:
@@ -57,16 +107,12 @@ class Hold:
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
-        self._state = HoldState()
-        self._changed = threading.Condition()
-        self._exit_stack = ExitStack()
-        self._connection = open_connection(endpoint, HOLD_PATH, self._exit_stack, SILENCE_MAX_S)
-        threading.Thread(target=self._run, name="hold", daemon=True).start()
-        with self._changed:
-            self._changed.wait_for(lambda: self._state.is_armed or self._state.error is not None)
-        if self._state.error is not None:
+        self._hold, self._loop = AsyncHold(endpoint), LoopThread("hold")
+        try:
+            self._loop.run(self._hold.open())
+        except BaseException:
             self.close()
-            raise self._state.error
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -79,85 +125,13 @@ class Hold:
     @property
     def reason(self) -> str:
         """Cause of the end of the arming, '' while it lasts."""
-        return self._state.reason
+        return self._hold.reason
 
     def wait(self) -> str:
         """Wait until the arming ends, and return the reason."""
-        with self._changed:
-            self._changed.wait_for(lambda: bool(self._state.reason))
-        return self._state.reason
+        return self._loop.run(self._hold.wait())
 
     def close(self) -> None:
         """Let go: the daemon disarms the board."""
-        self._exit_stack.close()
-
-    def _run(self) -> None:
-        reason = CONNECTION_LOST
-        try:
-            while True:
-                with suppress(ConnectionClosed):  # what the daemon has sent before is read first
-                    self._connection.send(BEAT)
-                with suppress(TimeoutError):
-                    self._take(self._connection.recv(timeout=BEAT_INTERVAL_S))
-        except ConnectionClosed as closed:
-            reason = (closed.rcvd.reason if closed.rcvd is not None else "") or reason
-        finally:
-            with self._changed:
-                self._state.end(reason)
-                self._changed.notify_all()
-
-    def _take(self, text: str | bytes) -> None:
-        with self._changed:
-            self._state.take(text)
-            self._changed.notify_all()
-
-
-class AsyncHold:
-    """Arming of the board that ends, dark, with `close`, or with the process. `open` arms.
-
-    A task sends the beats, so that a loop that is blocked for a second lets go, too.
-    """
-
-    def __init__(self, endpoint: Endpoint) -> None:
-        self._endpoint = endpoint
-        self._state = HoldState()
-        self._changed = asyncio.Event()
-        self._task: asyncio.Task[None] | None = None
-
-    async def open(self) -> None:
-        """Arm the board. Raise NotReadyError or BoardFaultError if that is refused."""
-        self._task = asyncio.create_task(self._run())
-        await self._changed.wait()
-        if self._state.error is not None:
-            await self.close()
-            raise self._state.error
-
-    @property
-    def reason(self) -> str:
-        """Cause of the end of the arming, '' while it lasts."""
-        return self._state.reason
-
-    async def close(self) -> None:
-        """Let go: the daemon disarms the board."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
-
-    async def _run(self) -> None:
-        reason = CONNECTION_LOST
-        try:
-            async with AsyncExitStack() as stack:
-                connection = await open_async_connection(self._endpoint, HOLD_PATH, stack, SILENCE_MAX_S)
-                while True:
-                    with suppress(ConnectionClosed):
-                        await connection.send(BEAT)
-                    with suppress(TimeoutError):
-                        self._state.take(await asyncio.wait_for(connection.recv(), BEAT_INTERVAL_S))
-                        self._changed.set()
-        except OptodriveError as error:
-            self._state.error = error
-        except ConnectionClosed as closed:
-            reason = (closed.rcvd.reason if closed.rcvd is not None else "") or reason
-        finally:
-            self._state.end(reason)
-            self._changed.set()
+        self._loop.run(self._hold.close())
+        self._loop.close()

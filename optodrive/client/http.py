@@ -1,4 +1,4 @@
-"""HTTP clients that run exchanges with a daemon, blocking and asynchronous."""
+"""Requests to a daemon, with blocking and with asynchronous input and output."""
 
 import asyncio
 import time
@@ -12,10 +12,9 @@ from typing import Any
 import httpx
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import Exchange, ExchangePolicy, Pause, Step, T, Transmission
+from optodrive.client.exchange import ExchangePolicy, run_blocking
 from optodrive.client.requests import ApiRequest, Response
 from optodrive.core.errors import NotReadyError
-from optodrive.daemon.responses.state import StateReport
 
 READ_TIMEOUT_S = 2.5
 """Longest wait for what the daemon only reads."""
@@ -27,18 +26,16 @@ PROBE_TIMEOUT_S = 1.5
 PROBE: dict[str, Any] = {"method": "GET", "url": "/v1/health", "timeout": PROBE_TIMEOUT_S}
 
 
-class DaemonClient:
-    """A blocking client. `policy` states the retries.
+class BlockingHttp:
+    """Requests that block. Their coroutines never wait.
 
-    timeout_s: longest wait for a part of an answer
+    timeout_s: longest wait for a part of an answer, None for the usual one
     """
 
-    def __init__(
-        self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0, timeout_s: float = TIMEOUT_S
-    ) -> None:
-        self.policy = ExchangePolicy(Endpoint(url, token), reconnect_timeout_s)
-        self._timeout_s = timeout_s
-        self._client = self.policy.endpoint.open_client(timeout_s)
+    def __init__(self, endpoint: Endpoint, timeout_s: float | None = None) -> None:
+        self.endpoint = endpoint
+        self._timeout_s = TIMEOUT_S if timeout_s is None else timeout_s
+        self._client = endpoint.open_client(self._timeout_s)
 
     def close(self) -> None:
         """Close the connections."""
@@ -48,44 +45,21 @@ class DaemonClient:
         """Raise NotReadyError after `close`."""
         _require_open(self._client)
 
-    def call(self, request: ApiRequest[Response]) -> Response:
-        """Run `ExchangePolicy.call`."""
-        return self.run(self.policy.call(request))
+    async def sleep(self, duration_s: float) -> None:
+        """See `HttpIo`."""
+        time.sleep(duration_s)
 
-    def stop(self) -> StateReport:
-        """Run `ExchangePolicy.stop`."""
-        return self.run(self.policy.stop())
+    async def send_alone(self, request: ApiRequest[Any], timeout_s: float) -> httpx.Response:
+        """See `HttpIo`."""
+        with self.endpoint.open_client(timeout_s) as client:
+            return client.request(**_build_arguments(request, self.endpoint))
 
-    def run(self, exchange: Exchange[T]) -> T:
-        """Run an exchange and return its result."""
-        try:
-            step = next(exchange)
-            while True:
-                try:
-                    response = self._perform(step)
-                except httpx.TransportError as error:
-                    step = exchange.throw(error)
-                else:
-                    step = exchange.send(response)
-        except StopIteration as end:
-            result: T = end.value
-            return result
-
-    def _perform(self, step: Step) -> httpx.Response | None:
-        if isinstance(step, Pause):
-            time.sleep(step.duration_s)
-            return None
-        if step.on_new_connection:
-            with self.policy.endpoint.open_client(step.timeout_s) as client:
-                return client.request(**_build_arguments(step.request, self.policy.endpoint))
+    async def send(self, request: ApiRequest[Any], timeout_s: float | None) -> httpx.Response:
+        """See `HttpIo`. For an action that takes long, watch whether the daemon answers others meanwhile."""
         self.require_open()
-        arguments = _build_arguments(step.request, self.policy.endpoint)
-        if step.request.method == "GET":
-            return self._client.request(**arguments, timeout=min(_limit_read_s(step), self._timeout_s))
-        return self._request_watched(arguments)
-
-    def _request_watched(self, arguments: dict[str, Any]) -> httpx.Response:
-        """Send a request that may take long. Raise TransportError as soon as the daemon no longer answers others."""
+        arguments = _build_arguments(request, self.endpoint)
+        if request.method == "GET":
+            return self._client.request(**arguments, timeout=min(_limit_read_s(timeout_s), self._timeout_s))
         future: Future[httpx.Response] = Future()
         Thread(target=_complete, args=(future, partial(self._client.request, **arguments)), daemon=True).start()
         while True:
@@ -94,19 +68,12 @@ class DaemonClient:
             self._client.request(**PROBE)
 
 
-def _complete(future: "Future[httpx.Response]", send: Callable[[], httpx.Response]) -> None:
-    try:
-        future.set_result(send())
-    except BaseException as error:  # of the caller's thread
-        future.set_exception(error)
+class AsyncHttp:
+    """Requests that wait in the running event loop."""
 
-
-class AsyncDaemonClient:
-    """An asynchronous client. `policy` states the retries."""
-
-    def __init__(self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0) -> None:
-        self.policy = ExchangePolicy(Endpoint(url, token), reconnect_timeout_s)
-        self._client = self.policy.endpoint.open_async_client(TIMEOUT_S)
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self._client = endpoint.open_async_client(TIMEOUT_S)
 
     async def close(self) -> None:
         """Close the connections."""
@@ -116,32 +83,21 @@ class AsyncDaemonClient:
         """Raise NotReadyError after `close`."""
         _require_open(self._client)
 
-    async def run(self, exchange: Exchange[T]) -> T:
-        """Run an exchange and return its result."""
-        try:
-            step = next(exchange)
-            while True:
-                try:
-                    response = await self._perform(step)
-                except httpx.TransportError as error:
-                    step = exchange.throw(error)
-                else:
-                    step = exchange.send(response)
-        except StopIteration as end:
-            result: T = end.value
-            return result
+    async def sleep(self, duration_s: float) -> None:
+        """See `HttpIo`."""
+        await asyncio.sleep(duration_s)
 
-    async def _perform(self, step: Step) -> httpx.Response | None:
-        if isinstance(step, Pause):
-            await asyncio.sleep(step.duration_s)
-            return None
-        if step.on_new_connection:
-            async with self.policy.endpoint.open_async_client(step.timeout_s) as client:
-                return await client.request(**_build_arguments(step.request, self.policy.endpoint))
+    async def send_alone(self, request: ApiRequest[Any], timeout_s: float) -> httpx.Response:
+        """See `HttpIo`."""
+        async with self.endpoint.open_async_client(timeout_s) as client:
+            return await client.request(**_build_arguments(request, self.endpoint))
+
+    async def send(self, request: ApiRequest[Any], timeout_s: float | None) -> httpx.Response:
+        """See `BlockingHttp.send`."""
         self.require_open()
-        arguments = _build_arguments(step.request, self.policy.endpoint)
-        if step.request.method == "GET":
-            return await self._client.request(**arguments, timeout=_limit_read_s(step))
+        arguments = _build_arguments(request, self.endpoint)
+        if request.method == "GET":
+            return await self._client.request(**arguments, timeout=_limit_read_s(timeout_s))
         task = asyncio.ensure_future(self._client.request(**arguments))
         try:
             while not (await asyncio.wait({task}, timeout=PROBE_PERIOD_S))[0]:
@@ -151,13 +107,32 @@ class AsyncDaemonClient:
             task.cancel()
 
 
+class DaemonClient:
+    """Blocking calls without a display, for commands."""
+
+    def __init__(self, url: str, token: str | None = None, timeout_s: float | None = None) -> None:
+        self.endpoint = Endpoint(url, token)
+        self._policy = ExchangePolicy(BlockingHttp(self.endpoint, timeout_s))
+
+    def call(self, request: ApiRequest[Response]) -> Response:
+        """Run `ExchangePolicy.call`."""
+        return run_blocking(self._policy.call(request))
+
+
+def _complete(future: "Future[httpx.Response]", send: Callable[[], httpx.Response]) -> None:
+    try:
+        future.set_result(send())
+    except BaseException as error:  # of the caller's thread
+        future.set_exception(error)
+
+
 def _require_open(client: httpx.Client | httpx.AsyncClient) -> None:
     if client.is_closed:
         raise NotReadyError("this display is closed, and only `stop` works; open another `Display`")
 
 
-def _limit_read_s(step: Transmission) -> float:
-    return READ_TIMEOUT_S if step.timeout_s is None else min(READ_TIMEOUT_S, step.timeout_s)
+def _limit_read_s(timeout_s: float | None) -> float:
+    return READ_TIMEOUT_S if timeout_s is None else min(READ_TIMEOUT_S, timeout_s)
 
 
 def _build_arguments(request: ApiRequest[Any], endpoint: Endpoint) -> dict[str, Any]:

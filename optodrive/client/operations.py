@@ -1,9 +1,9 @@
-"""The operations of a display as exchanges, stated once for `Display` and `AsyncDisplay`."""
+"""The operations of a display as coroutines, stated once for `Display` and `AsyncDisplay`."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Unpack
 
-from optodrive.client.exchange import Exchange, ExchangePolicy, Pause
+from optodrive.client.exchange import ExchangePolicy, HttpIo
 from optodrive.client.heights import HeightsLike, convert_to_pixels
 from optodrive.client.plan import Plan, report_loss
 from optodrive.client.requests import (
@@ -30,6 +30,7 @@ from optodrive.planning.effective_config import EffectiveConfig
 from optodrive.planning.stimuli.pattern import PatternDescription
 
 POLL_PERIOD_S = 0.03
+RECONNECT_TIMEOUT_S = 2.5
 LabelsLike = Mapping[str, str | int | float | bool] | None
 """Labels of a plan, None for those of its body."""
 
@@ -41,136 +42,161 @@ class DisplayOperations:
     last_plan: the plan that was reported last
     """
 
-    def __init__(self, policy: ExchangePolicy) -> None:
+    def __init__(self, http: HttpIo, reconnect_timeout_s: float) -> None:
         self.may_emit = False
         self.last_plan: Plan | None = None
-        self._policy = policy
+        self._http = http
+        self._policy = ExchangePolicy(http, reconnect_timeout_s)
         self._layout: PixelLayout | None = None
 
-    def arm(self) -> Exchange[StateReport]:
+    async def arm(self) -> StateReport:
         """Arm the board unless it is armed already."""
         self.may_emit = True
         try:
-            return (yield from self._policy.call(ARM))
+            return await self._policy.call(ARM)
         except NotReadyError:
-            state = yield from self.read_state()
+            state = await self.state()
             if not state.board.is_armed:
                 raise
             return state
 
-    def disarm(self) -> Exchange[StateReport]:
-        """Disarm the board."""
-        return (yield from self._policy.call(DISARM))
+    async def disarm(self) -> StateReport:
+        """Disarm the board. This also acknowledges a fault whose cause is gone."""
+        return await self._policy.call(DISARM)
 
-    def dim(self, share: float) -> Exchange[StateReport]:
-        """Cap the power of plans."""
-        return (yield from self._policy.call(build_dim_request(share)))
+    async def dim(self, share: float) -> StateReport:
+        """Cap the power of every pulse of the plans from now on, as a share of the laser's, 0 to 1.
 
-    def pause(self) -> Exchange[StateReport]:
-        """Pause the light."""
-        return (yield from self._policy.call(PAUSE))
+        It stays when this client leaves. Only an armer may raise it again; RefusedError for others.
+        """
+        return await self._policy.call(build_dim_request(share))
 
-    def resume(self) -> Exchange[StateReport]:
-        """Resume the light, which this client must then stop when it leaves."""
+    async def pause(self) -> StateReport:
+        """Switch the gate off and keep the board armed and all plans, for five minutes at most. Then it is disarmed.
+
+        Streamed frames are refused meanwhile. NotReadyError if the board is not armed.
+        """
+        return await self._policy.call(PAUSE)
+
+    async def resume(self) -> StateReport:
+        """Play the rest of the paused plan, limited again, and the plans that wait.
+
+        NotReadyError if the board is not armed.
+        """
         self.may_emit = True
-        return (yield from self._policy.call(RESUME))
+        return await self._policy.call(RESUME)
 
-    def stop(self) -> Exchange[StateReport]:
-        """Stop the board."""
-        state = yield from self._policy.stop()
+    async def stop(self) -> StateReport:
+        """Switch the gate off, drop all plans, disarm the board. Raise LinkError if no answer confirms it."""
+        state = await self._policy.stop()
         self.may_emit = False
         return state
 
-    def read_state(self) -> Exchange[StateReport]:
-        """Read the daemon's state."""
-        return (yield from self._policy.call(READ_STATE))
+    async def state(self) -> StateReport:
+        """Return the state of board, link and queue."""
+        return await self._policy.call(READ_STATE)
 
-    def read_config(self) -> Exchange[EffectiveConfig]:
-        """Read the daemon's configuration."""
-        return (yield from self._policy.call(READ_CONFIG))
+    async def config(self) -> EffectiveConfig:
+        """Return the daemon's configuration with everything derived from it."""
+        return await self._policy.call(READ_CONFIG)
 
-    def read_layout(self) -> Exchange[PixelLayout]:
-        """Return the layout of the pixels. Read it from the configuration once."""
+    async def layout(self) -> PixelLayout:
+        """Return the positions of the pixels: x_m, y_m, row, column, all [p]. Rows count from the bottom."""
         if self._layout is None:
-            config = yield from self.read_config()
-            self._layout = build_pixel_layout(config.display)
+            self._layout = build_pixel_layout((await self.config()).display)
         return self._layout
 
-    def list_patterns(self) -> Exchange[list[PatternDescription]]:
-        """List the named patterns."""
-        return (yield from self._policy.call(LIST_PATTERNS)).patterns
+    async def patterns(self) -> list[PatternDescription]:
+        """Return the named patterns and their parameters."""
+        return (await self._policy.call(LIST_PATTERNS)).patterns
 
-    def show(
+    async def show(
         self,
         heights_um: HeightsLike,
-        duration_s: float,
-        simultaneous: bool,
-        options: PushOptions,
-        dry_run: bool,
-        wait: bool,
+        duration_s: float = 1.0,
+        *,
+        simultaneous: bool = False,
+        wait: bool = True,
         labels: LabelsLike = None,
-    ) -> Exchange[Plan]:
-        """Plan one frame, and show it unless `dry_run`."""
-        layout = yield from self.read_layout()
-        body = build_frame_body(convert_to_pixels(heights_um, layout), duration_s, simultaneous)
-        return (yield from self.push(body, options, dry_run, wait, labels))
+        **options: Unpack[PushOptions],
+    ) -> Plan:
+        """Raise each pixel once to its height within duration_s. Wait until that is done unless `wait` is False.
 
-    def push(
+        heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
+        positions without a pixel are ignored)
+        labels: recorded with the plan: at most 32 of text, numbers and truth values
+        options: `policy` and `fit`, as PushOptions describes them
+        """
+        body = build_frame_body(convert_to_pixels(heights_um, await self.layout()), duration_s, simultaneous)
+        return await self.push(body, wait=wait, labels=labels, **options)
+
+    async def push(
         self,
         sequence: Mapping[str, Any],
-        options: PushOptions,
-        dry_run: bool,
-        wait: bool,
+        *,
+        wait: bool = True,
         labels: LabelsLike = None,
-    ) -> Exchange[Plan]:
-        """Plan frames and trains, and show them unless `dry_run`."""
-        body = _add_labels(sequence, labels)
-        return (yield from self._submit(build_push_request(body, options, dry_run), dry_run, wait))
+        **options: Unpack[PushOptions],
+    ) -> Plan:
+        """Show frames and trains in the form of FRAMES.json."""
+        return await self._submit(build_push_request(_add_labels(sequence, labels), options, dry_run=False), wait)
 
-    def play(
+    async def play(
         self,
+        /,
         name: str,
-        parameters: dict[str, Any],
-        dry_run: bool,
-        wait: bool,
+        *,
+        dry_run: bool = False,
+        wait: bool = True,
         labels: LabelsLike = None,
-    ) -> Exchange[Plan]:
-        """Plan a named pattern, and show it unless `dry_run`.
+        **parameters: Any,
+    ) -> Plan:
+        """Play a named pattern with its parameters by name.
 
-        parameters: of the pattern, together with the options of the push
+        dry_run: plan only; parameters: of the pattern, together with the options of `show`
         """
         options = select_push_options(parameters)
-        body = _add_labels(parameters, labels)
-        return (yield from self._submit(build_play_request(name, body, options, dry_run), dry_run, wait))
+        request = build_play_request(name, _add_labels(parameters, labels), options, dry_run)
+        return await (self._report(request) if dry_run else self._submit(request, wait))
 
-    def read_plan(self, plan: Plan | str) -> Exchange[Plan]:
-        """Read a plan."""
-        return (yield from self._report(build_read_request(_get_plan_id(plan))))
+    async def preview(
+        self,
+        heights_um: HeightsLike,
+        duration_s: float = 1.0,
+        *,
+        simultaneous: bool = False,
+        **options: Unpack[PushOptions],
+    ) -> Plan:
+        """Plan a frame as `show` would. Nothing moves."""
+        body = build_frame_body(convert_to_pixels(heights_um, await self.layout()), duration_s, simultaneous)
+        return await self._report(build_push_request(body, options, dry_run=True))
 
-    def cancel_plan(self, plan: Plan | str) -> Exchange[Plan]:
-        """Cancel a plan."""
-        return (yield from self._report(build_cancel_request(_get_plan_id(plan))))
+    async def plan(self, plan: Plan | str) -> Plan:
+        """Return a plan's present report."""
+        return await self._report(build_read_request(_get_plan_id(plan)))
 
-    def wait_for_plan(self, plan: Plan | str) -> Exchange[Plan]:
-        """Wait until a plan has ended. Raise RefusedError if it failed or was stopped."""
+    async def cancel(self, plan: Plan | str) -> Plan:
+        """Remove a plan from the queue, or end it if it runs. The board stays armed."""
+        return await self._report(build_cancel_request(_get_plan_id(plan)))
+
+    async def wait(self, plan: Plan | str) -> Plan:
+        """Wait until a plan has ended and return it. Raise RefusedError if it failed or was stopped."""
         poll = build_read_request(_get_plan_id(plan), pulses=False)
-        while not (yield from self._policy.call(poll)).has_ended:
-            yield Pause(POLL_PERIOD_S)
-        return (yield from self.read_plan(plan)).raise_if_failed()
+        while not (await self._policy.call(poll)).has_ended:
+            await self._http.sleep(POLL_PERIOD_S)
+        return (await self.plan(plan)).raise_if_failed()
 
-    def _submit(self, request: ApiRequest[Plan], dry_run: bool, wait: bool) -> Exchange[Plan]:
-        if dry_run:
-            return (yield from self._report(request))
+    async def _submit(self, request: ApiRequest[Plan], wait: bool) -> Plan:
         self.may_emit = True  # before the request: its effect is unknown if the response is lost
-        plan = yield from self._report(request)
+        plan = await self._report(request)
         if not wait:
             return plan
         with report_loss(plan.plan):
-            return (yield from self.wait_for_plan(plan))
+            return await self.wait(plan)
 
-    def _report(self, request: ApiRequest[Plan]) -> Exchange[Plan]:
-        plan = yield from self._policy.call(request)
-        self.last_plan = plan.place_on((yield from self.read_layout()))
+    async def _report(self, request: ApiRequest[Plan]) -> Plan:
+        plan = await self._policy.call(request)
+        self.last_plan = plan.place_on(await self.layout())
         return self.last_plan
 
 

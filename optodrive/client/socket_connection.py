@@ -1,16 +1,13 @@
-"""WebSocket connections to a daemon, blocking and asynchronous."""
+"""WebSocket connections to a daemon."""
 
 import logging
-from contextlib import AsyncExitStack, ExitStack
-from typing import Any
+from contextlib import AsyncExitStack
 
-import websockets.asyncio.client
-import websockets.sync.client
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.problems import parse_problem
-from optodrive.client.tls_socket import build_tls_context
 from optodrive.core.errors import OptodriveError
 
 OPEN_TIMEOUT_S = 2.5
@@ -29,77 +26,43 @@ def build_socket_url(endpoint: Endpoint, path: str) -> str:
     return f"ws{endpoint.url.removeprefix('http')}{path}"
 
 
-def open_connection(
+async def open_connection(
     endpoint: Endpoint,
     path: str,
-    stack: ExitStack,
+    stack: AsyncExitStack,
     silence_max_s: float = SILENCE_MAX_S,
     open_timeout_s: float = OPEN_TIMEOUT_S,
-) -> websockets.sync.client.ClientConnection:
+) -> ClientConnection:
     """Open a WebSocket that the stack closes. Raise the error of a refusal, LinkError if no daemon can be reached.
 
     silence_max_s: after which the daemon counts as lost, which closes the connection
     open_timeout_s: longest wait for the answer to the handshake
     """
 
-    def connect() -> websockets.sync.client.ClientConnection:
-        options = _build_options(endpoint, silence_max_s, open_timeout_s)
-        if endpoint.url.startswith("https"):
-            options["ssl"] = build_tls_context()
-        opened: websockets.sync.client.ClientConnection = websockets.sync.client.connect(
-            build_socket_url(endpoint, path), **options
+    async def open_once() -> ClientConnection:
+        opening = connect(
+            build_socket_url(endpoint, path),
+            additional_headers=endpoint.headers,
+            sock=endpoint.open_unix_socket(),
+            proxy=None,
+            open_timeout=open_timeout_s,
+            close_timeout=CLOSE_TIMEOUT_S,
+            ping_interval=silence_max_s / 2,
+            ping_timeout=silence_max_s / 2,
+            compression=None,
+            logger=QUIET,
         )
-        return stack.enter_context(opened)
-
-    endpoint.is_lost = False
-    try:
-        return connect()
-    except InvalidStatus as error:
-        _renew_token(endpoint, error)
-        return connect()
-    except CONNECTION_ERRORS as error:
-        endpoint.is_lost = True
-        raise endpoint.build_unreachable_error(error) from None
-
-
-async def open_async_connection(
-    endpoint: Endpoint,
-    path: str,
-    stack: AsyncExitStack,
-    silence_max_s: float = SILENCE_MAX_S,
-    open_timeout_s: float = OPEN_TIMEOUT_S,
-) -> websockets.asyncio.client.ClientConnection:
-    """Open a WebSocket as `open_connection` does."""
-
-    async def connect() -> websockets.asyncio.client.ClientConnection:
-        options = _build_options(endpoint, silence_max_s, open_timeout_s)
-        opening = websockets.asyncio.client.connect(build_socket_url(endpoint, path), **options)
         return await stack.enter_async_context(opening)
 
     endpoint.is_lost = False
     try:
-        return await connect()
+        return await open_once()
     except InvalidStatus as error:
         _renew_token(endpoint, error)
-        return await connect()
+        return await open_once()
     except CONNECTION_ERRORS as error:
         endpoint.is_lost = True
         raise endpoint.build_unreachable_error(error) from None
-
-
-def _build_options(endpoint: Endpoint, silence_max_s: float, open_timeout_s: float) -> dict[str, Any]:
-    """Build the options of a new connection for both kinds."""
-    return {
-        "additional_headers": endpoint.headers,
-        "sock": endpoint.open_unix_socket(),
-        "proxy": None,
-        "open_timeout": open_timeout_s,
-        "close_timeout": CLOSE_TIMEOUT_S,
-        "ping_interval": silence_max_s / 2,
-        "ping_timeout": silence_max_s / 2,
-        "compression": None,
-        "logger": QUIET,
-    }
 
 
 def _renew_token(endpoint: Endpoint, refused: InvalidStatus) -> None:

@@ -1,5 +1,6 @@
 """The daemon behind a TLS proxy, for other computers and phones: names, origins, cookie, WebSockets, client."""
 
+import asyncio
 import os
 import select
 import socket
@@ -11,12 +12,11 @@ from contextlib import suppress
 
 import httpx
 import pytest
+from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
-from websockets.sync.client import connect
 
 from forked_process import run_process
 from optodrive.client import Display
-from optodrive.client.tls_socket import build_tls_context
 from optodrive.core.errors import NotReadyError
 from rig import OPTODRIVE, TOKEN
 
@@ -112,18 +112,20 @@ def test_the_page_opens_with_the_cookie_of_its_name(behind_proxy):
 
 def test_websockets_pass_a_proxy_for_their_own_origin_only(behind_proxy):
     _, proxy = behind_proxy
-    context = build_tls_context()  # a plain one is unfit for a client of two threads
-    context.load_verify_locations(proxy.certificate)
-    options = {"ssl": context, "additional_headers": AUTHORIZATION, "proxy": None}
-    address, url = ("127.0.0.1", proxy.port), f"wss://{NAME}/v1/stream"
-    with (
-        socket.create_connection(address) as link,
-        connect(url, sock=link, origin=f"https://{NAME}", **options) as stream,
-    ):
-        stream.send("no frame")
-        assert "refused" in stream.recv()
-    with socket.create_connection(address) as link, pytest.raises(InvalidStatus, match="HTTP 403"):
-        connect(url, sock=link, origin="https://evil.example", **options)
+    context = ssl.create_default_context(cafile=proxy.certificate)
+    options = {"ssl": context, "additional_headers": AUTHORIZATION, "proxy": None, "server_hostname": NAME}
+
+    def open_stream(origin):
+        return connect(f"wss://{NAME}/v1/stream", host="127.0.0.1", port=proxy.port, origin=origin, **options)
+
+    async def open_streams():
+        async with open_stream(f"https://{NAME}") as stream:
+            await stream.send("no frame")
+            assert "refused" in await stream.recv()
+        with pytest.raises(InvalidStatus, match="HTTP 403"):
+            await open_stream("https://evil.example")
+
+    asyncio.run(open_streams())
 
 
 def test_client_and_commands_reach_the_daemon_over_tls(behind_proxy, monkeypatch):

@@ -3,26 +3,26 @@
 import asyncio
 import socket
 import ssl
-from contextlib import AsyncExitStack, ExitStack
+from contextlib import AsyncExitStack
 from math import inf
 
 import httpx
 import pytest
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import STOP_LOST_TIMEOUTS_S, ExchangePolicy, parse_response
+from optodrive.client.exchange import STOP_LOST_TIMEOUTS_S, ExchangePolicy, parse_response, run_blocking
 from optodrive.client.hold import SILENCE_MAX_S
 from optodrive.client.http import (
     PROBE_PERIOD_S,
     PROBE_TIMEOUT_S,
     READ_TIMEOUT_S,
-    AsyncDaemonClient,
-    DaemonClient,
+    AsyncHttp,
+    BlockingHttp,
 )
 from optodrive.client.plan import report_loss
 from optodrive.client.problems import build_error, parse_problem
 from optodrive.client.requests import READ_STATE, STOP, ApiRequest, build_push_request
-from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_async_connection, open_connection
+from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_connection
 from optodrive.core.errors import (
     BoardFaultError,
     InputError,
@@ -110,8 +110,8 @@ def call(request, monkeypatch):
         monkeypatch.setattr(
             Endpoint, "open_client", lambda self, timeout_s: httpx.Client(base_url=self.url, transport=transport)
         )
-        client = DaemonClient("http://localhost", "token", reconnect_timeout_s)
-        return [client.run(exchange(client.policy)) for exchange in exchanges], script.requests
+        policy = ExchangePolicy(BlockingHttp(Endpoint("http://localhost", "token")), reconnect_timeout_s)
+        return [run_blocking(exchange(policy)) for exchange in exchanges], script.requests
 
     def asynchronous(replies, *exchanges, reconnect_timeout_s=0.0):
         script = Scripted(replies)
@@ -123,8 +123,8 @@ def call(request, monkeypatch):
         )
 
         async def run():
-            client = AsyncDaemonClient("http://localhost", "token", reconnect_timeout_s)
-            return [await client.run(exchange(client.policy)) for exchange in exchanges]
+            policy = ExchangePolicy(AsyncHttp(Endpoint("http://localhost", "token")), reconnect_timeout_s)
+            return [await exchange(policy) for exchange in exchanges]
 
         return asyncio.run(run()), script.requests
 
@@ -186,11 +186,11 @@ def test_stop_is_attempted_twice_but_once_at_a_daemon_that_has_just_not_answered
     with pytest.raises(LinkError, match="emergency stop"):
         call([silence] * 2, ExchangePolicy.stop)
 
-    def fail_and_stop(policy):
+    async def fail_and_stop(policy):
         try:
-            yield from policy.call(HEALTH)
+            await policy.call(HEALTH)
         except LinkError:
-            yield from policy.stop()
+            await policy.stop()
 
     with pytest.raises(LinkError, match="emergency stop"):
         call([silence] * 2, fail_and_stop)
@@ -200,13 +200,20 @@ def test_a_call_at_a_suspended_daemon_leaves_time_for_its_stop():
     """The silence that a stream, a hold, a request and a new connection wait for, and the stop of the client's exit."""
     longest_s = max(PROBE_PERIOD_S + PROBE_TIMEOUT_S, READ_TIMEOUT_S, OPEN_TIMEOUT_S, SILENCE_MAX_S)
     assert longest_s + sum(STOP_LOST_TIMEOUTS_S) <= 3.5
-    with socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as stack:  # accepts, and nobody answers
-        policy = ExchangePolicy(Endpoint(f"http://127.0.0.1:{listener.getsockname()[1]}", "token"))
+    waits_s = []
+
+    class Watched(BlockingHttp):
+        async def send_alone(self, request, timeout_s):
+            waits_s.append(timeout_s)
+            raise httpx.ReadTimeout("silence")
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:  # accepts, and nobody answers
+        http = Watched(Endpoint(f"http://127.0.0.1:{listener.getsockname()[1]}", "token"))
         with pytest.raises(LinkError):
-            open_connection(policy.endpoint, "/v1/hold", stack, open_timeout_s=0.05)
-        with pytest.raises(LinkError):
-            asyncio.run(open_async_connection(policy.endpoint, "/v1/hold", AsyncExitStack(), open_timeout_s=0.05))
-    assert next(policy.stop()).timeout_s == 1.0
+            asyncio.run(open_connection(http.endpoint, "/v1/hold", AsyncExitStack(), open_timeout_s=0.05))
+    with pytest.raises(LinkError, match="emergency stop"):
+        run_blocking(ExchangePolicy(http).stop())
+    assert waits_s == [1.0]
 
 
 @pytest.mark.parametrize(("scheme", "mode"), [("https", ssl.CERT_REQUIRED), ("http", ssl.CERT_NONE)])

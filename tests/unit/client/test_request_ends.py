@@ -8,7 +8,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from optodrive.client import http
-from optodrive.client.http import AsyncDaemonClient, DaemonClient
+from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import ExchangePolicy
+from optodrive.client.http import AsyncHttp, DaemonClient
 from optodrive.client.requests import ApiRequest
 from optodrive.core.errors import LinkError
 from optodrive.daemon.responses.health import HealthReport
@@ -52,17 +54,13 @@ def call(request):
     """Return a function that sends a request to a URL with one of the clients."""
 
     def blocking(url, sent):
-        client = DaemonClient(url, "token")
-        try:
-            return client.call(sent)
-        finally:
-            client.close()
+        return DaemonClient(url, "token").call(sent)
 
     def asynchronous(url, sent):
         async def run():
-            client = AsyncDaemonClient(url, "token")
+            client = AsyncHttp(Endpoint(url, "token"))
             try:
-                return await client.run(client.policy.call(sent))
+                return await ExchangePolicy(client).call(sent)
             finally:
                 await client.close()
 

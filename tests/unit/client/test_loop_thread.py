@@ -1,0 +1,140 @@
+"""A blocking stream over TLS: threads that send and wait leave its OpenSSL to the thread of its loop."""
+
+import asyncio
+import json
+import ssl
+import subprocess
+import threading
+
+import numpy as np
+import pytest
+from websockets.asyncio.server import serve
+
+from optodrive.client.endpoint import Endpoint
+from optodrive.client.loop_thread import LoopThread
+from optodrive.client.stream import Stream
+from optodrive.core.errors import LinkError, NotReadyError
+from optodrive.device.config import PixelLayout
+
+FRAMES, SENDERS = 40, 3
+PIXEL = np.zeros(1)
+
+
+@pytest.fixture
+def certificate(tmp_path):
+    path, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    names = ("-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost")
+    options = ("-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *names, "-keyout", key)
+    subprocess.run(["openssl", "req", *options, "-out", path], check=True, capture_output=True)
+    return path, key
+
+
+@pytest.fixture
+def stream(certificate, monkeypatch):
+    """A stream to a server that answers every frame."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*certificate)
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate[0]))
+
+    async def answer(connection):
+        async for frame in connection:
+            number = int.from_bytes(frame[4:8], "little")
+            await connection.send(json.dumps({"frame": number, "status": "superseded"}))
+
+    loop = LoopThread("server")
+
+    async def start():
+        return await serve(answer, "localhost", 0, ssl=context)
+
+    server = loop.run(start())
+    port = server.sockets[0].getsockname()[1]
+    layout = PixelLayout(PIXEL, PIXEL, PIXEL.astype(int), PIXEL.astype(int))
+    with Stream(Endpoint(f"https://localhost:{port}", "token"), layout, "trim", 0.0, lambda: None) as stream:
+        yield stream
+
+    async def stop():
+        server.close()
+        await server.wait_closed()
+
+    loop.run(stop())
+    loop.close()
+
+
+def test_one_thread_alone_enters_the_connection(stream, monkeypatch):
+    entered = set()
+    for name in ("read", "write"):
+        original = getattr(ssl.SSLObject, name)
+
+        def call(self, *arguments, original=original):
+            if not self.server_side:
+                entered.add(threading.current_thread().name)
+            return original(self, *arguments)
+
+        monkeypatch.setattr(ssl.SSLObject, name, call)
+
+    def send():
+        for _ in range(FRAMES):
+            stream.wait(stream.send([50.0]))
+
+    senders = [threading.Thread(target=send) for _ in range(SENDERS)]
+    for sender in senders:
+        sender.start()
+    for sender in senders:
+        sender.join()
+    assert len(stream.results()) == FRAMES * SENDERS
+    assert entered == {"stream"}
+
+
+def test_a_closed_stream_still_tells_what_arrived(stream):
+    number = stream.send([50.0])
+    result = stream.wait(number)
+    stream.close()
+    assert stream.wait(number) == result
+    assert stream.results() == [result]
+    with pytest.raises(NotReadyError, match="the stream is closed"):
+        stream.send([50.0])
+    with pytest.raises(NotReadyError, match="the stream is closed"):
+        stream.wait(number + 1)
+
+
+def test_a_wait_in_another_thread_ends_with_the_stream(stream):
+    errors = []
+
+    def wait():
+        try:
+            stream.wait(7, timeout_s=3600.0)
+        except (LinkError, NotReadyError) as error:
+            errors.append(error)
+
+    waiter = threading.Thread(target=wait)
+    waiter.start()
+    stream.close()
+    waiter.join()
+    assert len(errors) == 1
+
+
+def test_an_interrupted_caller_cancels_its_coroutine():
+    loop, cancelled = LoopThread("test"), threading.Event()
+
+    class Interrupted(BaseException):
+        pass
+
+    async def sleep():
+        try:
+            await asyncio.Event().wait()
+        finally:
+            cancelled.set()
+
+    with pytest.MonkeyPatch.context() as patch:
+        submit = asyncio.run_coroutine_threadsafe
+
+        def interrupt(coroutine, target):
+            future = submit(coroutine, target)
+            future.result = lambda: (_ for _ in ()).throw(Interrupted)
+            return future
+
+        patch.setattr(asyncio, "run_coroutine_threadsafe", interrupt)
+        with pytest.raises(Interrupted):
+            loop.run(sleep())
+    loop.close()
+    assert cancelled.is_set()
