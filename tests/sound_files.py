@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,18 +10,18 @@ import numpy as np
 from hidden_field import CONFIG as FIELD_CONFIG
 from hidden_field import PRIOR, grid_codes, measure_spots
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import OTHER_UNITS
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import OTHER_UNITS, PlausibleRange, collect_ranges
+from optodrive.core.plausible_ranges import FRAMES
 from optodrive.device.config import build_pixel_layout
-from optodrive.device.config_file import apply_measured_servo, load_config, locate_shipped
-from optodrive.device.field_file import load_field
+from optodrive.device.config_file import MirrorsFile, apply_measured_servo, load_config, locate_shipped
+from optodrive.device.field_file import _FieldFile, load_field
 from optodrive.device.field_geometry import FieldGeometry
-from optodrive.device.pixel_map import load_pixel_map, replace_pixel_map
-from optodrive.lab.calibration.camera.folder import read_picture_folder
+from optodrive.device.pixel_map import _PixelMapFile, load_pixel_map, replace_pixel_map
+from optodrive.lab.calibration.camera.folder import _PicturesFile, read_picture_folder
 from optodrive.lab.calibration.spot_checks import check_spots
 from optodrive.lab.calibration.spots import COLUMNS, read_spots
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
-from optodrive.physics.parameters import load_parameters
+from optodrive.physics.parameters import ParameterSet, load_parameters
 from optodrive.physics.terms import discover_terms
 from optodrive.planning.stimuli.sequence_file import parse_sequence
 
@@ -112,11 +113,12 @@ class Format:
     """A format: draws sound content, changes a quantity, and reads the file as the product does."""
 
     name = ""
+    ranges: Mapping[str, PlausibleRange] = {}
 
     def list_places(self, content):
         """Return the quantities of a content: path, unit and name in a refusal."""
         places = []
-        for key, item in RANGES[self.name].items():
+        for key, item in self.ranges.items():
             path = tuple(key.split("."))
             values = find_value(content, path)
             if isinstance(values, list) and len(values) and isinstance(values[0], list):
@@ -138,6 +140,7 @@ class Parameters(Format):
     """A parameter set with one or two terms, typed by a person, with its sigmas."""
 
     name = "parameters"
+    ranges = collect_ranges(ParameterSet)
 
     def draw(self, rng):
         table = tomllib.loads(CALIBRATED)
@@ -169,7 +172,7 @@ class Parameters(Format):
     def list_places(self, content):
         places = super().list_places(content)
         places += [
-            ((key, "sigma"), RANGES["parameters"][f"{key}.value"].unit, key)
+            ((key, "sigma"), self.ranges[f"{key}.value"].unit, key)
             for key in ("tau_g", "kappa", "phi", "R_width_product", "C_mean")
         ]
         for key, values in content["terms"].items():
@@ -188,6 +191,7 @@ class Mirrors(Format):
     """mirrors.toml."""
 
     name = "mirrors"
+    ranges = collect_ranges(MirrorsFile)
 
     def draw(self, rng):
         servo = {"bandwidth_hz": vary(rng, 1500.0, 4.0), "damping": float(rng.uniform(0.35, 0.85))}
@@ -202,6 +206,7 @@ class FieldFile(Format):
     """field.toml, in lengths: a command writes it, and its smallest angles look the same in degrees."""
 
     name = "field"
+    ranges = collect_ranges(_FieldFile)
 
     def draw(self, rng):
         geometry = FieldGeometry(*(np.array(PRIOR.mean) + 0.7 * PRIOR.sigma * rng.standard_normal(len(PRIOR.sigma))))
@@ -232,6 +237,7 @@ class Pixels(Format):
     """pixels.toml."""
 
     name = "pixels"
+    ranges = collect_ranges(_PixelMapFile)
 
     def draw(self, rng):
         display = CONFIG.display
@@ -263,6 +269,7 @@ class Pictures(Format):
     """pictures.toml: a grid that is turned by a multiple of a right angle and a little."""
 
     name = "pictures"
+    ranges = collect_ranges(_PicturesFile)
 
     def draw(self, rng):
         turn = float(rng.choice([0.0, 0.5, -0.5, 1.0])) * np.pi + float(rng.normal(0.0, 0.02)) * (rng.random() < 0.3)
@@ -295,6 +302,7 @@ class Spots(Format):
     """spots.csv, with both columns or one of them in another unit."""
 
     name = "spots"
+    ranges = dict.fromkeys(("x_m", "y_m"), PlausibleRange(0.0, 0.5, "m"))
 
     def draw(self, rng):
         truth = GroundTruthGeometry.sample(int(rng.integers(1_000_000)), FIELD_CONFIG)
@@ -318,6 +326,7 @@ class Frames(Format):
     """FRAMES.json. Times at which frames are shown have no physical scale: only those of pulses are mistaken."""
 
     name = "frames"
+    ranges = FRAMES
 
     def draw(self, rng):
         frames, show_at_s = [], 0.0

@@ -1,8 +1,11 @@
 """Plausible ranges of quantities, and the unit that a value outside its range is probably in."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import cache
 from math import inf, pi
-from typing import NamedTuple
+from typing import Any, NamedTuple, get_args
+
+from pydantic import BaseModel
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_range
@@ -59,6 +62,31 @@ class PlausibleRange(NamedTuple):
     low: float
     high: float
     unit: str
+
+
+@cache
+def collect_ranges(model: type[BaseModel]) -> Mapping[str, PlausibleRange]:
+    """Collect the ranges in the annotations of a model's fields, by dotted key without the indices of lists.
+
+    A field that holds a table without a model states a mapping of ranges by its keys.
+    """
+    found: dict[str, PlausibleRange] = {}
+    for name, field in model.model_fields.items():
+        for part in (*field.metadata, *_list_parts(field.annotation)):
+            if isinstance(part, PlausibleRange):
+                found[name] = part
+                continue
+            is_model = isinstance(part, type) and issubclass(part, BaseModel)
+            inner = collect_ranges(part) if is_model else part if isinstance(part, Mapping) else {}
+            found |= {f"{name}.{key}": plausible for key, plausible in inner.items()}
+    return found
+
+
+def _list_parts(annotation: Any) -> Iterator[Any]:
+    """Yield a type and all that it is made of, with its annotations."""
+    yield annotation
+    for part in get_args(annotation):
+        yield from _list_parts(part)
 
 
 def guess_unit(value: float, plausible: PlausibleRange) -> str | None:

@@ -1,11 +1,14 @@
 """Tables of TOML files as pydantic models, with one-line errors."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.core.errors import MISSING, InputError, suggest_nearest
+from optodrive.core.plausibility import check_table, collect_ranges
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class ConflictError(ValueError):
@@ -56,6 +59,20 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
         raise InputError(f"{path}: format", table.get("format", MISSING), f"'{expected}'")
     if table.get("version") != version or isinstance(table["version"], bool):
         raise InputError(f"{path}: version", table.get("version", MISSING), f"{version}, the one this release reads")
+
+
+def parse_table(path: Path, table: dict[str, Any], model: type[Model]) -> Model:
+    """Return a file's table as its model. Raise InputError, first for a quantity that is probably in another unit."""
+    check_table(str(path), table, collect_ranges(model))
+    return validate_table(path, table, model)
+
+
+def validate_table(path: Path, table: dict[str, Any], model: type[Model]) -> Model:
+    """Return a file's table as its model, whose units were checked. Raise InputError."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        raise build_input_error(error, str(path), model) from None
 
 
 def build_input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:

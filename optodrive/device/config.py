@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from optodrive.core.errors import MISSING, InputError, Unquoted
+from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.device.config_sections import (
@@ -43,7 +44,7 @@ class Config(Section):
     """Version of the format."""
     name: Name
     """Name of the display."""
-    ambient_c: Annotated[float, Field(ge=-20, le=60)]
+    ambient_c: Annotated[float, Field(ge=-20, le=60), PlausibleRange(0.0, 60.0, "°C")]
     """Ambient temperature, °C."""
     display: DisplaySection
     """The pixel lattice."""

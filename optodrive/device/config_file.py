@@ -6,16 +6,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import check_table
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import check_table, collect_ranges
 from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.core.toml_model import Section, check_format, parse_table, validate_table
 from optodrive.device.config import FORMAT, VERSION, Config
 from optodrive.device.config_sections import ServoSection
-from optodrive.device.plausible_config import check_units
 
 RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
 """Keys that version 4 renamed, with their new names."""
@@ -59,13 +57,10 @@ def build_config(path: Path, table: dict[str, Any]) -> Config:
         expected = f"{VERSION}: {renamed}; `optodrive config migrate` renames them, or lists the lines to change"
         raise InputError(f"{path}: version", table["version"], expected)
     check_format(path, table, FORMAT, VERSION)
-    check_units(path, table)
+    check_table(str(path), table, collect_ranges(Config))
     for section, key in list_named_files(table):
         section[key] = str(path.parent / section[key])
-    try:
-        config = Config.model_validate(table).read_from(path)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), Config) from None
+    config = validate_table(path, table, Config).read_from(path)
     return config.list_stage_configs()[0] if len(config.stages) == 1 else config
 
 
@@ -123,11 +118,7 @@ def apply_measured_servo(config: Config, path: Path) -> Config:
     """Return the configuration with measured servos and the galvo cap that they leave. Raise InputError."""
     table = read_toml(path)
     check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
-    check_table(str(path), table, RANGES["mirrors"])
-    try:
-        measured = MirrorsFile.model_validate(table)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), MirrorsFile) from None
+    measured = parse_table(path, table, MirrorsFile)
     scanner = config.scanner.model_copy(update={**measured.scanner.model_dump(), "mirrors": str(path)})
     stated = config.limits.galvo_acceleration_rms_max_rad_per_s2
     cap = {"galvo_acceleration_rms_max_rad_per_s2": stated * measured.galvo.share}

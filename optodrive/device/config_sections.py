@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from optodrive.core.errors import Unquoted
+from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import ConflictError, Name, Section
 
 WIRE_ON_MAX_S = 65_535e-6
@@ -26,7 +27,15 @@ HELIOS_POINT_EXCESS_S = 1e-8
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-HalfWidth = Annotated[float, Field(ge=0, le=0.5)]
+HalfWidth = Annotated[float, Field(ge=0, le=0.5), PlausibleRange(0.0, 0.5, "1")]
+Pitch = Annotated[Positive, PlausibleRange(1e-4, 0.1, "m")]
+BridgeWidth = Annotated[Positive, PlausibleRange(1e-5, 5e-3, "m")]
+FocalLength = Annotated[Positive, PlausibleRange(5e-3, 3.0, "m")]
+AbsorberSide = Annotated[Positive, PlausibleRange(5e-5, 0.05, "m")]
+PanelSide = Annotated[Positive, PlausibleRange(1e-3, 3.0, "m")]
+FocusSide = Annotated[Positive, PlausibleRange(1e-6, 0.05, "m")]
+MeanPower = Annotated[Positive, PlausibleRange(1e-4, 60.0, "W")]
+Window = Annotated[Positive, PlausibleRange(1e-3, 120.0, "s")]
 UsbId = Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
@@ -37,15 +46,15 @@ class DisplaySection(Section):
     """Number of rows, counted from the bottom."""
     columns: Annotated[int, Field(ge=1, le=200)]
     """Number of columns, counted from the left."""
-    pitch_m: Positive
+    pitch_m: Pitch
     """Distance between neighbouring pixels, m."""
     missing: tuple[tuple[int, int], ...] = ()
     """Places without a pixel, as pairs of row and column."""
-    bridge_width_m: Positive
+    bridge_width_m: BridgeWidth
     """Width of the bridges that hold the absorbers, m."""
-    absorber_width_m: Positive = 2.0e-3
+    absorber_width_m: AbsorberSide = 2.0e-3
     """Width of an absorber in x, m; less than the pitch of several columns."""
-    absorber_height_m: Positive = 1.5e-3
+    absorber_height_m: AbsorberSide = 1.5e-3
     """Height of an absorber in y, m; less than the pitch of several rows."""
     pixel_map: Annotated[str, Field(min_length=1)] | None = None
     """File with the measured gain, offset and state of every pixel, relative to the configuration's folder."""
@@ -84,50 +93,50 @@ class PixelModelSection(Section):
 class PanelSection(Section):
     """The laminate with its frame, to which all walls lose their heat, and which loses it to the room."""
 
-    width_m: Positive | None = None
+    width_m: PanelSide | None = None
     """Outer width, m; by default that of the pixels and a rim of 10 mm on either side."""
-    height_m: Positive | None = None
+    height_m: PanelSide | None = None
     """Outer height, m; by default that of the pixels and a rim of 10 mm on either side."""
-    resistance_k_per_w: Positive | None = None
+    resistance_k_per_w: Annotated[Positive, PlausibleRange(1e-3, 1e3, "K/W")] | None = None
     """Thermal resistance to the room, K/W; by default that of still air on both faces."""
-    capacity_j_per_k: Positive | None = None
+    capacity_j_per_k: Annotated[Positive, PlausibleRange(0.1, 1e5, "J/K")] | None = None
     """Heat capacity with all walls, J/K; by default that of a laminate of acrylic and polystyrene."""
 
 
 class LaserSection(Section):
     """The diode, its modulation and its focus."""
 
-    max_power_w: Positive
+    max_power_w: Annotated[Positive, PlausibleRange(1e-3, 60.0, "W")]
     """Incident power at the sample at full duty, W."""
-    pwm_hz: Positive
+    pwm_hz: Annotated[Positive, PlausibleRange(50.0, 1e7, "Hz")]
     """Frequency of the pulse-width modulation, Hz; pulses are whole periods wide."""
-    focus_width_m: Positive
+    focus_width_m: FocusSide
     """Width of the focus on the absorber in x, m."""
-    focus_height_m: Positive
+    focus_height_m: FocusSide
     """Height of the focus on the absorber in y, m."""
 
 
 class ServoSection(Section):
     """The servo of either mirror: a delay, a slew-limited target, and two underdamped poles."""
 
-    bandwidth_hz: Annotated[float, Field(ge=100, le=100_000)]
+    bandwidth_hz: Annotated[float, Field(ge=100, le=100_000), PlausibleRange(100.0, 1e5, "Hz")]
     """Natural frequency of the closed loop, Hz."""
     damping: Annotated[float, Field(ge=0.3, le=0.9)]
     """Damping ratio of the closed loop."""
-    delay_s: Annotated[float, Field(ge=0, le=0.01)]
+    delay_s: Annotated[float, Field(ge=0, le=0.01), PlausibleRange(1e-9, 2e-3, "s")]
     """Time from a command to the first movement of the servo's target, s."""
-    slew_rad_per_s: Annotated[float, Field(ge=1, le=100_000)]
+    slew_rad_per_s: Annotated[float, Field(ge=1, le=100_000), PlausibleRange(1.0, 1500.0, "rad/s")]
     """Speed at which the servo's target moves to the command, rad/s."""
 
 
 class ScannerSection(ServoSection):
     """The mirrors and the lens. Without a calibrated field the lens is an ideal f-theta lens, x = f · 2 · angle."""
 
-    focal_length_m: Positive
+    focal_length_m: FocalLength
     """Focal length of the f-theta lens, m."""
-    range_rad: Annotated[float, Field(gt=0, lt=0.8)]
+    range_rad: Annotated[float, Field(gt=0, lt=0.8), PlausibleRange(1e-3, 0.8, "rad")]
     """Mechanical mirror angle at either end of the converter's range, rad."""
-    aim_error_m: NonNegative
+    aim_error_m: Annotated[NonNegative, PlausibleRange(1e-9, 5e-3, "m")]
     """Largest distance of a settled beam from its target, m."""
     field: Annotated[str, Field(min_length=1)] | None = None
     """File of a calibrated scan field that replaces the ideal lens, relative to the configuration's folder."""
@@ -151,7 +160,7 @@ class UncertaintySection(Section):
     """Thermal resistance of the bridges."""
     absorber_capacity: HalfWidth = 0.05
     """Heat capacity of an absorber."""
-    exponent: Annotated[float, Field(ge=0, le=0.5)] = 0.02
+    exponent: HalfWidth = 0.02
     """Exponent of the bridge resistance in temperature, absolute; it is 0 in a set without bridge_conductivity."""
     gas_lag: HalfWidth = 0.25
     """Time constant of the gas."""
@@ -176,31 +185,31 @@ class LimitsSection(Section):
 
     power_share: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Largest power of a pulse as a share of the laser's; `optodrive dim` lowers it further while the daemon runs."""
-    absorber_max_c: float
+    absorber_max_c: Annotated[float, PlausibleRange(1.0, 560.0, "°C")]
     """Highest absorber temperature, °C."""
-    wall_max_c: float
+    wall_max_c: Annotated[float, PlausibleRange(1.0, 200.0, "°C")]
     """Highest wall temperature, °C, if the parameter set has walls and touch_max_c is not lower."""
-    touch_max_c: float
+    touch_max_c: Annotated[float, PlausibleRange(1.0, 90.0, "°C")]
     """Highest temperature of all that a finger touches, °C: touch surfaces and walls, if any, and the panel."""
-    galvo_acceleration_rms_max_rad_per_s2: Positive
+    galvo_acceleration_rms_max_rad_per_s2: Annotated[Positive, PlausibleRange(1.0, 1e6, "rad/s²")]
     """Root mean square of either mirror's angular acceleration, rad/s²."""
-    galvo_mean_s: Annotated[float, Field(ge=0.05, allow_inf_nan=False)]
+    galvo_mean_s: Annotated[float, Field(ge=0.05), PlausibleRange(1e-3, 100.0, "s")]
     """Averaging time of the galvo acceleration, s."""
-    pulse_energy_max_j: Positive
+    pulse_energy_max_j: Annotated[Positive, PlausibleRange(1e-6, 10.0, "J")]
     """Incident energy of a pulse, and of a pixel's leaky bucket, J."""
-    pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S)]
+    pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S), PlausibleRange(1e-7, 0.07, "s")]
     """Gate-on time of a pulse, s."""
-    pulse_gap_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
+    pulse_gap_min_s: Annotated[float, Field(gt=0, le=0.01), PlausibleRange(1e-9, 0.01, "s")] = 5e-4
     """Pulses on a pixel with a shorter gap count as one against pulse_width_max_s, s."""
-    pixel_mean_power_max_w: Positive
+    pixel_mean_power_max_w: MeanPower
     """Mean incident power of a pixel over its window, and leak rate of its energy bucket, W."""
-    pixel_mean_window_s: Positive
+    pixel_mean_window_s: Window
     """Averaging window of a pixel's mean power, s."""
-    display_mean_power_max_w: Positive
+    display_mean_power_max_w: MeanPower
     """Mean incident power of the display over its window, W."""
-    display_mean_window_s: Positive
+    display_mean_window_s: Window
     """Averaging window of the display's mean power, s."""
-    stage_skew_max_s: Annotated[float, Field(gt=0, le=0.01)] = 1e-3
+    stage_skew_max_s: Annotated[float, Field(gt=0, le=0.01), PlausibleRange(1e-7, 0.01, "s")] = 1e-3
     """Largest error of the clock of one of several stages, s; a plan starts on none if one may be further off."""
     uncertainty: UncertaintySection = UncertaintySection()
     """Declared uncertainty of the model."""
@@ -217,9 +226,9 @@ class BoardSection(Section):
     """Bit rate of the serial port, 1/s."""
     uid: str = ""
     """The only board, or name of a Helios, that is accepted; empty: any."""
-    lease_s: Annotated[float, Field(ge=0.02, le=1.0)] = 0.1
+    lease_s: Annotated[float, Field(ge=0.02, le=1.0), PlausibleRange(1e-3, 1.0, "s")] = 0.1
     """Time after the last lease until the board closes the gate, s."""
-    stream_lead_s: Annotated[float, Field(ge=0.01, le=0.2)] = 0.03
+    stream_lead_s: Annotated[float, Field(ge=0.01, le=0.2), PlausibleRange(1e-3, 0.2, "s")] = 0.03
     """Time for which points of a stream are sent ahead, s; a longer stall of this computer interrupts the stream."""
     vendor_id: UsbId | None = None
     """USB vendor of the board."""

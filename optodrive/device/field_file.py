@@ -5,15 +5,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field as Item
-from pydantic import ValidationError
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.plausibility import check_table
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.device.calibrated_field import CalibratedField
-from optodrive.device.field_geometry import FieldGeometry
+from optodrive.device.config_sections import FocalLength
+from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
 from optodrive.device.field_surface import ORDER, TERM_COUNT, Extent
 
 FORMAT = "optodrive-field"
@@ -23,12 +22,13 @@ VERSION = 2
 Code = Annotated[float, Item(ge=-1e5, le=1e5)]
 HalfRange = Annotated[float, Item(ge=1, le=1e5)]
 Coefficient = Annotated[float, Item(ge=-1e3, le=1e3)]
-Displacement = Annotated[float, Item(ge=-1, le=1)]
+PIXEL_OFFSET = PlausibleRange(0.0, 5e-3, "m")
+Displacement = Annotated[float, Item(ge=-1, le=1), PIXEL_OFFSET]
 
 
 class _Scanner(Section):
-    rad_per_code: Annotated[float, Item(gt=0)]
-    focal_length_m: Annotated[float, Item(gt=0)]
+    rad_per_code: Annotated[float, Item(gt=0), PlausibleRange(3e-8, 4e-4, "rad")]
+    focal_length_m: FocalLength
 
 
 class _Extent(Section):
@@ -45,7 +45,7 @@ class _Surface(Section):
 
 
 class _Uncertainty(Section):
-    sigma_m: Annotated[tuple[tuple[Annotated[float, Item(gt=0, le=1)], ...], ...], Item(min_length=2)]
+    sigma_m: Annotated[tuple[tuple[Annotated[float, Item(gt=0, le=1), PIXEL_OFFSET], ...], ...], Item(min_length=2)]
 
 
 class _FieldFile(Section):
@@ -54,7 +54,7 @@ class _FieldFile(Section):
     about: dict[str, str | float | int] = Item(default_factory=dict)
     scanner: _Scanner
     extent: _Extent
-    geometry: dict[str, Coefficient]
+    geometry: Annotated[dict[str, Coefficient], GEOMETRY_RANGES]
     surface: _Surface
     uncertainty: _Uncertainty
 
@@ -88,11 +88,7 @@ def load_field(path: Path) -> CalibratedField:
     """Load field.toml. Raise InputError for another format or version, and for invalid content."""
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
-    check_table(str(path), table, RANGES["field"])
-    try:
-        content = _FieldFile.model_validate(table)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), _FieldFile) from None
+    content = parse_table(path, table, _FieldFile)
     differing = set(FieldGeometry._fields) ^ set(content.geometry)
     if differing:
         raise InputError(

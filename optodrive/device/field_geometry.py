@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config_sections import HALF_RANGE_CODES
 
@@ -43,6 +44,26 @@ class FieldGeometry(NamedTuple):
     turn_rad: float
     tilt_x_rad: float
     tilt_y_rad: float
+
+
+_ANGLE = PlausibleRange(0.0, 0.2, "rad")
+GEOMETRY_RANGES = {
+    "offset_x_rad": _ANGLE,
+    "offset_y_rad": _ANGLE,
+    "cubic_x_per_rad2": PlausibleRange(0.0, 1e5, "1/rad²"),
+    "cubic_y_per_rad2": PlausibleRange(0.0, 1e5, "1/rad²"),
+    "mirror_distance_m": PlausibleRange(0.0, 0.5, "m"),
+    "lens_distance_m": PlausibleRange(0.0, 0.5, "m"),
+    "focal_length_m": PlausibleRange(5e-3, 3.0, "m"),
+    "distortion3_per_rad2": PlausibleRange(0.0, 1e5, "1/rad²"),
+    "distortion5_per_rad4": PlausibleRange(0.0, 1e9, "1/rad⁴"),
+    "shift_x_m": PlausibleRange(0.0, 0.05, "m"),
+    "shift_y_m": PlausibleRange(0.0, 0.05, "m"),
+    "turn_rad": PlausibleRange(0.0, 0.5, "rad"),
+    "tilt_x_rad": _ANGLE,
+    "tilt_y_rad": _ANGLE,
+}
+"""Plausible ranges of absolute values."""
 
 
 def beam_position_m(geometry: FieldGeometry, x_rad: FloatArray, y_rad: FloatArray) -> tuple[FloatArray, FloatArray]:

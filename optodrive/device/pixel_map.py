@@ -7,17 +7,15 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field as Item
-from pydantic import ValidationError
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.files import atomic_write
-from optodrive.core.plausibility import check_table
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.core.types.arrays import BoolArray, FloatArray, StrArray, freeze_arrays
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
-from optodrive.device.config_sections import DisplaySection
+from optodrive.device.config_sections import DisplaySection, Pitch
 
 FORMAT = "optodrive-pixels"
 VERSION = 1
@@ -28,22 +26,25 @@ GAIN_MIN, GAIN_MAX = 0.2, 5.0
 MEASURED, DEAD, NOT_MEASURED = "measured", "dead", "not measured"
 
 
+Offset = Annotated[float, PlausibleRange(0.0, 5e-3, "m")]
+
+
 class _Pixel(Section):
     index: Annotated[int, Item(ge=0)]
     state: Literal["measured", "dead", "not measured"] = "measured"
     gain: Annotated[float, Item(ge=GAIN_MIN, le=GAIN_MAX)] = 1.0
     gain_sigma: Annotated[float, Item(ge=0)] | None = None
-    offset_x_m: float = 0.0
-    offset_y_m: float = 0.0
-    offset_x_sigma_m: Annotated[float, Item(ge=0)] | None = None
-    offset_y_sigma_m: Annotated[float, Item(ge=0)] | None = None
+    offset_x_m: Offset = 0.0
+    offset_y_m: Offset = 0.0
+    offset_x_sigma_m: Annotated[Offset, Item(ge=0)] | None = None
+    offset_y_sigma_m: Annotated[Offset, Item(ge=0)] | None = None
 
 
 class _Display(Section):
     name: str
     rows: int
     columns: int
-    pitch_m: float
+    pitch_m: Pitch
     missing: tuple[tuple[int, int], ...]
 
 
@@ -182,11 +183,7 @@ def _format_entry(pixel_map: PixelMap, index: int) -> str:
 def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
     table = read_toml(path, BYTES_MAX)
     check_format(path, table, FORMAT, VERSION)
-    check_table(str(path), table, RANGES["pixels"])
-    try:
-        return _PixelMapFile.model_validate(table)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), _PixelMapFile) from None
+    return parse_table(path, table, _PixelMapFile)
 
 
 def _check_display(path: Path, mapped: _Display, config: Config) -> None:

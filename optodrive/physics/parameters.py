@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from optodrive.core.errors import InputError, suggest_nearest
-from optodrive.core.plausibility import PlausibleRange, check_table, guess_unit
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import PlausibleRange, guess_unit
 from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import locate_shipped
+from optodrive.device.config_sections import BridgeWidth
 from optodrive.device.pixel_map import load_pixel_map
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.terms import check_requirements, discover_terms, find_term
@@ -52,6 +52,10 @@ class NonNegativeParameter(Parameter):
     value: Annotated[float, Field(ge=0)]
 
 
+def _within(low: float, high: float, unit: str) -> dict[str, PlausibleRange]:
+    return {"value": PlausibleRange(low, high, unit)}
+
+
 class _SiUnits(Section):
     """A model that refuses values in other units than those of `PARAMETER_UNITS`."""
 
@@ -75,9 +79,9 @@ class _SiUnits(Section):
 class Bridge(_SiUnits):
     """Thermal parameters of the absorber at one bridge width, a row of Table S3."""
 
-    width_m: Annotated[float, Field(gt=0)]
-    R: NonNegativeParameter
-    C: NonNegativeParameter
+    width_m: BridgeWidth
+    R: Annotated[NonNegativeParameter, _within(5.0, 3000.0, "K/W")]
+    C: Annotated[NonNegativeParameter, _within(5e-6, 2e-3, "J/K")]
 
 
 class ParameterSet(_SiUnits):
@@ -91,12 +95,12 @@ class ParameterSet(_SiUnits):
     version: Literal[1]
     name: str
     claims: str
-    epsilon: NonNegativeParameter
-    tau_g: NonNegativeParameter
-    kappa: NonNegativeParameter
-    phi: NonNegativeParameter
-    R_width_product: NonNegativeParameter
-    C_mean: NonNegativeParameter
+    epsilon: Annotated[NonNegativeParameter, _within(0.02, 1.0, "1")]
+    tau_g: Annotated[NonNegativeParameter, _within(1e-4, 0.1, "s")]
+    kappa: Annotated[NonNegativeParameter, _within(1e-7, 1e-4, "m/K")]
+    phi: Annotated[NonNegativeParameter, _within(1e-5, 5e-3, "N/K")]
+    R_width_product: Annotated[NonNegativeParameter, _within(5e-3, 1.0, "m K/W")]
+    C_mean: Annotated[NonNegativeParameter, _within(5e-6, 2e-3, "J/K")]
     bridge: tuple[Bridge, ...]
     terms: dict[str, dict[str, Parameter]] = Field(default_factory=dict)
     planner_terms: tuple[str, ...] = ()
@@ -160,11 +164,7 @@ def load_parameters(name: str | Path) -> ParameterSet:
             raise InputError("pixel_model.parameters", str(name), "a .toml file, or " + ", ".join(known))
         path = locate_shipped("parameters", f"{name}.toml")
     table = _merge_base(path, read_toml(path))
-    check_table(str(path), table, RANGES["parameters"])
-    try:
-        parameters = ParameterSet.model_validate(table)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), ParameterSet) from None
+    parameters = parse_table(path, table, ParameterSet)
     terms = {key: _complete_term(f"{path}: terms.{key}", key, values) for key, values in parameters.terms.items()}
     parameters = parameters.model_copy(update={"terms": terms})
     check_requirements(f"{path}: terms", parameters.terms)

@@ -9,8 +9,8 @@ import pytest
 
 from labs import lab
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import OTHER_UNITS
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import OTHER_UNITS, collect_ranges
+from optodrive.device.config import Config
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON
@@ -27,7 +27,7 @@ DRAWS = [
 ]
 """Seeds, and the number of sound recordings or configurations, each of which is then changed."""
 REFUSED_SHARE = 0.99
-CONFIG_RANGES = RANGES["config"]
+CONFIG_RANGES = collect_ranges(Config)
 
 
 def _refusal(check, *arguments):

@@ -12,7 +12,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import check_plausible
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausible_ranges import RECORDING
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
@@ -22,7 +22,7 @@ from optodrive.physics.pixel import Pixel
 
 MIRROR_SIGNALS = tuple(SIGNALS[kind] for kind in MIRROR_KINDS)
 UNITS = {name: name.rpartition("_")[2] for name in SIGNALS}
-PLAUSIBLE = RANGES["recording"]
+PLAUSIBLE = RECORDING
 WEAK_POWER_W = 5.0
 """Powers that respond a hundred times too weakly are taken for mW above this value."""
 LENGTHS = ("bridge_width_m", "aim_x_m", "aim_y_m")

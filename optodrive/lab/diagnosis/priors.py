@@ -3,7 +3,7 @@
 from math import log
 
 from optodrive.core.plausibility import check_plausible
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausible_ranges import RECORDING
 from optodrive.core.types.measurements import Measurement
 from optodrive.device.config import Config
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior
@@ -24,9 +24,7 @@ def build_prior(measurement: Measurement, config: Config | None) -> tuple[BasePa
     for run in measurement.runs:
         width = run.attributes.get("bridge_width_m")
         if isinstance(width, (int, float)):
-            check_plausible(
-                f"recording: {run.name}: bridge_width_m", float(width), RANGES["recording"]["bridge_width_m"]
-            )
+            check_plausible(f"recording: {run.name}: bridge_width_m", float(width), RECORDING["bridge_width_m"])
     widths_m = [run.attributes.get("bridge_width_m") for run in measurement.runs]
     stated_m = next((float(width) for width in widths_m if isinstance(width, (int, float))), None)
     if config is not None:

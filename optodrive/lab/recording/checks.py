@@ -4,7 +4,7 @@ import numpy as np
 
 from optodrive.core.errors import MISSING, InputError, Unquoted, suggest_nearest
 from optodrive.core.plausibility import guess_unit
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausible_ranges import RECORDING
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.storage import (
     COMMANDS,
@@ -20,7 +20,7 @@ from optodrive.lab.recording.storage import (
     format_name,
 )
 
-AMBIENT = RANGES["recording"]["ambient_K"]
+AMBIENT = RECORDING["ambient_K"]
 PIXEL_MAX = 10**6
 LONG_PULSE_S = 0.1
 """Overlapping pulses above this width, s, that would not overlap a thousand times shorter, are taken to be in ms."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import guess_unit
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausible_ranges import FRAMES
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import TactileFrame
 from optodrive.core.units import m_to_um, um_to_m
@@ -14,7 +14,7 @@ from optodrive.planning.stimuli.json_values import require_number, require_objec
 
 FRAME_QUANTITIES = ("show_at_s", "duration_s", "target_um")
 """Required keys of a frame."""
-HEIGHT = RANGES["frames"]["frames.target_um"]
+HEIGHT = FRAMES["frames.target_um"]
 ID_MAX = 100
 """Largest length of a frame's identifier, characters."""
 HEIGHT_MIN_UM = 0.01

@@ -8,7 +8,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import guess_unit
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausible_ranges import FRAMES
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain, Train
 from optodrive.core.units import m_to_um, um_to_m
@@ -19,7 +19,7 @@ PULSE_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", 
 HEIGHT_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "period_s", "target_um", "peak_to_peak_um")
 HEIGHT_ONLY_KEYS = frozenset(HEIGHT_TRAIN_KEYS) - frozenset(PULSE_TRAIN_KEYS)
 """Keys that only a height train has."""
-PLAUSIBLE = RANGES["frames"]
+PLAUSIBLE = FRAMES
 LONG_INTERVAL_S = 1.0
 """Intervals from here on, in a shorter train, are compared with ms."""
 PULSES_MAX = 2_000_000

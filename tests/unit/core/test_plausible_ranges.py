@@ -8,18 +8,17 @@ import pytest
 from pydantic import BaseModel
 
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import OTHER_UNITS, PlausibleRange, check_plausible, check_table
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import OTHER_UNITS, PlausibleRange, check_plausible, check_table, collect_ranges
+from optodrive.core.plausible_ranges import FRAMES, RECORDING
 from optodrive.device.config import Config
 from optodrive.device.config_file import MirrorsFile
 from optodrive.device.field_file import _FieldFile
-from optodrive.device.field_geometry import FieldGeometry
+from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
 from optodrive.device.pixel_map import _PixelMapFile
 from optodrive.lab.calibration.camera.folder import _PicturesFile
-from optodrive.lab.calibration.spots import COLUMNS
 from optodrive.lab.diagnosis.plausible_units import LENGTHS
 from optodrive.lab.recording.storage import SAMPLE_COLUMNS, SIGNALS, TABLE_COLUMNS
-from optodrive.physics.parameters import PARAMETER_UNITS, ParameterSet
+from optodrive.physics.parameters import PARAMETER_UNITS, Bridge, ParameterSet
 from optodrive.physics.terms import discover_terms
 from optodrive.planning.stimuli.frame_json import FRAME_QUANTITIES
 from optodrive.planning.stimuli.pattern_registry import describe_patterns
@@ -48,13 +47,7 @@ UNITS = {
 """Endings of names to units, longer ones first."""
 COUNTS = {"board.points_per_s", "stages.board.points_per_s", "daemon.requests_per_s"}
 """Rates of events, of which each has its own bounds."""
-MODELS = {
-    "config": Config,
-    "mirrors": MirrorsFile,
-    "field": _FieldFile,
-    "pixels": _PixelMapFile,
-    "pictures": _PicturesFile,
-}
+MODELS = (Config, MirrorsFile, _FieldFile, _PixelMapFile, _PicturesFile)
 
 
 def list_models(annotation):
@@ -78,46 +71,55 @@ def find_unit(key):
     return next((unit for ending, unit in UNITS.items() if key.endswith(ending)), None)
 
 
-def list_quantities():
-    """Return format, place and unit of every quantity."""
-    found = {(name, key): find_unit(key) for name, model in MODELS.items() for key in list_keys(model)}
-    found |= {("field", f"geometry.{name}"): find_unit(name) for name in FieldGeometry._fields}
-    found |= {("config", key): "1" for key in list_keys(Config) if key.startswith("limits.uncertainty.")}
-    found |= {
-        ("recording", f"{name}.{key}"): find_unit(f"_{key}") for name in TABLE_COLUMNS for key in TABLE_COLUMNS[name]
-    }
-    found |= {("recording", f"signal.{key}"): find_unit(f"_{key}") for key in SAMPLE_COLUMNS}
-    found |= {("recording", name): find_unit(name) for name in (*SIGNALS, *LENGTHS, "ambient_K")}
-    found |= {("spots", name): find_unit(name) for name in COLUMNS}
-    found |= {("frames", f"frames.{name}"): find_unit(name) for name in FRAME_QUANTITIES}
-    found |= {("frames", f"trains.{name}"): find_unit(name) for name in (*PULSE_TRAIN_KEYS, *HEIGHT_TRAIN_KEYS)}
-    parameters = [key for key in list_keys(ParameterSet) if key.endswith((".value", "_m"))]
-    found |= {
-        ("parameters", key): find_unit(key) or PARAMETER_UNITS[key.split(".")[-2]]
-        for key in parameters
-        if not key.startswith("terms.")
-    }
-    return {place: unit for place, unit in found.items() if unit is not None and place[1] not in COUNTS}
+def list_quantities(model):
+    """Return the dotted keys of a model's quantities with their units."""
+    found = {key: find_unit(key) for key in list_keys(model)}
+    return {key: unit for key, unit in found.items() if unit is not None and key not in COUNTS}
 
 
-QUANTITIES = list_quantities()
+def list_stated(ranges):
+    return {key: plausible.unit for key, plausible in ranges.items()}
 
 
-def test_every_quantity_has_a_range_in_its_unit_and_every_range_a_quantity():
-    stated = {(name, key): item.unit for name, table in RANGES.items() for key, item in table.items()}
-    assert stated == QUANTITIES
+@pytest.mark.parametrize("model", MODELS)
+def test_every_quantity_has_a_range_in_its_unit_and_every_range_a_quantity(model):
+    stated = list_stated(collect_ranges(model))
+    unnamed = {key: unit for key, unit in stated.items() if unit != "1" and not key.startswith("geometry.")}
+    assert unnamed == list_quantities(model)
 
 
 def test_a_new_quantity_without_a_range_is_noticed():
     class Extended(Config):
         settling_time_s: float
 
-    new = [key for key in list_keys(Extended) if find_unit(key) and ("config", key) not in QUANTITIES]
-    assert [key for key in new if key not in COUNTS] == ["settling_time_s"]
+    assert set(list_quantities(Extended)) - set(collect_ranges(Extended)) == {"settling_time_s"}
+
+
+def test_what_is_no_model_has_ranges_too():
+    assert list_stated(GEOMETRY_RANGES) == {key: find_unit(key) for key in FieldGeometry._fields if find_unit(key)}
+    uncertain = [key for key in list_keys(Config) if key.startswith("limits.uncertainty.")]
+    assert dict.fromkeys(uncertain, "1").items() <= list_stated(collect_ranges(Config)).items()
+    columns = [f"{name}.{key}" for name in TABLE_COLUMNS for key in TABLE_COLUMNS[name]]
+    columns += [f"signal.{key}" for key in SAMPLE_COLUMNS]
+    names = (*columns, *SIGNALS, *LENGTHS, "ambient_K")
+    units = {name: find_unit(f"_{name.rpartition('.')[2]}") for name in names}
+    assert list_stated(RECORDING) == {name: unit for name, unit in units.items() if unit}
+    trains = {f"trains.{name}" for name in (*PULSE_TRAIN_KEYS, *HEIGHT_TRAIN_KEYS)}
+    keys = {f"frames.{name}" for name in FRAME_QUANTITIES} | trains
+    assert list_stated(FRAMES) == {key: find_unit(key) for key in keys if find_unit(key)}
+
+
+def test_every_parameter_has_a_range_in_its_unit():
+    stated = list_stated(collect_ranges(ParameterSet))
+    named = {name: name for name in ParameterSet.model_fields if name in PARAMETER_UNITS}
+    named |= {f"bridge.{name}": name for name in Bridge.model_fields if name in PARAMETER_UNITS}
+    expected = {f"{key}.value": PARAMETER_UNITS[name] for key, name in named.items()}
+    assert stated == expected | {"bridge.width_m": "m"}
 
 
 def test_another_unit_is_known_for_each_range():
-    assert {item.unit for table in RANGES.values() for item in table.values()} <= set(OTHER_UNITS)
+    tables = [RECORDING, FRAMES, *map(collect_ranges, (*MODELS, ParameterSet))]
+    assert {item.unit for table in tables for item in table.values()} <= set(OTHER_UNITS)
 
 
 @pytest.mark.parametrize("key", sorted(discover_terms()))

@@ -6,7 +6,7 @@ from typing import get_args
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import collect_ranges
 from optodrive.core.toml_model import Section
 from optodrive.device.config import Config
 from optodrive.device.config_file import load_config, locate_shipped
@@ -74,9 +74,9 @@ def test_no_version_is_a_boolean(tmp_path):
 
 @pytest.mark.parametrize("value", [1e6, 1e9, 1e12, 1e305])
 def test_no_number_lies_outside_the_range_that_it_can_have(tmp_path, value):
-    places = [key.split(".") for key in RANGES["config"] if not key.startswith("stages")]
+    places = [key.split(".") for key in collect_ranges(Config) if not key.startswith("stages")]
     for place in places:
-        if value > RANGES["config"][".".join(place)].high:
+        if value > collect_ranges(Config)[".".join(place)].high:
             with pytest.raises(InputError, match=place[-1]):
                 load_with(tmp_path, place, value)
 

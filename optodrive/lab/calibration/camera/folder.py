@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field as Item
-from pydantic import ValidationError, model_validator
+from pydantic import model_validator
 
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import check_plausible, check_table
-from optodrive.core.plausible_ranges import RANGES
+from optodrive.core.plausibility import PlausibleRange, check_plausible
 from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.device.field_geometry import CODE_MAX
 
 FORMAT = "optodrive-pictures"
@@ -28,6 +27,7 @@ SPOTS_FILE = "spots.csv"
 VIEWS_MIN = 3
 """Smallest number of views of the grid, if more than one, that separates the camera's intrinsics from its pose."""
 
+PITCH = PlausibleRange(0.2e-3, 0.1, "m")
 Finite = Annotated[float, Item(allow_inf_nan=False)]
 FinitePair = tuple[Finite, Finite]
 FileName = Annotated[str, Item(min_length=1)]
@@ -39,7 +39,7 @@ class GridSection(Section):
     kind: Literal["chessboard", "circles"]
     rows: Annotated[int, Item(ge=3, le=200)]
     columns: Annotated[int, Item(ge=3, le=200)]
-    pitch_m: Annotated[float, Item(gt=0)]
+    pitch_m: Annotated[float, Item(gt=0), PITCH]
     pictures: Annotated[tuple[FileName, ...], Item(min_length=1)]
 
 
@@ -52,8 +52,8 @@ class OriginSection(Section):
     """
 
     marks_px: tuple[FinitePair, FinitePair, FinitePair]
-    first_corner_m: FinitePair
-    turn_rad: Annotated[float, Item(ge=-3.2, le=3.2)] = 0.0
+    first_corner_m: Annotated[FinitePair, PlausibleRange(0.0, 0.5, "m")]
+    turn_rad: Annotated[float, Item(ge=-3.2, le=3.2), PlausibleRange(0.0, 3.2, "rad")] = 0.0
 
 
 class SpotsSection(Section):
@@ -109,12 +109,8 @@ def read_picture_folder(folder: Path) -> PictureFolder:
     path = folder / DESCRIPTION_FILE
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
-    check_table(str(path), table, RANGES["pictures"])
-    try:
-        content = _PicturesFile.model_validate(table)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), _PicturesFile) from None
-    check_plausible(f"{path}: grid.pitch_m", content.grid.pitch_m, RANGES["pictures"]["grid.pitch_m"])
+    content = parse_table(path, table, _PicturesFile)
+    check_plausible(f"{path}: grid.pitch_m", content.grid.pitch_m, PITCH)
     if 1 < len(content.grid.pictures) < VIEWS_MIN:
         expected = f"1, or at least {VIEWS_MIN}, which the calibration of the camera needs"
         raise InputError(f"{path}: grid.pictures", len(content.grid.pictures), expected)

@@ -3,9 +3,8 @@
 import pytest
 
 from displays import DISPLAYS
-from optodrive.core.plausible_ranges import RANGES
 from optodrive.device.config import Config
-from optodrive.device.field_geometry import FieldGeometry
+from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
 from optodrive.lab.calibration.field_prior import FieldPrior
 
 
@@ -19,5 +18,5 @@ def test_what_tolerances_permit_is_plausible(name, focal_length_m):
         table["display"]["pitch_m"] = 2.5e-3
     prior = FieldPrior.from_config(Config.model_validate(table))
     for key, mean, sigma in zip(FieldGeometry._fields, prior.mean, prior.sigma, strict=True):
-        plausible = RANGES["field"].get(f"geometry.{key}")
+        plausible = GEOMETRY_RANGES.get(key)
         assert plausible is None or abs(mean) + 4.0 * sigma <= plausible.high, key
