@@ -1,6 +1,6 @@
-"""Plausible ranges of what recordings and sequences hold, by place; those of a TOML file stand at its models' fields.
+"""Plausible ranges of what recordings and sequences hold, by place.
 
-A place is the dotted key, without the indices of lists. A longest time of a day refuses nothing by itself: times are
+Those of a TOML file stand at the fields of its models. A place is the dotted key, without the indices of lists. A longest time of a day refuses nothing by itself: times are
 judged against each other, or against the response.
 """
 
