@@ -1,7 +1,7 @@
-"""Plausible ranges of what recordings and sequences hold, by place.
+"""Ranges of absolute values that are plausible in recordings and sequences.
 
-Those of a TOML file stand at the fields of its models. A place is the dotted key, without the indices of lists. A longest time of a day refuses nothing by itself: times are
-judged against each other, or against the response.
+Those of a TOML file stand at the fields of its models. A place is the dotted key, without the indices of lists. A
+longest time of a day refuses nothing by itself: times are judged against each other, or against the response.
 """
 
 from optodrive.core.plausibility import PlausibleRange
