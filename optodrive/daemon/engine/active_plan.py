@@ -66,16 +66,16 @@ class ActivePlan:
             rows = np.concatenate([self.executed_rows, rows])
         self.executed, self.executed_rows = executed, rows
 
-    def interrupt(self, off_s: float, emitted: BoolArray | None = None) -> None:
+    def interrupt(self, off_s: float, first_row: int | None = None) -> None:
         """Keep the rows behind the last executed one for later. off_s: board time at which the light went off.
 
         The rows before it count as executed, also one that was cut short.
-        emitted: [n] whether each row may have been emitted; the others are then kept instead, behind these
+        first_row: keep the rows from this one on instead
         """
         if self.executed is None or self.executed_rows is None:
             return
-        if emitted is not None:
-            self._put_first(emitted, self.executed_rows)
+        if first_row is not None:
+            self.first_row = first_row
         elif len(self.executed_rows):
             self.first_row = int(self.executed_rows[-1]) + 1
         if self.first_row:
@@ -87,16 +87,19 @@ class ActivePlan:
         self.record.change_status(PlanStatus.PAUSED)
         self.record.sent = self.executed_before
 
-    def _put_first(self, emitted: BoolArray, executed_rows: IntArray) -> None:
-        """Put rows before all others, each part in order of time."""
+    def reorder(self, emitted: BoolArray) -> "ActivePlan":
+        """Return the plan with some rows [n] before all others, each part in order of time.
+
+        It is another object, because the telemetry may still read this one by its rows.
+        """
         order = np.argsort(~emitted, kind="stable")
-        plan = self.planned.plan
+        plan, record = self.planned.plan, self.record
         columns = {item.name: getattr(plan, item.name)[order] for item in fields(plan) if item.name != "headroom_k"}
-        self.planned = replace(self.planned, plan=replace(plan, **columns), predicted_m=self.planned.predicted_m[order])
-        self.first_row = int(np.count_nonzero(emitted))
-        self.executed_rows = np.flatnonzero(np.isin(order, executed_rows))
-        self.record.pulses = ListedPulses.from_planned(self.planned)
-        self.record.largest_target = LargestTarget.from_planned(self.planned)
+        reordered = replace(plan, **columns)
+        planned = replace(self.planned, plan=reordered, predicted_m=self.planned.predicted_m[order])
+        record.pulses, record.largest_target = ListedPulses.from_planned(planned), LargestTarget.from_planned(planned)
+        rows = None if self.executed_rows is None else np.flatnonzero(np.isin(order, self.executed_rows))
+        return replace(self, planned=planned, executed_rows=rows)
 
     def _fold_delay(self) -> None:
         """Shift the plan's zero by the delay of the executed pulses, so that the remaining rows are as late."""

@@ -42,6 +42,8 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from math import inf
 
+import numpy as np
+
 from optodrive.core.errors import StoppedError
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import PlanRecord
@@ -376,12 +378,13 @@ class PlanQueue:
 
         Its pulses that the lost board may have emitted count as executed. Time in the dark without a pulse is over.
         """
-        plan, record = run.plan, run.plan.record
         self.accounts.collect_executed(run)
         emitted = find_emitted(run, lost)
-        left_s = record.start_s + float(plan.planned.plan.start_s[~emitted].min(initial=inf))
-        plan.interrupt(max(off_s, min(left_s, lost.dark_s)), emitted)
-        self.accounts.count_executed(run)
+        plan, record = run.plan.reorder(emitted), run.plan.record
+        first_row = int(np.count_nonzero(emitted))
+        left_s = record.start_s + float(plan.planned.plan.start_s[first_row:].min(initial=inf))
+        plan.interrupt(max(off_s, min(left_s, lost.dark_s)), first_row)
+        self.accounts.count_executed(plan)
         left = plan.rest_count
         if left and not self.running and not any(each.record.streamed for each in self.waiting):
             self.waiting.appendleft(plan)

@@ -2,6 +2,7 @@
 
 from collections import deque
 
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
@@ -36,9 +37,9 @@ class PulseAccounts:
         self.totals["executed"] += executed - record.executed_count
         record.sent, record.executed_count = sent, executed
 
-    def count_executed(self, run: PlanRun) -> None:
+    def count_executed(self, plan: ActivePlan) -> None:
         """Count all executed pulses of an interrupted plan, also those behind a gap that the lost board has left."""
-        record, executed = run.plan.record, run.plan.executed_before
+        record, executed = plan.record, plan.executed_before
         self.totals["executed"] += executed - record.executed_count
         record.executed_count = executed
 

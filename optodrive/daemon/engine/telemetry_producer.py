@@ -57,7 +57,7 @@ class TelemetryProducer:
         self._executed_state = LiveThermalState(engine.display)
         self._batches: deque[Message] = deque(maxlen=BATCHES_MAX)
         self._batch_number = 0
-        self._announced_rows: dict[str, int] = {}
+        self._announced_rows: dict[ActivePlan, int] = {}
         self._next_s: dict[str, float] = {}
         self._board_clock_reference = (0.0, 0.0)
         self._is_warm = self._has_upcoming = False
@@ -164,17 +164,16 @@ class TelemetryProducer:
         """Publish the planned pulses that start soon."""
         upcoming = self._engine.list_upcoming()
         self._has_upcoming = bool(upcoming)
-        plan_ids = [active.record.plan_id for active in upcoming]
-        self._announced_rows = {plan_id: self._announced_rows.get(plan_id, 0) for plan_id in plan_ids}
+        self._announced_rows = {active: self._announced_rows.get(active, 0) for active in upcoming}
         for active in upcoming:
             record, plan = active.record, active.planned.plan
-            begin = max(self._announced_rows[record.plan_id], active.first_row)
+            begin = max(self._announced_rows[active], active.first_row)
             end = int(np.searchsorted(plan.start_s, board_s + ANNOUNCE_LEAD_S - record.start_s))
             if end > begin:
                 row = np.arange(begin, end)
                 columns = (plan.start_s[begin:end] + record.start_s, plan.width_s[begin:end], plan.power_w[begin:end])
                 self._add_batch("planned", active, row, *columns)
-                self._announced_rows[record.plan_id] = end
+                self._announced_rows[active] = end
 
     def _add_batch(
         self,

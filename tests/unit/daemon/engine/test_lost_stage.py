@@ -6,6 +6,7 @@ import pytest
 from link_service_rig import OPERATOR, WEB
 from optodrive.core.errors import NotReadyError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
+from optodrive.daemon.engine.display_snapshot import ExecutedBatch
 from optodrive.daemon.engine.rest_sequence import DURATION_MIN_S, build_rest_sequence
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.board_group import BoardGroup
@@ -212,6 +213,19 @@ def test_a_plan_that_waits_is_planned_anew_for_the_others(rig):
     assert waiting.execution.simulated_m == pytest.approx(np.full(16, 60e-6), rel=0.01)
     totals = rig.queue.accounts.totals
     assert totals["planned"] == sum(record.pulse_count for record in rig.store.list_recent())
+
+
+def test_the_telemetry_gets_each_executed_pulse_with_its_pixel(rig):
+    record = lose(rig)
+    rig.until(lambda: record.has_ended)
+    batches = [ExecutedBatch.from_progress(event, rig.remote.scales) for event in rig.queue.accounts.events]
+    names = "start_s", "pixel", "stage"
+    start_s, pixel, stage = (np.concatenate([getattr(batch, name) for batch in batches]) for name in names)
+    assert len(start_s) == record.executed_count
+    emitted = rig.collect_emitted()
+    nearest = np.abs(emitted.start_s[None, :] - start_s[:, None]) < 2e-3
+    nearest &= emitted.stage[None, :] == stage[:, None]
+    assert [pixel[k] in emitted.pixel[nearest[k]] for k in range(len(pixel))] == [True] * len(pixel)
 
 
 # --- what is left of a plan
