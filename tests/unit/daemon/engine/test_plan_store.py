@@ -40,7 +40,7 @@ def holds_heavy(record):
     return [type(item).__name__ for item in list_reachable(record) if isinstance(item, HEAVY)]
 
 
-@pytest.mark.parametrize("ending", ["done", "superseded", "failed", "cancelled", "removed"])
+@pytest.mark.parametrize("ending", ["done", "superseded", "stopped", "cancelled", "removed"])
 def test_an_ended_plan_leaves_its_report_and_no_thermal_state(rig, ending):
     blocker = submit(rig, build_train(0.3)) if ending == "removed" else None
     record = submit(rig, build_frame(60.0, duration_s=9.0), streamed=ending == "superseded")
@@ -52,7 +52,7 @@ def test_an_ended_plan_leaves_its_report_and_no_thermal_state(rig, ending):
     if ending == "superseded":
         last = submit(rig, build_frame(80.0), streamed=True)
         rig.until(lambda: last.has_ended)
-    elif ending == "failed":
+    elif ending == "stopped":
         rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))
     elif ending in ("cancelled", "removed"):
         rig.queue.cancel(record)
