@@ -107,9 +107,10 @@ def only_a_lease_of_this_session_prevents_fault_link(bench, state):
     points = [here(50_000, duty=2000)] * PULSES[state]
     pieces = [host.data(*points[at : at + 20]) for at in range(0, len(points), 20)]
     start = [host.frame("START", job=1, first_index=0, start_tick=0, watermark=1)] * bool(points)
-    requested = host.frame("CLOCK", host_t=1), host.frame("CLOCK", host_t=2)
-    # Both clocks bracket the lease; the board's maximum applies, and a shorter lease does not shorten it.
-    leases = requested[0] + host.frame("LEASE", ms=60_000) + host.frame("LEASE", ms=1) + requested[1]
+    # Both ticks bracket the lease; the board's maximum applies, and a shorter lease does not shorten it. The first is of
+    # STATUS: a simulated board that ran late takes bytes as of the time before, but tells the present one to CLOCK.
+    before = host.status().tick
+    leases = host.frame("LEASE", ms=60_000) + host.frame("LEASE", ms=1) + host.frame("CLOCK", host_t=1)
     host.raw(b"".join(pieces + start) + leases)
     useless = b"".join(
         [
@@ -118,12 +119,12 @@ def only_a_lease_of_this_session_prevents_fault_link(bench, state):
             host.frame("LEASE", ms=60_000)[:-3] + b"\0",
             frame(HOST["LEASE"][0] | 0x80, 0, host.session, body_of("LEASE", ms=60_000)),
             host.frame("GET"),
-            host.frame("CLOCK", host_t=3),
+            host.frame("CLOCK", host_t=2),
             host.frame("DATA", seq=(host.seq + 9) % 256, first_index=0, points=[here(1)]),
         ]
     )
     host.status()
-    before, after = [m.tick for m in host.of("CLOCK_REPLY")]
+    (after,) = [m.tick for m in host.of("CLOCK_REPLY")]
     while (status := host.status()).state != "FAULT":
         assert status.tick <= after + LEASE_MS * 1000 + host.board.late_us, f"{state}: no fault without a lease"
         host.raw(useless)

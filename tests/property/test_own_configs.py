@@ -49,6 +49,7 @@ def record(capsys, folder, path, shown, seed):
     """Plan and simulate. Return the recording and its number of pulses."""
     (folder / "frames.json").write_text(json.dumps(shown))
     out = folder / "recording.h5"
+    out.unlink(missing_ok=True)
     status, planned, error = call(capsys, "plan", folder / "frames.json", "--config", path, "--json")
     assert status in (0, DOES_NOT_FIT), error
     options = ("--out", out, "--repeats", 3, "--seed", seed, "--json")

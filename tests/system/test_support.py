@@ -105,7 +105,7 @@ def test_without_a_daemon_and_with_a_damaged_configuration_there_is_an_archive(t
     assert texts["daemon/state.json"].startswith("not available: ")
     assert "a device" in texts["logs/0-zero"]
     assert run(arguments) == 2
-    assert "nothing is overwritten" in capsys.readouterr().err
+    assert "expected a new file; this one exists" in capsys.readouterr().err
 
 
 def test_text_without_secrets_stays_as_it_is():

@@ -96,11 +96,12 @@ class Verdict:
 class _Examination:
     """Residual tests of a refit, without and with other forms of its cause.
 
-    explained, explained_with_forms: shares of the excess
+    log_evidence: of the refit as it ended; explained, explained_with_forms: shares of the excess
     """
 
     detection: Detection
     with_forms: Detection
+    log_evidence: float
     explained: float
     explained_with_forms: float
 
@@ -184,9 +185,11 @@ def _examine(
     )
     forms = compute_discrepancy_basis(problem, item.fit, item.hypotheses, hypotheses)
     detections = score_effects(problem, item.fit, simulated), score_effects(problem, item.fit, simulated, forms)
-    reduction = base.chi2 - item.chi2
+    # The tests are of the fit as it is: one that ended early may count by its score, and must not gain its rest twice.
+    chi2 = max(item.chi2, detections[0].residual_chi2)
+    log_evidence, reduction = item.log_evidence - 0.5 * (chi2 - item.chi2), base.chi2 - chi2
     plain, with_forms = (_compute_explained_fraction(detection, reduction) for detection in detections)
-    examined[item] = _Examination(*detections, plain, max(plain, with_forms))
+    examined[item] = _Examination(*detections, log_evidence, plain, max(plain, with_forms))
 
 
 def _compute_explained_fraction(detection: Detection, reduction: float) -> float:
@@ -230,13 +233,13 @@ def _list_explanations(
         if rest is None:
             continue
         prior += log(OTHER_ODDS)
-        forms = item.log_evidence + rest.with_forms.form_evidence
+        forms = rest.log_evidence + rest.with_forms.form_evidence
         own_forms = compute_own_share(1.0 - rest.explained, FORM_REST)
         own_bins = compute_own_share(1.0 - rest.explained_with_forms, BINS_REST)
         bins, both = rest.detection.omnibus.log_evidence, rest.with_forms.omnibus.log_evidence
         variants = (
             (prior, forms, own_forms),
-            (prior, item.log_evidence + bins, own_bins),
+            (prior, rest.log_evidence + bins, own_bins),
             (prior + log(OTHER_ODDS), forms + both, own_forms * own_bins),
         )
         single, share = _find_sufficient_single(item, refits, examined)

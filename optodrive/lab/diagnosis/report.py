@@ -74,7 +74,7 @@ def _build_probabilities(probabilities: Probabilities) -> list[str]:
         "<p>Of each cause alone, of causes that act together, of a cause that is in no catalogue, and of no effect. "
         "They sum to one; what has less than "
         f"{format_probability(MIN_SHOWN)} is not listed.</p>",
-        render_table(("explanation", "", "probability"), cells, frozenset({2}), "Probabilities"),
+        render_table(("explanation", "diagram", "probability"), cells, frozenset({2}), "Probabilities"),
     ]
 
 
