@@ -107,7 +107,7 @@ def only_a_lease_of_this_session_prevents_fault_link(bench, state):
     points = [here(50_000, duty=2000)] * PULSES[state]
     pieces = [host.data(*points[at : at + 20]) for at in range(0, len(points), 20)]
     start = [host.frame("START", job=1, first_index=0, start_tick=0, watermark=1)] * bool(points)
-    # Both ticks bracket the lease; the board's maximum applies, and a shorter lease does not shorten it. The first is of
+    # Both ticks bracket the lease; the maximum applies, and a shorter lease does not shorten it. The first is that of
     # STATUS: a simulated board that ran late takes bytes as of the time before, but tells the present one to CLOCK.
     before = host.status().tick
     leases = host.frame("LEASE", ms=60_000) + host.frame("LEASE", ms=1) + host.frame("CLOCK", host_t=1)
