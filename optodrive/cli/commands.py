@@ -29,6 +29,7 @@ MODULES = {
     "helios": ("helios",),
     "recording": ("recording",),
     "diagnose": ("diagnose",),
+    "discover": ("discover",),
     "terms": ("terms",),
     "validate": ("validate",),
     "config": ("config",),

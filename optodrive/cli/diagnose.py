@@ -8,8 +8,9 @@ import typer
 
 from optodrive.cli.options import ConfigOption
 from optodrive.cli.output import announce_compilation, print_json, show_step
+from optodrive.cli.requirements import require_scipy
 from optodrive.cli.signals import end_as_interrupted
-from optodrive.core.errors import MISSING, InputError
+from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
     from optodrive.core.provenance import Provenance
@@ -64,7 +65,7 @@ def diagnose(
     ] = None,
 ) -> None:
     """Name the errors of the model in measured data, and the gain from correcting them."""
-    _require_scipy()
+    require_scipy()
     from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.display_diagnosis import MAX_JOINT_PIXELS
     from optodrive.lab.recording import DisplayRuns
@@ -175,13 +176,6 @@ def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) 
         print(line)
     if out is not None:
         print(f"written: {out}/report.html, diagnosis.json" + (", model.toml" if output.model_toml is not None else ""))
-
-
-def _require_scipy() -> None:
-    from importlib.util import find_spec
-
-    if find_spec("scipy") is None:
-        raise InputError("scipy", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
 
 
 def _check_output_paths(json: str | None, out: Path | None) -> None:

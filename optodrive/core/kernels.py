@@ -198,6 +198,10 @@ class _KernelCache(FunctionCache):
         _import_array_functions()
         return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        """Return the key of a signature. Numba adds the function, with a number per process for one within another."""
+        return sig, codegen.magic_tuple()
+
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         self._open()
         return super()._load_overload(sig, target_context)  # type: ignore[no-untyped-call]

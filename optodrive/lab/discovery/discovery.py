@@ -1,0 +1,316 @@
+"""Discovery: find the terms that a simulation lacks, from measured records.
+
+Theory of operation. 1. The parameters are fitted, first with filters that keep the states near the data, then in free
+run. 2. Filters of several tightness give the states; `screening` compares all places, variables and factors on what no
+parameter can do, by cross-validation over blocks of samples. 3. The best formulas of the best places are fitted,
+together with all parameters, by their prediction errors and then in free run; the simplest of those that do as well as
+the best is proposed. 4. It is a finding if it predicts held-out blocks, which no choice has used, better than the model
+without it, by more than the noise can explain. 5. Steps 2 to 4 are repeated with the finding in the model.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import FloatArray
+from optodrive.lab.discovery.blocks import Data, split, thin
+from optodrive.lab.discovery.evidence import compute_probability, find_p_value
+from optodrive.lab.discovery.fitting import (
+    Point,
+    Simulation,
+    Terms,
+    choose_step,
+    estimate_noise,
+    fit,
+    free_run_rmse,
+    output_sizes,
+)
+from optodrive.lab.discovery.formula_text import build_terms, describe_term
+from optodrive.lab.discovery.model import Curve, Discovery, Finding, OdeModel, Record
+from optodrive.lab.discovery.screening import (
+    Candidate,
+    Filtered,
+    Place,
+    Screened,
+    differentiate,
+    list_places,
+    rank_formulas,
+    screen,
+)
+
+TIGHTNESS = (0.3, 0.03, 0.003)
+"""Model errors that the filters assume, relative to the rms of each state's rate."""
+START_UNCERTAINTY = 0.3
+"""Standard deviation of the states at the start of a record, relative to their rms."""
+RATE_MEMORY = 10.0
+"""Samples over which a model error persists that the filters assume."""
+MAX_TERMS = 4
+PLACES, FORMULAS = 3, 4
+"""Places whose formulas are fitted, and how many of each."""
+TOLERANCE, SHARE_TOLERANCE = 0.06, 0.05
+"""Squared error above the best formula's that a number saved is worth: relative to it, and to the best's reduction."""
+MIN_ERROR = 1e-3
+"""Error of a model, relative to the output, that the integration and the inputs' interpolation may cause."""
+MIN_REDUCTION, MIN_FURTHER_REDUCTION = 0.005, 0.03
+"""Reduction of the held-out RMSE of the first term, and of further ones, below which none is reported."""
+MIN_FURTHER_GAIN = 0.01
+"""Share of the first model's avoidable error that a further term removes at least."""
+MAX_P = 1e-3
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Proposal:
+    """A formula with all numbers fitted, and its squared prediction error."""
+
+    screened: Screened
+    candidate: Candidate
+    point: Point
+    loss: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """An accepted proposal, the share of the avoidable held-out error that it removes, and its probability."""
+
+    proposal: _Proposal
+    gain: float
+    probability: float
+
+
+def discover(
+    model: OdeModel,
+    train: Sequence[Record],
+    seed: int = 0,
+    progress: Progress = lambda stage, fraction: None,
+) -> Discovery:
+    """Return the terms that a simulation lacks, and the model extended by them.
+
+    progress: receives the name of each stage and the share of the work that is done. seed: kept for methods that draw;
+    this one does not. Raises InputError for records that do not fit the model.
+    """
+    del seed
+    if not train:
+        raise InputError("train", "no record", "at least one record")
+    for record in train:
+        record.check(model)
+    return _Search(model, split(train), progress).run()
+
+
+class _Search:
+    """One discovery."""
+
+    def __init__(self, model: OdeModel, data: Data, progress: Progress) -> None:
+        self.model, self.data, self.few, self.progress = model, data, thin(data), progress
+        progress("compiling", 0.0)
+        self.simulation = Simulation(model)
+        self.sizes = output_sizes(data.records)
+        self.noise = np.maximum(estimate_noise(data.records), 1e-4 * self.sizes)
+        self.state_sizes = np.ones(len(model.states))
+        self.rate_sizes = np.ones(len(model.states))
+
+    def run(self) -> Discovery:
+        """Return the answer."""
+        base = self._fit_base()
+        base_rmse = rmse = self._held_out_rmse(base)
+        point, found = base, list[_Step]()
+        for number in range(MAX_TERMS):
+            self.progress(f"term {number + 1}", 0.2 + 0.16 * number)
+            if float(np.max(rmse / self.sizes)) < MIN_ERROR:
+                break
+            proposal, probability = self._extend(point, MIN_FURTHER_REDUCTION if found else MIN_REDUCTION)
+            if proposal is None:
+                break
+            shorter_rmse = self._held_out_rmse(proposal.point)
+            avoidable = np.maximum(base_rmse - np.minimum(self.noise, shorter_rmse), 1e-300)
+            gain = float(np.max((rmse - shorter_rmse) / avoidable))
+            if found and gain < MIN_FURTHER_GAIN:
+                break
+            point, rmse = proposal.point, shorter_rmse
+            found.append(_Step(proposal, gain, probability))
+        self.progress("final fit", 0.85)
+        everything = [*self.data.fitted, *self.data.held_out]
+        final_base = self._fit_free(base, everything)
+        final = self._fit_free(point, everything) if found else final_base
+        findings = self._report(final, found)
+        self.progress("done", 1.0)
+        simulation = self.simulation
+
+        def simulate(record: Record) -> FloatArray:
+            record.check(self.model)
+            return simulation.run(record, final)[0]
+
+        return Discovery(
+            findings,
+            float(np.sqrt(np.mean(base_rmse**2))),
+            float(np.sqrt(np.mean(rmse**2))),
+            dict(zip(simulation.names, final.parameters.tolist(), strict=True)),
+            dict(zip(simulation.names, final_base.parameters.tolist(), strict=True)),
+            simulate,
+        )
+
+    # Base model
+
+    def _fit_base(self) -> Point:
+        """Return the fitted parameters, and settle the inputs' interpolation and the integration step."""
+        simulation = self.simulation
+        dt_s = float(np.median(np.concatenate([np.diff(r.t_s) for r in self.data.records])))
+        simulation.h_max = dt_s
+        start = Point(simulation.start, Terms.none())
+        simulation.h_max = choose_step(simulation, self.few.records, start)
+        self._measure_sizes(start)
+        best: tuple[float, int, Point] | None = None
+        for hold in (0, 1, 2) if self.model.inputs else (0,):
+            simulation.hold, point, loss = hold, start, np.inf
+            for tightness in TIGHTNESS[:2]:
+                filtered = self._filter(point, tightness)
+                point, loss = self._fit_filtered(point, filtered)
+                self._measure_sizes(point)
+            if best is None or loss < best[0]:
+                best = (loss, hold, point)
+            self.progress("parameters", 0.02 + 0.04 * hold)
+        assert best is not None  # noqa: S101
+        simulation.hold, point = best[1], best[2]
+        simulation.h_max = choose_step(simulation, self.few.records, point)
+        trials = [start, point, self._fit_free(point, self.data.fitted)]
+        masks = self.data.masks(self.data.fitted)
+        losses = [np.sum((free_run_rmse(simulation, self.data.records, p, masks) / self.sizes) ** 2) for p in trials]
+        return trials[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
+
+    def _measure_sizes(self, point: Point) -> None:
+        """Note rms of states and of their rates along the filtered records."""
+        filtered = self._filter(point, TIGHTNESS[0])
+        states = [each.line.states for each in filtered]
+        rates = [np.diff(x, axis=0) / np.diff(e.record.t_s)[:, None] for x, e in zip(states, filtered, strict=True)]
+        for name, values in (("state_sizes", states), ("rate_sizes", rates)):
+            joined = np.concatenate(values)
+            joined = joined[np.isfinite(joined).all(axis=1)]
+            if len(joined):
+                sizes = np.sqrt(np.mean(joined**2, axis=0))
+                setattr(self, name, np.where(sizes > 0.0, sizes, 1.0))
+
+    def _filter(self, point: Point, tightness: float) -> list[Filtered]:
+        """Return the search records filtered and linearised; the filter assumes model errors of this relative size."""
+        simulation, filtered = self.simulation, []
+        for record, block in zip(self.few.records, self.few.block, strict=True):
+            dt_s = float(np.median(np.diff(record.t_s)))
+            noise_rate = (tightness * self.rate_sizes) ** 2 * RATE_MEMORY * dt_s
+            line, start = simulation.linearise(
+                record, point, self.state_sizes, noise_rate, self.noise**2, START_UNCERTAINTY * self.state_sizes
+            )
+            measured = np.isfinite(record.outputs) & np.isfinite(line.predicted) & (line.variance > 0.0)
+            weights = np.where(measured, 1.0 / np.sqrt(np.where(measured, line.variance, 1.0)), 0.0)
+            filtered.append(Filtered(record, line, differentiate(line, start), block, weights))
+        return filtered
+
+    def _fit_filtered(self, point: Point, filtered: Sequence[Filtered], evaluations: int = 15) -> tuple[Point, float]:
+        """Return the point that minimises the prediction errors in fitted blocks, with the filters' gains kept."""
+        masks = self.few.masks(self.few.fitted)
+        weights = [each.weights * mask[:, None] for each, mask in zip(filtered, masks, strict=True)]
+        gains = [each.line.gains for each in filtered]
+        return fit(self.simulation, self.few.records, point, weights, gains, evaluations)
+
+    def _fit_free(self, point: Point, blocks: Sequence[int], evaluations: int = 15) -> Point:
+        """Return the point that minimises the error of free runs in these blocks."""
+        masks = self.data.masks(blocks)
+        weights = [np.outer(mask, 1.0 / self.sizes) for mask in masks]
+        return fit(self.simulation, self.data.records, point, weights, evaluations=evaluations)[0]
+
+    def _held_out_rmse(self, point: Point) -> FloatArray:
+        return free_run_rmse(self.simulation, self.data.records, point, self.data.masks(self.data.held_out))
+
+    # One further term
+
+    def _extend(self, point: Point, min_reduction: float) -> tuple[_Proposal | None, float]:
+        """Return the best further term, None if there is no evidence for one, and its probability."""
+        base, filtered, ranked = self._screen(point)
+        if not ranked or ranked[0].loss >= 1.0:
+            return None, 0.0
+        base, base_loss = self._fit_filtered(base, filtered, 5)
+        proposals = []
+        for screened in ranked[:PLACES]:
+            for candidate in rank_formulas(screened, FORMULAS):
+                terms = point.terms.extend(build_terms(candidate, screened.nodes))
+                longer, loss = self._fit_filtered(base.with_terms(terms), filtered, 5)
+                proposals.append(_Proposal(screened, candidate, longer, loss))
+        proposals.sort(key=lambda p: p.loss)
+        if not proposals:
+            return None, 0.0
+        chosen = _choose_simplest(proposals, base_loss)
+        p_value = find_p_value(self.simulation, self.few, filtered, base, chosen.point)
+        if p_value > MAX_P:
+            return None, 0.0
+        # Numbers that fit one step ahead need not fit free runs best; those of a chaotic system fit only the former.
+        masks, records = self.data.masks(self.data.fitted), self.data.records
+        trials = [chosen.point, self._fit_free(chosen.point, self.data.fitted, 8)]
+        losses = [np.sum((free_run_rmse(self.simulation, records, p, masks) / self.sizes) ** 2) for p in trials]
+        chosen = replace(chosen, point=trials[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))])
+        before, after = self._held_out_rmse(point) / self.sizes, self._held_out_rmse(chosen.point) / self.sizes
+        if not np.sum(after**2) < np.sum(before**2) * (1.0 - min_reduction) ** 2:
+            return None, 0.0
+        return chosen, compute_probability(p_value)
+
+    def _screen(self, point: Point) -> tuple[Point, list[Filtered], list[Screened]]:
+        """Return the places in order of evidence, with the filter that shows it most clearly, and its parameters."""
+        best: tuple[Point, list[Filtered], list[Screened]] = (point, [], [])
+        for tightness in (*TIGHTNESS, 0.0):
+            refitted, _ = self._fit_filtered(point, self._filter(point, tightness), 5)
+            filtered = self._filter(refitted, tightness)
+            if not all(np.isfinite(each.line.predicted).all() for each in filtered):
+                continue
+            found = [
+                screened
+                for place in list_places(self.simulation, filtered, refitted)
+                # A term in an output also changes how strongly a filter follows the data: only free runs judge it.
+                if (place.place < len(self.model.states) or tightness == 0.0)
+                and (screened := screen(filtered, place, self.few.fitted, len(self.model.states))) is not None
+            ]
+            found.sort(key=lambda each: each.loss)
+            if found and (not best[2] or found[0].loss < best[2][0].loss):
+                best = (refitted, filtered, found)
+        return best
+
+    def _report(self, final: Point, steps: Sequence[_Step]) -> tuple[Finding, ...]:
+        """Return one finding per place and variable, with the numbers of the final fit.
+
+        The curve is the formula plus what the data still ask for there; its band is that of a curve without a formula.
+        """
+        groups: dict[Place, list[int]] = {}
+        for row, step in enumerate(steps):
+            groups.setdefault(step.proposal.candidate.at, []).append(row)
+        names, findings = self.model.variable_names, []
+        filtered = self._filter(final, TIGHTNESS[1])
+        for at, rows in groups.items():
+            screened = screen(filtered, at, self.few.fitted, len(self.model.states))
+            curve = (steps[rows[0]].proposal.screened if screened is None else screened).curve
+            involved = (names[at.variable], *((names[at.factor],) if at.factor >= 0 else ()))
+            numbers = [final.terms.values[row] for row in rows]
+            forms = [steps[row].proposal.candidate.form for row in rows]
+            values = sum(n[0] * form.evaluate(curve.x, n[1], n[2]) for form, n in zip(forms, numbers, strict=True))
+            texts = [describe_term(form, n, *involved) for form, n in zip(forms, numbers, strict=True)]
+            findings.append(
+                Finding(
+                    self.model.place_names[at.place],
+                    involved,
+                    Curve(curve.x, values + curve.y, values + curve.low, values + curve.high),
+                    " + ".join(texts).replace("+ -", "- "),
+                    " and ".join(dict.fromkeys(form.kind for form in forms)),
+                    min(1.0, sum(steps[row].gain for row in rows)),
+                    max(steps[row].probability for row in rows),
+                )
+            )
+        return tuple(findings)
+
+
+def _choose_simplest(proposals: Sequence[_Proposal], base_loss: float) -> _Proposal:
+    """Return the proposal with the fewest numbers that does as well as the best."""
+    best = min(proposals, key=lambda p: p.loss)
+    chosen = best
+    for proposal in sorted(proposals, key=lambda p: p.loss):
+        saved = best.candidate.numbers - proposal.candidate.numbers
+        allowed = saved * min(TOLERANCE * best.loss, SHARE_TOLERANCE * max(base_loss - best.loss, 0.0))
+        if proposal.candidate.numbers < chosen.candidate.numbers and proposal.loss - best.loss <= allowed:
+            chosen = proposal
+    return chosen

@@ -1,0 +1,304 @@
+"""A model with terms on prepared records: free run, filter, and fit of all free numbers by their prediction errors."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
+from optodrive.lab.discovery.integration import STEP, Kernels, Linearisation, allocate_work, build_kernels
+from optodrive.lab.discovery.model import OdeModel, Record
+
+DIVERGED = 1e3
+"""Residual in standard deviations of an output that stands for a diverged one."""
+CONVERGED = 1e-3
+"""Change of a free run, relative to the outputs, at which the integration step is short enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """Terms added to a model, [r, 4] as in `integration`, with their numbers [r, 3] and which of them are fitted."""
+
+    table: IntArray
+    values: FloatArray
+    free: BoolArray
+    low: FloatArray
+    high: FloatArray
+
+    @classmethod
+    def none(cls) -> "Terms":
+        """Return an empty table."""
+        empty = np.zeros((0, 3))
+        return cls(np.zeros((0, 4), dtype=np.int64), empty, np.zeros((0, 3), dtype=bool), empty, empty)
+
+    def extend(self, other: "Terms") -> "Terms":
+        """Return both."""
+        return Terms(*(np.concatenate([getattr(self, f), getattr(other, f)]) for f in Terms.__dataclass_fields__))
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Numbers of a model: parameters [q] in the model's order, and terms."""
+
+    parameters: FloatArray
+    terms: Terms
+
+    def with_terms(self, terms: Terms) -> "Point":
+        """Return the same parameters with other terms."""
+        return replace(self, terms=terms)
+
+
+class Simulation:
+    """A model with an integration step and a rule for inputs between samples."""
+
+    def __init__(self, model: OdeModel, h_max: float = np.inf, hold: int = 1) -> None:
+        self.model = model
+        self.h_max = h_max
+        self.hold = hold
+        self.names = tuple(model.parameters)
+        items = tuple(model.parameters.values())
+        self.low = np.array([item.low for item in items])
+        self.high = np.array([item.high for item in items])
+        self.start = np.array([item.start for item in items])
+        self.logarithmic = np.array([item.is_logarithmic for item in items])
+        sizes = (len(model.states), len(model.inputs), len(model.outputs))
+        self.kernels: Kernels = build_kernels(model.rhs, model.output, *sizes, self.names)
+        self._work = allocate_work(*sizes)
+        self._type = [(name, np.float64) for name in self.names]
+
+    def pack(self, rows: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+        """Return parameters [k, q] as a structured array [k]."""
+        packed = np.zeros(len(rows), dtype=self._type)
+        for column, name in enumerate(self.names):
+            packed[name] = rows[:, column]
+        return packed
+
+    def initial_state(self, record: Record, parameters: FloatArray) -> FloatArray:
+        """Return the states [n] at the start of a record."""
+        rows = record.first_outputs
+        p = self.pack(parameters[None, :]).view(np.recarray)[0]
+        for first in (rows, rows[0]):
+            try:
+                values = [np.asarray(each, dtype=np.float64) for each in self.model.initial(first, p)]
+            except (TypeError, IndexError, ValueError):
+                continue
+            if len(values) == len(self.model.states) and all(each.size == 1 for each in values):
+                return np.array([each.item() for each in values])
+        raise InputError("model.initial", "another result", f"a list of {len(self.model.states)} numbers")
+
+    def run(self, record: Record, point: Point, gains: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return predicted outputs [m, o] and states [m, n]; with gains [m, n, o] the states follow the data."""
+        m, n, o = len(record.t_s), len(self.model.states), len(self.model.outputs)
+        predicted, states = np.zeros((m, o)), np.zeros((m, n))
+        x0 = self.initial_state(record, point.parameters)
+        self.kernels.run(
+            record.t_s,
+            record.inputs,
+            record.slopes,
+            record.outputs,
+            x0,
+            self.pack(point.parameters[None, :]),
+            point.terms.table,
+            point.terms.values,
+            self.h_max,
+            self.hold,
+            np.zeros((m, n, o)) if gains is None else gains,
+            self._work,
+            predicted,
+            states,
+        )
+        return predicted, states
+
+    def linearise(
+        self,
+        record: Record,
+        point: Point,
+        scales: FloatArray,
+        noise_rate: FloatArray,
+        noise: FloatArray,
+        start_sigma: FloatArray,
+    ) -> tuple[Linearisation, FloatArray]:
+        """Return the filter's linearisation and the derivatives [n, q] of the first state by all free numbers."""
+        columns = self.free_columns(point)
+        ps, values, deltas, starts = [point.parameters], [point.terms.values], [], []
+        x0 = self.initial_state(record, point.parameters)
+        for kind, position in columns:
+            parameters, numbers = point.parameters.copy(), point.terms.values.copy()
+            if kind == "parameter":
+                delta = STEP * max(abs(parameters[position]), 1e-3 * (self.high - self.low)[position])
+                parameters[position] += delta
+                starts.append((self.initial_state(record, parameters) - x0) / delta)
+            else:
+                row, column = divmod(position, 3)
+                delta = STEP * max(abs(numbers[row, column]), 1e-12)
+                numbers[row, column] += delta
+                starts.append(np.zeros(len(x0)))
+            ps.append(parameters)
+            values.append(numbers)
+            deltas.append(delta)
+        out = Linearisation.allocate(len(record.t_s), len(x0), len(noise), len(columns))
+        self.kernels.linearise(
+            record.t_s,
+            record.inputs,
+            record.slopes,
+            record.outputs,
+            x0,
+            self.pack(np.array(ps)),
+            point.terms.table,
+            np.array(values),
+            np.array(deltas),
+            scales,
+            self.h_max,
+            self.hold,
+            noise_rate,
+            noise,
+            start_sigma**2,
+            self._work,
+            out,
+        )
+        return out, np.array(starts).T.reshape(len(x0), len(columns))
+
+    def find_parametrised(self, record: Record, states: FloatArray, point: Point) -> list[int]:
+        """Return the states whose equation a parameter changes directly, at some of the states [m, n] of a record."""
+        found = set[int]()
+        for k in np.linspace(0, len(states) - 1, 20).astype(int):
+            rows = [point.parameters]
+            for position in range(len(self.names)):
+                rows.append(point.parameters.copy())
+                rows[-1][position] *= 1.01
+                rows[-1][position] += 1e-3 * (self.high - self.low)[position] * (rows[-1][position] == 0.0)
+            packed = self.pack(np.array(rows)).view(np.recarray)
+            rates = [
+                np.array(self.model.rhs(record.t_s[k], states[k], record.inputs[k], p), dtype=np.float64)
+                for p in packed
+            ]
+            found |= {int(s) for rate in rates[1:] for s in np.flatnonzero(rate != rates[0])}
+        return sorted(found)
+
+    def free_columns(self, point: Point) -> list[tuple[str, int]]:
+        """Return what is fitted: parameters by index, numbers of terms by flat index."""
+        return [("parameter", k) for k in range(len(self.names))] + [
+            ("term", int(k)) for k in np.flatnonzero(point.terms.free.ravel())
+        ]
+
+    def to_vector(self, point: Point) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the fitted numbers and their limits, logarithms where declared so."""
+
+        def join(parameters: FloatArray, numbers: FloatArray) -> FloatArray:
+            head = parameters.copy()
+            head[self.logarithmic] = np.log(head[self.logarithmic])
+            return np.concatenate([head, numbers[point.terms.free]])
+
+        terms = point.terms
+        return join(point.parameters, terms.values), join(self.low, terms.low), join(self.high, terms.high)
+
+    def from_vector(self, vector: FloatArray, point: Point) -> Point:
+        """Return the point with these fitted numbers."""
+        count = len(self.names)
+        parameters = vector[:count].copy()
+        parameters[self.logarithmic] = np.exp(parameters[self.logarithmic])
+        values = point.terms.values.copy()
+        values[point.terms.free] = vector[count:]
+        return Point(parameters, replace(point.terms, values=values))
+
+
+def fit(
+    simulation: Simulation,
+    records: Sequence[Record],
+    point: Point,
+    weights: Sequence[FloatArray],
+    gains: Sequence[FloatArray] | None = None,
+    evaluations: int = 30,
+    on_progress: Callable[[], None] = lambda: None,
+) -> tuple[Point, float]:
+    """Return the point that minimises the weighted squared prediction errors, and their sum.
+
+    weights: [m, o] per record, 0 where a sample does not count; gains: as of `Simulation.run`, None for free runs
+    """
+    used = [np.isfinite(r.outputs) & (w > 0.0) for r, w in zip(records, weights, strict=True)]
+
+    def residuals(vector: FloatArray) -> FloatArray:
+        trial = simulation.from_vector(vector * unit, point)
+        parts = []
+        for k, record in enumerate(records):
+            predicted, _ = simulation.run(record, trial, None if gains is None else gains[k])
+            error = ((record.outputs - predicted) * weights[k])[used[k]]
+            parts.append(np.nan_to_num(np.clip(error, -DIVERGED, DIVERGED), nan=DIVERGED))
+        on_progress()
+        return np.concatenate(parts)
+
+    vector, low, high = simulation.to_vector(point)
+    span = high - low
+    unit = np.maximum(np.abs(vector), np.where(np.isfinite(span), 1e-6 * span, 1e-12))
+    unit[unit == 0.0] = 1.0
+    margin = np.where(np.isfinite(span), 1e-9 * span, 0.0)
+    start = np.clip(vector, low + margin, high - margin) / unit
+    best = least_squares(
+        residuals,
+        start,
+        bounds=(low / unit, high / unit),
+        x_scale="jac",
+        diff_step=STEP,
+        ftol=1e-6,
+        xtol=1e-7,
+        gtol=1e-10,
+        max_nfev=evaluations,
+    )
+    return simulation.from_vector(best.x * unit, point), float(2.0 * best.cost)
+
+
+def estimate_noise(records: Sequence[Record]) -> FloatArray:
+    """Return an upper estimate of the measurement noise of each output [o], from fourth differences.
+
+    They vanish for a signal that is a cubic over five samples; the estimate is robust against steps.
+    """
+    columns = range(records[0].outputs.shape[1])
+    estimates = []
+    for column in columns:
+        differences = [np.diff(r.outputs[:, column], 4) / np.sqrt(70.0) for r in records if len(r.t_s) > 8]
+        joined = np.concatenate([d[np.isfinite(d)] for d in differences]) if differences else np.zeros(0)
+        estimates.append(1.4826 * float(np.median(np.abs(joined))) if len(joined) else 0.0)
+    return np.array(estimates)
+
+
+def output_sizes(records: Sequence[Record]) -> FloatArray:
+    """Return the standard deviation of each output [o] over all records."""
+    joined = np.concatenate([r.outputs for r in records])
+    sizes = np.array([np.std(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in joined.T])
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def free_run_rmse(
+    simulation: Simulation, records: Sequence[Record], point: Point, masks: Sequence[BoolArray]
+) -> FloatArray:
+    """Return the RMSE of each output [o] in free run over the samples [m] of the masks, infinite after divergence."""
+    total, count = np.zeros(len(simulation.model.outputs)), np.zeros(len(simulation.model.outputs))
+    for record, mask in zip(records, masks, strict=True):
+        predicted, _ = simulation.run(record, point)
+        use = np.isfinite(record.outputs) & mask[:, None]
+        error = np.where(use, record.outputs - predicted, 0.0)
+        total += np.sum(np.where(np.isnan(error), np.inf, error) ** 2, axis=0)
+        count += use.sum(axis=0)
+    result: FloatArray = np.sqrt(total / np.maximum(count, 1.0))
+    return result
+
+
+def choose_step(simulation: Simulation, records: Sequence[Record], point: Point) -> float:
+    """Return the longest step, a sample divided by a power of two, that halving does not change the free run by."""
+    record = records[0]
+    h = float(np.median(np.diff(record.t_s)))
+    probe = Record(record.t_s[:4000], record.inputs[:4000], record.outputs[:4000])
+    size = output_sizes(records)
+    before = Simulation(simulation.model, h, simulation.hold).run(probe, point)[0]
+    for _ in range(7):
+        after = Simulation(simulation.model, h / 2.0, simulation.hold).run(probe, point)[0]
+        difference = np.abs(after - before) / size
+        if np.isfinite(difference).all() and np.percentile(difference, 99) < CONVERGED:
+            return h
+        h, before = h / 2.0, after
+    return h

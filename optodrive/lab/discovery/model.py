@@ -1,0 +1,180 @@
+"""A small ODE simulation, measured records of the system, and the answer of a discovery."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import FloatArray
+
+FIRST_ROWS = 100
+"""Rows of measured outputs that `OdeModel.initial` receives at most."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Number to be fitted: start and limits."""
+
+    start: float
+    low: float
+    high: float
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether the number is positive and known to a decade or worse, so that its logarithm is fitted."""
+        return self.low > 0.0 and self.high >= 10.0 * self.low
+
+
+@dataclass(frozen=True, eq=False)
+class OdeModel:
+    """Simulation dx/dt = rhs(t, state, u, p), y = output(state, u, p).
+
+    rhs, output: return a list of numbers from time, s, the states, the inputs and the parameters, `p["name"]` or
+    `p.name`; compiled if numba can, interpreted otherwise. initial: returns the states at the start of a record from
+    its first measured outputs, [up to 100 samples, outputs] (of one sample, [outputs], if the function needs it so),
+    and the parameters, of which some may occur only there.
+    """
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    parameters: Mapping[str, Parameter]
+    rhs: Callable[[Any, Any, Any, Any], Sequence[Any]]
+    output: Callable[[Any, Any, Any], Sequence[Any]]
+    initial: Callable[[Any, Any], Sequence[Any]]
+
+    def __post_init__(self) -> None:
+        for field in ("states", "inputs", "outputs"):
+            object.__setattr__(self, field, tuple(getattr(self, field)))
+        names = [*self.states, *self.inputs]
+        repeated = next((name for name in names if names.count(name) > 1), None)
+        if repeated is not None:
+            raise InputError("states and inputs", repeated, "every name once")
+        if not self.states or not self.outputs or not self.parameters:
+            raise InputError("model", (self.states, self.outputs), "at least one state, output and parameter")
+        for name, item in self.parameters.items():
+            if not item.low < item.high or not item.low <= item.start <= item.high:
+                raise InputError(f"parameter {name}", (item.start, item.low, item.high), "low <= start <= high")
+
+    @property
+    def variable_names(self) -> tuple[str, ...]:
+        """Quantities that a term can depend on: states, inputs, time."""
+        return (*self.states, *self.inputs, "t")
+
+    @property
+    def place_names(self) -> tuple[str, ...]:
+        """Places where a term can enter: the equation of each state, each output."""
+        return (*(f"d{name}/dt" for name in self.states), *self.outputs)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Measured inputs [m, i] and outputs [m, o] at increasing times t_s [m]. An output that is NaN was not measured."""
+
+    t_s: FloatArray
+    inputs: FloatArray
+    outputs: FloatArray
+
+    def __post_init__(self) -> None:
+        times = np.array(self.t_s, dtype=np.float64).reshape(-1)
+        object.__setattr__(self, "t_s", times)
+        for name in ("inputs", "outputs"):
+            values = np.array(getattr(self, name), dtype=np.float64, order="C")
+            if values.ndim == 1 and len(values) == len(times):
+                values = values[:, None]
+            if values.size == 0 and name == "inputs":
+                values = np.zeros((len(times), 0))
+            if values.ndim != 2 or len(values) != len(times):
+                raise InputError(f"record.{name}", values.shape, f"[{len(times)}, columns], as many rows as t_s")
+            object.__setattr__(self, name, values)
+        if len(times) < 2 or not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+            raise InputError("record.t_s", f"{len(times)} values", "two or more finite, increasing times")
+        if not np.isfinite(self.inputs).all():
+            row = int(np.flatnonzero(~np.isfinite(self.inputs).all(axis=1))[0])
+            raise InputError(f"record.inputs, row {row}", "not finite", "a number; only outputs may be missing")
+        if np.isinf(self.outputs).any():
+            raise InputError("record.outputs", "inf", "numbers, or NaN where nothing was measured")
+
+    def check(self, model: OdeModel) -> None:
+        """Refuse a record whose columns are not those of the model."""
+        for name, values, names in (
+            ("inputs", self.inputs, model.inputs),
+            ("outputs", self.outputs, model.outputs),
+        ):
+            if values.shape[1] != len(names):
+                raise InputError(f"record.{name}", values.shape[1], f"{len(names)} columns: {', '.join(names)}")
+
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """Derivatives of the inputs [m, i] at the samples, of a cubic spline."""
+        if self.inputs.shape[1] == 0 or len(self.t_s) < 4:
+            return np.zeros_like(self.inputs)
+        from scipy.interpolate import CubicSpline
+
+        slopes: FloatArray = CubicSpline(self.t_s, self.inputs).derivative()(self.t_s)
+        return np.ascontiguousarray(slopes)
+
+    @property
+    def first_outputs(self) -> FloatArray:
+        """First measured rows [up to 100, o], each missing value replaced by the nearest one of its column."""
+        rows = self.outputs[:FIRST_ROWS].copy()
+        for column in rows.T:
+            known = np.flatnonzero(np.isfinite(column))
+            if len(known) == 0:
+                column[:] = 0.0
+            else:
+                column[:] = np.interp(np.arange(len(column)), known, column[known])
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Term as a function of the quantity that it depends on, without a formula, with its 95 % band, each [n]."""
+
+    x: FloatArray
+    y: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """Term that the simulation lacks.
+
+    where: equation or output that it is added to; depends_on: names of the quantities; curve: the term against the
+    first of them, per unit of the second, if any; formula: text with numbers in the units of the model; kind: name of
+    the formula's class; gain: share of the avoidable held-out error that this term removes; probability: that the
+    term, in any form, is real
+    """
+
+    where: str
+    depends_on: tuple[str, ...]
+    curve: Curve
+    formula: str
+    kind: str
+    gain: float
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """Answer of `discover`.
+
+    base_rmse, extended_rmse: root mean square error over all outputs in free run, in the held-out parts, to which
+    neither model was fitted; parameters: of the extended model, fitted to everything; base_parameters: likewise without
+    terms
+    """
+
+    findings: tuple[Finding, ...]
+    base_rmse: float
+    extended_rmse: float
+    parameters: dict[str, float]
+    base_parameters: dict[str, float]
+    _simulate: Callable[[Record], FloatArray]
+
+    def simulate(self, record: Record) -> FloatArray:
+        """Return the outputs [m, o] of the extended model in free run from `initial`, NaN once it has diverged."""
+        return self._simulate(record)

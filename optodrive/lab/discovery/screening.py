@@ -1,0 +1,272 @@
+"""Where a term enters and on what it depends: all curves and formulas compared on one linear regression.
+
+Theory of operation. Along the states of the filter, a term g(z) at one place changes the predictions, to first order,
+by a linear functional of g. With g as a sum of hat functions of z, one linear recursion per hat gives a regression of
+the prediction errors on the hats' weights. The columns of all fitted parameters stand beside them, so a term only
+counts for what no parameter can do (orthogonality). The normal equations of each block of samples suffice: curves with
+a roughness penalty that is chosen by cross-validation over blocks, their band, and any formula, whose column is the
+hats' columns times its values at the nodes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.lab.discovery.fitting import Point, Simulation
+from optodrive.lab.discovery.forms import Form, list_forms
+from optodrive.lab.discovery.integration import Linearisation, propagate_parameters, propagate_term
+from optodrive.lab.discovery.model import Curve, Record
+
+EVEN_NODES = 11
+SHARES = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.3, 0.4])
+"""Nodes at equal distances, and at these shares of the samples from either end: end stops act on few samples."""
+FOLDS = 4
+PENALTIES = np.geomspace(1e-7, 1e3, 11)
+RIDGE = 1e-9
+PARAMETER_SHARE = 1e-4
+"""Share of a column's sum of squares that no parameter explains, below which the column is one of the parameters'."""
+BAND = 1.96
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """Linearisation of one record with the derivatives [m, o, q] by all fitted numbers and a label of each sample [m].
+
+    block: number of the block, which is used for fits if it is in the list of fitted blocks
+    """
+
+    record: Record
+    line: Linearisation
+    columns: FloatArray
+    block: IntArray
+    weights: FloatArray
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a term enters, the variable, and the variable that multiplies it, -1 for none; as in `integration`."""
+
+    place: int
+    variable: int
+    factor: int
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """A place with its normal equations in the hats' weights, after projection on what no parameter explains.
+
+    nodes: [c]; matrix: [c, c]; full: [c, c] before that projection; vector: [c], over all fitted blocks; loss:
+    cross-validated, relative to that without a term; weights: [c] of the smooth curve; sigma: [c] their standard errors
+    """
+
+    at: Place
+    nodes: FloatArray
+    matrix: FloatArray
+    full: FloatArray
+    vector: FloatArray
+    total: float
+    loss: float
+    weights: FloatArray
+    sigma: FloatArray
+
+    @property
+    def curve(self) -> Curve:
+        """The smooth curve with its band."""
+        half = BAND * self.sigma
+        return Curve(self.nodes, self.weights, self.weights - half, self.weights + half)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A form at a place, with its inner numbers and its amplitude."""
+
+    at: Place
+    form: Form
+    first: float
+    second: float
+    amplitude: float
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers the formula has."""
+        return 1 + self.form.free
+
+
+def list_places(simulation: Simulation, filtered: Sequence[Filtered], point: Point) -> list[Place]:
+    """Return all places with the variables and factors to be tried.
+
+    An equation that no parameter changes defines its state, as dx/dt = v does, and is left out unless all do.
+    """
+    model = simulation.model
+    n, i, o = len(model.states), len(model.inputs), len(model.outputs)
+    equations = simulation.find_parametrised(filtered[0].record, filtered[0].line.states, point) or list(range(n))
+    quantities = list(range(n + i))
+    places = []
+    for place in [*equations, *range(n, n + o)]:
+        factors = [-1, *quantities] if place < n else [-1]
+        for variable, factor in product([*quantities, n + i], factors):
+            if factor != variable:
+                places.append(Place(place, variable, factor))
+    return places
+
+
+def variable_values(each: Filtered, variable: int) -> FloatArray:
+    """Return a variable [m] along a record."""
+    n, i = each.line.states.shape[1], each.record.inputs.shape[1]
+    if variable < n:
+        return each.line.states[:, variable]
+    return each.record.inputs[:, variable - n] if variable < n + i else each.record.t_s
+
+
+def choose_nodes(values: FloatArray) -> FloatArray:
+    """Return nodes [c] for a variable: over its range, and denser where its values are."""
+    low, high = float(values.min()), float(values.max())
+    shares = np.quantile(values, [*SHARES, 0.5, *(1.0 - SHARES)])
+    nodes = np.unique(np.concatenate([np.linspace(low, high, EVEN_NODES), shares]))
+    apart = 4e-3 * (high - low)
+    kept = [nodes[0]]
+    for node in nodes[1:-1]:
+        if node - kept[-1] > apart and high - node > apart:
+            kept.append(node)
+    return np.array([*kept, high])
+
+
+def hat_functions(z: FloatArray, nodes: FloatArray) -> FloatArray:
+    """Return the hat functions [m, c] of the nodes at z [m]."""
+    right = np.clip(np.searchsorted(nodes, z), 1, len(nodes) - 1)
+    share = np.clip((z - nodes[right - 1]) / (nodes[right] - nodes[right - 1]), 0.0, 1.0)
+    hats = np.zeros((len(z), len(nodes)))
+    rows = np.arange(len(z))
+    hats[rows, right - 1], hats[rows, right] = 1.0 - share, share
+    return hats
+
+
+def screen(filtered: Sequence[Filtered], at: Place, blocks: Sequence[int], n: int) -> Screened | None:
+    """Return the regression of a place on the fitted blocks, None if the variable does not vary."""
+    values = np.concatenate([variable_values(each, at.variable) for each in filtered])
+    if not np.isfinite(values).all() or np.ptp(values) <= 1e-9 * np.abs(values).max():
+        return None
+    nodes = choose_nodes(values)
+    grams = _build_grams(filtered, at, nodes, blocks, n)
+    if not np.isfinite(grams).all():
+        return None
+    q = filtered[0].columns.shape[2]
+    total = grams.sum(axis=0)
+    folds = [grams[k::FOLDS].sum(axis=0) for k in range(FOLDS)]
+    without = float(np.sum([_held_loss(total - fold, fold, q, 0, None) for fold in folds]))
+    roughness = _roughness(nodes)
+    trace = np.trace(total[q:-1, q:-1]) / np.trace(roughness)
+    c = len(nodes)
+    losses = [
+        float(np.sum([_held_loss(total - fold, fold, q, c, penalty * trace * roughness) for fold in folds]))
+        for penalty in PENALTIES
+    ]
+    best = int(np.argmin(losses))
+    matrix, vector, rest = _project(total, q)
+    ridge = RIDGE * np.trace(matrix) * np.eye(len(nodes))
+    regular = np.linalg.inv(matrix + PENALTIES[best] * trace * roughness + ridge)
+    weights = regular @ vector
+    samples = sum(int((each.weights > 0.0).sum()) for each in filtered)
+    variance = np.maximum(rest - 2.0 * weights @ vector + weights @ matrix @ weights, 0.0) / float(max(samples, 1))
+    sigma = np.sqrt(np.maximum(np.diag(regular), 0.0) * variance)
+    return Screened(
+        at, nodes, matrix, total[q:-1, q:-1], vector, rest, losses[best] / max(without, 1e-300), weights, sigma
+    )
+
+
+def _build_grams(
+    filtered: Sequence[Filtered], at: Place, nodes: FloatArray, blocks: Sequence[int], n: int
+) -> FloatArray:
+    """Return the products of all columns, parameters, hats and prediction errors, of each block [b, k, k]."""
+    o = filtered[0].line.predicted.shape[1]
+    direct = np.zeros(o)
+    if at.place >= n:
+        direct[at.place - n] = 1.0
+    size = filtered[0].columns.shape[2] + len(nodes) + 1
+    grams = np.zeros((len(blocks), size, size))
+    for each in filtered:
+        hats = hat_functions(variable_values(each, at.variable), nodes)
+        if at.factor >= 0:
+            hats *= variable_values(each, at.factor)[:, None]
+        line = each.line
+        drive = line.response[:, :, at.place] if at.place < n else np.zeros(line.states.shape)
+        change = propagate_term(
+            line.transition, np.ascontiguousarray(drive), line.observation, direct, line.gains, hats
+        )
+        error = np.nan_to_num(each.record.outputs - line.predicted)[:, :, None]
+        joined = np.concatenate([each.columns, change, error], axis=2) * each.weights[:, :, None]
+        for row, block in enumerate(blocks):
+            part = joined[each.block == block].reshape(-1, size)
+            grams[row] += part.T @ part
+    return grams
+
+
+def _roughness(nodes: FloatArray) -> FloatArray:
+    """Return the quadratic form of the squared second derivative of the curve through the nodes [c, c]."""
+    h = np.diff((nodes - nodes[0]) / (nodes[-1] - nodes[0]))
+    c = len(nodes)
+    second = np.zeros((c - 2, c))
+    for k in range(c - 2):
+        second[k, k : k + 3] = np.array([1.0 / h[k], -1.0 / h[k] - 1.0 / h[k + 1], 1.0 / h[k + 1]])
+        second[k] /= np.sqrt(0.5 * (h[k] + h[k + 1]))
+    form: FloatArray = second.T @ second
+    return form
+
+
+def _solve(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix / scale[:, None] / scale[None, :]
+    solution: FloatArray = np.linalg.solve(scaled + RIDGE * np.eye(len(scaled)), vector / scale) / scale
+    return solution
+
+
+def _held_loss(fitted: FloatArray, held: FloatArray, q: int, c: int, penalty: FloatArray | None) -> float:
+    """Return the squared error in held blocks of the regression on the fitted ones, on q parameters and c hats."""
+    keep = np.arange(q + c)
+    matrix = fitted[np.ix_(keep, keep)].copy()
+    if penalty is not None:
+        matrix[q:, q:] += penalty
+    w = _solve(matrix, fitted[keep, -1])
+    return float(held[-1, -1] - 2.0 * w @ held[keep, -1] + w @ held[np.ix_(keep, keep)] @ w)
+
+
+def _project(total: FloatArray, q: int) -> tuple[FloatArray, FloatArray, float]:
+    """Return matrix, vector and sum of squares in the hats' weights, without the parameters' part."""
+    head, cross = total[:q, :q], total[:q, q:]
+    inner = np.column_stack([_solve(head, column) for column in cross.T]) if q else cross
+    rest = total[q:, q:] - cross.T @ inner
+    rest = 0.5 * (rest + rest.T)
+    return rest[:-1, :-1], rest[:-1, -1], float(rest[-1, -1])
+
+
+def rank_formulas(found: Screened, count: int) -> list[Candidate]:
+    """Return the best formulas of a place. What a parameter does already is none."""
+    columns, owners = [], []
+    for form in list_forms(found.nodes):
+        for first, second in form.starts:
+            values = form.evaluate(found.nodes, float(first), float(second))
+            if not np.isfinite(values).all() or np.abs(values).max() == 0.0:
+                continue
+            columns.append(values / np.abs(values).max())
+            owners.append((form, float(first), float(second), float(np.abs(values).max())))
+    g = np.array(columns)
+    squares = np.einsum("kc,cd,kd->k", g, found.matrix, g)
+    usable = squares > PARAMETER_SHARE * np.maximum(np.einsum("kc,cd,kd->k", g, found.full, g), 1e-300)
+    vector = g @ found.vector
+    share = np.where(usable, vector**2 / np.maximum(squares, 1e-300), 0.0) / max(found.total, 1e-300)
+    best: dict[tuple[str, str], int] = {}
+    for k in np.argsort(-share):
+        best.setdefault((owners[k][0].kind, owners[k][0].text), int(k))
+    return [
+        Candidate(found.at, *owners[k][:3], float(vector[k] / squares[k] / owners[k][3]))
+        for k in list(best.values())[:count]
+        if usable[k]
+    ]
+
+
+def differentiate(each: Linearisation, start: FloatArray) -> FloatArray:
+    """Return the derivatives of the predictions [m, o, q] by all fitted numbers."""
+    return propagate_parameters(each.transition, each.forcing, each.observation, each.direct, each.gains, start)

@@ -1,0 +1,133 @@
+"""Terms that simulations lack, found in systems simulated by SciPy, and in measured data where they are at hand."""
+
+import gzip
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from foreign_systems import motor_model, motor_record, pendulum_model, pendulum_record
+from optodrive.cli.main import run
+from optodrive.core.errors import InputError
+from optodrive.lab.discovery import OdeModel, Parameter, Record, discover
+
+SILVERBOX = os.environ.get("OPTODRIVE_SILVERBOX")
+SAMPLE_RATE_HZ = 610.35
+
+
+def rmse(answer, record, first=0):
+    return float(np.sqrt(np.nanmean((answer.simulate(record) - record.outputs)[first:] ** 2)))
+
+
+@pytest.mark.slow
+def test_dry_friction_of_a_motor():
+    answer = discover(motor_model(), [motor_record(1, 12.0)])
+    (finding,) = answer.findings
+    assert (finding.where, finding.depends_on, finding.kind) == ("dspeed/dt", ("speed",), "dry friction")
+    assert finding.probability > 0.99
+    assert finding.gain > 0.95
+    assert rmse(answer, motor_record(2, 12.0)) < 0.05 * answer.base_rmse
+    fast = np.abs(finding.curve.x) > 2.0
+    assert np.abs(finding.curve.y[fast] + 12.0 * np.sign(finding.curve.x[fast])).max() < 2.5
+
+
+@pytest.mark.slow
+def test_end_stop_of_a_pendulum():
+    answer = discover(pendulum_model(), [pendulum_record(1, 0.35)])
+    spring, damper = answer.findings
+    assert (spring.where, spring.depends_on, spring.kind) == ("dspeed/dt", ("angle",), "end stop")
+    assert (damper.where, damper.depends_on) == ("dspeed/dt", ("angle", "speed"))
+    assert {"gravity": 30.0, "damping": 0.8, "gain": 12.0} == pytest.approx(answer.parameters, rel=0.01)
+    assert rmse(answer, pendulum_record(2, 0.35)) < 0.1 * answer.base_rmse
+
+
+def test_nothing_is_found_where_nothing_is_missing():
+    record = motor_record(3, 0.0, count=1200)
+    record.outputs[100:160] = np.nan
+    record.outputs[::7] = np.nan
+    answer = discover(motor_model(), [record])
+    assert answer.findings == ()
+    assert answer.extended_rmse == answer.base_rmse == pytest.approx(1e-3, rel=0.15)
+    assert answer.parameters == pytest.approx({"gain": 50.0, "damping": 2.0}, rel=2e-3)
+
+
+@pytest.mark.slow
+def test_no_finding_in_sixty_records_without_an_effect():
+    found = []
+    for seed in range(100, 160):
+        record = motor_record(seed, 0.0, noise=3e-3 * (1 + seed % 4), count=600)
+        found += discover(motor_model(), [record]).findings
+    assert found == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(SILVERBOX is None, reason="OPTODRIVE_SILVERBOX does not name the benchmark's silverbox.csv.gz")
+@pytest.mark.timeout(1500)
+def test_cubic_spring_of_the_silverbox():
+    with gzip.open(Path(SILVERBOX), "rt") as file:
+        table = np.loadtxt(file, delimiter=",", skiprows=1)
+
+    def part(begin, end):
+        return Record(np.arange(end - begin) / SAMPLE_RATE_HZ, table[begin:end, :1], table[begin:end, 1:])
+
+    middle = 40_650 + 3 * (127_400 - 40_650) // 4
+    model = OdeModel(
+        states=("x", "v"),
+        inputs=("u",),
+        outputs=("y",),
+        parameters={
+            "stiffness": Parameter(1.8e5, 1e3, 1e7),
+            "damping": Parameter(20.0, 0.1, 1e3),
+            "gain": Parameter(1e5, 1e3, 1e7),
+        },
+        rhs=lambda t, s, u, p: [s[1], p["gain"] * u[0] - p["stiffness"] * s[0] - p["damping"] * s[1]],
+        output=lambda s, u, p: [s[0]],
+        initial=lambda first, p: [first[0, 0], (first[1, 0] - first[0, 0]) * SAMPLE_RATE_HZ],
+    )
+    answer = discover(model, [part(40_650, middle)])
+    assert "cubic" in answer.findings[0].kind
+    assert rmse(answer, part(middle, 127_400), 50) < 1.1 * 0.91e-3
+    assert rmse(answer, part(99, 40_574), 50) < 1.1 * 0.96e-3
+
+
+MODEL_FILE = """
+from optodrive.lab.discovery import OdeModel, Parameter
+
+model = OdeModel(
+    states=("level",), inputs=("flow",), outputs=("measured",),
+    parameters={"area": Parameter(1.0, 0.1, 10.0), "outflow": Parameter(0.5, 0.01, 10.0)},
+    rhs=lambda t, state, u, p: [(u[0] - p["outflow"] * state[0]) / p["area"]],
+    output=lambda state, u, p: [state[0]],
+    initial=lambda first, p: [first[0, 0]],
+)
+"""
+
+
+def test_the_command(tmp_path, capsys):
+    rng = np.random.default_rng(5)
+    t = 0.1 * np.arange(600)
+    flow = 1.0 + 0.8 * np.repeat(rng.uniform(-1.0, 1.0, 20), 30)
+    level, levels = 1.0, []
+    for value in flow:
+        levels.append(level)
+        for _ in range(20):
+            level += 0.005 * (value - 1.0 * level**2)
+    model, record = tmp_path / "tank.py", tmp_path / "record.csv"
+    model.write_text(MODEL_FILE)
+    rows = np.column_stack([t, flow, np.array(levels) + 1e-3 * rng.standard_normal(600)])
+    record.write_text("t_s,flow,measured\n" + "\n".join(",".join(map(repr, row.tolist())) for row in rows))
+    assert run(["discover", str(model), str(record)]) == 0
+    output = capsys.readouterr().out
+    assert output.startswith("dlevel/dt lacks ")
+    assert "held-out error" in output
+    record.write_text("t_s,flow\n0,1\n")
+    assert run(["discover", str(model), str(record)]) == 2
+    assert capsys.readouterr().err.strip().endswith("expected a column measured")
+
+
+def test_a_record_that_does_not_fit_is_refused():
+    with pytest.raises(InputError, match="increasing times"):
+        Record(np.zeros(10), np.zeros((10, 1)), np.zeros((10, 1)))
+    with pytest.raises(InputError, match="1 columns: voltage"):
+        discover(motor_model(), [Record(np.arange(100.0), np.zeros((100, 2)), np.zeros((100, 1)))])
