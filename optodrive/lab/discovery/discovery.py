@@ -192,7 +192,7 @@ class _Search:
                 setattr(self, name, np.where(sizes > 0.0, sizes, 1.0))
 
     def _filter(self, point: Point, tightness: float) -> list[Filtered]:
-        """Return the search records filtered and linearised; the filter assumes model errors of this relative size."""
+        """Return the search records, filtered under model errors of this relative size, and linearised."""
         simulation, filtered = self.simulation, []
         for record, block in zip(self.few.records, self.few.block, strict=True):
             dt_s = float(np.median(np.diff(record.t_s)))
@@ -288,7 +288,10 @@ class _Search:
             involved = (names[at.variable], *((names[at.factor],) if at.factor >= 0 else ()))
             numbers = [final.terms.values[row] for row in rows]
             forms = [steps[row].proposal.candidate.form for row in rows]
-            values = sum(n[0] * form.evaluate(curve.x, n[1], n[2]) for form, n in zip(forms, numbers, strict=True))
+            parts = [n[0] * form.evaluate(curve.x, n[1], n[2]) for form, n in zip(forms, numbers, strict=True)]
+            values = np.sum(parts, axis=0)
+            by_size = np.argsort([-np.ptp(part) for part in parts], kind="stable")
+            forms, numbers = [forms[k] for k in by_size], [numbers[k] for k in by_size]
             texts = [describe_term(form, n, *involved) for form, n in zip(forms, numbers, strict=True)]
             findings.append(
                 Finding(

@@ -92,7 +92,7 @@ class Simulation:
         raise InputError("model.initial", "another result", f"a list of {len(self.model.states)} numbers")
 
     def run(self, record: Record, point: Point, gains: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return predicted outputs [m, o] and states [m, n]; with gains [m, n, o] the states follow the data."""
+        """Return predicted outputs [m, o] and states [m, n], which follow the data if there are gains [m, n, o]."""
         m, n, o = len(record.t_s), len(self.model.states), len(self.model.outputs)
         predicted, states = np.zeros((m, o)), np.zeros((m, n))
         x0 = self.initial_state(record, point.parameters)
@@ -181,7 +181,7 @@ class Simulation:
         return sorted(found)
 
     def free_columns(self, point: Point) -> list[tuple[str, int]]:
-        """Return what is fitted: parameters by index, numbers of terms by flat index."""
+        """Return the fitted numbers, parameters by index and those of terms by flat index."""
         return [("parameter", k) for k in range(len(self.names))] + [
             ("term", int(k)) for k in np.flatnonzero(point.terms.free.ravel())
         ]

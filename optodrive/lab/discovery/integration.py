@@ -194,7 +194,10 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         work: Any,
         u: Any,
     ) -> None:
-        """Advance x in place. work: [5, n]; u: [i]; d0, d1: slopes of the inputs; hold: 0, 1 or 2."""
+        """Advance x in place.
+
+        work: [5, n]; u: [i]; d0, d1: slopes of the inputs; hold: 0, 1 or 2
+        """
         steps = min(max(1, ceil((t1 - t0) / h_max - 1e-6)), MAX_SUBSTEPS)
         h = (t1 - t0) / steps
         for step in range(steps):
@@ -385,7 +388,7 @@ def _correct(
     variance: FloatArray,
     gains: FloatArray,
 ) -> None:
-    """Correct states and covariance by the outputs that were measured, one after the other; write their joint gains."""
+    """Correct states and covariance by each output that was measured, and write their joint gains."""
     n, o = len(x), len(y)
     for j in range(o):
         s = noise[j]
@@ -479,7 +482,7 @@ def propagate_parameters(
     gains: FloatArray,
     start: FloatArray,
 ) -> FloatArray:
-    """Return the derivatives of the predictions [m, o, q] by parameters; start: [n, q] of the first state."""
+    """Return the derivatives of the predictions [m, o, q] by parameters, from those of the first state [n, q]."""
     m, n, count = forcing.shape
     o = direct.shape[1]
     out, delta, moved = np.zeros((m, o, count)), start.copy(), np.zeros((n, count))

@@ -1,4 +1,4 @@
-"""Where a term enters and on what it depends: all curves and formulas compared on one linear regression.
+"""Comparison of all places, variables, curves and formulas of a term by linear regression.
 
 Theory of operation. Along the states of the filter, a term g(z) at one place changes the predictions, to first order,
 by a linear functional of g. With g as a sum of hat functions of z, one linear recursion per hat gives a regression of
@@ -47,7 +47,7 @@ class Filtered:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a term enters, the variable, and the variable that multiplies it, -1 for none; as in `integration`."""
+    """Place of a term, its variable, and the variable that multiplies it (-1: none), as in `integration`."""
 
     place: int
     variable: int
@@ -56,7 +56,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A place with its normal equations in the hats' weights, after projection on what no parameter explains.
+    """A place with its normal equations in the hats' weights, less the part that parameters explain.
 
     nodes: [c]; matrix: [c, c]; full: [c, c] before that projection; vector: [c], over all fitted blocks; loss:
     cross-validated, relative to that without a term; weights: [c] of the smooth curve; sigma: [c] their standard errors
@@ -243,7 +243,7 @@ def _project(total: FloatArray, q: int) -> tuple[FloatArray, FloatArray, float]:
 
 
 def rank_formulas(found: Screened, count: int) -> list[Candidate]:
-    """Return the best formulas of a place. What a parameter does already is none."""
+    """Return the best formulas of a place, none of which a parameter can imitate."""
     columns, owners = [], []
     for form in list_forms(found.nodes):
         for first, second in form.starts:
