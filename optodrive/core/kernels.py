@@ -198,10 +198,6 @@ class _KernelCache(FunctionCache):
         _import_array_functions()
         return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
-    def _index_key(self, sig: Any, codegen: Any) -> Any:
-        """Return the key of a signature. Numba adds the function, with a number per process for one within another."""
-        return sig, codegen.magic_tuple()
-
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         self._open()
         return super()._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -269,21 +265,26 @@ def kernel(function: Callable[P, T]) -> Callable[P, T]:
     Views of its arguments are no new arrays. Without reference counts, small kernels are several times as fast, and the
     compiler refuses to create or return an array.
     """
-    return _compile(function, counts_references=False)
+    return _cache(compile_here(function, counts_references=False), function, counts_references=False)
 
 
 def array_kernel(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a function that creates arrays on its first use and cache the machine code on disk."""
-    return _compile(function, counts_references=True)
+    return _cache(compile_here(function, counts_references=True), function, counts_references=True)
 
 
 _njit: Any = numba.njit  # numba's types lack _nrt
 
 
-def _compile(function: Callable[P, T], counts_references: bool) -> Callable[P, T]:
+def compile_here(function: Callable[P, T], counts_references: bool) -> Callable[P, T]:
+    """Compile a function on its first use, for this process only: one that was made at run time has no lasting name."""
     # No kernel is passed as a value or called from C: an entry for that would be compiled with all that it inlines.
     options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": counts_references}
-    compiled = _njit(**options)(function)
+    compiled: Callable[P, T] = _njit(**options)(function)
+    return compiled
+
+
+def _cache(compiled: Any, function: Callable[P, T], counts_references: bool) -> Callable[P, T]:
     if CACHED:
         compiled._cache = _new_cache(function)
         compiled._cache.counts_references = counts_references

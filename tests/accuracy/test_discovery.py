@@ -45,10 +45,11 @@ def test_end_stop_of_a_pendulum():
 def test_nothing_is_found_where_nothing_is_missing():
     record = motor_record(3, 0.0, count=1200)
     record.outputs[100:160] = np.nan
-    record.outputs[::7] = np.nan
+    record.outputs[3::7] = np.nan
     answer = discover(motor_model(), [record])
     assert answer.findings == ()
-    assert answer.extended_rmse == answer.base_rmse == pytest.approx(1e-3, rel=0.15)
+    noise = np.hypot(1e-3, record.outputs[0, 0])  # the run starts from the first sample, where the angle is zero
+    assert answer.extended_rmse == answer.base_rmse == pytest.approx(noise, rel=0.15)
     assert answer.parameters == pytest.approx({"gain": 50.0, "damping": 2.0}, rel=2e-3)
 
 

@@ -42,12 +42,17 @@ from optodrive.lab.discovery.screening import (
 
 TIGHTNESS = (0.3, 0.03, 0.003)
 """Model errors that the filters assume, relative to the rms of each state's rate."""
+LOOSER = 1.1
+"""Share of squares that a term removes, relative to that with a tighter filter, from which a looser filter is used.
+
+States of a loose one are further from the data, and the regression along them is only of first order.
+"""
 START_UNCERTAINTY = 0.3
 """Standard deviation of the states at the start of a record, relative to their rms."""
 RATE_MEMORY = 10.0
 """Samples over which a model error persists that the filters assume."""
 MAX_TERMS = 4
-PLACES, FORMULAS = 3, 4
+PLACES, FORMULAS = 3, 5
 """Places whose formulas are fitted, and how many of each."""
 TOLERANCE, SHARE_TOLERANCE = 0.06, 0.05
 """Squared error above the best formula's that a number saved is worth: relative to it, and to the best's reduction."""
@@ -268,7 +273,7 @@ class _Search:
                 and (screened := screen(filtered, place, self.few.fitted, len(self.model.states))) is not None
             ]
             found.sort(key=lambda each: each.loss)
-            if found and (not best[2] or found[0].loss < best[2][0].loss):
+            if found and (not best[2] or 1.0 - found[0].loss > LOOSER * (1.0 - best[2][0].loss)):
                 best = (refitted, filtered, found)
         return best
 

@@ -24,7 +24,7 @@ from numba import literal_unroll
 from numba.core.errors import NumbaError
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from optodrive.core.kernels import array_kernel, kernel
+from optodrive.core.kernels import array_kernel, compile_here, kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.forms import evaluate_form
 
@@ -115,10 +115,9 @@ def _return_tuple(function: Any) -> Any:
 def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: bool | None) -> Kernels:
     """Return compiled functions, with reference counts or without, or interpreted ones (None)."""
     is_compiled = counts_references is not None
-    decorator: Any = array_kernel if counts_references else kernel
 
     def compile_(function: Any) -> Any:
-        return decorator(function) if is_compiled else function
+        return function if counts_references is None else compile_here(function, counts_references)
 
     if is_compiled:
         # User functions receive tuples: numba can unpack these.

@@ -28,6 +28,8 @@ PENALTIES = np.geomspace(1e-7, 1e3, 11)
 RIDGE = 1e-9
 PARAMETER_SHARE = 1e-4
 """Share of a column's sum of squares that no parameter explains, below which the column is one of the parameters'."""
+OWN_SHARE = 1e-3
+"""The same share, below which the curve is not drawn as the term's."""
 BAND = 1.96
 
 
@@ -166,8 +168,9 @@ def screen(filtered: Sequence[Filtered], at: Place, blocks: Sequence[int], n: in
     ]
     best = int(np.argmin(losses))
     matrix, vector, rest = _project(total, q)
-    ridge = RIDGE * np.trace(matrix) * np.eye(len(nodes))
-    regular = np.linalg.inv(matrix + PENALTIES[best] * trace * roughness + ridge)
+    # What parameters can do nearly as well is not determined, and is drawn as zero.
+    own = RIDGE * np.trace(matrix) * np.eye(c) + OWN_SHARE * total[q:-1, q:-1]
+    regular = np.linalg.inv(matrix + PENALTIES[best] * trace * roughness + own)
     weights = regular @ vector
     samples = sum(int((each.weights > 0.0).sum()) for each in filtered)
     variance = np.maximum(rest - 2.0 * weights @ vector + weights @ matrix @ weights, 0.0) / float(max(samples, 1))
