@@ -103,6 +103,15 @@ class GalvoSection(Section):
     """Remaining fraction of the cap."""
 
 
+class EffectSection(Section):
+    """Error of either mirror that no settling time removes, because the mirror has a nonlinear effect."""
+
+    name: tuple[str, str]
+    """Effect of mirrors x and y."""
+    error_rad: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
+    """Largest error that stays after a move of mirrors x and y, rad."""
+
+
 class MirrorsFile(Section):
     """The file mirrors.toml as `optodrive calibrate servo` writes it. The tables about and axes are informative."""
 
@@ -110,6 +119,7 @@ class MirrorsFile(Section):
     version: Literal[1]
     scanner: ServoSection
     galvo: GalvoSection = GalvoSection()
+    effect: EffectSection | None = None
     about: dict[str, Any] = Field(default_factory=dict)
     axes: dict[str, Any] = Field(default_factory=dict)
 
@@ -120,6 +130,22 @@ def apply_measured_servo(config: Config, path: Path) -> Config:
     check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
     measured = parse_table(path, table, MirrorsFile)
     scanner = config.scanner.model_copy(update={**measured.scanner.model_dump(), "mirrors": str(path)})
+    if measured.effect is not None:
+        scanner = scanner.model_copy(update={"aim_error_m": _bound_aim_error_m(config, measured.effect, path)})
     stated = config.limits.galvo_acceleration_rms_max_rad_per_s2
     cap = {"galvo_acceleration_rms_max_rad_per_s2": stated * measured.galvo.share}
     return config.model_copy(update={"scanner": scanner, "limits": config.limits.model_copy(update=cap)})
+
+
+def _bound_aim_error_m(config: Config, effect: EffectSection, path: Path) -> float:
+    """Return the aim error including the rest of an effect, or raise InputError if the gate would never open."""
+    for axis, (name, error_rad, tolerance_rad) in enumerate(
+        zip(effect.name, effect.error_rad, config.tolerance_rad, strict=True)
+    ):
+        if error_rad + 2.0 * config.scanner.rad_per_code >= tolerance_rad:
+            expected = (
+                f"below the gate's tolerance of {tolerance_rad:.3g}: {name} of mirror {'xy'[axis]} leaves an error "
+                "that no settling time removes"
+            )
+            raise InputError(f"{path}: effect.error_rad", error_rad, expected)
+    return config.scanner.aim_error_m + 2.0 * config.scanner.focal_length_m * max(effect.error_rad)

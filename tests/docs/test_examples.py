@@ -39,6 +39,7 @@ ELSEWHERE = {
     "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
     "optodrive calibrate pixels": "tests/accuracy/test_calibrate_pixels.py records its sweep, which takes minutes",
     "optodrive calibrate servo recording.h5 --stage": "tests/accuracy/test_calibrate_servo.py",
+    "optodrive calibrate servo responses.npz": "tests/accuracy/test_servo_effects.py",
     "optodrive calibrate sweep": "tests/system/test_calibrate_sweep.py",
     "optodrive recording merge sweep/": "tests/unit/lab/commissioning/test_sweep_player.py",
     "optodrive token": "tests/unit/cli/test_token_command.py",

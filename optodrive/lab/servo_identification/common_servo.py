@@ -1,5 +1,6 @@
 """One servo model for both mirrors that settles no sooner than either of them, since the gate timing relies on it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import cos, exp, pi, sin, sqrt
 
@@ -35,10 +36,16 @@ class CommonServo:
     settling_excess: tuple[float, float]
 
 
-def find_common_servo(mirrors: tuple[IdentifiedServo, IdentifiedServo], config: Config) -> CommonServo:
+def find_common_servo(
+    mirrors: tuple[IdentifiedServo, IdentifiedServo],
+    config: Config,
+    settle: Callable[[int, float, float], float] = lambda axis, move_rad, tolerance_rad: 0.0,
+) -> CommonServo:
     """Find the servo with the smallest mean settling time that covers the 95 % intervals of both mirrors.
 
     Moves range from one pitch to the whole display, at the gate's tolerances.
+
+    settle: further lower bound of the settling time of a move of an axis, s
     """
     moves = [
         (step_rad, share * tolerance_rad, axis)
@@ -46,7 +53,12 @@ def find_common_servo(mirrors: tuple[IdentifiedServo, IdentifiedServo], config: 
         for step_rad in move_sizes_rad(config, axis)
         for share in TOLERANCE_SHARES
     ]
-    required_s = np.array([mirrors[axis].settling_s(step, tolerance)[2] for step, tolerance, axis in moves])
+    required_s = np.array(
+        [
+            max(mirrors[axis].settling_s(step, tolerance)[2], settle(axis, step, tolerance))
+            for step, tolerance, axis in moves
+        ]
+    )
     candidates = [_slow_to_required(mirror.servo, mirrors, moves, required_s) for mirror in mirrors]
     servo = min(candidates, key=lambda each: float(_settling_times_s(each, moves).mean()))
     steps_rad = [step for step, _, _ in moves]

@@ -12,8 +12,10 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.step_response import step_response_rad
-from optodrive.lab.servo_identification.step_trace import AXES, StepTrace, TraceSegment
+from optodrive.lab.servo_identification.effect_fit import Linearity, ServoData, ServoRecord
+from optodrive.lab.servo_identification.effects import FORMS, LINEAR_FORM, SLEW, SLEW_LIMIT
+from optodrive.lab.servo_identification.step_response import Steps, step_response_rad
+from optodrive.lab.servo_identification.step_trace import AXES, GAIN_TOLERANCE, StepTrace, TraceSegment
 
 PARAMETER_NAMES = ("frequency", "damping", "delay", "slowness")
 """Fitted parameters: logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
@@ -107,6 +109,49 @@ def identify(where: str, trace: StepTrace, assumed_slew_rad_per_s: float) -> Ide
     return found
 
 
+def identify_excitation(
+    where: str, records: list[ServoRecord], axis: int, found: Linearity, assumed_slew_rad_per_s: float
+) -> IdentifiedServo:
+    """Fit a servo to records of any excitation, with a slew limit if that is the effect found.
+
+    Raise InputError like `identify`.
+    """
+    limited = found.probability[SLEW_LIMIT] > 0.5
+    start = found.fits[SLEW_LIMIT]
+    base = np.array(start.base) if limited else found.linear
+    data = ServoData(records, float(np.exp(base[0])))
+    rows = slice(None, None, max(1, len(data.target) // FIT_SAMPLES_MAX))
+    constant = np.concatenate([np.full(each.use.sum(), 1.0 / each.noise) for each in records])[rows]
+    form = next(each for each in FORMS if each.kind == SLEW) if limited else LINEAR_FORM
+    y = data.target[rows]
+
+    def solve(packed: FloatArray) -> tuple[FloatArray, float, float]:
+        servo = _unpack(packed)
+        core = np.array([np.log(2.0 * np.pi * servo.frequency), servo.damping, servo.delay])
+        model = np.column_stack([constant, data.simulate(form, core, (servo.slew, 1.0), 1.0, 1)[rows]])
+        offset, gain = np.linalg.lstsq(model, y, rcond=None)[0]
+        return np.asarray(y - model @ [offset, gain]), float(gain), float(offset)
+
+    frequency = float(np.exp(base[0])) / (2.0 * np.pi)
+    slew = start.effect[0] if limited else assumed_slew_rad_per_s
+    packed = _pack(Servo(frequency, float(base[1]), float(base[2]), slew))
+    free = np.array([True, True, True, limited])
+    best, _, covariance = _fit_residual(lambda each: solve(each)[0], packed, free)
+    residual, gain, offset_rad = solve(best)
+    segments = tuple(TraceSegment(Steps(each.at_s, each.command), each.t_s, each.value, each.noise) for each in records)
+    spacing_s = float(np.median(np.concatenate([np.diff(each.t_s) for each in records])))
+    trace = StepTrace(axis, segments, spacing_s)
+    misfit = float(np.sqrt((residual**2).mean()))
+    servo = IdentifiedServo(trace, _unpack(best), covariance, gain, offset_rad, misfit, limited)
+    if abs(gain - 1.0) > GAIN_TOLERANCE:
+        expected = (
+            f"within {GAIN_TOLERANCE:.0%} of 1: the mirror's mechanical angle in rad, axes not exchanged or inverted"
+        )
+        raise InputError(f"{where}: mirror_{AXES[axis]}_rad", f"{gain:.2g} times the {AXES[axis]} commands", expected)
+    _check_identifiable(f"{where}: mirror_{AXES[axis]}_rad", servo)
+    return servo
+
+
 def _check_identifiable(where: str, found: IdentifiedServo) -> None:
     spacing_s, servo = found.trace.spacing_s, found.servo
     if servo.frequency * spacing_s > SAMPLE_SPACING_MAX or 2.0 * found.sigma[0] > FREQUENCY_UNCERTAINTY_MAX:
@@ -138,6 +183,12 @@ def _residual(trace: StepTrace, packed: FloatArray) -> tuple[FloatArray, float, 
 
 
 def _fit(trace: StepTrace, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
+    return _fit_residual(lambda packed: _residual(trace, packed)[0], start, free)
+
+
+def _fit_residual(
+    compute: Callable[[FloatArray], FloatArray], start: FloatArray, free: BoolArray
+) -> tuple[FloatArray, float, FloatArray]:
     """Fit from a starting point. Return parameters, cost, and covariance with zeros for fixed parameters."""
 
     def expand(part: FloatArray) -> FloatArray:
@@ -145,7 +196,7 @@ def _fit(trace: StepTrace, start: FloatArray, free: BoolArray) -> tuple[FloatArr
         packed[free] = part * SCALE[free]
         return packed
 
-    residual: Callable[[FloatArray], FloatArray] = lambda part: _residual(trace, expand(part))[0]  # noqa: E731
+    residual: Callable[[FloatArray], FloatArray] = lambda part: compute(expand(part))  # noqa: E731
     low, high = LOWER_BOUNDS[free] / SCALE[free], UPPER_BOUNDS[free] / SCALE[free]
     initial = np.clip(start[free] / SCALE[free], low + 1e-9, high - 1e-9)
     solution = least_squares(residual, initial, bounds=(low, high), jac="3-point", x_scale="jac", max_nfev=80)

@@ -12,7 +12,9 @@ from optodrive.device.config import Config
 from optodrive.device.config_file import MIRRORS_FORMAT, MIRRORS_VERSION
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.common_servo import CommonServo
+from optodrive.lab.servo_identification.common_servo import CommonServo, move_sizes_rad
+from optodrive.lab.servo_identification.effect_fit import LINEAR, Linearity
+from optodrive.lab.servo_identification.gate_effect import MirrorEffect
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.lab.servo_identification.step_trace import AXES
 
@@ -30,17 +32,71 @@ CRITICAL_DAMPING = 0.99
 
 
 def build_report(
-    mirrors: tuple[IdentifiedServo, IdentifiedServo], common: CommonServo, config: Config
+    mirrors: tuple[IdentifiedServo, IdentifiedServo],
+    common: CommonServo,
+    config: Config,
+    effects: tuple[MirrorEffect, MirrorEffect],
 ) -> dict[str, Any]:
     """Build the report in SI units. Intervals are 95 %."""
     return {
         "scanner": scanner_table(common.servo),
         "galvo": {"share": common.galvo_share},
         "settling_excess": dict(zip(AXES, common.settling_excess, strict=True)),
-        "axes": {AXES[mirror.trace.axis]: _axis_report(mirror, config) for mirror in mirrors},
+        "effect": {
+            "name": [each.name for each in effects],
+            "error_rad": [each.error_rad for each in effects],
+        },
+        "axes": {
+            AXES[mirror.trace.axis]: _axis_report(mirror, config) | {"linearity": report_linearity(effect.linearity)}
+            for mirror, effect in zip(mirrors, effects, strict=True)
+        },
         "remarks": [remark for mirror in mirrors for remark in _axis_remarks(mirror, config)]
-        + _common_servo_remarks(mirrors, common),
+        + _common_servo_remarks(mirrors, common)
+        + [
+            remark
+            for axis, effect in enumerate(effects)
+            for remark in _effect_remarks(AXES[axis], effect, config.tolerance_rad[axis])
+        ],
     }
+
+
+def report_linearity(linearity: Linearity) -> dict[str, Any]:
+    """Return probabilities, rms misfits of held-out samples in units of the noise, and the best form's gain."""
+    return {
+        "probability": linearity.probability,
+        "misfit": {name: float(np.sqrt(each.misfit2)) for name, each in linearity.fits.items()},
+        "form": {name: each.form.name for name, each in linearity.fits.items()},
+        "gain": linearity.gain,
+    }
+
+
+def describe_linearity(report: dict[str, Any]) -> str:
+    """Describe whether one linear servo suffices, and the best effect."""
+    probability, misfit = report["probability"], report["misfit"]
+    name = max(probability, key=lambda each: probability[each])
+    text = f"one linear servo suffices with probability {probability[LINEAR]:.3f}"
+    if name == LINEAR:
+        return text
+    detail = (
+        f" ({report['form'][name]}; held-out error {misfit[LINEAR]:.3g} to {misfit[name]:.3g} × noise)"
+        if name in misfit
+        else ""
+    )
+    return f"{text}; {name} {probability[name]:.3f}{detail}"
+
+
+def _effect_remarks(axis: str, effect: MirrorEffect, tolerance_rad: float) -> list[str]:
+    if effect.error_rad == 0.0:
+        return []
+    sizes = (
+        f"{format_quantity(effect.error_rad, 'rad')} of the gate's tolerance of {format_quantity(tolerance_rad, 'rad')}"
+    )
+    if effect.error_rad < tolerance_rad:
+        return [f"{axis}: {effect.name} leaves an error of up to {sizes}; plans keep it as aim error"]
+    return [
+        f"{axis}: {effect.name} leaves an error of up to {sizes}: no settling time opens the gate, "
+        "and plans refuse this file"
+    ]
 
 
 def scanner_table(servo: Servo) -> dict[str, float]:
@@ -66,6 +122,7 @@ def format_report_lines(report: dict[str, Any]) -> list[str]:
             f"                 residual {1e6 * axis['residual_rad']:.1f} µrad rms, "
             f"noise {1e6 * axis['noise_rad']:.1f}; "
             f"gain {axis['gain']:.4f}; {axis['steps']} steps",
+            f"                 {describe_linearity(axis['linearity'])}",
         ]
         for row in axis["settling"]:
             lines.append(f"  step {1e3 * row['step_rad']:8.3f} mrad  " + _describe_settling(row))
@@ -87,10 +144,21 @@ def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
     ]
     text += ["[scanner] # for both mirrors, instead of the configuration's", *_format_pairs(report["scanner"])]
     text += ["", "[galvo] # factor on the galvo cap, for the faster mirror", *_format_pairs(report["galvo"])]
+    if any(error_rad > 0.0 for error_rad in report["effect"]["error_rad"]):
+        text += [
+            "",
+            "[effect] # of x and y: what stays after a move, beyond the servo",
+            *_format_effect(report["effect"]),
+        ]
     for name, axis in report["axes"].items():
         text += ["", f"[axes.{name}] # as measured, for information", *_format_pairs(axis)]
     with atomic_write(path) as temporary:
         temporary.write_text("\n".join(text) + "\n", encoding="utf-8")
+
+
+def _format_effect(effect: dict[str, Any]) -> list[str]:
+    names = ", ".join(f'"{name}"' for name in effect["name"])
+    return [f"name = [{names}]", f"error_rad = {effect['error_rad']!r}"]
 
 
 def _format_pairs(table: dict[str, Any]) -> list[str]:
@@ -119,9 +187,7 @@ def _axis_report(mirror: IdentifiedServo, config: Config) -> dict[str, Any]:
         "residual_rad": mirror.residual_rad,
         "noise_rad": mirror.trace.noise_rad,
         "steps": len(mirror.trace.steps_rad),
-        "settling": [
-            _settling_row(mirror, step_rad, config) for step_rad in _distinct_sizes_rad(mirror.trace.steps_rad)
-        ],
+        "settling": [_settling_row(mirror, step_rad, config) for step_rad in _list_sizes_rad(mirror, config)],
     }
 
 
@@ -133,6 +199,12 @@ def _distinct_sizes_rad(steps_rad: "np.ndarray[Any, np.dtype[np.float64]]") -> l
             sizes.append(step_rad)
     rows = np.unique(np.linspace(0, len(sizes) - 1, SIZES_MAX).round().astype(int))
     return [sizes[at] for at in rows]
+
+
+def _list_sizes_rad(mirror: IdentifiedServo, config: Config) -> list[float]:
+    """Return the sizes of a recording's steps, or of the display's moves where it has an excitation."""
+    axis = mirror.trace.axis
+    return move_sizes_rad(config, axis) if mirror.trace.is_dense else _distinct_sizes_rad(mirror.trace.steps_rad)
 
 
 def _settling_row(mirror: IdentifiedServo, step_rad: float, config: Config) -> dict[str, Any]:
@@ -188,7 +260,7 @@ def _axis_remarks(mirror: IdentifiedServo, config: Config) -> list[str]:
         remarks.append(
             f"{name}: critically damped or overdamped within the uncertainty; a configuration is always underdamped"
         )
-    for row in (_settling_row(mirror, step_rad, config) for step_rad in _distinct_sizes_rad(mirror.trace.steps_rad)):
+    for row in (_settling_row(mirror, step_rad, config) for step_rad in _list_sizes_rad(mirror, config)):
         low_s, high_s = row["share"]["interval_s"]
         if high_s - low_s > 2.0 * SETTLING_TOLERANCE * row["share"]["measured_s"]:
             remarks.append(

@@ -15,10 +15,17 @@ STEPS_MAX = 400
 """Steps beyond this number add no information."""
 WINDOW_S = 0.02
 """Samples later than this after a step are not used."""
+DENSE_HOLD_S = 5e-3
+"""Commands that mostly hold for less are an excitation rather than steps."""
 STUCK_GAIN = 0.02
 """A mirror with a smaller gain than this is stuck."""
 GAIN_TOLERANCE = 0.25
 NOISE_MIN = 1e-4
+
+
+def is_dense(changes_s: FloatArray) -> bool:
+    """Return whether commands that change at changes_s are an excitation: too dense for steps that settle."""
+    return len(changes_s) > 2 and float(np.median(np.diff(changes_s))) < DENSE_HOLD_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +55,11 @@ class StepTrace:
     axis: int
     segments: tuple[TraceSegment, ...]
     spacing_s: float
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether the commands are an excitation rather than steps."""
+        return any(is_dense(piece.steps.at_s) for piece in self.segments)
 
     @property
     def noise_rad(self) -> float:

@@ -1,0 +1,177 @@
+"""One linear servo or not: hidden servos with and without an effect, of other code and other forms."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+from hidden_nonlinear_servo import EFFECT_OF, KINDS, HiddenServo, recording
+
+from optodrive.cli.main import run
+from optodrive.lab.recording import write_recording
+from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, find_effect
+from optodrive.lab.servo_identification.excitation import estimate_noise, extract_records
+from optodrive.lab.servo_identification.gate_effect import CERTAIN
+
+FORMS = ("multisine", "noise", "sweep", "holds")
+
+
+def judge(kind, seed):
+    """Return the name given to a hidden servo, None if no name is certain, and the answer."""
+    random = np.random.default_rng(seed)
+    servo = HiddenServo.sample(kind, random)
+    form, noise = FORMS[random.integers(4)], float(np.exp(random.uniform(np.log(0.002), np.log(0.05))))
+    records = extract_records("r", recording((servo, servo), random, form, noise=noise), 0)
+    found = find_effect(records, 2.0 * np.pi * servo.hz * random.uniform(0.7, 1.4))
+    name = max(found.probability, key=lambda each: found.probability[each])
+    return (name if found.probability[name] >= CERTAIN and name != OTHER else None), found
+
+
+@pytest.mark.parametrize("kind", ["linear with a lag", "slew", "arctangent", "smooth friction", "play", "Duffing"])
+def test_an_effect_is_named_or_none(kind):
+    name, found = judge(kind, 40)
+    assert name == (EFFECT_OF[kind] or LINEAR)
+    assert (found.gain > 0.5) is (name != LINEAR)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_of_68_hidden_servos_at_most_one_gets_a_false_name():
+    answers = [
+        (kind, judge(kind, 50_000 + 100 * repeat + row)[0]) for repeat in range(4) for row, kind in enumerate(KINDS)
+    ]
+    wrong = [(kind, name) for kind, name in answers if name not in (None, EFFECT_OF[kind] or LINEAR)]
+    assert len(wrong) <= 1, wrong
+    assert sum(name is not None for _, name in answers) >= 55, answers
+
+
+def test_noise_is_that_of_white_samples_on_a_smooth_response():
+    random, t_s = np.random.default_rng(3), np.arange(5000) / 25.0
+    value = np.sin(2.0 * np.pi * t_s) + 0.01 * random.standard_normal(5000)
+    assert estimate_noise(value) == pytest.approx(0.01, rel=0.05)
+
+
+def calibrate(folder, capsys, servo, name):
+    other = HiddenServo("linear", 0.0, 1200.0, 0.5, 3e-5)
+    measured = recording(
+        (servo, other), np.random.default_rng(7), amplitudes_rad=(0.004, 0.012, 0.04), noise=0.01, count=2048
+    )
+    write_recording(folder / f"{name}.h5", measured)
+    out = folder / f"{name}.toml"
+    assert run(["calibrate", "servo", f"{folder}/{name}.h5", "--json", "--out", str(out)]) == 0
+    return json.loads(capsys.readouterr().out), out
+
+
+@pytest.fixture
+def frames(tmp_path):
+    path = tmp_path / "frames.json"
+    path.write_text('{"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "300": 60}}]}')
+    return path
+
+
+def test_friction_beyond_the_gate_is_refused_by_name(tmp_path, capsys, frames):
+    report, out = calibrate(tmp_path, capsys, HiddenServo("Coulomb", 0.05, 900.0, 0.6, 4e-5), "stuck")
+    assert report["effect"]["name"] == ["dry_friction", "linear"]
+    assert report["axes"]["x"]["linearity"]["probability"]["linear"] < 0.01
+    assert report["axes"]["y"]["linearity"]["probability"]["linear"] > 0.95
+    assert run(["plan", str(frames), "--mirrors", str(out)]) == 2
+    assert "dry_friction of mirror x leaves an error that no settling time removes" in capsys.readouterr().err
+
+
+def test_a_small_friction_is_planned_with_and_takes_longer_to_settle(tmp_path, capsys, frames):
+    def settling_s(path):
+        assert run(["plan", str(frames), "--json", "--mirrors", str(path)]) == 0
+        return json.loads(capsys.readouterr().out)["settling_s"]
+
+    report, out = calibrate(tmp_path, capsys, HiddenServo("Coulomb", 0.006, 900.0, 0.6, 4e-5), "stiff")
+    assert report["effect"]["name"] == ["dry_friction", "linear"]
+    # The loop pulls by the distance from the target: the mirror may rest where friction balances that.
+    assert 0.8 * 0.006 * 0.04 < report["effect"]["error_rad"][0] < 1.6 * 0.006 * 0.04
+    _, clean = calibrate(tmp_path, capsys, HiddenServo("linear", 0.0, 900.0, 0.6, 4e-5), "clean")
+    assert settling_s(out) > settling_s(clean)
+
+
+def coupled_responses(exponent, lag, levels=(0.1, 0.2, 0.3), n=2048, realisations=5):
+    """Return u and y of two coupled resonances whose stiffness falls by 4 % times (A / 0.3)^exponent, with that lag."""
+    random, responses = np.random.default_rng(11), {}
+    line = np.arange(n // 2 + 1)
+    modes = np.array([[1.0, 0.6], [-0.5, 1.0]])
+    for level in levels:
+        softening = 0.04 * (level / 0.3) ** exponent * (1.0 + 1j * lag)
+        phases = np.exp(2j * np.pi * random.random((n // 2 + 1, 2, realisations)))
+        u = np.fft.irfft(phases * ((line > 0) & (line < 900))[:, None, None], n, axis=0)
+        u *= level / np.sqrt((u**2).mean(axis=(0, 1)))
+        modal = 1.0 / (
+            1.0 - softening - (line[:, None] / np.array([330.0, 470.0])) ** 2 + 0.03j * line[:, None] / 400.0
+        )
+        response = np.einsum("oa,la,ia->loi", modes, modal, modes)
+        y = np.fft.irfft(response @ np.fft.rfft(u, axis=0), n, axis=0)
+        noise = 1e-3 * random.standard_normal((*y.shape, 2))
+        responses[f"u_{level}"], responses[f"y_{level}"] = np.stack([u, u], axis=3), y[..., None] + noise
+    return responses
+
+
+@pytest.mark.parametrize(
+    ("exponent", "lag", "name"),
+    [(1.0, 0.42, "hysteresis"), (2.0, 0.0, "amplitude_dependent_stiffness"), (0.0, 0.0, "linear")],
+)
+def test_coupled_axes_are_told_apart_by_their_law_of_the_amplitude(tmp_path, capsys, exponent, lag, name):
+    # The sign of a lag: a response Y/U with negative imaginary part follows late.
+    np.savez(tmp_path / "r.npz", **coupled_responses(exponent, -lag))
+    assert run(["calibrate", "servo", f"{tmp_path}/r.npz", "--sample-rate", "5000", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["probability"][name] > 0.95
+    if name == "linear":
+        return
+    for level, error in report["error"]["model"].items():
+        assert error < 0.3 * report["error"]["linear"][level]
+
+
+def test_decoupled_axes_of_an_npz_are_judged_one_by_one(tmp_path, capsys):
+    random, arrays = np.random.default_rng(5), {}
+    servos = HiddenServo("Duffing", 0.1, 300.0, 0.5, 0.0), HiddenServo("linear", 0.0, 400.0, 0.5, 0.0)
+    n, rate_hz = 1024, 8000.0
+    for level in (0.2, 0.5, 1.0):
+        line = np.arange(1, 100)
+        u = np.zeros((n, 2, 3, 2))
+        for realisation in range(3):
+            for axis in range(2):
+                spectrum = np.zeros(n // 2 + 1, complex)
+                spectrum[line] = np.exp(2j * np.pi * random.random(len(line)))
+                period = np.fft.irfft(spectrum, n)
+                u[:, axis, realisation] = (level * period / period.std())[:, None]
+        y = np.zeros_like(u)
+        for axis, servo in enumerate(servos):
+            for realisation in range(3):
+                steady = servo.follow(np.tile(u[:, axis, realisation, 0], 5), rate_hz, 1.0)[3 * n :]
+                y[:, axis, realisation] = steady.reshape(2, n).T + 1e-3 * random.standard_normal((n, 2))
+        arrays[f"u_{level}"], arrays[f"y_{level}"] = u, y
+    np.savez(tmp_path / "r.npz", **arrays)
+    assert run(["calibrate", "servo", f"{tmp_path}/r.npz", "--sample-rate", f"{rate_hz}", "--json"]) == 0
+    first, second = (each["linearity"]["probability"] for each in json.loads(capsys.readouterr().out)["axes"])
+    assert first["amplitude_dependent_stiffness"] > 0.95
+    assert second["linear"] > 0.95
+
+
+@pytest.mark.skipif("OPTODRIVE_STEERING_MIRROR" not in os.environ, reason="OPTODRIVE_STEERING_MIRROR names no data")
+def test_a_measured_piezo_mirror_has_hysteresis_and_one_model_halves_the_error(capsys):
+    path = os.environ["OPTODRIVE_STEERING_MIRROR"]
+    assert run(["calibrate", "servo", path, "--sample-rate", "6400", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["probability"]["hysteresis"] > 0.95
+    # Half of 0.37, 0.25 and 0.31 µm, the errors of one linear response; at the last one 0.155 µm is not reached by 1 %.
+    errors = list(report["error"]["model"].values())
+    assert errors == pytest.approx([0.068, 0.116, 0.157], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "--sample-rate: missing"),
+        (("--sample-rate", "5000", "--out", "m.toml"), "a plan cannot use responses in other units"),
+    ],
+)
+def test_what_an_npz_lacks_is_one_line(tmp_path, capsys, arguments, words):
+    np.savez(tmp_path / "r.npz", u_1=np.zeros((64, 1, 2, 2)))
+    assert run(["calibrate", "servo", f"{tmp_path}/r.npz", *arguments]) == 2
+    assert words in capsys.readouterr().err
