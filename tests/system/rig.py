@@ -102,6 +102,12 @@ class Board:
     def of(self, kind):
         return [event for event in self.events() if event["event"] == kind]
 
+    def kill(self):
+        """Kill the process. Its port's name goes first: the kernel soon gives its terminal to another board."""
+        self.port.unlink(missing_ok=True)
+        self.process.kill()
+        self.process.wait()
+
     def stop(self):
         self.process.terminate()
         self.process.wait()

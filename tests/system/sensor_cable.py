@@ -19,6 +19,7 @@ class Cable:
         assert self.process.stdout.readline()
 
     def stop(self):
+        self.port.unlink(missing_ok=True)  # the kernel soon gives its terminal to another program
         self.process.kill()
         self.process.communicate()
 

@@ -202,8 +202,7 @@ def test_a_board_that_comes_late_is_waited_for(tmp_path):
         try:
             wait_for(lambda: daemon.state()["link"]["state"] == "up", "the link")
             assert daemon.arm()["board"]["state"] == "ARMED"
-            board.process.kill()
-            board.process.wait()
+            board.kill()
             state = wait_for(lambda: (s := daemon.state())["link"]["state"] == "down" and s, "the loss")
             assert state["board"]["state"] not in ("ARMED", "RUNNING", "HOLD")
         finally:

@@ -43,7 +43,7 @@ def test_a_killed_board_process_is_missing_and_the_timing_error_was_reported(boa
     assert daemon.state()["totals"]["timing_error"]["pulses"] == 5
     plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
     wait_for(lambda: daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["executed"], "light")
-    board.process.kill()
+    board.kill()
     cause = wait_for_cause(daemon, "is missing")
     assert str(board.port) in cause
     failed = daemon.finished(plan)

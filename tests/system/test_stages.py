@@ -161,14 +161,14 @@ def test_the_loss_of_one_board_darkens_the_other_within_its_lease(bench):
     bench.arm()
     bench.begin(build_trains())
     lost, left = bench.boards
-    lost.process.kill()
+    lost.kill()
     wait_for(lambda: left.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the other board")
     assert_dark_within_lease(left)
     state = wait_for(lambda: (s := bench.daemon.state())["link"]["state"] == "down" and s, "the loss")
     assert "stage 'left'" in state["link"]["error"]
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("end", ["killed", "suspended"])
 def test_the_other_board_draws_what_is_left_where_configured(programs, tmp_path, end):
     bench = Bench(tmp_path, programs, GOES_ON)
     lost, left = bench.boards
@@ -177,7 +177,10 @@ def test_the_other_board_draws_what_is_left_where_configured(programs, tmp_path,
         plan = bench.begin(build_trains(4.0))
         before = {(pulse["x"], pulse["y"]) for pulse in left.of("pulse")}
         assert len(before) == 1
-        lost.process.send_signal(end)
+        if end == "killed":
+            lost.kill()
+        else:
+            lost.process.send_signal(signal.SIGSTOP)
         stages = wait_for(lambda: (s := bench.daemon.state()["stages"])[0]["lost"] and s, "the loss")
         assert (stages[0]["connected"], stages[1]["lost"]) == (False, None)
         assert "stage     left at " in bench.run_command("status")
