@@ -195,7 +195,7 @@ class Planner:
             self._require_armed()
             if request.push.streamed and self._plan_queue.pause.is_held:  # unless it was resumed a moment ago
                 self._run_in_loop(self._plan_queue.pause.require_no_pause)
-            if request.push.streamed and self._plan_queue.must_preempt:
+            if request.push.streamed and self._plan_queue.stream.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
             began_s = self._clock.now_s()
             reserved_s = self._compute_reserved_s(request, late_count, took_s)
@@ -206,7 +206,7 @@ class Planner:
             # The snapshot is stale: a predecessor was late, has sent points beyond the splice, or its heat is gone.
             late_count += 1
             if request.push.streamed and late_count == SPLICE_TRIES:
-                self._run_in_loop(self._plan_queue.truncate_stream)
+                self._run_in_loop(self._plan_queue.stream.truncate)
 
     def _compute_reserved_s(self, request: PlanningRequest, late_count: int, took_s: float) -> float:
         """Return the time to reserve for an attempt after late ones, of which the last took took_s."""
@@ -217,7 +217,7 @@ class Planner:
         """Make room for a streamed plan, unless its epoch has passed."""
         self._plan_queue.require_epoch(request.push.epoch)
         self._plan_queue.pause.require_no_pause()
-        self._plan_queue.preempt()
+        self._plan_queue.stream.preempt()
 
     def _plan_once(
         self,

@@ -1,17 +1,27 @@
-"""Pause of the queue: keeps plans from starting until they are limited and proven again."""
+"""Pause of the queue: keeps plans from starting until they are limited and proven again.
 
-import threading
-from collections import deque
+The board drops its queue; what was not executed becomes the rest of the same plan, which waits at the front and
+is limited again for the time at which the light returns (decision 37). A stream is dropped, as it shows the present.
+The loss of a stage, where the others go on, interrupts as a pause does. Nobody knows what the lost board emitted: what
+it was sent for the time before it was dark for certain counts, and is not repeated. What is left is planned anew, also
+that of a stream, unless a newer frame waits already (decision 49).
+"""
+
 from collections.abc import Callable
+from math import inf
 from typing import NamedTuple
+
+import numpy as np
 
 from optodrive.core.errors import NotReadyError
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_restart import RestartedPlan, restart_plans
-from optodrive.daemon.engine.pulse_accounts import PulseAccounts
-from optodrive.daemon.engine.queue_thermal import QueueThermal
+from optodrive.daemon.engine.progress import PlanRun, find_emitted
+from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.thermal_estimate import estimate_before_rest
+from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
+from optodrive.link.session.stage_loss import LostStage
 from optodrive.planning.display_model import DisplayModel
 
 START_LEAD_S = 0.05
@@ -32,19 +42,9 @@ class QueuePause:
     off_s: board time at which the light went off, None once the queue goes on
     """
 
-    def __init__(
-        self,
-        lock: threading.RLock,
-        waiting: deque[ActivePlan],
-        thermal: QueueThermal,
-        session: RemoteSession,
-        accounts: PulseAccounts,
-    ) -> None:
+    def __init__(self, plans: QueuedPlans, session: RemoteSession) -> None:
         self.off_s: float | None = None
-        self._accounts = accounts
-        self._lock = lock
-        self._waiting = waiting
-        self._thermal = thermal
+        self._plans = plans
         self._session = session
 
     @property
@@ -67,15 +67,75 @@ class QueuePause:
         """Let nothing start until the waiting plans are limited and proven again."""
         self.off_s = off_s
 
+    def interrupt(self, off_s: float) -> None:
+        """Let the plans that ran at the pause wait for the rest of their pulses. Drop the rest of a stream.
+
+        off_s: board time at which the light went off
+        """
+        plans = self._plans
+        with plans.lock:
+            self.begin(off_s)
+            streams = [run.plan for run in plans.running if run.plan.record.streamed]
+            while plans.running:
+                run = plans.running.popleft()
+                plans.accounts.count_progress(run)
+                if self._session.lost is not None and self._counts_on(run, self._session.lost.stage):
+                    self._interrupt_by_loss(run, self._session.lost, off_s)
+                    continue
+                plan, record = run.plan, run.plan.record
+                left = record.pulse_count - record.executed_count
+                if record.streamed or not left:
+                    record.dropped = left
+                    error = "the light was paused, and a stream shows the present" if left else None
+                    plans.conclude(run, PlanStatus.SUPERSEDED if left else PlanStatus.DONE, error)
+                    continue
+                plans.accounts.collect_executed(run)
+                delay_s = record.delay_s
+                plan.interrupt(off_s)
+                plans.delay_all(delay_s)
+                plans.waiting.appendleft(plan)
+            if streams and not plans.waiting:
+                plans.thermal.rewind(streams)
+
+    @staticmethod
+    def _counts_on(run: PlanRun, stage: int) -> bool:
+        """Return whether a running plan has points for a stage."""
+        return len(run.plan.points.stages[stage]) > 0
+
+    def _interrupt_by_loss(self, run: PlanRun, lost: LostStage, off_s: float) -> None:
+        """Let the plan that ran last when a stage was lost wait for its rest, unless a newer streamed one waits.
+
+        Its pulses that the lost board may have emitted count as executed. Time in the dark without a pulse is over.
+        """
+        plans = self._plans
+        plans.accounts.collect_executed(run)
+        emitted = find_emitted(run, lost)
+        plan, record = run.plan.reorder(emitted), run.plan.record
+        first_row = int(np.count_nonzero(emitted))
+        left_s = record.start_s + float(plan.planned.plan.start_s[first_row:].min(initial=inf))
+        plan.interrupt(max(off_s, min(left_s, lost.dark_s)), first_row)
+        plans.accounts.count_executed(plan)
+        left = plan.rest_count
+        if left and not plans.running and not any(each.record.streamed for each in plans.waiting):
+            plans.waiting.appendleft(plan)
+            return
+        record.dropped = left
+        if plans.waiting and not plans.running:
+            first, estimate = plans.waiting[0], plans.thermal.estimate_before(plan)
+            first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
+        plans.end_waiting(
+            plan, PlanStatus.SUPERSEDED if left else PlanStatus.DONE, "replaced by a newer plan" if left else None
+        )
+
     def end_if_idle(self) -> None:
         """Let the queue go on after a pause if nothing waits."""
-        if self.off_s is not None and not self._waiting and not self.is_held:
+        if self.off_s is not None and not self._plans.waiting and not self.is_held:
             self.off_s = None
 
     @property
     def can_restart(self) -> bool:
         """Whether waiting plans are to be limited and proven again now. Any thread may read it."""
-        return self.off_s is not None and bool(self._waiting) and not self.is_held
+        return self.off_s is not None and bool(self._plans.waiting) and not self.is_held
 
     def build_restart(
         self, display: DisplayModel, planning_time_s: float, on_progress: Callable[[], None]
@@ -84,8 +144,8 @@ class QueuePause:
 
         planning_time_s: time that is reserved for this. Raise LocalProtocolError if one exceeds a cap.
         """
-        with self._lock:
-            plans, off_s = tuple(self._waiting), self.off_s
+        with self._plans.lock:
+            plans, off_s = tuple(self._plans.waiting), self.off_s
             if not self.can_restart:
                 return None
         start_s = self._session.board_s() + START_LEAD_S + planning_time_s
@@ -97,14 +157,14 @@ class QueuePause:
     def commit_restart(self, restart: Restart) -> bool:
         """Let the queue go on. Return False if the queue has changed meanwhile, or the light is paused again."""
         self._session.connection.receive()  # a STOP or a pause that has been answered is known from here on
-        with self._lock:
-            if not self.can_restart or tuple(self._waiting) != restart.plans or self.off_s != restart.off_s:
+        with self._plans.lock:
+            if not self.can_restart or tuple(self._plans.waiting) != restart.plans or self.off_s != restart.off_s:
                 return False
             delay_s = max(0.0, self._session.board_s() + START_LEAD_S - restart.restarted[0].start_s)
             for plan in restart.restarted:
-                self._accounts.totals["planned"] += plan.added_count
+                self._plans.accounts.totals["planned"] += plan.added_count
                 plan.apply(delay_s)
             last = restart.restarted[-1]
-            self._thermal.set(last.after.with_delay(delay_s), last.end_s + delay_s)
+            self._plans.thermal.set(last.after.with_delay(delay_s), last.end_s + delay_s)
             self.off_s = None
             return True

@@ -1,0 +1,114 @@
+"""Streamed plans of the queue.
+
+A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed plan
+leave only `lead_s` before they are due; a newer plan cuts the running one at the first point that has not left
+(`build_cut_snapshot`) and is spliced behind it, one job for the board. The lead is longer without real-time priority,
+because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is refused
+by link, and the plan is made again; after two such plans `truncate` cuts the running one at once, and the third begins
+behind it without a deadline.
+"""
+
+from optodrive.core.types.arrays import BoolArray
+from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.planning_snapshot import (
+    PlanningSnapshot,
+    RefreshCycle,
+    build_cut_snapshot,
+    mark_refreshed,
+)
+from optodrive.daemon.engine.progress import PlanRun
+from optodrive.daemon.engine.queued_plans import QueuedPlans
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.link.protocol.point_cut import PointCut
+from optodrive.link.service.remote_session import RemoteSession
+from optodrive.planning.display_model import DisplayModel
+
+STREAM_START_LEAD_S = 0.02
+SHARED_STREAM_LEAD_S = 0.04
+"""Least lead of a stream if the link process has no real-time scheduling."""
+
+
+class QueueStream:
+    """Replacement of unsent pulses by a streamed plan. Any thread may read lead_s and must_preempt."""
+
+    def __init__(self, plans: QueuedPlans, display: DisplayModel, session: RemoteSession) -> None:
+        self._plans = plans
+        self._display = display
+        self._session = session
+        self._refresh_cycle: RefreshCycle | None = None
+
+    @property
+    def lead_s(self) -> float:
+        """Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
+        lead_s = self._display.config.stream_lead_s
+        return lead_s if self._session.is_realtime else max(lead_s, SHARED_STREAM_LEAD_S)
+
+    def find_running(self) -> ActivePlan | None:
+        """Return the running streamed plan that a newer one may truncate, None without one."""
+        if self._plans.waiting or not self._plans.running:
+            return None
+        plan = self._plans.running[-1].plan
+        return plan if plan.record.streamed and not plan.record.dropped else None
+
+    def build_cut_snapshot(
+        self, running: ActivePlan, thermal: ThermalEstimate, planning_time_s: float
+    ) -> PlanningSnapshot | None:
+        """Build the snapshot of a plan that truncates a running one, None if that is not possible any more."""
+        min_start_s = self._session.board_s() + self.lead_s + planning_time_s
+        return build_cut_snapshot(running, thermal, min_start_s, self._display.budget, self._session.tick_s)
+
+    def splice(self, plan: ActivePlan, predecessor: ActivePlan, cut: PointCut) -> bool:
+        """Continue the points of a running plan with those of a new one. Return False if the cut has been sent."""
+        if not self._plans.running or self._plans.running[-1].plan is not predecessor:
+            return False
+        zero_s, ahead_s = plan.record.start_s, self.lead_s
+        job = self._session.splice(plan.points, cut.kept_points, zero_s, plan.epoch, ahead_s, plan.crc)
+        if job is None:
+            return False
+        predecessor.record.dropped = predecessor.record.pulse_count - cut.row
+        self._plans.running.append(PlanRun(plan, job))
+        return True
+
+    @property
+    def must_preempt(self) -> bool:
+        """Whether a newer streamed plan must preempt others first."""
+        with self._plans.lock:
+            return bool(self._plans.waiting) or any(not run.plan.record.streamed for run in self._plans.running)
+
+    def preempt(self) -> None:
+        """Supersede the waiting plans, and end a running plan that is not streamed, for a newer plan."""
+        with self._plans.lock:
+            if self._plans.waiting:
+                self._plans.thermal.set(self._plans.thermal.estimate_before(self._plans.waiting[0]))
+            while self._plans.waiting:
+                plan = self._plans.waiting.popleft()
+                plan.record.dropped = plan.rest_count
+                self._plans.end_waiting(plan, PlanStatus.SUPERSEDED, "replaced by a newer plan")
+            if self._plans.running and not self._plans.running[-1].plan.record.streamed and not self._session.is_held:
+                plan, job = self._plans.running[0]
+                plan.record.dropped = plan.record.pulse_count - job.sent_count
+                self._session.flush()
+                self._plans.end_running(PlanStatus.SUPERSEDED, "replaced by a newer plan")
+
+    def truncate(self) -> None:
+        """Truncate the running streamed plan at the first pulse not yet due to be sent.
+
+        The next plan then starts after it, without a splice deadline.
+        """
+        with self._plans.lock:
+            last = self.find_running()
+            if last is None:
+                return
+            snapshot = self.build_cut_snapshot(last, self._plans.thermal.estimate, planning_time_s=0.0)
+            if snapshot is None or snapshot.cut is None or not self._session.truncate(snapshot.cut.kept_points):
+                return
+            last.record.dropped = last.record.pulse_count - snapshot.cut.row
+            estimate = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
+            self._plans.thermal.set(estimate, snapshot.start_s)
+            self._refresh_cycle = RefreshCycle(estimate, mark_refreshed(last, snapshot.cut.row))
+
+    def find_refreshed(self, thermal: ThermalEstimate) -> BoolArray | None:
+        """Return the pixels that the current refresh cycle has drawn, [p], None if another plan has come in between."""
+        cycle = self._refresh_cycle
+        return cycle.refreshed if cycle is not None and cycle.thermal is thermal else None
