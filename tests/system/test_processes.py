@@ -18,7 +18,7 @@ import pytest
 from optodrive.core.scheduling import LIGHT, PLANNING
 from optodrive.daemon.priority import NICE
 from optodrive.daemon.server import acceptor
-from optodrive.daemon.server.acceptor_client import PERMITTED
+from optodrive.daemon.server.acceptor import UNOPENED_MAX
 from optodrive.daemon.server.request_head import Rank
 from optodrive.daemon.supervisor.child import HANG_S
 from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, read_proc, wait_for
@@ -249,7 +249,7 @@ def test_connections_that_a_web_process_has_not_opened_at_its_end_are_opened_by_
     first = shared.daemon.find_process("web")
     os.kill(first, signal.SIGSTOP)
     with ThreadPoolExecutor() as pool:
-        answers = [pool.submit(ask, shared.daemon) for _ in range(2 * PERMITTED[Rank.TOKEN])]
+        answers = [pool.submit(ask, shared.daemon) for _ in range(2 * UNOPENED_MAX[Rank.TOKEN])]
         wait_for(lambda: count_sockets(shared.daemon, "acceptor", ESTABLISHED) >= len(answers), "connections")
         os.kill(first, signal.SIGKILL)
         assert all(answer.result()["display"] for answer in answers)

@@ -10,7 +10,6 @@ import select
 import signal
 import socket
 import time
-from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.reload_message import apply_reload
 from optodrive.daemon.api.tokens import Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.daemon.server.acceptor_protocol import BEAT, decode_permission, send_connection
+from optodrive.daemon.server.acceptor_protocol import BEAT, NUMBER, send_connection
 from optodrive.daemon.server.listeners import raise_descriptor_limit
 from optodrive.daemon.server.request_head import Rank, parse_head, peek_head, rank_request
 from optodrive.daemon.server.waiting_room import Waiting, WaitingRoom
@@ -34,6 +33,8 @@ TURN_MAX_S = 0.05
 """Interval of the beats, and longest wait of the loop."""
 BUSY_PAUSE_S = 0.003
 """Pause after a turn that left something to accept: real-time work must leave time for the other processes."""
+UNOPENED_MAX = {Rank.STOP: 16, Rank.TOKEN: 2, Rank.OTHER: 1}
+"""Connections that the web process has got and not opened. The order is that in which they are handed over."""
 NICE = -15
 """Priority where real-time scheduling is not permitted."""
 
@@ -80,7 +81,6 @@ class Acceptor:
         self._listener = open_unix_listener(path, 0o600, 1, "socket of the acceptor process", socket.SOCK_SEQPACKET)
         self._listener.setblocking(False)
         self._web: socket.socket | None = None
-        self._permitted: Counter[Rank] = Counter()
         self._unopened: dict[int, Waiting] = {}  # handed over; another web process gets them if this one ends before
         self._handed_over = 0
         self._beat_at_s = self._room_at_s = 0.0
@@ -118,7 +118,7 @@ class Acceptor:
         if self._listener.fileno() in ready:
             self._accept_web()
         if self._web is not None and self._web.fileno() in ready:
-            self._receive_permission(self._web)
+            self._receive_confirmation(self._web)
         self._hand_over()
         if now_s >= self._beat_at_s:
             self._beat_at_s = now_s + TURN_MAX_S
@@ -185,16 +185,15 @@ class Acceptor:
         self._web = web
 
     def _lose_web(self) -> None:
-        self._permitted.clear()
         while self._unopened:
             self._room.put_back(self._unopened.popitem()[1])
         if self._web is not None:
             self._web.close()
             self._web = None
 
-    def _receive_permission(self, web: socket.socket) -> None:
+    def _receive_confirmation(self, web: socket.socket) -> None:
         try:
-            data = web.recv(4096)
+            data = web.recv(NUMBER.size)
         except BlockingIOError:
             return
         except OSError:
@@ -202,18 +201,17 @@ class Acceptor:
         if not data:
             self._lose_web()
             return
-        rank, number = decode_permission(data)
-        self._permitted[rank] += 1
-        if number in self._unopened:
-            self._unopened.pop(number).sock.close()
+        opened = self._unopened.pop(NUMBER.unpack(data)[0], None)
+        if opened is not None:
+            opened.sock.close()
 
     def _hand_over(self) -> None:
-        """Hand over the connections that the web process accepts, the highest rank first."""
-        for rank in Rank:
-            while self._web is not None and self._permitted[rank] and self._room.count(rank):
-                if not self._send(self._web, self._room.take(rank)):
+        """Hand over as many connections as the web process may have unopened, the highest rank first."""
+        for rank, unopened_max in UNOPENED_MAX.items():
+            unopened = sum(waiting.rank is rank for waiting in self._unopened.values())
+            for _ in range(min(unopened_max - unopened, self._room.count(rank))):
+                if self._web is None or not self._send(self._web, self._room.take(rank)):
                     return
-                self._permitted[rank] -= 1
 
     def _send(self, web: socket.socket, waiting: Waiting) -> bool:
         self._handed_over += 1

@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from optodrive.daemon.server.acceptor_protocol import NO_CONNECTION, encode_permission, receive_packet
-from optodrive.daemon.server.request_head import Rank
+from optodrive.daemon.server.acceptor_protocol import NUMBER, receive_packet
 from optodrive.daemon.server.waiting_room import Waiting
 
 RETRY_S = 0.05
@@ -17,14 +16,12 @@ STALL_S = 0.5
 """A loop that was away for longer was stalled itself, and judges nobody by the time that has passed."""
 PACKETS_MAX = 16
 """Packets taken per turn of the loop."""
-PERMITTED = {Rank.STOP: 16, Rank.TOKEN: 2, Rank.OTHER: 1}
-"""Connections that the acceptor may hand over before the first of them is opened."""
 
 
 class AcceptorClient:
     """Connection to the acceptor, which connects again after its end. The event loop's thread calls everything.
 
-    on_connection: receives each connection, and owns it; it calls `permit` when the next may come
+    on_connection: receives each connection, and owns it; it calls `confirm` when the next may come
     on_connected: called before the first connection may come; on_lost: after the end of the acceptor's process
     """
 
@@ -65,15 +62,12 @@ class AcceptorClient:
         self._socket, self._beaten_s = link, time.monotonic()
         loop.add_reader(link, self._receive, link)
         self.on_connected()
-        for rank, count in PERMITTED.items():
-            for _ in range(count):
-                self.permit(rank)
 
-    def permit(self, rank: Rank, opened: int = NO_CONNECTION) -> None:
-        """Permit one more connection of a rank. opened: number of the connection that has been opened or closed."""
+    def confirm(self, number: int) -> None:
+        """Report that a connection has been opened or closed."""
         if self._socket is not None:
             try:
-                self._socket.send(encode_permission(rank, opened))
+                self._socket.send(NUMBER.pack(number))
             except OSError:
                 self._lose()
 

@@ -1,7 +1,7 @@
 """Packets between acceptor and web process, on a Unix socket that preserves message boundaries.
 
 acceptor → web: a beat, or a connection with its number, its rank and the time of its head
-web → acceptor: a permission for one more connection of a rank, with the number of the connection that it has opened
+web → acceptor: the number of a connection that it has opened or closed, after which one more of its rank may come
 """
 
 import socket
@@ -12,10 +12,8 @@ from optodrive.daemon.server.timed_socket import TimedSocket
 from optodrive.daemon.server.waiting_room import Waiting
 
 BEAT = b"beat"
-NO_CONNECTION = 0
-"""Number in a permission that follows no connection."""
 _CONNECTION = struct.Struct("<QBd")
-_PERMISSION = struct.Struct("<QB")
+NUMBER = struct.Struct("<Q")
 
 
 def send_connection(link: socket.socket, waiting: Waiting) -> None:
@@ -33,14 +31,3 @@ def receive_packet(link: socket.socket) -> Waiting | bytes:
     sock.setblocking(False)
     number, rank, since_s = _CONNECTION.unpack(data)
     return Waiting(sock, since_s, Rank(rank), number)
-
-
-def encode_permission(rank: Rank, number: int) -> bytes:
-    """Encode a permission."""
-    return _PERMISSION.pack(number, rank)
-
-
-def decode_permission(data: bytes) -> tuple[Rank, int]:
-    """Decode a permission into its rank and the number of the opened connection."""
-    number, rank = _PERMISSION.unpack(data)
-    return Rank(rank), number

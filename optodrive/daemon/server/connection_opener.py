@@ -14,7 +14,7 @@ RETRY_S = 0.02
 
 
 class ConnectionOpener:
-    """Opens connections, and permits the acceptor to hand over the next ones."""
+    """Opens connections, and confirms them to the acceptor, which then hands over the next ones."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class ConnectionOpener:
         else:
             self._hold(waiting)
             return
-        self._loop.call_soon(self._acceptor.permit, waiting.rank, waiting.number)
+        self._loop.call_soon(self._acceptor.confirm, waiting.number)
 
     def _hold(self, waiting: Waiting) -> None:
         def retry() -> None:

@@ -14,8 +14,8 @@ from optodrive.core.ipc import MessageSocket
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.server import acceptor_client, waiting_room
-from optodrive.daemon.server.acceptor import Acceptor
-from optodrive.daemon.server.acceptor_client import PERMITTED, AcceptorClient
+from optodrive.daemon.server.acceptor import UNOPENED_MAX, Acceptor
+from optodrive.daemon.server.acceptor_client import AcceptorClient
 from optodrive.daemon.server.listeners import open_tcp_listener
 from optodrive.daemon.server.request_head import Rank, parse_head
 from optodrive.device.config_sections import DaemonSection
@@ -171,19 +171,19 @@ async def await_beats(client):
             await asyncio.sleep(0.01)
 
 
-def test_a_connection_is_handed_over_with_its_request_if_its_rank_is_permitted(rig):
+def test_a_connection_is_handed_over_with_its_request_while_few_of_its_rank_are_unopened(rig):
     for rank in reversed(Rank):
         for _ in range(4):
             rig.send(build_head(*HEADERS[rank]))
 
     async def act(client, taken):
-        first = await await_count(client, taken, 4 + PERMITTED[Rank.TOKEN] + PERMITTED[Rank.OTHER])
+        first = await await_count(client, taken, 4 + UNOPENED_MAX[Rank.TOKEN] + UNOPENED_MAX[Rank.OTHER])
         assert taken[0].sock.recv(1000) == build_head(*HEADERS[Rank.STOP])
-        client.permit(Rank.OTHER)
+        client.confirm(next(waiting.number for waiting in taken if waiting.rank is Rank.OTHER))
         return first, await await_count(client, taken, len(first) + 1)
 
     first, later = run_client(rig, act)
-    assert first == [Rank.STOP] * 4 + [Rank.TOKEN] * PERMITTED[Rank.TOKEN] + [Rank.OTHER] * PERMITTED[Rank.OTHER]
+    assert first == [Rank.STOP] * 4 + [Rank.TOKEN] * UNOPENED_MAX[Rank.TOKEN] + [Rank.OTHER] * UNOPENED_MAX[Rank.OTHER]
     assert later == [*first, Rank.OTHER]
 
 
@@ -192,7 +192,7 @@ def open_first_of(count):
 
     async def act(client, taken):
         ranks = await await_count(client, taken, count)
-        client.permit(Rank.TOKEN, taken[0].number)
+        client.confirm(taken[0].number)
         await await_beats(client)
         return ranks
 

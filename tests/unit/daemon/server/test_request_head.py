@@ -1,10 +1,16 @@
 """Ranks of requests by their heads, as they wait in a socket."""
 
 import socket
+import string
+from urllib.parse import unquote
 
+import h11
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from optodrive.daemon.api.access_policy import AccessPolicy
+from optodrive.daemon.api.request_line import join_headers, normalise_path
 from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.server.request_head import HEAD_MAX_BYTES, Rank, is_complete, parse_head, peek_head, rank_request
 from optodrive.device.config_sections import DaemonSection
@@ -63,10 +69,26 @@ def test_a_token_in_the_body_gives_no_rank(policy):
     assert rank_request(parse_head(head.encode()), policy) is Rank.OTHER
 
 
-def test_a_head_is_parsed_as_the_server_does():
-    request = parse_head(b"GET /v1/plans/p%31?x=1 HTTP/1.1\r\nHost:  a:1 \r\nX-Y: b: c\r\nbroken\r\n\r\nbody: 1")
-    assert (request.method, request.path) == ("GET", "/v1/plans/p1")
-    assert request.headers == {"host": "a:1", "x-y": "b: c"}
+TOKEN = st.text(string.ascii_letters + string.digits + "!#$%&'*+-.^_`|~", min_size=1)
+VALUE = st.text(string.printable[:95], max_size=40)
+TARGET = st.text(string.ascii_letters + string.digits + "/?%:@.-_~", max_size=40).map("/".__add__)
+
+
+@given(TOKEN, TARGET, st.lists(st.tuples(TOKEN.map("X-".__add__), VALUE)), st.binary(max_size=20))
+def test_a_head_is_parsed_as_the_server_does(method, target, headers, body):
+    lines = [f"{method} {target} HTTP/1.1", "Host:  a:1 ", *(f"{name}: {value}" for name, value in headers), "", ""]
+    head = "\r\n".join(lines).encode()
+    request = parse_head(head + body)
+    server = h11.Connection(h11.SERVER)
+    server.receive_data(head)
+    event = server.next_event()
+    assert request.method == event.method.decode()
+    assert request.path == normalise_path(unquote(event.target.decode().partition("?")[0]))
+    assert request.headers == join_headers((name.decode(), value.decode()) for name, value in event.headers)
+
+
+def test_a_line_without_a_colon_and_the_body_are_no_headers():
+    assert parse_head(b"GET / HTTP/1.1\r\nHost: a\r\nbroken\r\n\r\nbody: 1").headers == {"host": "a"}
 
 
 @pytest.mark.parametrize(
