@@ -1,4 +1,4 @@
-"""Real-time scheduling of threads."""
+"""Priority of threads on the processor."""
 
 import os
 from contextlib import suppress
@@ -16,6 +16,12 @@ def set_realtime_priority(priority: int) -> None:
     policy = os.SCHED_OTHER if priority == USUAL else os.SCHED_RR
     with suppress(OSError):
         os.sched_setscheduler(0, policy, os.sched_param(priority))
+
+
+def set_nice(nice: int) -> None:
+    """Set the niceness of this thread and of all threads and processes that it starts later, if that is permitted."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
 
 
 def use_usual_priority() -> None:

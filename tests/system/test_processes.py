@@ -16,11 +16,11 @@ import httpx
 import pytest
 
 from optodrive.core.scheduling import LIGHT, PLANNING
-from optodrive.daemon.priority import NICE
 from optodrive.daemon.server import acceptor
 from optodrive.daemon.server.acceptor import UNOPENED_MAX
 from optodrive.daemon.server.request_head import Rank
 from optodrive.daemon.supervisor.child import HANG_S
+from optodrive.daemon.supervisor.daemon import NICE
 from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, read_proc, wait_for
 from signalled_processes import EMITTING_STATES, assert_dark_within_lease, assert_stayed_dark
 

@@ -5,18 +5,16 @@ run in real time, and STOP reaches the board no matter what the web process does
 request as any other: it answers, and writes the audit log.
 """
 
-import os
 import select
 import signal
 import socket
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from optodrive.core.beat import BeatWriter, SupervisorGoneError
 from optodrive.core.clock import MonotonicClock
-from optodrive.core.scheduling import LIGHT, set_realtime_priority
+from optodrive.core.scheduling import LIGHT, set_nice, set_realtime_priority
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.reload_message import apply_reload
@@ -43,8 +41,7 @@ def run_acceptor(
     folder: RuntimeFolder, beat: BeatWriter, listeners: list[socket.socket], tokens: Tokens, daemon: DaemonSection
 ) -> None:
     """Keep the acceptor until SIGTERM or the end of the supervisor. listeners: sockets that listen already."""
-    with suppress(OSError):  # not permitted to every user
-        os.setpriority(os.PRIO_PROCESS, 0, NICE)
+    set_nice(NICE)
     set_realtime_priority(LIGHT)
     raise_descriptor_limit()
     acceptor = Acceptor(

@@ -11,15 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from optodrive.core.beat import BeatWriter
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
 from optodrive.core.forking import execute_module, fork_with_beat
+from optodrive.core.scheduling import set_nice
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES
 from optodrive.daemon.api.tokens import Tokens, load_daemon_tokens
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
-from optodrive.daemon.priority import raise_priority
 from optodrive.daemon.reload import ConfigReloader
 from optodrive.daemon.runtime_folder import SHARED_LINK_MODE, RuntimeFolder, open_runtime_folder
 from optodrive.daemon.server.listeners import BACKLOG, build_local_url, open_tcp_listener
@@ -36,6 +37,8 @@ from optodrive.link.transport.registry import find_transport_factory
 if TYPE_CHECKING:
     from optodrive.planning.display_model import DisplayModel
 
+NICE = -10
+"""Priority of the daemon's processes, as the systemd unit sets it; less than real time, which link has."""
 M_ARENA_MAX = -8
 LINK_MODULE = "optodrive.link.service.process"
 
@@ -60,7 +63,7 @@ def run(
             find_transport_factory(build_port_settings(stage))  # refuses a Helios
         if capture_path is not None and capture_path.exists():
             raise InputError("--capture", str(capture_path), "a name that is free: nothing is overwritten")
-        raise_priority()  # every process inherits it, link while it still loads
+        set_nice(NICE)  # every process inherits it, link while it still loads
         clock = MonotonicClock()
         notifier = Notifier(clock)
         exit_stack.callback(notifier.close)
@@ -150,37 +153,25 @@ def _build_starts(
     from optodrive.daemon.server.web_process import run_web
 
     memory = ThermalMemory()
+    kept = {"acceptor": [listener.fileno() for listener in listeners]}
+    targets: dict[str, Callable[[BeatWriter, int], None]] = {
+        "planner": lambda beat, number: run_planner(display, folder, beat, number_path(session_path, number), memory),
+        "preview": lambda beat, number: run_preview(display, folder, beat),
+        "acceptor": lambda beat, number: run_acceptor(folder, beat, listeners, reloader.tokens, reloader.config.daemon),
+        "web": lambda beat, number: run_web(display, folder, beat, reloader.tokens, reloader.config.daemon),
+    }
 
-    def start_planner(channel: socket.socket, number: int) -> int:
-        path = None if session_path is None else number_path(session_path, number)
+    def start(name: str, channel: socket.socket, number: int) -> int:
         return fork_with_beat(
-            lambda beat: run_planner(display, folder, beat, path, memory), "opto-planner", channel.fileno()
+            lambda beat: targets[name](beat, number), f"opto-{name}", channel.fileno(), kept.get(name, ())
         )
 
-    def start_preview(channel: socket.socket, number: int) -> int:
-        return fork_with_beat(lambda beat: run_preview(display, folder, beat), "opto-preview", channel.fileno())
-
-    def start_acceptor(channel: socket.socket, number: int) -> int:
-        return fork_with_beat(
-            lambda beat: run_acceptor(folder, beat, listeners, reloader.tokens, reloader.config.daemon),
-            "opto-acceptor",
-            channel.fileno(),
-            [listener.fileno() for listener in listeners],
-        )
-
-    def start_web(channel: socket.socket, number: int) -> int:
-        return fork_with_beat(
-            lambda beat: run_web(display, folder, beat, reloader.tokens, reloader.config.daemon),
-            "opto-web",
-            channel.fileno(),
-        )
-
-    return {"planner": start_planner, "preview": start_preview, "acceptor": start_acceptor, "web": start_web}
+    return {name: partial(start, name) for name in targets}
 
 
-def number_path(path: Path, number: int) -> Path:
+def number_path(path: Path | None, number: int) -> Path | None:
     """Return the path of a recording for a start of its process, because a recording never replaces a file."""
-    return path if number == 1 else path.with_stem(f"{path.stem}-{number}")
+    return path if path is None or number == 1 else path.with_stem(f"{path.stem}-{number}")
 
 
 def _announce(config: Config, address: str, unix: Path | None, tokens: Tokens, tokens_path: Path, is_new: bool) -> None:
