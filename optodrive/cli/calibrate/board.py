@@ -119,8 +119,8 @@ def measure_on_board(
     from optodrive.core.clock import MonotonicClock
     from optodrive.lab.calibration.field_prior import FieldPrior
     from optodrive.lab.commissioning.calibration_session import CalibrationSession
-    from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.measurement_loop import MeasurementLoop, fit_and_warm_up
+    from optodrive.lab.commissioning.spot_bounds import check_spot_power
     from optodrive.lab.commissioning.spot_locator import ManualLocator, SensorLocator
     from optodrive.lab.commissioning.worker_process import WorkerProcess
 

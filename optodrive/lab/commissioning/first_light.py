@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 from optodrive.core.errors import InputError
 from optodrive.device.config import Config
-from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, max_spot_power_w
+from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.commissioning.homing import DARK_STEPS, Homing, HomingResult
+from optodrive.lab.commissioning.spot_bounds import max_spot_power_w
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 
 DUTY_SHARE = 0.01
