@@ -71,10 +71,12 @@ class Physics:
     droop_by_power: bool = False
     power: str = ""  # "", "threshold", "threshold_full", "curvature"
     power_size: float = 0.0
-    ageing: str = ""  # "", "linear", "saturating"
+    ageing: str = ""  # by dose "linear", "saturating"; over the session "by_time", "by_run", "step"; "" for none
     ageing_loss: float = 0.0
     ageing_dose: float = 1.0  # J at which the loss is reached
     ageing_knee: float = 0.4  # saturating: share of that dose
+    ageing_s: float = 1.0  # by_time: duration until the loss is reached; step: its time
+    ageing_runs: float = 1.0  # by_run: number of runs until the loss is reached
     stray_pixel: int = -1
     stray: float = 0.0
 
@@ -114,6 +116,15 @@ class Physics:
     hum_signal: str = ""
     hum: float = 0.0
     hum_phase: float = 0.0
+    hum_hz: float = 50.0
+    hum_is_random: bool = False  # another phase in every run
+    jump_signal: str = ""  # telegraph of one instrument's zero
+    jump: float = 0.0
+    jump_rate: float = 0.0
+    wander_signal: str = ""  # drift of one instrument's zero over the session
+    wander: float = 0.0
+    wander_s: float = 1.0
+    wander_phase: float = 0.0  # 0: a ramp
     after: str = ""  # "", "flat", "fading"
     after_s: float = 0.0
     after_share: float = 1.0
@@ -406,8 +417,14 @@ def compute_delivered_w(p: Physics, commanded_w: float) -> float:
     return commanded_w
 
 
-def compute_absorption(p: Physics, dose_j: float) -> float:
-    """Return the remaining share of the absorption after a dose."""
+def compute_absorption(p: Physics, dose_j: float, session_s: float, run: int) -> float:
+    """Return the remaining share of the absorption after a dose, in a run at a time of the session."""
+    if p.ageing == "by_time":
+        return 1.0 - p.ageing_loss * session_s / p.ageing_s
+    if p.ageing == "by_run":
+        return 1.0 - p.ageing_loss * run / p.ageing_runs
+    if p.ageing == "step":
+        return 1.0 - p.ageing_loss * (session_s > p.ageing_s)
     x = dose_j / p.ageing_dose
     if p.ageing == "linear":
         return 1.0 - p.ageing_loss * x
@@ -417,7 +434,14 @@ def compute_absorption(p: Physics, dose_j: float) -> float:
 
 
 def _build_segments(
-    p: Physics, pulses: np.ndarray, pixel: int, end: float, factor: float, dose: float, noise_seed: int
+    p: Physics,
+    pulses: np.ndarray,
+    pixel: int,
+    end: float,
+    factor: float,
+    dose: float,
+    noise_seed: int,
+    session_s: float = 0.0,
 ):
     """Return the drive as segments with smooth power."""
     rng = np.random.default_rng([noise_seed, 77])
@@ -443,7 +467,7 @@ def _build_segments(
         power = compute_delivered_w(p, commanded) * factor
         wall = 0.0
         if own:
-            power *= compute_absorption(p, dose)
+            power *= compute_absorption(p, dose, session_s, noise_seed % 1000)
             dose += commanded * width
         if int(pulsed) == p.stray_pixel:
             wall = p.stray
@@ -528,12 +552,14 @@ def simulate_signals(
     thermal = [name for name in times if name not in MIRRORS]
     if thermal:
         end = max(max(float(query_s[name][-1]) for name in thermal), 1e-3) + 1e-6
-        segments = _build_segments(p, np.asarray(pulses, float).reshape(-1, 4), pixel, end, factor, dose_j, noise_seed)
+        segments = _build_segments(
+            p, np.asarray(pulses, float).reshape(-1, 4), pixel, end, factor, dose_j, noise_seed, session_s
+        )
         v = _pack_parameters(p, ambient_k)
         steps = _integrate(v, segments, _compute_max_step_s(p) / refinement, 2e-6 / refinement)
         for name in thermal:
             result[name] = _simulate_instrument(
-                p, name, segments, steps, query_s[name], times[name], ambient_k, session_s
+                p, name, segments, steps, query_s[name], times[name], ambient_k, session_s, noise_seed
             )
     for name in times:
         if name in MIRRORS:
@@ -542,7 +568,9 @@ def simulate_signals(
     return result
 
 
-def _simulate_instrument(p: Physics, name, segments, steps, query_s, shown_t_s, ambient_k, session_s) -> np.ndarray:
+def _simulate_instrument(
+    p: Physics, name, segments, steps, query_s, shown_t_s, ambient_k, session_s, noise_seed
+) -> np.ndarray:
     grid, values, slopes = steps
     if name == TEMPERATURE:
         if p.sensor == "moving_average":
@@ -569,7 +597,17 @@ def _simulate_instrument(p: Physics, name, segments, steps, query_s, shown_t_s, 
     else:
         result = p.phi * _interpolate(grid, values, slopes, OUT_GAS, query_s)
     if p.hum_signal == name:
-        result = result + p.hum * np.sin(2 * math.pi * 50.0 * shown_t_s + p.hum_phase)
+        phase = p.hum_phase
+        if p.hum_is_random:
+            phase = float(np.random.default_rng([noise_seed, 78]).uniform(0.0, 2.0 * math.pi))
+        result = result + p.hum * np.sin(2 * math.pi * p.hum_hz * shown_t_s + phase)
+    if p.jump_signal == name:
+        rng = np.random.default_rng([noise_seed, 79])
+        jumps = np.sort(rng.uniform(0.0, shown_t_s[-1], rng.poisson(p.jump_rate * shown_t_s[-1])))
+        result = result + p.jump * (np.searchsorted(jumps, shown_t_s) % 2)
+    if p.wander_signal == name:
+        x = session_s / p.wander_s
+        result = result + p.wander * (math.sin(2 * math.pi * x + p.wander_phase) if p.wander_phase else x)
     return result
 
 

@@ -133,12 +133,14 @@ class _Session:
     scene: SessionScale
 
 
-def _build_session(base: Physics, instruments: Instruments, design: list[Experiment], seeds: list[int]) -> _Session:
+def build_session(base: Physics, instruments: Instruments, design: list[Experiment], seeds: list[int]) -> _Session:
+    """Return the session of a design, with its bench."""
     runs = build_session_runs(np.random.default_rng(seeds), design, instruments, drop=0.06)
     return _Session(base, instruments, design, runs, build_bench(base, instruments, runs), build_scene(base, runs))
 
 
-def _is_too_hot(session: _Session, truth: Physics) -> bool:
+def is_too_hot(session: _Session, truth: Physics) -> bool:
+    """Return whether a pulse on the measured pixel burns its absorber."""
     pulsed = {r.experiment.name: r.experiment for r in session.runs if len(r.experiment.pulses)}
     own = [e for e in pulsed.values() if e.pulses[0, 3] == e.pixel]
     return any(compute_max_rise_k(truth, e.pulses, e.pixel) > MAX_ABSORBER_K for e in own)
@@ -153,8 +155,8 @@ def _draw_detectable_effects(
         effects = tuple(d(rng, session.scene) for d in draws)
         truth = apply_effects(session.base, effects)
         trial = session
-        while _is_too_hot(trial, truth):
-            trial = _build_session(session.base, session.instruments, reduce_power(trial.design, 0.88), seeds)
+        while is_too_hot(trial, truth):
+            trial = build_session(session.base, session.instruments, reduce_power(trial.design, 0.88), seeds)
         shown = simulate_ideal_rises(trial.base, trial.runs, truth)
         if trial.bench.sigma(shown, refits=1) < min_sigma:
             continue
@@ -183,7 +185,7 @@ def _draw_session(seeds: list[int], chosen: tuple[str, ...]) -> tuple[Rng, _Sess
     pixels = "beam_misalignment" in chosen or rng.random() < 0.2
     mirrors = "mirror_lag" in chosen or rng.random() < 0.25
     design = draw_design(rng, base, instruments, pixels=pixels, mirrors=mirrors)
-    return rng, _build_session(base, instruments, design, [*seeds, 1]), width
+    return rng, build_session(base, instruments, design, [*seeds, 1]), width
 
 
 def draw_case(

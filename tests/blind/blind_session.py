@@ -337,7 +337,15 @@ def _select_times(run: Run) -> dict[str, np.ndarray]:
 
 def simulate_ideal_rises(base: Physics, runs: list[Run], truth: Physics) -> list[dict[str, np.ndarray]]:
     """Return the noise-free signals: rises above ambient, mirrors relative to their commands."""
-    each = bool(truth.ageing or truth.room or truth.hop or truth.missed)
+    each = bool(
+        truth.ageing
+        or truth.room
+        or truth.hop
+        or truth.missed
+        or truth.hum_is_random
+        or truth.jump_signal
+        or truth.wander_signal
+    )
     kept: dict[str, dict[str, np.ndarray]] = {}
     result = []
     for run in runs:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.diagnosis import candidate_judgement
-from optodrive.lab.diagnosis.candidate_judgement import judge_candidates
+from optodrive.lab.diagnosis.candidate_judgement import NOISE_CHI2, judge_candidates
 from optodrive.lab.diagnosis.detection import NOISE_KNOWN_DEGREES, Detection, Score
 from optodrive.lab.diagnosis.evidence import Explanation, compute_probabilities, compute_score_evidence
 from optodrive.lab.diagnosis.model_selection import Verdict
@@ -16,8 +16,6 @@ from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
 KEYS = sorted(discover_terms())
-NOISE_OF_EVIDENCE = 3.0
-"""Difference of log evidence, 6 in χ², that noise alone gives."""
 evidences = st.lists(st.floats(-50.0, 1e6), min_size=2, max_size=len(KEYS))
 degrees = st.sampled_from([8, 20, NOISE_KNOWN_DEGREES])
 
@@ -39,17 +37,23 @@ def test_probabilities_sum_to_one(values, none_of_these, noise_degrees):
     assert both.no_effect + both.none_of_these + sum(both.causes.values()) == pytest.approx(1.0)
 
 
-def judge(values, noise_degrees):
-    """Return the judgement of each cause beside the others."""
-    found = explain(values, 0.0, noise_degrees)
+def judge(chi2, occam, refitted, noise_degrees, nominal_chi2=1e5):
+    """Return the judgement of each cause, and their probabilities.
+
+    chi2: of each cause's fit; occam: what its log evidence loses by its parameters; refitted: the others count by score
+    """
+    found = explain([0.5 * (nominal_chi2 - a) - b for a, b in zip(chi2, occam, strict=True)], 0.0, noise_degrees)
+    hypotheses = {key: Hypothesis(key, key, ({},), ()) for key in KEYS[: len(chi2)]}
+    fits = dict(zip(hypotheses, chi2, strict=True))
     scores = tuple(
-        Score(Hypothesis(key, key, ({},), ()), {}, 2.0 * value + 100.0, (1.0,), (0,), 1.0, 1.0)
-        for key, value in zip(KEYS, values, strict=False)
+        Score(item, {}, nominal_chi2 - fits[key], (1.0,), (0,), 1.0, 1.0) for key, item in hypotheses.items()
     )
+    ranked = [keys[0] for keys, _ in found.ranked if refitted[KEYS.index(keys[0])]]
+    refits = tuple(SimpleNamespace(hypotheses=(hypotheses[key],), chi2=fits[key]) for key in ranked)
     detection = Detection(scores, SimpleNamespace(), 0.0)
     chosen = SimpleNamespace(hypotheses=())
-    verdict = Verdict("cause", (), found, chosen, (), detection)
-    return {item.cause: item.verdict for item in judge_candidates(verdict, {})}
+    verdict = Verdict("ambiguous", (), found, chosen, refits, detection, nominal_chi2)
+    return {item.cause: item.verdict for item in judge_candidates(verdict, {})}, found
 
 
 @pytest.fixture(autouse=True)
@@ -57,19 +61,40 @@ def without_limits(monkeypatch):
     monkeypatch.setattr(candidate_judgement, "_describe_detection_limit", lambda score: "")
 
 
-@given(evidences, st.data(), degrees)
-def test_no_rival_within_the_noise_of_the_winner_is_ruled_out(values, data, noise_degrees):
-    winner = max(range(len(values)), key=values.__getitem__)
-    near = data.draw(st.integers(0, len(values) - 1).filter(lambda row: row != winner))
-    values[near] = values[winner] - data.draw(st.floats(0.0, NOISE_OF_EVIDENCE))
-    found = explain(values, 0.0, noise_degrees)
-    if found.causes[(KEYS[winner],)] < 0.05:  # no winner
-        return
-    assert judge(values, noise_degrees)[KEYS[near]] == "possible"
+@st.composite
+def fitted_candidates(draw):
+    """Draw χ², Occam's factor and whether it is refitted, of some causes: many of them near the best one."""
+    count = draw(st.integers(2, len(KEYS)))
+    best = draw(st.floats(0.0, 9e4))
+    chi2 = [best + draw(st.sampled_from([0.0, 2.0, 6.0, 9.0, 50.0, 1e4])) for _ in range(count)]
+    occam = draw(st.lists(st.floats(0.0, 40.0), min_size=count, max_size=count))
+    refitted = draw(st.lists(st.booleans(), min_size=count, max_size=count).filter(any))
+    return chi2, occam, refitted
 
 
-def test_a_rival_far_behind_is_ruled_out():
-    assert judge([100.0, 50.0], NOISE_KNOWN_DEGREES)[KEYS[1]] == "ruled out"
+@given(fitted_candidates(), degrees)
+def test_no_rival_within_the_noise_of_the_winner_is_ruled_out(candidates, noise_degrees):
+    chi2, occam, refitted = candidates
+    judgements, found = judge(chi2, occam, refitted, noise_degrees)
+    ranked = [KEYS.index(keys[0]) for keys, _ in found.ranked]
+    winner = next(row for row in ranked if refitted[row])
+    for row, value in enumerate(chi2):
+        evidence = -0.5 * value - occam[row]
+        if value <= chi2[winner] + NOISE_CHI2 or evidence >= -0.5 * chi2[winner] - occam[winner] - 0.5 * NOISE_CHI2:
+            assert judgements[KEYS[row]] == "possible"
+
+
+@pytest.mark.parametrize("is_refitted", [True, False])
+def test_a_rival_far_behind_is_ruled_out(is_refitted):
+    judgements, _ = judge([100.0, 200.0], [0.0, 0.0], [True, is_refitted], NOISE_KNOWN_DEGREES)
+    assert judgements[KEYS[1]] == "ruled out"
+
+
+def test_nothing_is_ruled_out_where_nothing_could_be_compared():
+    found = Probabilities(0.005, 0.995, dict.fromkeys([(KEYS[0],)], 0.0))
+    score = Score(Hypothesis(KEYS[0], KEYS[0], ({},), ()), {}, 500.0, (1.0,), (0,), 1.0, 1.0)
+    verdict = Verdict("unexplained", (), found, None, (), Detection((score,), SimpleNamespace(), 0.0), 1e5)
+    assert judge_candidates(verdict, {})[0].verdict == "possible"
 
 
 @given(st.floats(0.0, 1e4), st.floats(0.0, 1e4))

@@ -12,6 +12,8 @@ DETECTABLE_RATIO = 30.0
 """Likelihood ratio of an effect that is detected nine times in ten."""
 MAX_RULED_OUT = 1e-4
 """Probability up to which a cause is ruled out."""
+NOISE_CHI2 = 6.0
+"""Difference of χ² to the best fit that noise alone gives: no cause so near is ruled out, however improbable."""
 MIN_INDEPENDENT_FRACTION = 1e-4
 """Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
 
@@ -22,6 +24,7 @@ def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candida
     gains: reduction on held-out runs by label
     """
     chosen = verdict.chosen
+    near = _list_near(verdict)
     out = []
     for score in verdict.nominal_detection.scores:
         item = score.hypothesis
@@ -32,7 +35,7 @@ def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candida
             judgement = "indistinguishable" if verdict.verdict == "ambiguous" else "alternative form"
         elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
             judgement = "not observable"
-        elif probability > MAX_RULED_OUT:
+        elif probability > MAX_RULED_OUT or item.label in near:
             judgement = "possible"
         else:
             judgement = "not detected" if score.ratio < DETECTABLE_RATIO else "ruled out"
@@ -48,6 +51,21 @@ def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candida
             )
         )
     return tuple(out)
+
+
+def _list_near(verdict: Verdict) -> set[str]:
+    """Return the labels of the hypotheses whose χ², by their refit or by their score, is near the winner's.
+
+    A prior or an Occam's factor makes such a hypothesis improbable, but the data do not exclude it.
+    """
+    nominal = verdict.nominal_chi2
+    winner = nominal if verdict.verdict == "none" or not verdict.candidates else verdict.candidates[0].chi2
+    refits: dict[str, float] = {}
+    for item in verdict.candidates:
+        for part in item.hypotheses:
+            refits[part.label] = min(refits.get(part.label, item.chi2), item.chi2)
+    scores = {score.hypothesis.label: nominal - score.ratio for score in verdict.nominal_detection.scores}
+    return {label for label, chi2 in (scores | refits).items() if chi2 <= winner + NOISE_CHI2}
 
 
 def _describe_detection_limit(score: Score) -> str:

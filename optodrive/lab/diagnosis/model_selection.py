@@ -80,7 +80,7 @@ class Verdict:
     """Verdict on a subsystem.
 
     chosen: the model for all later steps; candidates: refits, best first; nominal_detection: beside the nominal fit;
-    explained_fraction: share of the detected excess
+    nominal_chi2: of that fit; explained_fraction: share of the detected excess
     """
 
     verdict: str
@@ -89,6 +89,7 @@ class Verdict:
     chosen: RefittedCandidate | None
     candidates: tuple[RefittedCandidate, ...]
     nominal_detection: Detection
+    nominal_chi2: float
     explained_fraction: float = 0.0
 
 
@@ -123,7 +124,7 @@ def select_causes(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothes
     nominal_detection = detect(problem, base, hypotheses, log)
     if has_replicate_excess(problem):
         probabilities = Probabilities(1.0 - CERTAIN, CERTAIN, {(item.key,): 0.0 for item in hypotheses})
-        return Verdict("unexplained", (), probabilities, None, (), nominal_detection)
+        return Verdict("unexplained", (), probabilities, None, (), nominal_detection, base.chi2)
     singles = refit_strongest(problem, base, (), nominal_detection.scores, log)
     return select_from(problem, base, hypotheses, nominal_detection, singles, log)
 
@@ -156,7 +157,7 @@ def select_from(
             _examine(problem, base, hypotheses, item, examined, log)
     explanations = _list_explanations(problem, base, hypotheses, nominal_detection, [*singles, *pairs], examined)
     probabilities = compute_probabilities(explanations, count_noise_degrees(problem.data))
-    return _build_verdict(problem, nominal_detection, [*singles, *pairs], examined, probabilities)
+    return _build_verdict(problem, base, nominal_detection, [*singles, *pairs], examined, probabilities)
 
 
 def select_near(base: ModelFit, ranked: list[RefittedCandidate]) -> list[RefittedCandidate]:
@@ -268,6 +269,7 @@ def _find_sufficient_single(
 
 def _build_verdict(
     problem: FitProblem,
+    base: ModelFit,
     nominal_detection: Detection,
     refits: list[RefittedCandidate],
     examined: _Examined,
@@ -279,9 +281,9 @@ def _build_verdict(
     ranked = [keys for keys, _ in probabilities.ranked if keys in by_causes]
     candidates = tuple(by_causes[keys] for keys in ranked)
     if probabilities.no_effect > MAX_NO_EFFECT:
-        return Verdict("none", (), probabilities, None, candidates, nominal_detection)
+        return Verdict("none", (), probabilities, None, candidates, nominal_detection, base.chi2)
     if not candidates or probabilities.none_of_these > probabilities.causes[ranked[0]]:
-        return Verdict("unexplained", (), probabilities, None, candidates, nominal_detection)
+        return Verdict("unexplained", (), probabilities, None, candidates, nominal_detection, base.chi2)
     keys = {key for keys in ranked for key in keys}
     named = tuple(sorted(key for key in keys if probabilities.sum_of(key) >= MIN_NAMED))
     if named in by_causes and probabilities.causes[named] >= MIN_ALONE and problem.noise.from_replicates:
@@ -296,6 +298,5 @@ def _build_verdict(
     rest = examined.get(best)
     explained = 0.0 if rest is None else rest.explained
     causes = tuple(dict.fromkeys(key for keys in chosen for key in by_causes[keys].causes))
-    return Verdict(
-        "cause" if named else "ambiguous", causes, probabilities, best, candidates, nominal_detection, explained
-    )
+    verdict = "cause" if named else "ambiguous"
+    return Verdict(verdict, causes, probabilities, best, candidates, nominal_detection, base.chi2, explained)
