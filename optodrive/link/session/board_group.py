@@ -18,11 +18,7 @@ for it while its link is up. The owner pauses them until it is dark for certain 
 the light of all. It counts as lost until all are disarmed.
 
 Time. One board keeps its own: `board_s` is its clock, its points follow each other by durations, and what is late is
-executed late and reported. Several keep the host's: `board_s` is the host's clock, a line is fitted to the exchanges
-with each board (`clock_sync.py`), and each point is shifted by as much as its board has drifted since the one before.
-Points leave at most `SEND_AHEAD_MAX_S` ahead, because the drift until then is a guess. A plan starts only if the error
-of every clock is below `stage_skew_max_s`, which the limiter has counted; until then exchanges repeat (`_seek_clocks`),
-for `CLOCK_PATIENCE_S`, then the start is refused by name.
+executed late and reported. Several keep the host's (`host_time.py`): `board_s` is the host's clock.
 
 Late light is not emitted. If one board would execute its next point late, all drop their points and stay armed
 (`_drop_late_points`), and the plan has failed: light out of order is not covered by any proof.
@@ -46,20 +42,14 @@ from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, LEASED_STATES, BoardState
 from optodrive.link.session.board_connector import BoardConnector
 from optodrive.link.session.board_view import BoardView
-from optodrive.link.session.clock_sync import DRIFT_MAX, ClockFit
+from optodrive.link.session.host_time import SEND_AHEAD_MAX_S, HostTime
 from optodrive.link.session.lease_renewal import LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause
-from optodrive.link.session.plan_job import PlanJob, PointTiming
+from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.session.stage_loss import LEASE_TRANSIT_MAX_S, LostStage, OnStageLoss
 from optodrive.link.session.staged_job import StagedJob
 
-SEND_AHEAD_MAX_S = 0.3
-"""Longest time for which points are sent ahead to several boards; meanwhile their clocks drift."""
-CLOCK_PATIENCE_S = 3.0
-"""Time for which a start waits until the boards' clocks are known well enough, then it is refused."""
-CLOCK_SEEK_SHARE = 0.5
-"""Clocks are compared more often while one may be further off than this share of what a start permits."""
 SUMS = ("done_index", "queued", "underruns", "crc_errors", "format_errors", "seq_errors", "laser_on_s")
 STATE_ORDER = (
     BoardState.RUNNING,
@@ -100,10 +90,9 @@ class BoardGroup:
         pairs = zip(self.sessions, open_ports, strict=True)
         self._connectors = tuple(BoardConnector(session, clock, open_port) for session, open_port in pairs)
         self._clock = clock
-        self._skew_max_s = skew_max_s
         self._refusal: str | None = None
-        self._clocks_awaited_s = clock.now_s()
         self.has_several = len(self.sessions) > 1
+        self._host_time = HostTime(clock, self.tick_s, skew_max_s, self._name) if self.has_several else None
         self.on_executed: Callable[[int, m.Executed], None] = lambda stage, message: None
         for stage, session in enumerate(self.sessions):
             session.on_executed = partial(self._forward_executed, stage)
@@ -111,12 +100,8 @@ class BoardGroup:
     def _forward_executed(self, stage: int, message: m.Executed) -> None:
         if self.sessions[stage] not in self._present:
             return
-        if self.has_several:
-            fit, tick_s = self._fit_clock(self.sessions[stage]), self.tick_s
-            records = tuple(
-                (round(fit.to_host_s(tick * tick_s) / tick_s), ticks, duty) for tick, ticks, duty in message.records
-            )
-            message = m.Executed(message.first_index, records)
+        if self._host_time is not None:
+            message = self._host_time.convert_report(self.sessions[stage], message)
         self.on_executed(stage, message)
 
     # --- state --------------------------------------------------------------------------------------------------
@@ -152,14 +137,14 @@ class BoardGroup:
     @property
     def clock_sample(self) -> tuple[float, float] | None:
         """Host time and board_s() of one moment, s, None before the first exchange with each board."""
-        if not self.has_several:
+        if self._host_time is None:
             return self.sessions[0].clock_sample
         now_s = self._clock.now_s()
         return (now_s, now_s) if all(session.clock_sync.is_synchronised for session in self._present) else None
 
     def board_s(self) -> float:
         """Return the present time on the clock of the board, or of the host if there are several boards, s."""
-        return self._clock.now_s() if self.has_several else self.sessions[0].board_s()
+        return self._clock.now_s() if self._host_time is not None else self.sessions[0].board_s()
 
     @property
     def faults(self) -> Counter[str]:
@@ -183,27 +168,12 @@ class BoardGroup:
     @property
     def is_ready(self) -> bool:
         """Whether a job may start now, or is refused because the time of a board has not become known in seconds."""
-        return self._are_boards_ready and (self._are_clocks_known or self._waited_for_clocks_s > CLOCK_PATIENCE_S)
+        time = self._host_time
+        return self._are_boards_ready and (time is None or time.are_known(self._present) or time.is_patience_over)
 
     @property
     def _are_boards_ready(self) -> bool:
         return all(session.is_ready for session in self._present)
-
-    @property
-    def _are_clocks_known(self) -> bool:
-        """Whether the time of each of several boards is known as exactly as a start needs it."""
-        return not self.has_several or all(
-            self._find_clock_error_s(session) <= self._skew_max_s for session in self._present
-        )
-
-    @property
-    def _waited_for_clocks_s(self) -> float:
-        """Time for which boards that are ready have waited until their clocks are known, s."""
-        return self._clock.now_s() - self._clocks_awaited_s
-
-    def _find_clock_error_s(self, session: BoardSession) -> float:
-        fit = session.clock_sync.fit(self._clock.now_s())
-        return inf if fit is None else fit.uncertainty_s
 
     @property
     def is_acknowledged(self) -> bool:
@@ -302,7 +272,8 @@ class BoardGroup:
         """
         self._readmit_lost()
         self._drop_late_points()
-        self._seek_clocks()
+        if self._host_time is not None:
+            self._host_time.seek(self._present, self._are_boards_ready)
         waiting = self._present[0]
         for session, connector in zip(self.sessions, self._connectors, strict=True):
             if session not in self._present or not session.connected:
@@ -346,15 +317,6 @@ class BoardGroup:
         are_idle = all(session.board.state in IDLE_STATES and session.is_acknowledged for session in self._present)
         if self.lost is not None and not self.has_arming and are_idle and self.has_lost_ended:
             self.lost, self._present = None, self.sessions
-
-    def _seek_clocks(self) -> None:
-        """Compare the clocks more often while they are not known well enough for the start of a plan."""
-        if not self.has_several:
-            return
-        for session in self._present:
-            session.seeks_clock = self._find_clock_error_s(session) > CLOCK_SEEK_SHARE * self._skew_max_s
-        if self._are_clocks_known or not self._are_boards_ready:
-            self._clocks_awaited_s = self._clock.now_s()
 
     def _drop_late_points(self) -> None:
         """Drop the points of all boards if one would execute its next point late."""
@@ -428,19 +390,17 @@ class BoardGroup:
         send_ahead_s: maximum time from sending a point to its start
         Raise NotReadyError if the time of a board is not known as exactly as several need it.
         """
-        zero_tick = round(start_s / self.tick_s)
-        if not self.has_several:
+        if self._host_time is None:
             part = self.sessions[0].begin(points.stages[0], start_s, send_ahead_s)
             return StagedJob([part], part.start_tick)
         self._require_nothing_lost(points)
-        self._require_clocks()
-        ahead_s = min(send_ahead_s, SEND_AHEAD_MAX_S)
-        parts = []
+        self._host_time.require_known(self._present)
+        zero_tick, ahead_s, parts = round(start_s / self.tick_s), min(send_ahead_s, SEND_AHEAD_MAX_S), []
         for session, one in zip(self.sessions, points.stages, strict=True):
             if session not in self._present:
                 parts.append(PlanJob(0, one, 0, 0))
                 continue
-            timing = PointTiming(zero_tick, partial(self._to_board_tick, session))
+            timing = self._host_time.build_timing(session, zero_tick)
             parts.append(session.begin(one, timing.to_board_tick(zero_tick) * self.tick_s, ahead_s, timing))
         return StagedJob(parts, zero_tick)
 
@@ -448,30 +408,6 @@ class BoardGroup:
         """Raise NotReadyError if a lost board would get points."""
         if self.lost is not None and len(points.stages[self.lost.stage]):
             raise NotReadyError(f"stage {self.names[self.lost.stage]!r} was lost: {self.lost.reason}")
-
-    def _require_clocks(self) -> None:
-        for session in self._present:
-            fit = self._fit_clock(session)
-            if fit.uncertainty_s > self._skew_max_s:
-                raise NotReadyError(
-                    f"{self._name(session)}after {self._waited_for_clocks_s:.1f} s of repeated exchanges its clock "
-                    f"is known to {1e6 * fit.uncertainty_s:.0f} µs, "
-                    f"limits.stage_skew_max_s permits {1e6 * self._skew_max_s:.0f} µs"
-                )
-            if abs(fit.rate - 1.0) > DRIFT_MAX:
-                raise NotReadyError(
-                    f"{self._name(session)}its clock drifts by {1e6 * (fit.rate - 1.0):+.0f} ppm, "
-                    f"at most {1e6 * DRIFT_MAX:.0f} ppm can be followed"
-                )
-
-    def _fit_clock(self, session: BoardSession) -> ClockFit:
-        fit = session.clock_sync.fit(self._clock.now_s())
-        if fit is None:
-            raise LinkError(f"{self._name(session)}its clock is not known")
-        return fit
-
-    def _to_board_tick(self, session: BoardSession, host_tick: int) -> float:
-        return self._fit_clock(session).to_board_s(host_tick * self.tick_s) / self.tick_s
 
     def splice(self, points: StagePoints, kept_points: Sequence[int], send_ahead_s: float) -> StagedJob | None:
         """Truncate the last job to `kept_points` points of each stage and continue with `points` without a pause.
@@ -488,8 +424,8 @@ class BoardGroup:
                 parts.append(PlanJob(0, one, 0, 0))
                 continue
             timing, last = None, session.last_job
-            if self.has_several and last is not None:
-                timing = PointTiming(last.find_host_end_tick(kept), partial(self._to_board_tick, session))
+            if self._host_time is not None and last is not None:
+                timing = self._host_time.build_timing(session, last.find_host_end_tick(kept))
             part = session.splice(one, kept, min(send_ahead_s, SEND_AHEAD_MAX_S) if timing else send_ahead_s, timing)
             if part is None:
                 raise LinkError("a board could not be spliced although the others were")
@@ -504,13 +440,9 @@ class BoardGroup:
 
     def find_first_sent_tick(self, job: StagedJob) -> float | None:
         """Return the tick of board_s() at which the first point of a job was sent, None before."""
-        if not self.has_several:
+        if self._host_time is None:
             return job.first_sent_tick
-        now_s = self._clock.now_s()
-        fits = [session.clock_sync.fit(now_s) for session in self.sessions]
-        pairs = ((fit, part.first_sent_tick) for fit, part in zip(fits, job.parts, strict=True))
-        sent_s = [fit.to_host_s(tick * self.tick_s) for fit, tick in pairs if fit is not None and tick is not None]
-        return min(sent_s) / self.tick_s if sent_s else None
+        return self._host_time.find_first_sent_tick(job, self.sessions)
 
     # --- statistics ---------------------------------------------------------------------------------------------
 
