@@ -6,7 +6,6 @@ import signal
 import socket
 from contextlib import contextmanager, suppress
 
-from optodrive.daemon.preview.worker import LOW_PRIORITY
 from rig import TOKEN, read_proc, read_role_tokens
 
 
@@ -65,9 +64,10 @@ def sent_dry_run(daemon, body):
 def find_dry_runs(daemon):
     """Return the ids of the processes of low priority that work for a caller: on a dry run, or on a slow build."""
     preview, found = daemon.find_process("preview"), []
+    usual = os.getpriority(os.PRIO_PROCESS, preview)
     for pid in map(int, read_proc(preview, f"task/{preview}/children").split()):
         with suppress(ProcessLookupError):  # it has ended meanwhile
-            if os.getpriority(os.PRIO_PROCESS, pid) == LOW_PRIORITY:
+            if os.getpriority(os.PRIO_PROCESS, pid) > usual:
                 found.append(pid)
     return found
 

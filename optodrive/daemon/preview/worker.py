@@ -1,7 +1,8 @@
 """Worker process of the preview process: a forked child that does one job at a time within limits.
 
-A job that exceeds its time ends with its worker. Fresh workers have the priority of the preview process; dry runs, and
-builds that take longer than usual, run at low priority and are the last job of their worker.
+A job that exceeds its processor time ends with its worker. Fresh workers have the priority of the preview process; dry
+runs, and builds that take longer than usual, run after the other processes of the daemon, but not after all other
+programs: those would starve them on a busy computer. They are the last job of their worker.
 """
 
 import os
@@ -18,12 +19,14 @@ from optodrive.core.forking import describe_end, fork_child
 from optodrive.core.ipc import Message, MessageDecoder, MessageSocket, encode_message
 from optodrive.daemon.preview.jobs import build_refusal
 
-WALL_S = {"build": 5.0, "dry_run": 60.0}
+CPU_S = {"build": 5, "dry_run": 60}
+"""Longest processor time of a job, s."""
+WALL_S = 90.0
 """Longest duration of a job, s, including the time for which the processor serves others."""
-CPU_MARGIN_S = 1
 MEMORY_BYTES = {"build": 768_000_000, "dry_run": 1_500_000_000}
 """Memory that a job may allocate, bytes."""
-LOW_PRIORITY = 10
+DEMOTION = 10
+"""Niceness of a slow job above that of the preview process."""
 QUICK_S = 0.1
 """Duration of a usual build, s."""
 JOBS_MAX = 200
@@ -36,7 +39,8 @@ JobRunner = Callable[[Message], Message]
 def build_timeout_error(kind: str) -> InputError:
     """Build the error of a job that took too long."""
     what = "a body that is built" if kind == "build" else "a sequence that is planned"
-    return InputError("body", "a longer computation", f"{what} within {WALL_S[kind]:g} s", "too_slow")
+    expected = f"{what} within {CPU_S[kind]} s of processor time, or {WALL_S:g} s in all"
+    return InputError("body", "a longer computation", expected, "too_slow")
 
 
 def build_memory_error(kind: str) -> InputError:
@@ -67,7 +71,7 @@ class Worker:
         self._kind = job.kind
         self._job_count += 1
         self.is_reusable &= self._job_count < JOBS_MAX and len(job.payload) < LARGE_BYTES
-        self.deadline_s, self._demote_at_s = now_s + WALL_S[job.kind], now_s + QUICK_S
+        self.deadline_s, self._demote_at_s = now_s + WALL_S, now_s + QUICK_S
         if job.kind == "dry_run":
             self._demote()
 
@@ -89,7 +93,7 @@ class Worker:
     def _demote(self) -> None:
         self.is_reusable = False
         self._demote_at_s = float("inf")
-        os.setpriority(os.PRIO_PROCESS, self.pid, LOW_PRIORITY)
+        os.setpriority(os.PRIO_PROCESS, self.pid, os.getpriority(os.PRIO_PROCESS, 0) + DEMOTION)
 
     def kill(self) -> None:
         """Kill the process if it still runs."""
@@ -130,7 +134,7 @@ def _read_data_bytes() -> int:
 
 def _limit(kind: str, base_bytes: int) -> None:
     """Limit the processor time and the memory of the next job."""
-    cpu_s = int(time.process_time() + WALL_S[kind]) + CPU_MARGIN_S
+    cpu_s = int(time.process_time()) + CPU_S[kind] + 1
     for limit, value in ((resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_DATA, base_bytes + MEMORY_BYTES[kind])):
         _, hard = resource.getrlimit(limit)
         resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
