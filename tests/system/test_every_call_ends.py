@@ -194,7 +194,8 @@ def start_call(call, stage, board, daemon, folder):
     if stage == "showing":
         wait_for(lambda: len(board.of("pulse")) > 10, "pulses")
     elif stage == "planning":
-        wait_for(lambda: daemon.state()["planner"]["busy"], "a busy planner")
+        wait_for(lambda: daemon.state()["planner"]["busy"] or started.has_failed, "a busy planner")
+        assert not started.has_failed, started.wait()
     else:
         state = "ARMING" if stage == "arming" else "ARMED"
         wait_for(lambda: any(event["state"] == state for event in board.of("state")), state)
