@@ -1,7 +1,11 @@
-"""`optodrive status | arm | disarm | dim | pause | resume | reload | stop`: control a running daemon."""
+"""`optodrive status | arm | disarm | dim | pause | resume | reload | stop`: control a running daemon.
+
+They print what the daemon says, without its models, whose import takes longer than everything else that they do.
+"""
 
 import sys
-from typing import TYPE_CHECKING, Annotated, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -14,7 +18,6 @@ from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
     from optodrive.daemon.responses.state import BoardReport, StageReport, StateReport
-    from optodrive.planning.effective_config import EffectiveLimits
 
 
 STATE_TIMEOUT_S = 2.0
@@ -29,8 +32,8 @@ def register(app: typer.Typer) -> None:
 
 def status(url: UrlOption = DEFAULT_URL, stage: StageOption = None, json: JsonOption = False) -> None:
     """Show the boards, the link with its error counters, the queue, and the limits in effect."""
+    from optodrive.client.api_request import READ_CONFIG, READ_STATE
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import READ_CONFIG, READ_STATE
 
     client = DaemonClient(url)
     state = client.call(READ_STATE)
@@ -39,25 +42,24 @@ def status(url: UrlOption = DEFAULT_URL, stage: StageOption = None, json: JsonOp
         return
     _print_state(state, json)
     if not json:
-        print(f"limits    {_format_limits(client.call(READ_CONFIG).limits)}")
+        print(f"limits    {_format_limits(client.call(READ_CONFIG)['limits'])}")
 
 
-def _print_stage(state: "StateReport", name: str, as_json: bool) -> None:
+def _print_stage(document: dict[str, Any], name: str, as_json: bool) -> None:
     """Print one of several stages. Raise InputError if the daemon drives none of this name."""
-    names = [stage.name for stage in state.stages]
-    if name not in names:
-        raise InputError("--stage", name, f"one of {', '.join(names)}" if names else "none: the daemon drives one")
-    stage = state.stages[names.index(name)]
+    stages = {stage["name"]: stage for stage in document["stages"]}
+    if name not in stages:
+        raise InputError("--stage", name, f"one of {', '.join(stages)}" if stages else "none: the daemon drives one")
     if as_json:
-        print_json(stage)
+        print_json(stages[name])
     else:
-        print(_format_stage(stage))
+        print(_format_stage(_view_object(stages[name])))
 
 
 def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption = False) -> None:
     """Arm the board. Its indicator is on for two seconds first. With --hold, until this command ends (Ctrl-C)."""
+    from optodrive.client.api_request import ARM, READ_STATE
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import ARM, READ_STATE
 
     client = DaemonClient(url)
     if not hold:
@@ -73,8 +75,8 @@ def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption
 
 def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Disarm the board. This also acknowledges a fault whose cause is gone."""
+    from optodrive.client.api_request import DISARM
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import DISARM
 
     _print_state(DaemonClient(url).call(DISARM), json)
 
@@ -85,8 +87,8 @@ def dim(
     json: JsonOption = False,
 ) -> None:
     """Cap the power of every pulse of the plans from now on. Only an armer may raise it again."""
+    from optodrive.client.api_request import build_dim_request
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import build_dim_request
 
     request = build_dim_request(share)
     _print_state(DaemonClient(url).call(request), json)
@@ -94,30 +96,30 @@ def dim(
 
 def pause(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Switch the gate off. The board stays armed and plans wait, for five minutes at most."""
+    from optodrive.client.api_request import PAUSE
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import PAUSE
 
     _print_state(DaemonClient(url).call(PAUSE), json)
 
 
 def resume(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Play the rest of the paused plan, and the waiting plans."""
+    from optodrive.client.api_request import RESUME
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import RESUME
 
     _print_state(DaemonClient(url).call(RESUME), json)
 
 
 def reload(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Let the daemon read its configuration and tokens again. Some keys apply at once, the others after a restart."""
+    from optodrive.client.api_request import RELOAD
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import RELOAD
 
     report = DaemonClient(url).call(RELOAD)
     if json:
         print_json(report)
     else:
-        print(report.message)
+        print(report["message"])
 
 
 def stop(context: typer.Context, url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -129,8 +131,8 @@ def stop(context: typer.Context, url: UrlOption = DEFAULT_URL, json: JsonOption 
 
     invocation: Invocation = context.obj
     result = invocation.stopped or stop_directly(url)
+    from optodrive.client.api_request import READ_STATE, STOP
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import READ_STATE, STOP
 
     if result is None:
         _print_state(DaemonClient(url).call(STOP), json)
@@ -156,9 +158,19 @@ def _print_stopped(result: dict[str, Any], error: OptodriveError, as_json: bool)
     print(f"optodrive: the board was stopped; the state of the daemon is not known: {error}", file=sys.stderr)
 
 
-def _format_limits(limits: "EffectiveLimits") -> str:
-    values = limits.model_dump(exclude={"caps"})
-    return "; ".join(f"{cap.label} {format_quantity(values[cap.setting], cap.unit, 6)}" for cap in limits.caps.values())
+def _view_object(value: Any) -> Any:
+    """Return a JSON object with its members as attributes, as its model has them."""
+    if isinstance(value, list):
+        return [_view_object(item) for item in value]
+    if isinstance(value, dict):
+        return SimpleNamespace(**{name: _view_object(item) for name, item in value.items()})
+    return value
+
+
+def _format_limits(limits: dict[str, Any]) -> str:
+    return "; ".join(
+        f"{cap['label']} {format_quantity(limits[cap['setting']], cap['unit'], 6)}" for cap in limits["caps"].values()
+    )
 
 
 def _format_board(board: "BoardReport") -> str:
@@ -176,10 +188,11 @@ def _format_stage(stage: "StageReport") -> str:
     return f"{stage.name} at {stage.port}: {_format_board(stage.board)}; {clock}"
 
 
-def _print_state(state: "StateReport", as_json: bool) -> None:
+def _print_state(document: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        print_json(state)
+        print_json(document)
         return
+    state = cast("StateReport", _view_object(document))
     board, link, queue, totals = state.board, state.link, state.queue, state.totals
     print(f"display   {state.display}, {state.pixels} pixels")
     print(f"link      {link.port}: {link.state}")

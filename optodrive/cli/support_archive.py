@@ -18,13 +18,13 @@ from optodrive.cli.redaction import Redaction
 from optodrive.cli.service_files import CONFIG_PATH, UNIT_PATH
 from optodrive.core.errors import OptodriveError
 from optodrive.core.files import read_last_lines
-from optodrive.daemon.api.tokens import (
+from optodrive.daemon.api.token_places import (
     ENVIRONMENT_VARIABLE,
     FILE_ENVIRONMENT_VARIABLE,
     SERVICE_TOKENS,
     build_tokens_path,
-    read_tokens,
 )
+from optodrive.daemon.api.tokens import read_tokens
 from optodrive.device.config_file import list_shipped_configs, load_config, locate_shipped
 
 if TYPE_CHECKING:
@@ -161,8 +161,8 @@ def _read_journal() -> str:
 
 
 def _read_state(url: str) -> str:
+    from optodrive.client.api_request import READ_STATE
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import READ_STATE
 
     client = DaemonClient(url, timeout_s=DAEMON_TIMEOUT_S)
-    return json.dumps(client.call(READ_STATE).model_dump(mode="json"), indent=2) + "\n"
+    return json.dumps(client.call(READ_STATE), indent=2) + "\n"

@@ -4,10 +4,10 @@ import asyncio
 from types import TracebackType
 from typing import Self
 
+from optodrive.client.async_http import AsyncHttp
 from optodrive.client.async_stream import AsyncStream
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.hold import AsyncHold
-from optodrive.client.http import AsyncHttp
 from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations
 from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError

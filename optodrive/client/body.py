@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from optodrive.client.api_request import encode_json_body
 from optodrive.core.errors import InputError
 
 EXPECTED_VALUE = "text, a finite number, true or false, a list or an object"
@@ -22,7 +23,7 @@ def encode_body(body: Mapping[str, Any] | bytes) -> dict[str, Any]:
             body = json.dumps(body, allow_nan=False, default=_convert).encode()
         except (TypeError, ValueError, RecursionError):
             raise _build_error(body) from None
-    return {"content": body, "headers": {"Content-Type": "application/json"}}
+    return encode_json_body(body)
 
 
 def _convert(value: object) -> object:

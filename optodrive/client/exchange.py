@@ -10,11 +10,9 @@ from typing import Any, Protocol, TypeVar
 
 import httpx
 
+from optodrive.client.api_request import ApiRequest, Response
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.problems import parse_problem
-from optodrive.client.requests import STOP, ApiRequest, Response
 from optodrive.core.errors import LinkError
-from optodrive.daemon.responses.state import StateReport
 
 RETRY_S = 0.1
 RETRY_TIMEOUT_MIN_S = 0.3
@@ -88,25 +86,24 @@ class ExchangePolicy:
             self._has_responded = True
             return parse_response(request, response)
 
-    async def stop(self) -> StateReport:
-        """Stop on new connections, since an open one may be broken unnoticed."""
+    async def stop(self, request: ApiRequest[Response]) -> Response:
+        """Send the request to stop on new connections, since an open one may be broken unnoticed."""
         error: Exception = LinkError("not attempted")
         for timeout_s in STOP_LOST_TIMEOUTS_S if self.endpoint.is_lost else STOP_TIMEOUTS_S:
             try:
-                response = await self._http.send_alone(STOP, timeout_s)
+                response = await self._http.send_alone(request, timeout_s)
                 if response.status_code == 401 and self.endpoint.renew_token():
-                    response = await self._http.send_alone(STOP, timeout_s)
-                return parse_response(STOP, response)
+                    response = await self._http.send_alone(request, timeout_s)
+                return parse_response(request, response)
             except httpx.TransportError as transport_error:
                 error = transport_error
         raise self.endpoint.build_stop_error(error)
 
 
 def parse_response(request: ApiRequest[Response], response: httpx.Response) -> Response:
-    """Parse a response as the request's model. Raise the error that a problem document describes.
-
-    Members that the model does not have are ignored: a newer daemon may send them.
-    """
+    """Parse a response as the request states. Raise the error that a problem document describes."""
     if response.is_success:
-        return request.response.model_validate_json(response.content, extra="ignore")
+        return request.parse(response.content)
+    from optodrive.client.problems import parse_problem  # its models take longer than a whole command without them
+
     raise parse_problem(response.status_code, response.content)

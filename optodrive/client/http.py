@@ -1,6 +1,5 @@
-"""Requests to a daemon, with blocking and with asynchronous input and output."""
+"""Requests to a daemon that block."""
 
-import asyncio
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -11,9 +10,9 @@ from typing import Any
 
 import httpx
 
+from optodrive.client.api_request import ApiRequest, Response
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import ExchangePolicy, run_blocking
-from optodrive.client.requests import ApiRequest, Response
 from optodrive.core.errors import NotReadyError
 
 READ_TIMEOUT_S = 2.5
@@ -43,7 +42,7 @@ class BlockingHttp:
 
     def require_open(self) -> None:
         """Raise NotReadyError after `close`."""
-        _require_open(self._client)
+        require_open(self._client)
 
     async def sleep(self, duration_s: float) -> None:
         """See `HttpIo`."""
@@ -52,59 +51,20 @@ class BlockingHttp:
     async def send_alone(self, request: ApiRequest[Any], timeout_s: float) -> httpx.Response:
         """See `HttpIo`."""
         with self.endpoint.open_client(timeout_s) as client:
-            return client.request(**_build_arguments(request, self.endpoint))
+            return client.request(**build_arguments(request, self.endpoint))
 
     async def send(self, request: ApiRequest[Any], timeout_s: float | None) -> httpx.Response:
         """See `HttpIo`. For an action that takes long, watch whether the daemon answers others meanwhile."""
         self.require_open()
-        arguments = _build_arguments(request, self.endpoint)
+        arguments = build_arguments(request, self.endpoint)
         if request.method == "GET":
-            return self._client.request(**arguments, timeout=min(_limit_read_s(timeout_s), self._timeout_s))
+            return self._client.request(**arguments, timeout=min(limit_read_s(timeout_s), self._timeout_s))
         future: Future[httpx.Response] = Future()
         Thread(target=_complete, args=(future, partial(self._client.request, **arguments)), daemon=True).start()
         while True:
             with suppress(TimeoutError):
                 return future.result(PROBE_PERIOD_S)
             self._client.request(**PROBE)
-
-
-class AsyncHttp:
-    """Requests that wait in the running event loop."""
-
-    def __init__(self, endpoint: Endpoint) -> None:
-        self.endpoint = endpoint
-        self._client = endpoint.open_async_client(TIMEOUT_S)
-
-    async def close(self) -> None:
-        """Close the connections."""
-        await self._client.aclose()
-
-    def require_open(self) -> None:
-        """Raise NotReadyError after `close`."""
-        _require_open(self._client)
-
-    async def sleep(self, duration_s: float) -> None:
-        """See `HttpIo`."""
-        await asyncio.sleep(duration_s)
-
-    async def send_alone(self, request: ApiRequest[Any], timeout_s: float) -> httpx.Response:
-        """See `HttpIo`."""
-        async with self.endpoint.open_async_client(timeout_s) as client:
-            return await client.request(**_build_arguments(request, self.endpoint))
-
-    async def send(self, request: ApiRequest[Any], timeout_s: float | None) -> httpx.Response:
-        """See `BlockingHttp.send`."""
-        self.require_open()
-        arguments = _build_arguments(request, self.endpoint)
-        if request.method == "GET":
-            return await self._client.request(**arguments, timeout=_limit_read_s(timeout_s))
-        task = asyncio.ensure_future(self._client.request(**arguments))
-        try:
-            while not (await asyncio.wait({task}, timeout=PROBE_PERIOD_S))[0]:
-                await self._client.request(**PROBE)
-            return task.result()
-        finally:
-            task.cancel()
 
 
 class DaemonClient:
@@ -126,16 +86,19 @@ def _complete(future: "Future[httpx.Response]", send: Callable[[], httpx.Respons
         future.set_exception(error)
 
 
-def _require_open(client: httpx.Client | httpx.AsyncClient) -> None:
+def require_open(client: httpx.Client | httpx.AsyncClient) -> None:
+    """Raise NotReadyError if the HTTP client is closed."""
     if client.is_closed:
         raise NotReadyError("this display is closed, and only `stop` works; open another `Display`")
 
 
-def _limit_read_s(timeout_s: float | None) -> float:
+def limit_read_s(timeout_s: float | None) -> float:
+    """Return the longest wait for a request that only reads, s."""
     return READ_TIMEOUT_S if timeout_s is None else min(READ_TIMEOUT_S, timeout_s)
 
 
-def _build_arguments(request: ApiRequest[Any], endpoint: Endpoint) -> dict[str, Any]:
+def build_arguments(request: ApiRequest[Any], endpoint: Endpoint) -> dict[str, Any]:
+    """Build the arguments of the HTTP client's `request`."""
     arguments = dict(request.arguments)
     headers = arguments.pop("headers", {}) | endpoint.headers
     return {"method": request.method, "url": request.path, "headers": headers, **arguments}

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Unpack
 
+from optodrive.client.api_request import ApiRequest
 from optodrive.client.exchange import ExchangePolicy, HttpIo
 from optodrive.client.heights import HeightsLike, convert_to_pixels
 from optodrive.client.plan import Plan, report_loss
@@ -14,7 +15,7 @@ from optodrive.client.requests import (
     READ_CONFIG,
     READ_STATE,
     RESUME,
-    ApiRequest,
+    STOP,
     build_cancel_request,
     build_dim_request,
     build_frame_body,
@@ -88,7 +89,7 @@ class DisplayOperations:
 
     async def stop(self) -> StateReport:
         """Switch the gate off, drop all plans, disarm the board. Raise LinkError if no answer confirms it."""
-        state = await self._policy.stop()
+        state = await self._policy.stop(STOP)
         self.may_emit = False
         return state
 

@@ -1,57 +1,45 @@
-"""The requests of the API, stated once for both displays and the command line."""
+"""The requests of the API with the models of their responses, for both displays and the commands that plan."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 from urllib.parse import quote
 
 from pydantic import BaseModel
 
+from optodrive.client import api_request
+from optodrive.client.api_request import ApiRequest
 from optodrive.client.body import encode_body
 from optodrive.client.heights import encode_json
 from optodrive.client.plan import Plan
-from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.push_options import PushOptions
 from optodrive.daemon.responses.patterns import PatternList
-from optodrive.daemon.responses.reload import ReloadReport
 from optodrive.daemon.responses.state import StateReport
 from optodrive.planning.effective_config import EffectiveConfig
 
-Response = TypeVar("Response", bound=BaseModel)
+Model = TypeVar("Model", bound=BaseModel)
 
 
-@dataclass(frozen=True)
-class ApiRequest(Generic[Response]):
-    """One request and the model of its response.
-
-    idempotent: the request has no effect but its response, so that it may be sent again
-    arguments: of the HTTP client's `request`
-    """
-
-    method: str
-    path: str
-    response: type[Response]
-    idempotent: bool = False
-    arguments: Mapping[str, Any] = field(default_factory=dict)
+def parse_as(model: type[Model]) -> Callable[[bytes], Model]:
+    """Return the parser of a response that ignores members which the model does not have, as of a newer daemon."""
+    return lambda content: model.model_validate_json(content, extra="ignore")
 
 
-READ_STATE = ApiRequest("GET", "/v1/state", StateReport, idempotent=True)
-READ_CONFIG = ApiRequest("GET", "/v1/config", EffectiveConfig, idempotent=True)
-LIST_PATTERNS = ApiRequest("GET", "/v1/patterns", PatternList, idempotent=True)
-ARM = ApiRequest("POST", "/v1/arm", StateReport)
-DISARM = ApiRequest("POST", "/v1/disarm", StateReport)
-PAUSE = ApiRequest("POST", "/v1/pause", StateReport)
-RESUME = ApiRequest("POST", "/v1/resume", StateReport)
-RELOAD = ApiRequest("POST", "/v1/reload", ReloadReport)
-STOP = ApiRequest("POST", "/v1/stop", StateReport)
+_parse_state = parse_as(StateReport)
+READ_STATE = api_request.READ_STATE.parsed_by(_parse_state)
+ARM = api_request.ARM.parsed_by(_parse_state)
+DISARM = api_request.DISARM.parsed_by(_parse_state)
+PAUSE = api_request.PAUSE.parsed_by(_parse_state)
+RESUME = api_request.RESUME.parsed_by(_parse_state)
+STOP = api_request.STOP.parsed_by(_parse_state)
+READ_CONFIG = api_request.READ_CONFIG.parsed_by(parse_as(EffectiveConfig))
+LIST_PATTERNS = ApiRequest("GET", "/v1/patterns", parse_as(PatternList), idempotent=True)
+_parse_plan = parse_as(Plan)
 
 
 def build_dim_request(share: float) -> ApiRequest[StateReport]:
     """Build the request that caps the power of plans at a share of the laser's. Raise InputError beyond 0 to 1."""
-    if not 0.0 <= share <= 1.0:  # also NaN
-        raise InputError("share", share, "a number from 0 to 1")
-    return ApiRequest("PUT", "/v1/dim", StateReport, True, encode_body({"share": share}))
+    return api_request.build_dim_request(share).parsed_by(_parse_state)
 
 
 def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bool) -> dict[str, Any]:
@@ -63,7 +51,7 @@ def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bo
 def build_push_request(body: Mapping[str, Any] | bytes, options: PushOptions, dry_run: bool) -> ApiRequest[Plan]:
     """Build the request that plans frames and trains, given as an object or as the bytes of a file."""
     query = {**options, "dry_run": dry_run}
-    return ApiRequest("POST", "/v1/plans", Plan, dry_run, encode_body(body) | {"params": query})
+    return ApiRequest("POST", "/v1/plans", _parse_plan, dry_run, encode_body(body) | {"params": query})
 
 
 def build_play_request(
@@ -72,17 +60,17 @@ def build_play_request(
     """Build the request that plays a named pattern."""
     query = {**options, "dry_run": dry_run}
     path = f"/v1/patterns/{quote(name, safe='')}"
-    return ApiRequest("POST", path, Plan, dry_run, encode_body(parameters) | {"params": query})
+    return ApiRequest("POST", path, _parse_plan, dry_run, encode_body(parameters) | {"params": query})
 
 
 def build_read_request(plan_id: str, pulses: bool = True) -> ApiRequest[Plan]:
     """Build the request that reads a plan, with or without its pulses."""
-    return ApiRequest("GET", _build_plan_path(plan_id), Plan, True, {"params": {"pulses": pulses}})
+    return ApiRequest("GET", _build_plan_path(plan_id), _parse_plan, True, {"params": {"pulses": pulses}})
 
 
 def build_cancel_request(plan_id: str) -> ApiRequest[Plan]:
     """Build the request that cancels a plan."""
-    return ApiRequest("DELETE", _build_plan_path(plan_id), Plan)
+    return ApiRequest("DELETE", _build_plan_path(plan_id), _parse_plan)
 
 
 def _build_plan_path(plan_id: str) -> str:

@@ -216,6 +216,7 @@ def test_commands_within_a_sentence_exist(path):
             assert "No such" not in refusal, (text, refusal)  # it may be named without its arguments
 
 
+@pytest.mark.timeout(900)  # a page has up to a hundred commands, each of which starts an interpreter
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in EVERY_TIME else [pytest.mark.slow]) for name in SCENARIOS]
 )

@@ -3,6 +3,7 @@
 import os
 import re
 import subprocess
+import sys
 
 import pytest
 
@@ -20,6 +21,7 @@ def rig(tmp_path_factory):
 def disarmed(rig):
     yield
     rig[1].call("POST", "/v1/stop")
+    rig[0].forget()
 
 
 def command(daemon, *arguments):
@@ -40,6 +42,30 @@ def test_status_shows_limits_and_the_counters_of_the_link(rig):
     assert re.match(r"\d+ frames retransmitted, \d+ refused, \d+ damaged on arrival here, ", lines["counters"])
     assert "absorber temperature 400 °C" in lines["limits"]
     assert "energy of a pulse 125 mJ" in lines["limits"]
+
+
+LIST_MODULES = """
+import sys
+from optodrive.cli.main import run
+
+status = run(sys.argv[1:])
+names = "optodrive.client.requests", "optodrive.core.json_model", "numpy", "asyncio", "websockets"
+print(*(name for name in names if name in sys.modules), file=sys.stderr)
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize("arguments", [("status",), ("arm",), ("status", "--json"), ("disarm",)])
+def test_control_imports_no_models(rig, arguments):
+    """They would take longer than everything else that the command does."""
+    _, daemon = rig
+    ended = subprocess.run(
+        [sys.executable, "-c", LIST_MODULES, *arguments],
+        env=os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN},
+        capture_output=True,
+        text=True,
+    )
+    assert (ended.returncode, ended.stderr) == (0, "\n")
 
 
 def test_arming_an_armed_board_does_nothing(rig):

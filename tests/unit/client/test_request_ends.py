@@ -8,15 +8,17 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from optodrive.client import http
+from optodrive.client.api_request import ApiRequest
+from optodrive.client.async_http import AsyncHttp
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import ExchangePolicy
-from optodrive.client.http import AsyncHttp, DaemonClient
-from optodrive.client.requests import ApiRequest
+from optodrive.client.http import DaemonClient
+from optodrive.client.requests import parse_as
 from optodrive.core.errors import LinkError
 from optodrive.daemon.responses.health import HealthReport
 
-READ = ApiRequest("GET", "/v1/read", HealthReport, idempotent=True)
-ACT = ApiRequest("POST", "/v1/act", HealthReport)
+READ = ApiRequest("GET", "/v1/read", parse_as(HealthReport), idempotent=True)
+ACT = ApiRequest("POST", "/v1/act", parse_as(HealthReport))
 PROBES = 3
 """Number of probes during an action of the server."""
 

@@ -1,15 +1,13 @@
 import pytest
 
 from optodrive.core.errors import InputError
+from optodrive.daemon.api.own_token import read_token
+from optodrive.daemon.api.token_places import ENVIRONMENT_VARIABLE, FILE_ENVIRONMENT_VARIABLE, build_tokens_path
 from optodrive.daemon.api.tokens import (
-    ENVIRONMENT_VARIABLE,
-    FILE_ENVIRONMENT_VARIABLE,
     Tokens,
-    build_tokens_path,
     create_tokens,
     load_daemon_tokens,
     read_private_tokens,
-    read_token,
     read_tokens,
 )
 
@@ -118,6 +116,17 @@ def test_a_secret_shows_in_no_repr_and_no_error(tmp_path):
 def test_another_version_is_refused_by_name(tmp_path):
     with pytest.raises(InputError, match="version: got 2"):
         read_tokens(write_tokens(tmp_path / "t.toml", ("anna", "armer", SECRET), version=2))
+
+
+@pytest.mark.parametrize(
+    ("entries", "version", "named"),
+    [((("anna", "armer", SECRET),), 2, "version: got 2"), ((), 1, "token: missing"), ((("a", "b", "c"),), 1, "role: ")],
+)
+def test_a_caller_is_told_what_is_wrong_with_its_file(tmp_path, monkeypatch, entries, version, named):
+    path = write_tokens(tmp_path / "t.toml", *entries, version=version)
+    monkeypatch.setenv(FILE_ENVIRONMENT_VARIABLE, str(path))
+    with pytest.raises(InputError, match=named):
+        read_token(8450)
 
 
 def test_a_caller_uses_whichever_is_there(tmp_path, monkeypatch):
