@@ -11,8 +11,7 @@ from session_rig import configured
 from virtual_rig import VirtualRig
 from wire_format import HOST
 
-from optodrive.link.session import board_requirements
-from optodrive.link.session import session as session_module
+from optodrive.link.session import board_link, board_requirements
 from optodrive.link.session.board_requirements import BITS_PER_BYTE, FRAME_BYTES
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 
@@ -92,7 +91,7 @@ def test_a_board_that_violates_a_guard_is_detected(monkeypatch, virtual, core, g
 def test_a_run_can_be_played_again(make_rig, monkeypatch):
     reported = []
     for _ in range(2):
-        monkeypatch.setattr(session_module.secrets, "randbits", random.Random(4).getrandbits)
+        monkeypatch.setattr(board_link.secrets, "randbits", random.Random(4).getrandbits)
         rig = make_rig(4, 0.1, extra=0.5, pauses=0.002)
         for _ in range(6):
             rig.live(1000, patience_s=4.0)

@@ -16,7 +16,7 @@ from link_service_rig import CuttableLink
 from optodrive.core.clock import ManualClock
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import WirePoints
-from optodrive.link.session import session as session_module
+from optodrive.link.session import board_link
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
@@ -225,7 +225,7 @@ class Staller(threading.Thread):
 
 def test_a_computer_that_stalls_changes_nothing(chips, monkeypatch):
     def start():
-        monkeypatch.setattr(session_module.secrets, "randbits", random.Random(4).getrandbits)
+        monkeypatch.setattr(board_link.secrets, "randbits", random.Random(4).getrandbits)
         return Rig(chips(0))
 
     rig, steps = start(), 0

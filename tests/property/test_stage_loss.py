@@ -11,7 +11,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.link.board_setup import build_scales
 from optodrive.link.protocol.states import ARMED_STATES
 from optodrive.link.service.link_service import LinkService
-from optodrive.link.session import session
+from optodrive.link.session import board_link
 from planner_rig import build_frame
 from stage_rig import BreakingLink, StageRig, build_stages
 
@@ -76,7 +76,7 @@ def test_without_abort_to_the_others_their_light_goes_on(monkeypatch):
 
 
 def test_without_the_short_silence_the_light_of_the_others_goes_on(monkeypatch):
-    monkeypatch.setattr(session.BoardSession, "_silence_max_s", session.SILENCE_TIMEOUT_S)
+    monkeypatch.setattr(board_link.BoardLink, "_silence_max_s", board_link.SILENCE_TIMEOUT_S)
     assert play_trains_through(monkeypatch, "silence") > LEASE_S + REACTION_S
 
 

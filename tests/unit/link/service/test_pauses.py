@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from link_service_rig import OPERATOR, PLANNER, STEP_S, WEB, ServiceRig
+from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.pauses import PAUSE_MAX_S
 from optodrive.link.service.remote_job import EXECUTED_RECORD
 from optodrive.link.session.point_drain import PointDrain
-from optodrive.link.session.session import BoardSession
 from wire_points import build_points
 
 DUTY = 20_000
@@ -80,27 +80,23 @@ def test_a_splice_is_refused_in_a_pause(rig):
     assert not rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=[150]))["done"]
 
 
-class ReportLosingSession(BoardSession):
-    """A session that loses some reports of the board."""
-
-    losses = 0
-
-    def _on_executed(self, message, now_s):
-        if self.losses:
-            self.losses -= 1
-            return
-        super()._on_executed(message, now_s)
-
-
 def test_lost_reports_are_requested_again(rig, monkeypatch):
-    monkeypatch.setattr(rig.session, "__class__", ReportLosingSession)
+    handlers, lost = rig.session._handlers, []
+    record = handlers[Executed]
+
+    def lose_three(message, now_s):
+        if len(lost) < 3:
+            lost.append(message)
+        else:
+            record(message, now_s)
+
     number = rig.begin(build_points(500, DUTY))
     rig.until(lambda: len(rig.list_emitted()) > 40)
-    rig.session.losses = 3
-    rig.until(lambda: rig.session.losses == 1)
+    monkeypatch.setitem(handlers, Executed, lose_three)
+    rig.until(lambda: len(lost) == 2)
     command(rig, "pause")
     rig.until(lambda: read_drained(rig) == [1])
-    assert rig.session.losses == 0  # the first answer to a request was lost, too
+    assert len(lost) == 3  # the first answer to a request was lost, too
     assert list_reported(rig, number) == set(range(len(rig.list_emitted())))
 
 
