@@ -96,7 +96,7 @@ def print_report(shown: list[tuple[str, Plan]]) -> bool:
         name, highest = max(done, key=lambda item: item[1].simulated_max_um or 0.0)
         print(
             f"largest membrane displacement {highest.simulated_max_um or 0.0:.1f} µm, in {name}, "
-            "computed from the executed pulses"
+            "also where pulses state a power instead of a height; computed from the executed pulses"
         )
     return planned == sent == executed > 0 and len(done) == len(shown)
 
