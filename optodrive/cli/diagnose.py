@@ -81,7 +81,7 @@ def diagnose(
         if len(runs.pixels) > MAX_JOINT_PIXELS:
             output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers, provenance)
         else:
-            output = _diagnose_jointly(recordings, out, title, seed, settings, provenance)
+            output = _diagnose_jointly(recordings, out, title, seed, config, settings, provenance)
         _write_output(output, out, json)
 
 
@@ -101,6 +101,7 @@ def _diagnose_jointly(
     out: Path | None,
     title: str,
     seed: int,
+    config_name: str | None,
     config: "Config | None",
     provenance: "Provenance",
 ) -> _DiagnosisOutput:
@@ -112,7 +113,7 @@ def _diagnose_jointly(
     from optodrive.lab.diagnosis.priors import build_prior
     from optodrive.lab.diagnosis.report import build_report
 
-    measurement = _read_recordings(recordings)
+    measurement, paths = _read_recordings(recordings), [str(path) for path in recordings]
     prior, epsilon, width_m = build_prior(measurement, config)
     announce_compilation()
     with show_step("reading") as on_progress:
@@ -121,7 +122,7 @@ def _diagnose_jointly(
     return _DiagnosisOutput(
         build_answer(diagnosis) | {"provenance": provenance.to_dict()},
         build_narrative(diagnosis),
-        build_report(diagnosis, title, provenance, [str(path) for path in recordings], str(out or OUT)),
+        build_report(diagnosis, title, provenance, paths, str(out or OUT), config_name),
         model,
     )
 

@@ -236,6 +236,9 @@ def test_the_report_says_what_to_run_next_and_the_commands_run(leak, tmp_path, m
             assert run(arguments) == 0, capsys.readouterr().err
 
 
+TAKE_CONFIG = "diagnose", "plan", "simulate", "serve", "calibrate"
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -256,6 +259,9 @@ def test_every_finding_has_its_next_command_whose_options_exist(leak, capsys, ch
         capsys.readouterr()
         assert run([*command[1:], "--help"]) == 0  # refuses an option that does not exist
     assert ("Run next" in build_report(found, "my rec.h5")) == bool(expected)
+    for step in list_next_steps(found, ["my rec.h5"], config="my.toml"):
+        takes_config = any(step.command.startswith(f"optodrive {name}") for name in TAKE_CONFIG)
+        assert step.command.endswith(" --config my.toml") is takes_config, "for another display, it is another plan"
 
 
 def test_commands_name_recordings_and_model_by_their_folders(leak):

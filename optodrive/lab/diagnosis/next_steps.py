@@ -21,11 +21,14 @@ class NextStep:
     command: str
 
 
-def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str], out: str = OUT) -> list[NextStep]:
+def list_next_steps(
+    discrepancy: Discrepancy, recordings: Sequence[str], out: str = OUT, config: str | None = None
+) -> list[NextStep]:
     """Return the steps in their order.
 
-    recordings, out: paths of those that were diagnosed and of the answer's folder, as the command named them
+    recordings, out, config: what was diagnosed, the answer's folder and the configuration, as the command named them
     """
+    display = () if config is None else ("--config", config)
     model = str(Path(out) / "model.toml")
     steps = [_inspect_term(label) for label in discrepancy.failures]
     if discrepancy.verdict == "unexplained":
@@ -35,11 +38,13 @@ def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str], out: st
         again = (
             "Record the proposed experiment" if discrepancy.next_experiment else "Record each experiment three times"
         )
-        more = ("diagnose", *recordings, "more.h5", "--out", f"{out.rstrip('/')}-2")
+        more = ("diagnose", *recordings, "more.h5", "--out", f"{out.rstrip('/')}-2", *display)
         steps.append(_step(f"{again}, and diagnose it together with these runs.", *more))
     if "mirror_lag" in discrepancy.causes:
-        steps.append(_step("Identify the mirrors' servos from steps.", "calibrate", "steps", "--out", "steps"))
-        servo = ("calibrate", "servo", "steps", "--out", "mirrors.toml")
+        steps.append(
+            _step("Identify the mirrors' servos from steps.", "calibrate", "steps", "--out", "steps", *display)
+        )
+        servo = ("calibrate", "servo", "steps", "--out", "mirrors.toml", *display)
         steps.append(_step("Complete the steps by the measured angles; plan with the result (--mirrors).", *servo))
     if "clock_offset" in discrepancy.causes:
         offset = discrepancy.parameters["clock_offset.displacement"].value
@@ -55,12 +60,11 @@ def list_next_steps(discrepancy: Discrepancy, recordings: Sequence[str], out: st
         steps.append(_step("Correct the instrument's times when session and measurement are merged.", *merge))
     changes_plans = any(_changes_plans(key) for key in discrepancy.causes)
     if discrepancy.base and discrepancy.verdict != "unexplained" and (changes_plans or discrepancy.verdict == "none"):
-        steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", model))
+        steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", model, *display))
         if changes_plans:
-            steps.append(
-                _step("See what the effect does to heights planned without it.", "simulate", FRAMES, "--truth", model)
-            )
-        steps.append(_step("Serve the display with it.", "serve", "--model", model))
+            simulate = ("simulate", FRAMES, "--truth", model, *display)
+            steps.append(_step("See what the effect does to heights planned without it.", *simulate))
+        steps.append(_step("Serve the display with it.", "serve", "--model", model, *display))
     return steps
 
 

@@ -26,15 +26,16 @@ def build_report(
     provenance: Provenance | None = None,
     recordings: Sequence[str] = ("recording.h5",),
     out: str = OUT,
+    config: str | None = None,
 ) -> str:
     """Return the report as HTML.
 
-    recordings, out: paths of those that were diagnosed and of the report's folder, as the command named them
+    recordings, out, config: what was diagnosed, the report's folder and the configuration, as the command named them
     """
     has_extension = bool(discrepancy.terms)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     parts = [
-        *_build_next_steps(list_next_steps(discrepancy, recordings, out)),
+        *_build_next_steps(list_next_steps(discrepancy, recordings, out, config)),
         *_build_probabilities(discrepancy.probabilities),
         "<h2>Measured against model</h2>",
         f"<p>{MEASURED}, {models}. The nominal model has the R, C, τ<sub>g</sub>, κ and φ that fit these data best, "
