@@ -34,7 +34,7 @@ from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_s
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.snapshot import SnapshotCache, compute_snapshot
 from optodrive.physics.stability import check_time_constants
-from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, TermValues
+from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, SESSION_TIME, TermValues
 from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import discover_terms
 
@@ -65,7 +65,8 @@ class ExtendedThermalState:
         indices = neighbours.indices if is_coupled else np.zeros((len(pixels), 0), dtype=np.int64)
         self._neighbours = np.ascontiguousarray(indices)
         self._context = np.zeros(CONTEXT_SIZE)
-        self._context[FULL_W], self._context[AMBIENT_K], self._context[DOSE] = full_w, ambient_k, 1.0
+        self._context[FULL_W], self._context[AMBIENT_K] = full_w, ambient_k
+        self._context[DOSE] = self._context[SESSION_TIME] = 1.0  # as at the end of the recording
         columns = np.stack([getattr(pixels, name) for name in Pixel._fields], axis=1)
         self._events = EventStates.cold(columns, at_s)
         self._snapshot_cache: SnapshotCache | None = None
@@ -186,7 +187,9 @@ class ExtendedThermalState:
         columns = []
         for index in pixels:
             acting = self._select_acting(pulses, index)
-            experiment = PixelExperiment(acting, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
+            experiment = PixelExperiment(
+                acting, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, session_time=1.0, full_w=full_w
+            )
             one = self.pixels.elements[index]
             absorber_k, displacement_m, force_n = simulate_signals(experiment, one, self._active, late_s)
             # κ = 1, because a dead pixel's κ is 0.

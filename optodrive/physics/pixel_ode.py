@@ -334,7 +334,7 @@ def _simulate(
         if reaches_edge:
             h_s = end_s - now_s
         if h_s > 0.0:
-            c[DOSE] = dose
+            c[DOSE], c[SESSION_TIME] = dose, span[2] + span[3] * now_s
             step(pixel, active, c, after_edge, now_s, since_edge_s, h_s, work)
             samples[0] = _fill_samples(
                 pixel, active, c, work, now_s, h_s, t_s[0], clock_delay_s[0], span, 0, samples[0], out[0]

@@ -224,11 +224,11 @@ def _list_explanations(
     for score in nominal_detection.scores:
         key, label = score.hypothesis.key, score.hypothesis.label
         if label not in refitted:
-            prior = log(PRIOR_ONE_CAUSE / catalogue / forms_of[key])
+            prior = log(PRIOR_ONE_CAUSE / catalogue / forms_of[key] / count_trials(score.hypothesis))
             out.append(Explanation((key,), prior, nothing + compute_score_evidence(score.ratio)))
     for item in refits:
         prior = PRIOR_ONE_CAUSE / catalogue if len(item.causes) == 1 else PRIOR_TWO_CAUSES / pair_count
-        prior = log(prior / np.prod([forms_of[key] for key in item.causes]))
+        prior = log(prior / np.prod([forms_of[part.key] * count_trials(part) for part in item.hypotheses]))
         out.append(Explanation(item.causes, prior, item.log_evidence))
         rest = examined.get(item)
         if rest is None:
@@ -249,6 +249,11 @@ def _list_explanations(
             if single is not None:
                 out.append(Explanation(single.causes, other_prior + log(share), evidence, own))
     return out
+
+
+def count_trials(hypothesis: Hypothesis) -> int:
+    """Return the number of forms of an effect of which the best one is taken, with no number for it in the fit."""
+    return len(hypothesis.starts) if hypothesis.is_linear and hypothesis.degrees == 1 else 1
 
 
 def _find_sufficient_single(

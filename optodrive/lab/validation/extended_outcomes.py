@@ -64,7 +64,7 @@ def _simulate(parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArra
     active = ActiveTerms.from_values({key: parameters.term_values(key) for key in keys})
     responses = [
         simulate_signals(
-            PixelExperiment(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0),
+            PixelExperiment(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0, session_time=1.0),
             parameters.build_pixel(stimulus.width_mm * 1e-3),
             active,
         )

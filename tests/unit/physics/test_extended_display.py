@@ -69,7 +69,12 @@ def simulate_alone(keys, pixel, columns, until_s):
     index, start_s, width_s, power_w = columns
     t_s = np.unique(np.concatenate([np.arange(0.0, until_s, 2e-5), start_s]))
     scene = PixelExperiment(
-        np.column_stack([start_s, width_s, power_w, index]), pixel, AMBIENT_K, (t_s, t_s, t_s[:0]), dose_before=1.0
+        np.column_stack([start_s, width_s, power_w, index]),
+        pixel,
+        AMBIENT_K,
+        (t_s, t_s, t_s[:0]),
+        dose_before=1.0,
+        session_time=1.0,
     )
     absorber_k, displacement_m, _ = simulate_signals(scene, PIXEL, ActiveTerms.from_values(default_values(*keys)))
     return t_s, absorber_k, displacement_m
@@ -118,7 +123,7 @@ def test_every_pixel_sees_the_panel_that_light_on_others_warmed(rest_s):
     at_s = start_s[-1] + rest_s
     pulses = np.column_stack([*columns[1:], np.full(400, ELSEWHERE)])
     t_s = np.array([at_s, at_s + 0.05])
-    scene = PixelExperiment(pulses, 5, AMBIENT_K, (t_s, t_s, t_s[:0]), dose_before=1.0)
+    scene = PixelExperiment(pulses, 5, AMBIENT_K, (t_s, t_s, t_s[:0]), dose_before=1.0, session_time=1.0)
     absorber_k, displacement_m, _ = simulate_signals(scene, PIXEL, ActiveTerms.from_values(values))
     state = heat.state_at(at_s)
     assert state.displacement_m[5] == pytest.approx(displacement_m[0], rel=2e-3)

@@ -264,7 +264,7 @@ def test_the_power_curve_keeps_full_power():
 
 
 def test_ageing_counts_the_dose_before_and_within_a_run():
-    aged = {"absorber_ageing": {"share": 0.1}}
+    aged = {"absorber_ageing": {"share": 0.1, "time_share": 0.0, "step_share": 0.0, "step_at": 0.0}}
     energy_j = float((PULSES[:2, 1] * PULSES[:2, 2]).sum())
     fresh, old = simulate(aged)[0], simulate(aged, dose_before=1.0)[0]
     assert fresh == pytest.approx(simulate({})[0])

@@ -30,7 +30,7 @@ LARGE = {
     "heat_capacity": {"slope": 3e-3},
     "neighbour_crosstalk": {"share": 0.02, "lag": 0.02},
     "power_nonlinearity": {"threshold": 0.0, "curvature": 0.25},
-    "absorber_ageing": {"share": 0.1},
+    "absorber_ageing": {"share": 0.1, "time_share": 0.1, "step_share": 0.05, "step_at": 0.5},
     "beam_misalignment": {"share": 0.2, "pixel": 5.0, "resistance": 20.0, "time": 0.3},
     "ambient_drift": {"offset": 3.0, "ramp": -1.0, "bend": 0.5, "rate": 0.0},
 }
@@ -58,9 +58,10 @@ def test_every_term_has_a_bound_except_crosstalk_above_the_touch_cap(key):
     build_budget_with(key)
 
 
-def test_increasing_absorption_has_no_bound():
+@pytest.mark.parametrize("name", ["share", "time_share", "step_share"])
+def test_increasing_absorption_has_no_bound(name):
     with pytest.raises(InputError, match=r"terms\.absorber_ageing: .* a term that the limiter can bound"):
-        build_budget(CONFIG, with_term("absorber_ageing", share=-0.05), DISPLAY.pixels)
+        build_budget(CONFIG, with_term("absorber_ageing", **{name: -0.05}), DISPLAY.pixels)
 
 
 def test_terms_that_cannot_add_heat_change_no_bound():
@@ -95,8 +96,9 @@ def compute_peak_fraction(key, budget, plan):
     pulses = np.column_stack([limited.start_s, limited.width_s, limited.power_w, limited.pixel])
     t_s = np.arange(0.0, float(plan.start_s[-1]) + 0.3, 1e-4)
     ambient_k = CONFIG.ambient_c + ZERO_CELSIUS_K
-    dose = 0.0 if key == "absorber_ageing" else 1.0
-    scene = PixelExperiment(pulses, 5, ambient_k, (t_s, t_s[:0], t_s[:0]), dose_before=dose)
+    dose, session_time = (0.0, -1.0) if key == "absorber_ageing" else (1.0, 0.0)
+    times = (t_s, t_s[:0], t_s[:0])
+    scene = PixelExperiment(pulses, 5, ambient_k, times, dose_before=dose, session_time=session_time)
     values = {key: LARGE[key]} if key != "ambient_drift" else {}
     rise_k = simulate_signals(scene, DISPLAY.pixels.elements[5], ActiveTerms.from_values(values))[0].max()
     drift_k = 4.5 if key == "ambient_drift" else 0.0
