@@ -38,10 +38,12 @@ COLUMNS = (
     *("seed", "kind", "causes", "forms", "target_sigma", "sigma", "rivals", "verdict", "named", "probabilities"),
     *("ruled_out", "aic", "bic", "elapsed_s", "code"),
 )
-KINDS = ("none", "single", "single", "pair", "single", "none", "single", "unknown", "single", "single")
+KINDS = ("none", "single", "single", "pair", "single", "none", "single", "unknown", "single", "instrument")
 KINDS += ("none", "single", "single", "unknown", "none", "single", "single", "none", "single", "unknown")
 """Kinds of the recordings, over and over."""
 STRENGTHS = (3.0, 5.0, 8.0, 12.0, 30.0)
+INSTRUMENT_FACTOR = 10.0
+"""Strength of an instrument's disturbance, which lasts for all of a recording, relative to that of an effect."""
 NO_EFFECT, NONE_OF_THESE = "no_effect", "none_of_these"
 SHOWN = 1e-3
 """Smallest probability that the table keeps."""
@@ -62,7 +64,8 @@ class Task:
 def build_task(seeds: str, number: int) -> Task:
     """Return the recording with this number: each kind with every strength in turn."""
     strength = STRENGTHS[(number + number // len(KINDS)) % len(STRENGTHS)]
-    return Task(FIRST_SEEDS[seeds] + number, KINDS[number % len(KINDS)], strength)
+    kind = KINDS[number % len(KINDS)]
+    return Task(FIRST_SEEDS[seeds] + number, kind, strength * (INSTRUMENT_FACTOR if kind == "instrument" else 1.0))
 
 
 def run_task(task: Task) -> dict[str, str]:
@@ -173,7 +176,7 @@ def write_table(path: Path, seeds: str, rows: list[dict[str, str]]) -> None:
 
 def find_truth(row: dict[str, str]) -> str:
     """Return the name of the true explanation of a row."""
-    return {"none": NO_EFFECT, "unknown": NONE_OF_THESE}.get(row["kind"], row["causes"])
+    return {"none": NO_EFFECT, "instrument": NO_EFFECT, "unknown": NONE_OF_THESE}.get(row["kind"], row["causes"])
 
 
 def is_detected(row: dict[str, str]) -> bool:
@@ -308,7 +311,8 @@ def format_summary(rows: list[dict[str, str]]) -> str:
     if not kept:
         return "The table is empty."
     nulls = [row for row in kept if row["kind"] == "none"]
-    hidden = [row for row in kept if row["kind"] != "none"]
+    instruments = [row for row in kept if row["kind"] == "instrument"]
+    hidden = [row for row in kept if row["kind"] not in ("none", "instrument")]
     codes = {row["code"] for row in kept} - {compute_code()}
     lines = [
         f"{len(kept)} recordings ({len(rows) - len(kept)} not sampled: no size of the effect has that strength); "
@@ -320,6 +324,11 @@ def format_summary(rows: list[dict[str, str]]) -> str:
         + format_share(sum(find_best(row, "bic") != NO_EFFECT for row in nulls), len(nulls))
         + ".",
         f"False names: {format_share(sum(map(is_false_name, hidden)), len(hidden))}.",
+        "Disturbances of an instrument: found "
+        + format_share(sum(row["verdict"] == "instrument" for row in instruments), len(instruments))
+        + ", taken for a cause in the pixel "
+        + format_share(sum(row["verdict"] in ("cause", "ambiguous") for row in instruments), len(instruments))
+        + ".",
         "Brier score, 0 to 2: "
         + ", ".join(
             f"{name} {compute_brier(kept, column):.3f}"
@@ -331,7 +340,7 @@ def format_summary(rows: list[dict[str, str]]) -> str:
         "",
         format_strengths(hidden),
         "",
-        *format_misses(hidden),
+        *format_misses([*hidden, *instruments]),
     ]
     return "\n".join(lines)
 

@@ -128,11 +128,12 @@ def draw_keys(kind: str, rng: Rng) -> tuple[str, ...]:
 
 
 def draw_case_of_strength(
-    kind: str, strength: float, seed: int, folder: str | Path, chosen: tuple[str, ...] | None = None
+    kind: str, strength: float, seed: int, folder: str | Path, chosen: tuple[str, ...] | None = None, form: str = ""
 ) -> Case | None:
     """Draw a hidden display and a recording of it, and return it with the ground truth.
 
-    kind: "none", "single", "pair", "unknown" or "instrument"; chosen: keys of the effects, drawn by default
+    kind: "none", "single", "pair", "unknown" or "instrument"; chosen: keys of the effects, drawn by default;
+    form: of all of them, drawn by default
     """
     rng = np.random.default_rng([seed, 31])
     keys = draw_keys(kind, rng) if chosen is None else chosen
@@ -146,7 +147,7 @@ def draw_case_of_strength(
         session = build_session(base, instruments, reduce_power(session.design, 0.88), [seed, 32])
     found = None if keys else ((), base, 0.0)
     for _ in range(MAX_DRAWS if keys else 0):
-        effects = tuple((CAUSES | MECHANISMS | INSTRUMENTS)[key](rng, session.scene) for key in keys)
+        effects = tuple(_draw_effect(key, form, rng, session.scene) for key in keys)
         if len(effects) > 1:  # each alone first, so that neither hides behind the other
             alone = [_scale_to_strength(session, (effect,), strength) for effect in effects]
             effects = tuple(item[0][0] for item in alone if item is not None)
@@ -168,6 +169,13 @@ def draw_case_of_strength(
     known = {name: getattr(base, name) for name in ("R", "C", "tau_g", "kappa", "phi")}
     causes = (kind, *keys) if kind in ("unknown", "instrument") else keys
     return Case(path, kind, seed, causes, {}, known, sigma, effects, truth, session.runs, session.instruments)
+
+
+def _draw_effect(key: str, form: str, rng: Rng, scene: SessionScale) -> Effect:
+    while True:
+        effect = (CAUSES | MECHANISMS | INSTRUMENTS)[key](rng, scene)
+        if form in ("", effect.form):
+            return effect
 
 
 def _scale_to_strength(session, effects: tuple[Effect, ...], strength: float):

@@ -66,11 +66,13 @@ def test_the_summary_counts_false_names_alarms_and_true_causes_ruled_out():
         build_row(6, kind="none", causes="", target_sigma=""),
         build_row(7, kind="unknown", causes="hum+unknown", verdict="unexplained", named=""),
         build_row(8, kind="single", causes="", verdict=""),
+        build_row(9, kind="instrument", causes="instrument+line", verdict="instrument", named=""),
     ]
     assert [calibration.is_named(row) for row in rows[:4]] == [True, False, True, False]
     assert [calibration.is_false_name(row) for row in rows[:7]] == [False, True, False, False, False, True, False]
     text = calibration.format_summary(rows)
-    assert "7 recordings (1 not sampled" in text
+    assert "8 recordings (1 not sampled" in text
+    assert "Disturbances of an instrument: found 1/1, 100 % (21 to 100), taken for a cause in the pixel 0/1" in text
     assert "False alarms in nulls: 1/2, 50 %" in text
     assert "False names: 1/5, 20 %" in text
     assert "| 5 | 5/5, 100 % (57 to 100) |" in text
@@ -106,7 +108,9 @@ def test_the_ideal_observer_agrees_with_simulated_tests():
 def test_every_kind_meets_every_strength_and_other_tables_are_refused(tmp_path):
     tasks = [calibration.build_task("report", k) for k in range(100)]
     assert {(task.kind, task.strength) for task in tasks} == {
-        (kind, strength) for kind in calibration.KINDS for strength in calibration.STRENGTHS
+        (kind, strength * (10.0 if kind == "instrument" else 1.0))
+        for kind in calibration.KINDS
+        for strength in calibration.STRENGTHS
     }
     assert len({task.seed for task in tasks}) == 100
     path = tmp_path / "table.csv"

@@ -120,6 +120,21 @@ class RivalModel:
 
 
 @dataclass(frozen=True)
+class InstrumentDisturbance:
+    """A disturbance that an instrument adds to one signal, SI.
+
+    form: "line", with the amplitude as size; "hops" of the zero, with their median; "drift" of the zero over the
+    recording, with its span; runs: in which it was found
+    """
+
+    signal: str
+    form: str
+    size: float
+    frequency_hz: float | None
+    runs: int
+
+
+@dataclass(frozen=True)
 class HeldOutError:
     """RMSE of both models in one signal of one held-out group, and the expected noise, in SI units."""
 
@@ -184,8 +199,9 @@ class ExampleTrace:
 class Discrepancy:
     """Diagnosis of a recording.
 
-    verdict: "cause", "none", "unexplained", "ambiguous", or "incomplete" if no error was found but failures prevent
-    "none"; probabilities: of all explanations; terms: the extension, term → parameter → value; base:
+    verdict: "cause", "none", "unexplained", "ambiguous", "instrument" if only disturbances were found, or "incomplete"
+    if no error was found but failures prevent "none"; disturbances: of the instruments, which were subtracted before
+    all else; probabilities: of all explanations; terms: the extension, term → parameter → value; base:
     nominal parameters as refitted with it; residual_traces: the first run of every group, with the models fitted to all
     runs; held_out_traces, held_out_errors: with the models fitted to the other runs; explained_fraction: share of the
     detected excess of χ²; doubts: why the size of a named cause is uncertain, a clause by cause; failures: hypotheses
@@ -195,6 +211,7 @@ class Discrepancy:
 
     verdict: str
     causes: tuple[str, ...]
+    disturbances: tuple[InstrumentDisturbance, ...]
     probabilities: Probabilities
     hypothesis_labels: tuple[str, ...]
     parameters: dict[str, Estimate]

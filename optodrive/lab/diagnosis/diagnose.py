@@ -14,6 +14,7 @@ from optodrive.core.types.discrepancy import (
     Estimate,
     HeldOutError,
     HeldOutGain,
+    InstrumentDisturbance,
     NextExperiment,
     Probabilities,
     ResidualTrace,
@@ -26,10 +27,17 @@ from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset
 from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
 from optodrive.lab.diagnosis.estimates import compute_estimates, describe_doubts, is_at_limit
-from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, fit
+from optodrive.lab.diagnosis.fitting import (
+    BaseParameterPrior,
+    FitProblem,
+    ModelFit,
+    compute_jitter_sensitivity,
+    fit,
+)
 from optodrive.lab.diagnosis.height_error import compute_height_error
 from optodrive.lab.diagnosis.held_out_gain import compute_held_out_errors, compute_held_out_gain, split_runs
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
+from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, remove_disturbances
 from optodrive.lab.diagnosis.model_selection import (
     MAX_INTRA_PULSE_POWER_EXCESS,
     MAX_REPLICATE_EXCESS,
@@ -42,7 +50,7 @@ from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fi
 from optodrive.lab.diagnosis.numeric_limits import check_numeric_limits
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
-from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
 from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, ignore_progress
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
@@ -76,6 +84,7 @@ class _SubsystemFit:
     rivals: tuple[RivalModel, ...]
     next_experiment: NextExperiment | None
     failures: dict[str, str]
+    disturbances: tuple[InstrumentDisturbance, ...]
 
     @property
     def comparison(self) -> ModelComparison:
@@ -142,6 +151,7 @@ def diagnose(
     return Discrepancy(
         verdict=verdict,
         causes=causes,
+        disturbances=tuple(item for subsystem in subsystems for item in subsystem.disturbances),
         probabilities=reduce(Probabilities.combine, (subsystem.verdict.probabilities for subsystem in subsystems)),
         hypothesis_labels=tuple(
             item.label
@@ -188,6 +198,14 @@ def _diagnose_subsystem(
     fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
     log.on_progress("noise and nominal model")
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
+    prediction = predict(data, base.point, epsilon)
+    sensitivity = compute_jitter_sensitivity(data, base.point, epsilon, prediction)
+    disturbances, added = find_disturbances(data, data.value - prediction, sensitivity, problem.noise)
+    if disturbances:
+        log.on_progress("nominal model without the instruments' disturbances")
+        data = remove_disturbances(data, added)
+        fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
+        problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
     problem, base = _revise_noise(problem, base, hypotheses, min_timing_sigma_s, log)
     verdict = select_causes(problem, base, hypotheses, log)
     gains: dict[str, float] = {}
@@ -229,6 +247,7 @@ def _diagnose_subsystem(
         list_rivals(verdict, gains),
         experiment,
         log.failures,
+        disturbances,
     )
 
 
@@ -287,11 +306,14 @@ def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
 def _combine_verdicts(subsystems: list[_SubsystemFit]) -> tuple[str, tuple[str, ...]]:
     """Return the weakest verdict of the subsystems that have an error, with all their causes.
 
-    Without an error the verdict is "incomplete" if a hypothesis could not be computed.
+    Without an error the verdict is "incomplete" if a hypothesis could not be computed, and "instrument" if only an
+    instrument is disturbed.
     """
     verdicts = [subsystem.verdict for subsystem in subsystems if subsystem.verdict.verdict != "none"]
     if not verdicts:
-        return "incomplete" if any(subsystem.failures for subsystem in subsystems) else "none", ()
+        if any(subsystem.failures for subsystem in subsystems):
+            return "incomplete", ()
+        return "instrument" if any(subsystem.disturbances for subsystem in subsystems) else "none", ()
     causes = tuple(dict.fromkeys(cause for item in verdicts for cause in item.causes))
     for verdict in ("unexplained", "ambiguous"):
         if any(item.verdict == verdict for item in verdicts):

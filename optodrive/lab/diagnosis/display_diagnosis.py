@@ -125,7 +125,7 @@ class DisplayAnswer:
         largest = groups[0] if groups else None
         if largest is None or 2 * len(largest.answers) <= len(self.pixels):
             return None, None, "no set of causes holds for most pixels"
-        if largest.verdict not in ("none", "cause"):
+        if largest.verdict not in ("none", "instrument", "cause"):
             return None, None, f"most pixels are {largest.verdict}"
         widths_m = {item.width_m for item in largest.answers}
         if len(widths_m) > 1:

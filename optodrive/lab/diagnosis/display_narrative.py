@@ -85,6 +85,8 @@ def describe_group(group: PixelGroup) -> str:
     named = [f"{discover_terms()[key].label} ({key})" for key in group.causes]
     if group.verdict == "none":
         return "no error found"
+    if group.verdict == "instrument":
+        return "no error of the model, but an instrument is disturbed"
     if group.verdict == "incomplete":
         return "no error found, but not every cause could be computed"
     if group.verdict == "cause":
@@ -111,7 +113,7 @@ def format_ranges(pixels: list[int]) -> str:
 def build_display_answer(answer: DisplayAnswer) -> dict[str, Any]:
     """Return JSON values: a summary, and per pixel index the same answer as for a recording of that pixel only."""
     model, _, reason = answer.build_model()
-    verdicts = ("none", "cause", "ambiguous", "unexplained", "incomplete")
+    verdicts = ("none", "cause", "ambiguous", "unexplained", "instrument", "incomplete")
     return {
         "summary": {
             "pixels": len(answer.pixels),

@@ -73,7 +73,7 @@ def _assign_marks(answer: DisplayAnswer) -> dict[int, PixelMark]:
 
 
 def _build_sign(group: PixelGroup) -> PixelMark:
-    if group.verdict == "none":
+    if group.verdict in ("none", "instrument"):
         return PixelMark("·", NOTHING_COLOUR, describe_group(group))
     return PixelMark("?" if group.verdict == "ambiguous" else "!", UNCERTAIN_COLOUR, describe_group(group))
 

@@ -6,10 +6,19 @@ from math import isfinite
 from typing import Any
 
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate, HeightError, Probabilities
+from optodrive.core.types.discrepancy import (
+    CandidateCause,
+    Discrepancy,
+    Estimate,
+    HeightError,
+    InstrumentDisturbance,
+    Probabilities,
+)
 from optodrive.physics.terms import discover_terms
 
 MAX_RULED_OUT = 6
+NOTHING_FOUND = ("none", "instrument", "incomplete")
+"""Verdicts that find no error of the model."""
 MIN_SHOWN = 0.01
 """Smallest probability of a set of causes that the text states."""
 
@@ -33,6 +42,7 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
             f"  {name} = {_format_interval(item)}" for name, item in discrepancy.parameters.items() if "." in name
         ]
         lines.append("")
+    lines += [f"{describe_disturbance(item)}; it was subtracted." for item in discrepancy.disturbances]
     lines.append(describe_probabilities(discrepancy.probabilities))
     if discrepancy.verdict in ("cause", "ambiguous"):
         lines.append(f"This explains {discrepancy.explained_fraction:.1%} of the excess χ² of the nominal model.")
@@ -42,7 +52,7 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
     if discrepancy.failures:
         lines.append("Could not be computed, and may explain what was measured:")
         lines += [f"- {label}: {reason}" for label, reason in discrepancy.failures.items()]
-    if discrepancy.verdict in ("none", "incomplete"):
+    if discrepancy.verdict in NOTHING_FOUND:
         lines += ["Detection limit of each effect:"]
         lines += [f"- {item.label}: {item.detection_limit}" for item in _deduplicate_by_label(discrepancy.candidates)]
     else:
@@ -83,6 +93,17 @@ def describe_probabilities(probabilities: Probabilities) -> str:
     return f"Probabilities: {', '.join(parts)}."
 
 
+def describe_disturbance(item: InstrumentDisturbance) -> str:
+    """Return a disturbance of an instrument as a clause."""
+    name, unit = item.signal.rsplit("_", 1)
+    size = format_quantity(item.size, unit)
+    if item.form == "line":
+        return f"{name} carries a line of {item.frequency_hz:.4g} Hz with an amplitude of {size}"
+    if item.form == "hops":
+        return f"the zero of {name} hops by {size}, seen in {item.runs} run{'s' if item.runs > 1 else ''}"
+    return f"the zero of {name} drifts by {size} over the recording"
+
+
 def format_probability(probability: float) -> str:
     """Return a probability in percent, never as certainty."""
     if probability < 1e-3:
@@ -94,6 +115,9 @@ def _build_headline(discrepancy: Discrepancy) -> str:
     names = [discover_terms()[key].label for key in discrepancy.causes]
     if discrepancy.verdict == "none":
         return "No error found: the refitted nominal model agrees with this recording within its noise."
+    if discrepancy.verdict == "instrument":
+        found = " and ".join(describe_disturbance(item) for item in discrepancy.disturbances)
+        return f"No error of the model found, but an instrument is disturbed: {found}."
     failed = ", ".join(discrepancy.failures)
     if discrepancy.verdict == "incomplete":
         return f"The search is incomplete, for {failed} could not be computed; nothing else shows an error."
@@ -135,7 +159,7 @@ def _count_pushes(error: HeightError) -> str:
 
 def _describe_locations(discrepancy: Discrepancy) -> list[str]:
     """Return the two groups with the largest change of residuals, or the largest residuals if unexplained."""
-    if discrepancy.verdict in ("none", "incomplete"):
+    if discrepancy.verdict in NOTHING_FOUND:
         return []
     rows = []
     for trace in discrepancy.residual_traces:
@@ -188,6 +212,17 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
     return {
         "verdict": discrepancy.verdict,
         "causes": list(discrepancy.causes),
+        "disturbances": [
+            {
+                "signal": item.signal,
+                "form": item.form,
+                "size": item.size,
+                "unit": item.signal.rsplit("_", 1)[1],
+                "frequency_hz": item.frequency_hz,
+                "runs": item.runs,
+            }
+            for item in discrepancy.disturbances
+        ],
         "probabilities": {
             "no_effect": discrepancy.probabilities.no_effect,
             "none_of_these": discrepancy.probabilities.none_of_these,

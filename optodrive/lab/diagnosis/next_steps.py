@@ -59,7 +59,8 @@ def list_next_steps(
         )
         steps.append(_step("Correct the instrument's times when session and measurement are merged.", *merge))
     changes_plans = any(_changes_plans(key) for key in discrepancy.causes)
-    if discrepancy.base and discrepancy.verdict != "unexplained" and (changes_plans or discrepancy.verdict == "none"):
+    is_nominal = discrepancy.verdict in ("none", "instrument")
+    if discrepancy.base and discrepancy.verdict != "unexplained" and (changes_plans or is_nominal):
         steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", model, *display))
         if changes_plans:
             simulate = ("simulate", FRAMES, "--truth", model, *display)

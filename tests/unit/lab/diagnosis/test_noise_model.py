@@ -5,9 +5,11 @@ import pytest
 
 from labs import PIXEL, lab
 from optodrive.lab.diagnosis.dataset import build_dataset
+from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, whiten
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
+from optodrive.lab.diagnosis.replicate_contrasts import compute_contrasts
 
 NOISE = ColouredNoise(white=0.3, sigma=(0.2, 0.4), tau_s=(0.01, 0.05), omega_rad_per_s=300.0)
 
@@ -73,3 +75,37 @@ def test_noise_and_base_are_recovered_from_repeats():
 
 def test_without_repeats_the_noise_is_a_guess():
     assert not fit_nominal(build_dataset(lab(5, {}, repeats=1)))[0].noise.from_replicates
+
+
+@pytest.mark.parametrize("repeats", [2, 3])
+@pytest.mark.parametrize("terms", [{}, {"laser_droop": {"share": 0.34, "time": 0.033, "spread": 1.0}}])
+def test_noise_and_jitter_never_exceed_what_repeats_show(terms, repeats):
+    data = build_dataset(lab(6, terms, repeats=repeats))
+    problem, base = fit_nominal(data)
+    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    contrasts = compute_contrasts(data, data.value - base.prediction, sensitivity.power, sensitivity.timing)
+    noise, powers = problem.noise, []
+    for kind in data.kinds:
+        spread = []
+        for item in (item for item in contrasts if item.kind == kind):
+            jitter = item.jitter / np.abs(item.jitter).max(axis=0)
+            solved = np.linalg.lstsq(jitter, item.value, rcond=None)[0]
+            spread.append(np.mean((item.value - jitter @ solved) ** 2))
+            powers.append(solved[0] / np.abs(item.jitter[:, 0]).max())
+        coloured = noise.coloured[kind]
+        modelled = coloured.white**2 + coloured.sigma[0] ** 2 + coloured.sigma[1] ** 2
+        assert modelled < 1.15 * np.mean(spread)
+    shown, count = np.sqrt(np.mean(np.square(powers))), len({item.pair for item in contrasts})
+    assert noise.power_sigma < shown * (1.0 + 3.0 / np.sqrt(2.0 * count))
+
+
+def test_an_effect_that_repeats_share_leaves_the_noise_as_it_is():
+    plain, drooping = (
+        fit_nominal(build_dataset(lab(7, terms)))[0].noise
+        for terms in ({}, {"laser_droop": {"share": 0.34, "time": 0.033, "spread": 1.0}})
+    )
+    assert drooping.power_sigma < 1.2 * plain.power_sigma
+    assert drooping.timing_sigma_s < 1.2 * plain.timing_sigma_s
+    for kind, item in plain.coloured.items():
+        assert drooping.coloured[kind].white == pytest.approx(item.white, rel=0.02)
+        assert sum(np.square(drooping.coloured[kind].sigma)) < 1.2 * sum(np.square(item.sigma))
