@@ -16,6 +16,7 @@ from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain,
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.batch_limiter import BatchLimiter
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.cold_start import COLD_START
 from optodrive.planning.limiter.limiter import concatenate
 from optodrive.planning.limiter.usage import compute_usage
 from optodrive.planning.planned_sequence import (
@@ -86,6 +87,7 @@ def plan_sequence(
         if on_progress is not None:
             on_progress(done)
 
+    COLD_START.begin(display.budget, budget)
     scheduler = Scheduler(
         display.scan_heads,
         display.build_assignment(sequence),

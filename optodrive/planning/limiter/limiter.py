@@ -19,6 +19,7 @@ from optodrive.core.types.plans import EMPTY_PLAN, BudgetState, LimitedPlan, Pul
 from optodrive.core.types.push_options import Policy
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.caps import CAPS_BY_KEY, REASONS, WRONG_ORDER
+from optodrive.planning.limiter.cold_start import COLD_START
 from optodrive.planning.limiter.galvo_moves import count_galvo_feasible
 from optodrive.planning.limiter.pulse_application import (
     COUNT_ONLY,
@@ -276,6 +277,7 @@ def _apply_plan(
     on_progress: Callable[[], None] = _ignore_progress,
 ) -> tuple[int, FloatArray, IntArray, LimiterWorkspace]:
     """Apply pulses [n] in chunks, between which nothing but the workspace is carried over."""
+    COLD_START.finish(budget, state)
     count, applied = len(pixel), 0
     workspace = open_workspace(state, count)
     power_w, cause = np.zeros(count), np.zeros(count, dtype=np.int64)

@@ -54,7 +54,7 @@ def apply_pulses(
             pixel[row], stage[row], start_s[row], width_s[row], x_rad[row], y_rad[row], power_w[row], panel_k
         )
         granted_w[row], cause[row] = request.power_w, NO_CAP
-        before = _compute_start_state(budget, workspace, request)
+        before = compute_start_state(budget, workspace, request)
         if request.power_w < budget.caps.min_power_w or request.power_w <= 0.0:
             continue
         if policy != COUNT_ONLY:
@@ -66,12 +66,12 @@ def apply_pulses(
                 if granted_w[row] < budget.caps.min_power_w:
                     granted_w[row] = 0.0
         if granted_w[row] > 0.0:
-            _commit(budget, workspace, request, granted_w[row], before)
+            commit(budget, workspace, request, granted_w[row], before)
     return len(pixel)
 
 
 @kernel
-def _compute_start_state(budget: Budget, workspace: LimiterWorkspace, request: PulseRequest) -> PixelStartState:
+def compute_start_state(budget: Budget, workspace: LimiterWorkspace, request: PulseRequest) -> PixelStartState:
     """Advance a pixel to the start of a pulse and return its state there."""
     exchange_wall_heat(budget.heat, workspace.nodes, request.start_s, budget.caps.pulse_width_s)
     advance_pixel(budget.heat, workspace.nodes, request.pixel, request.start_s)
@@ -85,7 +85,7 @@ def _compute_start_state(budget: Budget, workspace: LimiterWorkspace, request: P
 
 
 @kernel
-def _commit(
+def commit(
     budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, power_w: float, before: PixelStartState
 ) -> None:
     """Add a pulse to all budgets."""
