@@ -47,6 +47,8 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
 
     stopped: result of the link process, if it was stopped already
     """
+    modules: dict[str, Any] = sys.modules
+    modules.setdefault("httpx._main", None)  # its own command line, which it leaves out where rich is not installed
     invocation = Invocation(tuple(arguments), stopped)
     app = build_app(arguments[0] if arguments else None)
     try:
