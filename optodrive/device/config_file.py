@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import check_table, collect_ranges
+from optodrive.core.plausibility import PlausibleRange, check_table, collect_ranges
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format, parse_table, validate_table
 from optodrive.device.config import FORMAT, VERSION, Config
@@ -103,12 +103,15 @@ class GalvoSection(Section):
     """Remaining fraction of the cap."""
 
 
+_RestingError = Annotated[float, Field(ge=0), PlausibleRange(0.0, 0.1, "rad")]
+
+
 class EffectSection(Section):
     """Error of either mirror that no settling time removes, because the mirror has a nonlinear effect."""
 
     name: tuple[str, str]
     """Effect of mirrors x and y."""
-    error_rad: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
+    error_rad: tuple[_RestingError, _RestingError]
     """Largest error that stays after a move of mirrors x and y, rad."""
 
 

@@ -9,6 +9,9 @@ from hidden_servo import HiddenServo, recording
 from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.device.config_file import load_config
 from optodrive.lab.servo_identification.common_servo import DAMPING_MAX, find_common_servo
+from optodrive.lab.servo_identification.effect_fit import find_effect
+from optodrive.lab.servo_identification.excitation import extract_records
+from optodrive.lab.servo_identification.gate_effect import assess
 from optodrive.lab.servo_identification.identify import identify
 from optodrive.lab.servo_identification.report import build_report, format_report_lines
 from optodrive.lab.servo_identification.step_trace import extract_trace
@@ -21,7 +24,16 @@ def reported(measurement):
     slew = CONFIG.scanner.slew_rad_per_s
     mirrors = tuple(identify("r.h5", extract_trace("r.h5", measurement, axis), slew) for axis in range(2))
     common = find_common_servo(mirrors, CONFIG)
-    return build_report(mirrors, common, CONFIG), common
+    effects = tuple(
+        assess(
+            find_effect(extract_records("r.h5", measurement, axis), 2.0 * np.pi * mirror.servo.frequency),
+            mirror.residual_rad,
+            CONFIG,
+            axis,
+        )
+        for axis, mirror in enumerate(mirrors)
+    )
+    return build_report(mirrors, common, CONFIG, effects), common
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from test_caps_over_hours import build_model, build_worst_factors
 
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.daemon.engine import plan_queue, queue_pause
+from optodrive.daemon.engine import queue_pause
 from optodrive.daemon.engine.thermal_estimate import EndedPlan, rewind_estimate
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.link_service import LinkService
@@ -256,7 +256,7 @@ def is_one_draining(group):
 
 
 MUTANTS = {
-    "drawn twice": ("unplug", "frames", 0.2, plan_queue, "find_emitted", forget_sent),
+    "drawn twice": ("unplug", "frames", 0.2, queue_pause, "find_emitted", forget_sent),
     "before the lost board is dark": ("unplug", "page", 0.03, BoardGroup, "is_draining", property(is_one_draining)),
     "a lease again": ("lie", "frames", 0.2, BoardGroup, "_readmit_lost", arm_again),
     "not drawn": ("fault", "frames", 0.2, LinkService, "_interrupt_if_lost", lambda service: None),

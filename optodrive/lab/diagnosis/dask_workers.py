@@ -189,7 +189,9 @@ def _check_scheduler(client: Any, timeout_s: float) -> None:
 def _wait_for_error(future: Any) -> Exception | None:
     """Return the exception of a future. Raise OptodriveError if the scheduler is lost."""
     error: Exception | None = future.exception()
-    if future.status in ("cancelled", "lost"):
+    while future.status == "lost":  # a worker died with the result, which another computes again
+        error = future.exception()
+    if future.status == "cancelled":
         raise OptodriveError("the Dask scheduler was lost before all tasks ended; no file is written")
     return error
 
