@@ -15,7 +15,7 @@ from optodrive.client.http import DaemonClient
 from optodrive.client.plan import Plan
 from optodrive.client.requests import ARM, READ_STATE, STOP, build_play_request, build_read_request
 from optodrive.core.errors import InputError, LinkError, OptodriveError, RefusedError
-from optodrive.daemon.api.token_places import build_tokens_path
+from optodrive.daemon.api.tokens import build_tokens_path
 
 PATTERNS = ("showcase", "experiment-1", "experiment-2", "experiment-3", "experiment-4", "experiment-5", "experiment-6")
 COLUMNS = ("pattern", "planned", "sent", "executed", "target µm", "reached µm")

@@ -13,7 +13,7 @@ from optodrive.cli.invocation import Invocation
 from optodrive.cli.options import HoldOption, JsonOption, StageOption, UrlOption
 from optodrive.cli.output import print_json
 from optodrive.core.daemon_url import DEFAULT_URL
-from optodrive.core.errors import InputError, NotReadyError, OptodriveError
+from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def status(url: UrlOption = DEFAULT_URL, stage: StageOption = None, json: JsonOp
         return
     _print_state(state, json)
     if not json:
-        print(f"limits    {_format_limits(client.call(READ_CONFIG)['limits'])}")
+        print(f"limits    {_format_limits(_view_object(client.call(READ_CONFIG)).limits)}")
 
 
 def _print_stage(document: dict[str, Any], name: str, as_json: bool) -> None:
@@ -158,19 +158,25 @@ def _print_stopped(result: dict[str, Any], error: OptodriveError, as_json: bool)
     print(f"optodrive: the board was stopped; the state of the daemon is not known: {error}", file=sys.stderr)
 
 
+class _Members(SimpleNamespace):
+    """The members of a JSON object as attributes."""
+
+    def __getattr__(self, name: str) -> Any:  # only for a member that is missing
+        raise LinkError(f"the daemon's answer has no {name!r}: is the daemon of another version?")
+
+
 def _view_object(value: Any) -> Any:
     """Return a JSON object with its members as attributes, as its model has them."""
     if isinstance(value, list):
         return [_view_object(item) for item in value]
     if isinstance(value, dict):
-        return SimpleNamespace(**{name: _view_object(item) for name, item in value.items()})
+        return _Members(**{name: _view_object(item) for name, item in value.items()})
     return value
 
 
-def _format_limits(limits: dict[str, Any]) -> str:
-    return "; ".join(
-        f"{cap['label']} {format_quantity(limits[cap['setting']], cap['unit'], 6)}" for cap in limits["caps"].values()
-    )
+def _format_limits(limits: Any) -> str:
+    caps = vars(limits.caps).values()
+    return "; ".join(f"{cap.label} {format_quantity(getattr(limits, cap.setting), cap.unit, 6)}" for cap in caps)
 
 
 def _format_board(board: "BoardReport") -> str:

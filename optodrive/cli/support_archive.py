@@ -18,13 +18,13 @@ from optodrive.cli.redaction import Redaction
 from optodrive.cli.service_files import CONFIG_PATH, UNIT_PATH
 from optodrive.core.errors import OptodriveError
 from optodrive.core.files import read_last_lines
-from optodrive.daemon.api.token_places import (
+from optodrive.daemon.api.tokens import (
     ENVIRONMENT_VARIABLE,
     FILE_ENVIRONMENT_VARIABLE,
     SERVICE_TOKENS,
     build_tokens_path,
+    read_tokens,
 )
-from optodrive.daemon.api.tokens import read_tokens
 from optodrive.device.config_file import list_shipped_configs, load_config, locate_shipped
 
 if TYPE_CHECKING:

@@ -93,7 +93,7 @@ def revoke(name: NameArgument, file: FileOption = None, config: ConfigOption = N
 
 
 def _locate(file: Path | None, config: str | None) -> Path:
-    from optodrive.daemon.api.token_places import SERVICE_TOKENS
+    from optodrive.daemon.api.tokens import SERVICE_TOKENS
     from optodrive.device.config_file import load_config
 
     if file is not None:

@@ -7,7 +7,7 @@ import httpx
 
 from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError, LinkError
-from optodrive.daemon.api.own_token import read_token
+from optodrive.daemon.api.tokens import read_token
 
 PROBE_TIMEOUT_S = 2.0
 STOP_UNANSWERED = (

@@ -15,7 +15,7 @@ from optodrive.core.errors import (
     RefusedError,
     StoppedError,
 )
-from optodrive.daemon.api.token_places import ENVIRONMENT_VARIABLE
+from optodrive.daemon.api.tokens import ENVIRONMENT_VARIABLE
 from optodrive.daemon.responses.problem import Problem
 
 INPUT_ERROR_STATUSES = (400, 404, 413, 422)

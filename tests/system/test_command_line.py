@@ -7,7 +7,9 @@ import sys
 
 import pytest
 
+from optodrive.cli import control
 from optodrive.client import Display
+from optodrive.core.errors import LinkError
 from rig import OPTODRIVE, TOKEN, long_train, running, wait_for
 
 
@@ -66,6 +68,11 @@ def test_control_imports_no_models(rig, arguments):
         text=True,
     )
     assert (ended.returncode, ended.stderr) == (0, "\n")
+
+
+def test_a_daemon_of_another_version_is_named(capsys):
+    with pytest.raises(LinkError, match="no 'board': is the daemon of another version"):
+        control._print_state({"pixels": 3}, as_json=False)
 
 
 def test_arming_an_armed_board_does_nothing(rig):

@@ -15,8 +15,9 @@ from optodrive.core.errors import MISSING, InputError
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES, Role
-from optodrive.daemon.api.token_places import ENVIRONMENT_VARIABLE, FORMAT, VERSION, build_tokens_path
 
+ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
+FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"
 ALLOWED_PATTERN = r"^[!-~]{16,200}$"
 NAME_PATTERN = r"^[\w.@ -]{1,40}$"
 EXPECTED_VALUES = {
@@ -25,6 +26,9 @@ EXPECTED_VALUES = {
     "secret": "16 to 200 letters, digits or signs, no spaces",
 }
 """What each key of a token holds."""
+SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
+FORMAT = "optodrive-tokens"
+VERSION = 1
 FILE_MAX_BYTES = 64_000
 """Largest size of a file of tokens, bytes: several hundred, which one message to the web process holds."""
 
@@ -78,6 +82,12 @@ class _TokensFile(Section):
     format: Literal["optodrive-tokens"]
     version: Literal[1]
     token: Annotated[tuple[_TokenEntry, ...], Field(min_length=1)]
+
+
+def build_tokens_path(port: int) -> Path:
+    """Build the default path of the tokens of the daemon on a TCP port."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
+    return Path(runtime) / "optodrive" / f"token-{port}"
 
 
 def read_tokens(path: Path, *, private: bool = False) -> Tokens:
@@ -145,3 +155,22 @@ def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
         return (read_private_tokens(path) if os.path.lexists(path) else create_tokens(path)), path
     path = build_tokens_path(port)
     return create_tokens(path, os.environ.get(ENVIRONMENT_VARIABLE)), path
+
+
+def read_token(port: int | None) -> str:
+    """Read the token with the highest role for a daemon on a TCP port. Raise InputError if none is readable.
+
+    port: None for a daemon on a Unix socket
+    """
+    secret = os.environ.get(ENVIRONMENT_VARIABLE)
+    if secret:
+        return secret
+    file_name = os.environ.get(FILE_ENVIRONMENT_VARIABLE)
+    own_paths = [] if port is None else [build_tokens_path(port)]
+    candidates = [Path(file_name)] if file_name else [*own_paths, SERVICE_TOKENS]
+    for path in candidates:
+        if os.access(path, os.R_OK):
+            return read_tokens(path).highest_role.secret
+    listed = " or ".join(str(path) for path in candidates)
+    expected = f"a token: set it, name a file of tokens by {FILE_ENVIRONMENT_VARIABLE}, or make {listed} readable"
+    raise InputError(ENVIRONMENT_VARIABLE, MISSING, expected)

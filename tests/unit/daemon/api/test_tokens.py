@@ -1,13 +1,15 @@
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.daemon.api.own_token import read_token
-from optodrive.daemon.api.token_places import ENVIRONMENT_VARIABLE, FILE_ENVIRONMENT_VARIABLE, build_tokens_path
 from optodrive.daemon.api.tokens import (
+    ENVIRONMENT_VARIABLE,
+    FILE_ENVIRONMENT_VARIABLE,
     Tokens,
+    build_tokens_path,
     create_tokens,
     load_daemon_tokens,
     read_private_tokens,
+    read_token,
     read_tokens,
 )
 
