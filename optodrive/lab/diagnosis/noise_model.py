@@ -217,6 +217,11 @@ def estimate_resolution(values: FloatArray, span: float) -> float:
     return max(_find_quantum(values) / sqrt(12.0), RESOLUTION_SHARE * span, EPS)
 
 
+def find_resolution(data: Dataset, kind: int) -> float:
+    """Return the standard deviation that quantisation gives to samples of one kind of signal."""
+    return estimate_resolution(*_collect_values(data, data.value, kind))
+
+
 def _collect_values(data: Dataset, prediction: FloatArray, kind: int) -> tuple[FloatArray, float]:
     """Return the samples of one kind, and the range of data and prediction."""
     parts = [block.part for block in data.blocks if block.kind == kind]
