@@ -39,6 +39,7 @@ from blind_session import (
     draw_sample_times,
     reduce_power,
     simulate_ideal_rises,
+    write_recording,
     write_run,
 )
 
@@ -230,12 +231,7 @@ def draw_case(
     path.parent.mkdir(parents=True, exist_ok=True)
     stated_width = width if rng.random() < 0.5 else None
     noise = np.random.default_rng([*seeds, 2])
-    with h5py.File(path, "w") as file:
-        file.attrs["format"] = "optotactile-recording"
-        file.attrs["version"] = 1
-        file.create_group("runs")
-        for run in session.runs:
-            write_run(file["runs"], run, truth, session.instruments, noise, stated_width)
+    write_recording(path, session.runs, truth, session.instruments, noise, stated_width)
     return Case(
         path=path,
         block=block,

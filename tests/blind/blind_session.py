@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
+import h5py
 import numpy as np
 
 from blind_causes import SessionScale
@@ -286,6 +287,17 @@ def write_run(parent, run: Run, truth: Physics, instruments: Instruments, rng: R
             signal.attrs["sigma"] = instruments.stated[name]
         signal.create_dataset("t_s", data=np.asarray(t, np.float64))
         signal.create_dataset("value", data=np.asarray(value, np.float64))
+
+
+def write_recording(
+    path, runs: list[Run], truth: Physics, instruments: Instruments, rng: Rng, width: float | None
+) -> None:
+    with h5py.File(path, "w") as file:
+        file.attrs["format"] = "optotactile-recording"
+        file.attrs["version"] = 1
+        file.create_group("runs")
+        for run in runs:
+            write_run(file["runs"], run, truth, instruments, rng, width)
 
 
 def build_scene(base: Physics, runs: list[Run]) -> SessionScale:

@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from blind_causes import CATALOGUE, CONFUSABLE, MECHANISMS, Draw, Effect, Rng, SessionScale, apply_effects
 from blind_display import DISPLACEMENT, FORCE, TEMPERATURE
 from blind_lab import Case, build_session, is_too_hot
-from blind_session import draw_base, draw_design, draw_instruments, reduce_power, simulate_ideal_rises, write_run
+from blind_session import draw_base, draw_design, draw_instruments, reduce_power, simulate_ideal_rises, write_recording
 
 TOLERANCE = 0.1
 """Largest relative deviation of a strength from the wanted one."""
@@ -160,12 +159,7 @@ def draw_case_of_strength(
     path = Path(folder) / "case.h5"
     noise = np.random.default_rng([seed, 33])
     stated_width = width if rng.random() < 0.5 else None
-    with h5py.File(path, "w") as file:
-        file.attrs["format"] = "optotactile-recording"
-        file.attrs["version"] = 1
-        file.create_group("runs")
-        for run in session.runs:
-            write_run(file["runs"], run, truth, session.instruments, noise, stated_width)
+    write_recording(path, session.runs, truth, session.instruments, noise, stated_width)
     known = {name: getattr(base, name) for name in ("R", "C", "tau_g", "kappa", "phi")}
     causes = (kind, *keys) if kind in ("unknown", "instrument") else keys
     return Case(path, kind, seed, causes, {}, known, sigma, effects, truth, session.runs, session.instruments)
