@@ -36,6 +36,8 @@ class ApiRequest(Generic[Response]):
 
 def _parse_object(content: bytes) -> dict[str, Any]:
     parsed: dict[str, Any] = json.loads(content)
+    if not isinstance(parsed, dict):
+        raise ValueError("no object")
     return parsed
 
 

@@ -101,9 +101,15 @@ class ExchangePolicy:
 
 
 def parse_response(request: ApiRequest[Response], response: httpx.Response) -> Response:
-    """Parse a response as the request states. Raise the error that a problem document describes."""
+    """Parse a response as the request states.
+
+    Raise the error that a problem document describes, LinkError for a response of something else than this API.
+    """
     if response.is_success:
-        return request.parse(response.content)
+        try:
+            return request.parse(response.content)
+        except ValueError:
+            raise LinkError(f"the answer to {request.method} {request.path} is not that of this API") from None
     from optodrive.client.problems import parse_problem  # its models take longer than a whole command without them
 
     raise parse_problem(response.status_code, response.content)

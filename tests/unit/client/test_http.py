@@ -72,6 +72,13 @@ def test_a_response_without_a_problem_document_is_a_link_error():
             parse_response(HEALTH, httpx.Response(502, content=body))
 
 
+@pytest.mark.parametrize("body", [b"<html>", b"[]", b"\xff"])
+def test_a_response_of_something_else_is_a_link_error(body):
+    for request in (READ_STATE, api_request.READ_STATE):
+        with pytest.raises(LinkError, match="GET /v1/state is not that of this API"):
+            parse_response(request, httpx.Response(200, content=body))
+
+
 def test_an_unknown_code_is_a_refusal_that_keeps_the_code():
     error = build_error(build_problem(429, "too_many_requests", "Too many requests", "too often"))
     assert type(error) is RefusedError
