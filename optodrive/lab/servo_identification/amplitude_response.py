@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
-from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, SYSTEMATIC_WEIGHT, ServoRecord
+from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, SYSTEMATIC_WEIGHT, ServoRecord, normalise
 from optodrive.lab.servo_identification.effects import FRICTION, HYSTERESIS, STIFFNESS
 
 HALF_WINDOW, DEGREE = 5, 2
@@ -61,7 +61,7 @@ def read_responses(path: Path, sample_rate_hz: float) -> PeriodicResponses:
     names = sorted(name[2:] for name in arrays if name.startswith("u_"))
     if not names:
         raise InputError(
-            f"{path}: u_NAME", None, "arrays u_NAME and y_NAME, [samples, channels, realisations, periods]"
+            f"{path}: u_NAME", MISSING, "arrays u_NAME and y_NAME, [samples, channels, realisations, periods]"
         )
     u, y, held_out, differences = [], [], [], []
     for name in names:
@@ -73,7 +73,7 @@ def read_responses(path: Path, sample_rate_hz: float) -> PeriodicResponses:
             or answer.shape[::2] != drive.shape[::2]
             or len(answer) < 64
         ):
-            shape = None if answer is None else answer.shape
+            shape = MISSING if answer is None else answer.shape
             raise InputError(
                 f"{path}: y_{name}", shape, f"the shape of u_{name} {drive.shape} but for channels: four axes"
             )
@@ -205,12 +205,9 @@ def assess_coupled(responses: PeriodicResponses) -> dict[str, Any]:
         score[name] = -SYSTEMATIC_WEIGHT * np.log(mean2[name]) + phase
     unknown = mean2["model"] + OTHER_SHARE * max(mean2[LINEAR] - mean2["model"], 0.0)
     score[OTHER] = -SYSTEMATIC_WEIGHT * np.log(unknown) + np.log(OTHER_ODDS)
-    peak = max(score.values())
-    weight = {name: float(np.exp(each - peak)) for name, each in score.items()}
-    shares = {name: each / sum(weight.values()) for name, each in weight.items()}
     return {
         "formula": "G(A) = G0 + A G1 + A² G2, A: rms of the drive",
-        "probability": shares,
+        "probability": normalise(score),
         "noise": responses.noise,
         "error": {name: {f"{level:.4g}": each for level, each in of.items()} for name, of in errors.items()},
         "gain": 1.0 - float(np.sqrt(mean2["model"] / mean2[LINEAR])),

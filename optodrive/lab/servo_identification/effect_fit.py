@@ -211,14 +211,18 @@ def _weigh(fits: dict[str, FormFit], test: list[ServoRecord], base: FloatArray) 
     systematic = (max(winner - 1.0, 0.0) + error2) / (winner + error2)
     count /= 1.0 + count / (2.0 * SYSTEMATIC_WEIGHT) * systematic
     score = {name: -0.5 * count * np.log(each.misfit2 + error2) for name, each in fits.items()}
-    unknown = winner_floor = min(1.0, winner)
-    unknown += OTHER_SHARE * max(linear - winner_floor, 0.0)
+    floor = min(1.0, winner)
+    unknown = floor + OTHER_SHARE * max(linear - floor, 0.0)
     score[OTHER] = -0.5 * count * np.log(unknown + error2) + np.log(OTHER_ODDS)
     score[LINEAR] += np.log(LINEAR_ODDS)
+    return Linearity(normalise(score), fits, 1.0 - float(np.sqrt(winner / linear)), base)
+
+
+def normalise(score: dict[str, float]) -> dict[str, float]:
+    """Return probabilities from logarithms of weights."""
     peak = max(score.values())
     weight = {name: float(np.exp(value - peak)) for name, value in score.items()}
-    probability = {name: value / sum(weight.values()) for name, value in weight.items()}
-    return Linearity(probability, fits, 1.0 - float(np.sqrt(winner / linear)), base)
+    return {name: value / sum(weight.values()) for name, value in weight.items()}
 
 
 class EffectFits:
