@@ -5,13 +5,14 @@ import pickle
 import subprocess
 import sys
 
-import numba
 import pytest
 
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter import cold_start
-from optodrive.planning.limiter.cold_start import ColdStart
+from optodrive.planning.limiter.cap_checks import max_power_w
+from optodrive.planning.limiter.cold_start import BEFORE, REQUEST, ColdStart
+from optodrive.planning.limiter.workspace import open_workspace
 
 PLAN = """
 import sys
@@ -38,12 +39,20 @@ def display():
     return DisplayModel.from_config(load_config("display-1"))
 
 
-def test_the_second_process_compiles_for_the_very_types(display):
-    """An array that becomes writable on the way is another type, whose machine code nobody uses."""
-    types = tuple(map(numba.typeof, display.budget))
-    assert pickle.loads(pickle.dumps(types)) == types
-    assert pickle.loads(pickle.dumps(display.budget)).heat.r_k_per_w.flags.writeable
-    assert not display.budget.heat.r_k_per_w.flags.writeable
+def test_the_second_process_compiles_for_the_very_types(monkeypatch, display, tmp_path):
+    """An array that became writable on the way would be another type, whose machine code nobody uses."""
+    program, sent = tmp_path / "program", tmp_path / "sent"
+    program.write_text(f"#!/bin/sh\ncat > {sent}\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(cold_start, "is_cached", lambda kernel: False)
+    monkeypatch.setattr(cold_start.sys, "executable", str(program))
+    start, (_, budget_state) = ColdStart(), display.build_cold_state()
+    start.begin(display.budget, budget_state)
+    start.finish(display.budget, budget_state)
+    max_power_w.compile(pickle.loads(sent.read_bytes()))
+    count = len(max_power_w.signatures)
+    max_power_w(display.budget, open_workspace(budget_state, 1), REQUEST, BEFORE)
+    assert len(max_power_w.signatures) == count
 
 
 @pytest.mark.parametrize("program", ["/bin/true", "/bin/false"])
