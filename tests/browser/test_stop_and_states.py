@@ -330,6 +330,8 @@ def test_figures_that_stop_arriving_are_marked_as_stale(page, daemon):
         for panel in panels:
             expect(panel.locator(".stale-mark")).to_have_text(re.compile(r"^stale since \d\d:\d\d:\d\d$"))
         expect(page.locator("#idle")).to_contain_text("Unknown")
+        expect(page.locator("#dim-value")).to_have_text("unknown")
+        assert page.locator("#dim-value").evaluate("(value) => value.scrollWidth <= value.clientWidth"), "cut off"
     finally:
         for pid in reversed(processes):
             os.kill(pid, signal.SIGCONT)
