@@ -1,5 +1,7 @@
 """Judgement of every hypothesis, and the numbers of those that were refitted."""
 
+from math import exp
+
 import numpy as np
 
 from optodrive.core.quantity import format_quantity
@@ -13,7 +15,8 @@ DETECTABLE_RATIO = 30.0
 MAX_RULED_OUT = 1e-4
 """Probability up to which a cause is ruled out."""
 NOISE_CHI2 = 6.0
-"""Difference of χ² to the best fit that noise alone gives: no cause so near is ruled out, however improbable."""
+"""Difference of χ² to the best fit that noise alone gives, or of twice the log evidence: no cause so near is ruled out,
+however improbable."""
 MIN_INDEPENDENT_FRACTION = 1e-4
 """Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
 
@@ -54,18 +57,25 @@ def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candida
 
 
 def _list_near(verdict: Verdict) -> set[str]:
-    """Return the labels of the hypotheses whose χ², by their refit or by their score, is near the winner's.
+    """Return the labels of the hypotheses near the winner, by χ² of their refit or score, or by their probability.
 
-    A prior or an Occam's factor makes such a hypothesis improbable, but the data do not exclude it.
+    A prior or an Occam's factor makes a hypothesis of such a χ² improbable, but the data do not exclude it. The winner
+    was refitted; it may itself be improbable beside hypotheses that count by their score.
     """
-    nominal = verdict.nominal_chi2
-    winner = nominal if verdict.verdict == "none" or not verdict.candidates else verdict.candidates[0].chi2
+    nominal, stated = verdict.nominal_chi2, verdict.probabilities
+    winner, min_probability = nominal, stated.no_effect
+    if verdict.verdict != "none" and verdict.candidates:
+        best = verdict.candidates[0]
+        winner, min_probability = best.chi2, stated.causes[tuple(sorted({part.key for part in best.hypotheses}))]
+    min_probability *= exp(-0.5 * NOISE_CHI2)
     refits: dict[str, float] = {}
     for item in verdict.candidates:
         for part in item.hypotheses:
             refits[part.label] = min(refits.get(part.label, item.chi2), item.chi2)
     scores = {score.hypothesis.label: nominal - score.ratio for score in verdict.nominal_detection.scores}
-    return {label for label, chi2 in (scores | refits).items() if chi2 <= winner + NOISE_CHI2}
+    near = {label for label, chi2 in (scores | refits).items() if chi2 <= winner + NOISE_CHI2}
+    hypotheses = (score.hypothesis for score in verdict.nominal_detection.scores)
+    return near | {item.label for item in hypotheses if stated.sum_of(item.key) >= min_probability}
 
 
 def _describe_detection_limit(score: Score) -> str:
