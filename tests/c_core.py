@@ -113,6 +113,7 @@ def load(path):
         "shim_init": ([handle, u32, u64], None),
         "shim_tick": ([handle, u64], None),
         "shim_run": ([handle, u64], None),
+        "shim_loop": ([handle, u64], None),
         "shim_receive": ([handle, ctypes.c_char_p, size], None),
         "shim_link_lost": ([handle], None),
         "shim_set_inputs": ([handle, u32], None),
@@ -216,6 +217,11 @@ class CBoard:
     def run_loop(self, data=b""):
         """Run one iteration of the main loop without a tick."""
         self._library.shim_receive(self._handle, data, len(data))
+        self._drain()
+
+    def loop(self, now_us):
+        """Run one iteration of the main loop, possibly without the ticks before it."""
+        self._library.shim_loop(self._handle, now_us)
         self._drain()
 
     def bytes_to_send(self):

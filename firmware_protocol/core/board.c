@@ -67,8 +67,29 @@ static void run_due_event(struct board *b) {
     }
 }
 
-/* Carries out each event due up to now_us, in order and at its exact time. */
+/* B14: a fault of the board itself turns the gate off at once, before any due event is carried out. */
+static void enter_fault_at(struct board *b, enum fault fault, uint64_t now_us) {
+#if MUTANT != 14
+    b->now_us = now_us > b->now_us ? now_us : b->now_us;
+    enter_fault(b, fault);
+#else
+    (void)b, (void)fault, (void)now_us;
+#endif
+}
+
+/* Ticks are late from the first one on: clearing the tables takes a chip milliseconds. */
+static void watch_lateness(struct board *b, uint64_t now_us) {
+    if (b->has_ticked && now_us > b->last_tick_us + BOARD_TICK_US + BOARD_TICK_LATE_US) {
+        enter_fault_at(b, FAULT_TICK, now_us);
+    }
+}
+
+/* Carries out each event due up to now_us, in order and at its exact time, unless the tick that should have carried it
+   out is late: the main loop may come before it. */
 static void advance(struct board *b, uint64_t now_us) {
+    if (MUTANT != 104) {
+        watch_lateness(b, now_us);
+    }
     for (uint64_t due_us; (due_us = board_next_due_us(b)) <= now_us && due_us != NEVER;) {
         b->now_us = due_us > b->now_us ? due_us : b->now_us;
         run_due_event(b);
@@ -99,26 +120,10 @@ static void watch_inputs(struct board *b) {
 #endif
 }
 
-/* B14: a fault of the board itself turns the gate off at once, before any due event is carried out. */
-static void enter_fault_at(struct board *b, enum fault fault, uint64_t now_us) {
-#if MUTANT != 14
-    b->now_us = now_us > b->now_us ? now_us : b->now_us;
-    enter_fault(b, fault);
-#else
-    (void)b, (void)fault, (void)now_us;
-#endif
-}
-
 static void watch_tick(struct board *b, uint64_t now_us) {
-    uint64_t since_us = now_us > b->last_tick_us ? now_us - b->last_tick_us : 0;
-    b->last_tick_us += since_us;
-    if (!b->has_ticked) { /* clearing the tables takes a chip milliseconds */
-        b->has_ticked = true;
-        return;
-    }
-    if (since_us > BOARD_TICK_US + BOARD_TICK_LATE_US) {
-        enter_fault_at(b, FAULT_TICK, now_us);
-    }
+    watch_lateness(b, now_us);
+    b->last_tick_us = now_us > b->last_tick_us ? now_us : b->last_tick_us;
+    b->has_ticked = true;
 }
 
 /* Runs before this tick changes the command, so that a gate in transition is not compared. */

@@ -6,7 +6,8 @@
 #include "board.h"
 
 /* make MUTANT=n disables guard Bn at the one place that enforces it, to prove that the tests detect it; 101 and 102
-   remove the bounds checks of the receiver, 103 both what enforces B12: sequence numbers and indices. */
+   remove the bounds checks of the receiver, 103 both what enforces B12: sequence numbers and indices; 104 lets the main
+   loop run through points while the tick is late, which B14 forbids. */
 #ifndef MUTANT
 #define MUTANT 0
 #endif

@@ -35,6 +35,19 @@ def internal_fault_is_immediate_and_latched(bench, case):
 
 
 @scenario("B14")
+def tick_that_stops_is_a_fault_before_the_watchdog_bites(bench):
+    """The loop alone carries out nothing that the missing tick should have."""
+    host = failing(bench, "stop_tick")
+    board = host.board
+    board.wait(lambda: board.states()[-1] == ("DISARMED", "boot"), "the reset")
+    assert board.states()[-2] == ("FAULT", "fault")
+    assert board.faults() == ["TICK"]
+    assert is_off_by(board, board.changes("fault")[-1])
+    assert_no_session(host)
+    assert host.hello().reset_cause == WATCHDOG
+
+
+@scenario("B14")
 def gate_stuck_off_is_a_fault_at_the_next_pulse(bench):
     host = bench.ready(act("stick_gate"), **BRIGHT)
     host.board.next_step()

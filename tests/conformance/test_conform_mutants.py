@@ -25,6 +25,7 @@ class Mutant(NamedTuple):
 
 MUTANTS = [Mutant("python", name.partition("_")[0].upper(), name) for name in mutants.MUTANTS]
 MUTANTS += [Mutant("c", guard, guard.removeprefix("B")) for guard in GUARDS]
+MUTANTS += [Mutant("c", "B14", "104")]
 
 
 def caught_by(kind, guard):

@@ -43,7 +43,8 @@ class VirtualClock(ManualClock):
 class VirtualBoard(BoardLog):
     """A board core with its port. steps: of its script, carried out by `next_step`.
 
-    The C core's main loop can stop (the watchdog then resets it), its tick be late and its gate stick, as in the ports.
+    The C core's main loop or tick can stop (the watchdog then resets it), its tick be late and its gate stick, as in
+    the ports.
     """
 
     patience_s = 15.0
@@ -53,7 +54,7 @@ class VirtualBoard(BoardLog):
         self._log = []
         self.core = make_core(settings, self._log.append, seed=seed)
         self._steps = list(steps)
-        self._is_open = self._loop_stopped = False
+        self._is_open = self._loop_stopped = self._tick_stopped = False
         self._resumes_us = 0
         self._input = self._output = b""
         clock.boards.append(self)
@@ -70,7 +71,7 @@ class VirtualBoard(BoardLog):
 
     @property
     def _is_serving(self):
-        return not self._loop_stopped and self.clock.now_us() >= self._resumes_us
+        return not self._loop_stopped and not self._tick_stopped and self.clock.now_us() >= self._resumes_us
 
     def advance(self, now_us):
         """Advance to a time."""
@@ -79,14 +80,17 @@ class VirtualBoard(BoardLog):
         if self._resumes_us:
             self.core.tick(self._resumes_us)
             self._resumes_us = 0
-        if not self._loop_stopped:
+        if not self._loop_stopped and not self._tick_stopped:
             self.core.advance(now_us)
             self._receive(now_us)
             return
-        self.core.advance(now_us, loop=False)
+        if self._loop_stopped:
+            self.core.advance(now_us, loop=False)
+        else:
+            self.core.loop(now_us)
         if now_us - self.core.fed_us > WATCHDOG_US:
             self.core.reset(now_us, WATCHDOG_CAUSE)
-            self._loop_stopped = False
+            self._loop_stopped = self._tick_stopped = False
 
     def _receive(self, now_us):
         data, self._input = self._input, b""
@@ -104,6 +108,8 @@ class VirtualBoard(BoardLog):
             self._output = b""
         elif step["do"] == "stop_loop":
             self._loop_stopped = True
+        elif step["do"] == "stop_tick":
+            self._tick_stopped = True
         elif step["do"] == "late_tick":
             self._resumes_us = now_us + LATE_TICK_US
         else:

@@ -122,6 +122,11 @@ void shim_run(struct shim *s, uint64_t now_us) {
     shim_tick(s, now_us);
 }
 
+void shim_loop(struct shim *s, uint64_t now_us) {
+    s->now_us = now_us;
+    board_receive(&s->board, NULL, 0, now_us);
+}
+
 void shim_receive(struct shim *s, const uint8_t *bytes, size_t n) { board_receive(&s->board, bytes, n, s->now_us); }
 void shim_link_lost(struct shim *s) { board_on_link_lost(&s->board, s->now_us); }
 void shim_set_inputs(struct shim *s, uint32_t inputs) { s->inputs = (uint8_t)inputs; }

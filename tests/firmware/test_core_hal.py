@@ -27,10 +27,11 @@ def emit(bench, dark_us=0):
 # --- B14 ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("run", [CBoard.tick, CBoard.loop], ids=["tick", "loop"])
 @pytest.mark.parametrize(("late_us", "fault"), [(600, ""), (601, "TICK")])
-def test_a_tick_may_be_half_a_millisecond_late(bench, late_us, fault):
+def test_a_tick_may_be_half_a_millisecond_late(bench, late_us, fault, run):
     core, board, now_us = emit(bench)
-    core.tick(now_us + late_us)
+    run(core, now_us + late_us)
     assert (core.fault, core.gate_output) == (fault, not fault)
     pulses = [(pulse["index"], pulse["off_us"]) for pulse in board.of("pulse")]
     assert pulses == ([(0, now_us + late_us)] if fault else []), "the record tells how long it really was lit"

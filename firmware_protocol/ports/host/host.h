@@ -46,6 +46,7 @@ enum step_kind {
     STEP_RESET,
     STEP_CLOSE,
     STEP_STOP_LOOP,  /* stops the main loop until the watchdog resets */
+    STEP_STOP_TICK,  /* stops the safety tick until the watchdog resets */
     STEP_LATE_TICK,  /* delays the safety tick by a millisecond */
     STEP_STICK_GATE, /* freezes the gate's readback until repair */
 };
@@ -127,7 +128,7 @@ struct port {
     uint64_t started_ns, at_us, watchdog_fed_us, ticks_resume_us;
     uint64_t exit_when_closed_us; /* UINT64_MAX: never */
     uint8_t inputs;
-    bool gate_on, readback_stuck, readback_value, loop_stopped;
+    bool gate_on, readback_stuck, readback_value, loop_stopped, tick_stopped;
 };
 
 /* Runs until a signal, a long close of the port, or a log error; then disarms. */

@@ -81,11 +81,13 @@ static void reset(struct port *port, enum reset_cause cause) {
     }
     board_init(&port->board, &port->hal, &port->config, cause, port->at_us);
     port->watchdog_fed_us = port->at_us;
-    port->loop_stopped = false;
+    port->loop_stopped = port->tick_stopped = false;
 }
 
 static void tick(struct port *port) {
-    board_tick(&port->board, port->at_us);
+    if (!port->tick_stopped) {
+        board_tick(&port->board, port->at_us);
+    }
     if (!port->loop_stopped) {
         board_receive(&port->board, NULL, 0, port->at_us);
     }
@@ -153,6 +155,9 @@ static void run_step(struct port *port, const struct step *step) {
         break;
     case STEP_STOP_LOOP:
         port->loop_stopped = true;
+        break;
+    case STEP_STOP_TICK:
+        port->tick_stopped = true;
         break;
     case STEP_LATE_TICK:
         port->ticks_resume_us = port->at_us + LATE_TICK_US;

@@ -42,7 +42,7 @@ class EmulatedChip:
 
     lease_until_us = 0
     """The chip reports its leases itself."""
-    FAULTS = {"stop_loop": b"H", "late_tick": b"T", "stick_gate": b"S"}  # noqa: RUF012 - nobody writes to it
+    FAULTS = {"stop_loop": b"H", "stop_tick": b"K", "late_tick": b"T", "stick_gate": b"S"}  # noqa: RUF012 - nobody writes to it
 
     def __init__(
         self,

@@ -2,8 +2,8 @@
 
    The bench simulates the environment. It sends the configuration when the chip requests it with the record C, then
    commands: run until a time (U), bytes from the host (B), input levels (I), link lost (L), reset (R), and faults: the
-   main loop stops (H), the tick is late (T), the gate's readback freezes (S). Each ends with the record D: the chip's
-   time and that of its next due event. */
+   main loop stops (H), the tick stops (K) or is late (T), the gate's readback freezes (S). Each ends with the record D: the
+   chip's time and that of its next due event. */
 
 #include <string.h>
 
@@ -11,11 +11,11 @@
 #include "board.h"
 #include "chip.h"
 
-#define LOOP_BYTES_MAX 64u /* so that the ticks between are not late */
+#define LOOP_BYTES_MAX 64u
 
 static struct board board;
 static uint8_t inputs = INPUT_INTERLOCK | INPUT_KEY;
-static bool gate_on, readback_stuck, readback_value, loop_stopped;
+static bool gate_on, readback_stuck, readback_value, loop_stopped, tick_stopped;
 static uint32_t entropy_state;
 
 /* --- log --- */
@@ -107,7 +107,9 @@ static const struct board_hal hal = {
 /* --- the loop --- */
 
 static void run_loop_once(const uint8_t *bytes, size_t n) {
-    board_tick(&board, chip_now_us());
+    if (!tick_stopped) {
+        board_tick(&board, chip_now_us());
+    }
     if (loop_stopped) {
         return;
     }
@@ -127,9 +129,21 @@ static void run_until(uint64_t end_us) {
     }
 }
 
+/* Returns the number of bytes up to the end of a frame, so that the ticks between two answers are not late. */
+static size_t count_to_delimiter(const uint8_t *bytes, size_t n) {
+    size_t max = n < LOOP_BYTES_MAX ? n : LOOP_BYTES_MAX;
+    for (size_t k = 0; k < max; k++) {
+        if (bytes[k] == 0) {
+            return k + 1;
+        }
+    }
+    return max;
+}
+
 static void receive(const uint8_t *bytes, size_t n) {
-    for (size_t at = 0; at < n; at += LOOP_BYTES_MAX) {
-        run_loop_once(bytes + at, n - at < LOOP_BYTES_MAX ? n - at : LOOP_BYTES_MAX);
+    for (size_t at = 0, count; at < n; at += count) {
+        count = count_to_delimiter(bytes + at, n - at);
+        run_loop_once(bytes + at, count);
     }
 }
 
@@ -198,6 +212,9 @@ static void run(const struct command *command) {
         break;
     case 'H':
         loop_stopped = true;
+        break;
+    case 'K':
+        tick_stopped = true;
         break;
     case 'T':
         miss_ticks();

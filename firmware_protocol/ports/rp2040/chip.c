@@ -142,9 +142,11 @@ static void start_uart(void) {
 
 size_t chip_read(uint8_t *bytes, size_t size) {
     size_t n = 0;
-    while (n < size && received.out != received.in) {
-        bytes[n++] = received.bytes[received.out % RX_RING];
+    bool ended = false;
+    while (n < size && received.out != received.in && !ended) {
+        bytes[n] = received.bytes[received.out % RX_RING];
         received.out = received.out + 1;
+        ended = bytes[n++] == 0;
     }
     return n;
 }

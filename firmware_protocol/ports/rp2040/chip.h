@@ -26,7 +26,7 @@ void chip_set_alarm(uint64_t at_us);
 void chip_hold_alarm(void);
 void chip_release_alarm(void);
 
-/* Reads up to size received bytes. */
+/* Reads up to size received bytes, none beyond the end of a frame: the tick waits while the core answers one. */
 size_t chip_read(uint8_t *bytes, size_t size);
 /* Returns whether a BREAK was received since the last call. */
 bool chip_pop_break(void);
