@@ -5,6 +5,7 @@ The engine, `optodrive plan` and `optodrive simulate` use this pipeline.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 
@@ -68,68 +69,112 @@ def plan_sequence(
     initial_pixels: tuple[int, ...] | None = None,
     visiting_orders: Mapping[int, IntArray] | None = None,
 ) -> PlannedSequence:
-    """Plan and limit a sequence from the given heat and budget, which are on the plan's time line and not changed.
+    """Plan and limit a whole sequence, as `SequencePlanner` does.
+
+    Raises RefusedError under policy "refuse" for a missed deadline too.
+    """
+    planner = SequencePlanner(display, sequence, heat, budget, policy, on_progress, initial_pixels, visiting_orders)
+    planned = planner.plan_until()
+    if policy == "refuse":
+        _refuse_late(planned)
+    return planned
+
+
+class SequencePlanner:
+    """Plans and limits a sequence from the given heat and budget, which are on the plan's time line and not changed.
 
     Under policy "delay", a pulse above a cap is delayed until it fits, together with everything after it: a train pulse
     by itself, a frame as a whole.
 
+    on_progress: receives the completed fraction, 0 to 1; may be replaced between two parts
     initial_pixels: pixel on which each stage's mirrors stand at the plan's start, None while unknown
     visiting_orders: by source, visiting orders that replace the scheduler's own
 
     Raises InputError for an unreachable height or peak-to-peak value. Raises RefusedError under "refuse" for a pulse
-    above a cap or a missed deadline, and under "delay" for a pulse that never fits.
+    above a cap, and under "delay" for a pulse that never fits.
     """
-    sequence, dead_pixels = remove_dead_pixels(display, sequence)
-    check_targets_reachable(display, sequence)
-    done = 0.0
 
-    def report_progress() -> None:
-        if on_progress is not None:
-            on_progress(done)
+    def __init__(
+        self,
+        display: DisplayModel,
+        sequence: FrameSequence,
+        heat: ThermalState,
+        budget: BudgetState,
+        policy: Policy = "trim",
+        on_progress: Progress | None = None,
+        initial_pixels: tuple[int, ...] | None = None,
+        visiting_orders: Mapping[int, IntArray] | None = None,
+    ) -> None:
+        self.on_progress = on_progress
+        self.is_complete = False
+        self._display = display
+        self._sequence, self._dead_pixels = remove_dead_pixels(display, sequence)
+        self._heat = heat
+        self._done = 0.0
+        check_targets_reachable(display, self._sequence)
+        COLD_START.begin(display.budget, budget)
+        self._scheduler = Scheduler(
+            display.scan_heads,
+            display.build_assignment(self._sequence),
+            self._sequence,
+            display.build_cold_heat,
+            train_batch=1 if policy == "delay" else TRAIN_BATCH,
+            on_progress=self._report_progress,
+            initial_pixels=initial_pixels,
+            visiting_orders=visiting_orders,
+        )
+        frame_count = len(self._sequence.frames)
+        self._limiter = BatchLimiter(self._scheduler, display.budget, budget, frame_count, policy)
+        self._batches = self._scheduler.run(heat.copy(), self._limiter.grant)
+        self._limited: list[LimitedPlan] = []
+        self._recent: list[LimitedPlan] = []
 
-    COLD_START.begin(display.budget, budget)
-    scheduler = Scheduler(
-        display.scan_heads,
-        display.build_assignment(sequence),
-        sequence,
-        display.build_cold_heat,
-        train_batch=1 if policy == "delay" else TRAIN_BATCH,
-        on_progress=report_progress,
-        initial_pixels=initial_pixels,
-        visiting_orders=visiting_orders,
-    )
-    limiter = BatchLimiter(scheduler, display.budget, budget, len(sequence.frames), policy)
-    limited: list[LimitedPlan] = []
-    recent: list[LimitedPlan] = []
-    for batch in scheduler.run(heat.copy(), limiter.grant):
-        recent.append(batch)
-        if len(recent) == CONCATENATE_EVERY:
-            limited, recent = [*limited, concatenate(recent, limiter.state, display.budget)], []
-        done = _compute_progress(sequence, batch)
-        report_progress()
-    plan = concatenate([*limited, *recent], limiter.state, display.budget)
-    report_progress()
-    final_heat = heat.copy()
-    peaks = final_heat.apply_pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, report_progress)
-    lead_in_s = scheduler.lead_in_us * 1e-6
-    planned = PlannedSequence(
-        sequence=sequence,
-        plan=plan,
-        predicted_m=peaks.displacement_m,
-        lead_in_s=lead_in_s,
-        skipped=tuple(scheduler.skipped),
-        frames=_compute_frame_timings(sequence, plan, lead_in_s, report_progress),
-        simultaneous=tuple(scheduler.simultaneous),
-        shortfall=limiter.build_shortfall(),
-        delays=_merge_delays(limiter.delays),
-        galvo_pause_s=limiter.galvo_pause_s,
-        heat=final_heat,
-        budget=limiter.state,
-        dead_pixels=dead_pixels,
-    )
-    if policy == "refuse":
-        _refuse_late(planned)
-    return planned
+    def plan_until(self, until_s: float = inf) -> PlannedSequence:
+        """Go on to the first pulse that ends at this time of the plan or later, and return the plan so far.
+
+        Later calls add rows and change none. Parts and whole have the same pulses where the heat of a pixel does not
+        depend on its neighbours'.
+        """
+        self._scheduler.until_us = until_s * 1e6
+        self.is_complete = True
+        for batch in self._batches:
+            self._recent.append(batch)
+            if len(self._recent) == CONCATENATE_EVERY:
+                self._limited.append(self._concatenate(self._recent))
+                self._recent = []
+            self._done = _compute_progress(self._sequence, batch)
+            self._report_progress()
+            if batch.end_s >= until_s:
+                self.is_complete = False
+                break
+        return self._build_planned(self._concatenate([*self._limited, *self._recent]))
+
+    def _build_planned(self, plan: LimitedPlan) -> PlannedSequence:
+        self._report_progress()
+        heat, lead_in_s = self._heat.copy(), self._scheduler.lead_in_us * 1e-6
+        peaks = heat.apply_pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, self._report_progress)
+        return PlannedSequence(
+            sequence=self._sequence,
+            plan=plan,
+            predicted_m=peaks.displacement_m,
+            lead_in_s=lead_in_s,
+            skipped=tuple(self._scheduler.skipped),
+            frames=_compute_frame_timings(self._sequence, plan, lead_in_s, self._report_progress),
+            simultaneous=tuple(self._scheduler.simultaneous),
+            shortfall=self._limiter.build_shortfall(),
+            delays=_merge_delays(self._limiter.delays),
+            galvo_pause_s=self._limiter.galvo_pause_s,
+            heat=heat,
+            budget=self._limiter.state,
+            dead_pixels=self._dead_pixels,
+        )
+
+    def _concatenate(self, batches: list[LimitedPlan]) -> LimitedPlan:
+        return concatenate(batches, self._limiter.state, self._display.budget)
+
+    def _report_progress(self) -> None:
+        if self.on_progress is not None:
+            self.on_progress(self._done)
 
 
 def _merge_delays(delays: list[Delay]) -> tuple[Delay, ...]:

@@ -128,6 +128,10 @@ class BatchDraft:
         row = PlannedPulse(start_us, width_us, power_w, pixel, settling_us, target_m, requested_us, source, stage)
         self.rows.append(row)
 
+    def find_end_us(self) -> int:
+        """Return the end of the last pulse of all beams, µs."""
+        return max(beam.free_us for beam in self.state.beams)
+
     def sort_rows(self, first: int) -> None:
         """Put the rows from `first` on in order of their starts."""
         self.rows[first:] = sorted(self.rows[first:], key=lambda row: row.start_us)

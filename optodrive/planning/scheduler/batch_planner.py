@@ -127,14 +127,25 @@ class BatchPlanner:
             self._draft_train_pulse(draft, stage, heat)
         return draft
 
-    def extend_round(self, draft: BatchDraft, each: Round, heat: ThermalState, max_rows: int | None = None) -> None:
-        """Append pulses of a round: up to the next due train pulse, `max_rows` pulses or the end of the round."""
+    def extend_round(
+        self,
+        draft: BatchDraft,
+        each: Round,
+        heat: ThermalState,
+        max_rows: int | None = None,
+        until_us: float = inf,
+    ) -> None:
+        """Append pulses of a round: up to the next due train pulse, `max_rows` pulses or the end of the round.
+
+        until_us: behind the first of them, append none to a beam whose last pulse ends then or later
+        """
         have_trains = any(self._next_train_pulse(draft, stage) for stage in range(len(self._stages)))
         if isinstance(heat, NominalThermalState) and each.periods is None and not have_trains:
-            self._extend_nominal_round(draft, each, heat, None if max_rows is None else max_rows - len(draft.rows))
+            max_count = None if max_rows is None else max_rows - len(draft.rows)
+            self._extend_nominal_round(draft, each, heat, max_count, until_us)
             return
-        rows_max, pulses = inf if max_rows is None else max_rows, dict[int, _FramePulse]()
-        while len(draft.rows) < rows_max:
+        rows_max, first, pulses = inf if max_rows is None else max_rows, len(draft.rows), dict[int, _FramePulse]()
+        while len(draft.rows) < rows_max and (len(draft.rows) == first or draft.find_end_us() < until_us):
             for stage in range(len(self._stages)):
                 pulse = None if stage in pulses else self._solve_next_pulse(draft, stage, each, heat)
                 if pulse is not None:
@@ -166,13 +177,13 @@ class BatchPlanner:
             draft.state.beams[stage].position += 1
 
     def _extend_nominal_round(
-        self, draft: BatchDraft, each: Round, heat: NominalThermalState, max_count: int | None
+        self, draft: BatchDraft, each: Round, heat: NominalThermalState, max_count: int | None, until_us: float
     ) -> None:
         """Append up to max_count pulses of a round without train pulses, each stage's in one kernel."""
         counts: list[int | None] = [max_count] * len(self._stages)
         if len(self._stages) > 1 and max_count is not None:
             trial, first = draft.copy(), len(draft.rows)
-            self._extend_nominal_round(trial, each, heat, None)
+            self._extend_nominal_round(trial, each, heat, None, inf)
             stages = [row.stage for row in trial.rows[first : first + max_count]]
             counts = [stages.count(stage) for stage in range(len(self._stages))]
         frame, first, begun_us = self._sequence.frames[each.source], len(draft.rows), draft.state.begun_us
@@ -182,7 +193,7 @@ class BatchPlanner:
             self._on_progress()
             pixels = np.array(each.orders[stage][draft.state.beams[stage].position :], dtype=np.int64)
             if len(pixels):
-                given = (requested_us, earliest_us, each.source, tools.drive, counts[stage])
+                given = (requested_us, earliest_us, each.source, tools.drive, counts[stage], until_us)
                 draft_round(draft, stage, heat, pixels, frame.target_m[pixels], *given)
         draft.sort_rows(first)
 

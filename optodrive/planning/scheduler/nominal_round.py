@@ -62,17 +62,19 @@ def draft_round(
     source: int,
     drive: DriveRange,
     max_count: int | None,
+    until_us: float,
 ) -> None:
     """Draft at most max_count pulses of a stage, to the heights target_m [n] on `pixel` [n], in this order.
 
-    earliest_us: no pulse starts before. Raises ValueError for a pulse before its pixel's last event.
+    earliest_us: no pulse starts before; until_us: none but the first follows one that ends then or later
+    Raises ValueError for a pulse before its pixel's last event.
     """
     beam, pulses = draft.state.beams[stage], RoundPulses.empty(len(pixel))
     start = KernelBeam(beam.free_us, NO_PIXEL if beam.pixel is None else beam.pixel, beam.arrival_us, beam.dwell_us)
     span = DriveSpan(drive.max_power_w, drive.period_s, drive.max_periods)
     count = len(pixel) if max_count is None else max_count
     visited, *after = _solve_round(
-        *heat.kernel_state, draft.paths[stage].moves, pixel, target_m, earliest_us, start, span, count, pulses
+        *heat.kernel_state, draft.paths[stage].moves, pixel, target_m, earliest_us, until_us, start, span, count, pulses
     )
     if visited < 0:
         row = -1 - visited
@@ -107,6 +109,7 @@ def _solve_round(
     pixel: IntArray,
     target_m: FloatArray,
     earliest_us: int,
+    until_us: float,
     beam: KernelBeam,
     drive: DriveSpan,
     max_rows: int,
@@ -118,7 +121,7 @@ def _solve_round(
     """
     row = rows = 0
     free_us, origin, arrival_us, dwell_us = beam.free_us, beam.pixel, beam.arrival_us, beam.dwell_us
-    while row < len(pixel) and rows < max_rows:
+    while row < len(pixel) and rows < max_rows and (rows == 0 or free_us < until_us):
         i = pixel[row]
         settling_us = _compute_settling_us(moves, origin, i, dwell_us)
         start_us = max(earliest_us, free_us + settling_us)

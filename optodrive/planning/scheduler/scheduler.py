@@ -79,6 +79,7 @@ class Scheduler:
     visiting_orders: by source, the order [k] of a frame's active pixels; other frames follow a short path
     lead_in_us: gate-off time before the sequence's zero, in which all mirrors reach their first pixel from anywhere;
     zero if the initial pixels are known
+    until_us: a batch ends with the first pulse that ends then or later, and the next goes on behind it
     skipped, simultaneous: skipped pulses and interleaved frames of the plan so far
 
     Raises InputError for a train by height whose height or peak-to-peak value no cycle has, or that has no beam time.
@@ -102,6 +103,7 @@ class Scheduler:
         self._visiting_orders = visiting_orders or {}
         lead_ins_us = [scan_head.settling.lead_in_us for scan_head in scan_heads]
         self.lead_in_us = max(lead_ins_us) if initial_pixels is None else 0
+        self.until_us = inf
         self.skipped: list[SkippedPulse] = []
         self.simultaneous: list[SimultaneousFrame] = []
         tools = []
@@ -170,7 +172,7 @@ class Scheduler:
             kept.state.beams[self._pending_pause.stage].free_us += self._pending_pause.pause_us
             self._kept, self._pending_pause = kept, None
         draft = kept.copy()
-        self._planner.extend_round(draft, step, heat)
+        self._planner.extend_round(draft, step, heat, until_us=self.until_us)
         return draft
 
     def accept(self) -> None:
@@ -270,6 +272,7 @@ class Scheduler:
         fork._state = self._state.copy()
         fork._state.begin_order()
         fork._steps = deque(rounds)
+        fork.until_us = inf
         fork.skipped = []
         return fork
 
