@@ -40,6 +40,6 @@ def add_labels(source: str, body: bytes, options: list[str]) -> dict[str, object
 def _convert(text: str) -> object:
     try:
         value = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
     return value if isinstance(value, bool | int | float) else text

@@ -11,7 +11,7 @@ from typing import Literal
 
 from optodrive.cli.service_program import check_program
 from optodrive.core.errors import InputError, RefusedError
-from optodrive.core.files import atomic_write, lock_folder
+from optodrive.core.files import atomic_write, lock_folder, read_regular_file
 from optodrive.core.toml_file import parse_toml
 from optodrive.device.config import Config
 from optodrive.device.config_file import DEFAULT_CONFIG, build_config, list_named_files, load_config, locate_shipped
@@ -22,6 +22,8 @@ USERS_PATH = Path("/etc/sysusers.d/optodrive.conf")
 RULES_PATH = Path("/etc/udev/rules.d/60-optodrive.rules")
 MANIFEST_PATH = Path("/etc/optodrive/installed.json")
 FORMAT, VERSION = "optodrive-service", 1
+BYTES_MAX = 16_000_000
+"""Largest size of a file that is installed, bytes: that of a pixel map."""
 DAEMON_HEADER = re.compile(r"^[ \t]*\[[ \t]*daemon[ \t]*\][ \t]*(?:#.*)?(?:\n|\Z)", re.MULTILINE)
 DEVICE_LINK = "/dev/optodrive-board"
 DAEMON_PATHS = {
@@ -65,7 +67,7 @@ def build_service_files(source: str | Path | None, program: Path) -> tuple[Confi
 def _load_configuration(source: str | Path | None) -> tuple[Config, str]:
     load_config(source)  # reports errors under the given name
     path = _locate_configuration(source)
-    text = _add_daemon_paths(path.read_text("utf-8"), str(path))
+    text = _add_daemon_paths(_read_text(path), str(path))
     return build_config(path, parse_toml(text.encode(), str(path))), text
 
 
@@ -174,21 +176,21 @@ class Installation:
                 f"{', '.join(obstacles)}: edited, or not written by `optodrive service install`; nothing was "
                 "written. Move it away, and put changes to the unit into a drop-in (systemctl edit optodrive)"
             )
-        actions = [(file.path, self._install_file(file, file in edited)) for file in files]
-        self._save_digests()
-        return actions
+        return [(file.path, self._install_file(file, file in edited)) for file in files]
 
     def _install_file(self, file: ServiceFile, edited: bool) -> str:
         if edited and file.preserve_edits:
             return "edited, kept"
         self._digests[str(file.path)] = _compute_digest(file.text)
         if self._is_current(file):
-            return "unchanged"
-        target = self.resolve(file.path)
-        action = "replaced" if target.exists() else "written"
-        _make_folder(target.parent)
-        with atomic_write(target) as temporary:
-            temporary.write_text(file.text, encoding="utf-8")
+            action = "unchanged"
+        else:
+            target = self.resolve(file.path)
+            action = "replaced" if target.exists() else "written"
+            _make_folder(target.parent)
+            with atomic_write(target) as temporary:
+                temporary.write_text(file.text, encoding="utf-8")
+        self._save_digests()  # for each: an installation that fails at the next file knows this one as its own
         return action
 
     def remove(self) -> list[tuple[Path, str]]:
@@ -225,7 +227,7 @@ class Installation:
         try:
             document = json.loads(_read_text(target))
             file_format, files = (document["format"], document["version"]), dict(document["sha256"])
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             file_format, files = None, {}
         if file_format != (FORMAT, VERSION):
             raise InputError(str(target), "another format", f"{FORMAT} version {VERSION}")
@@ -247,10 +249,7 @@ def _compute_digest(text: str) -> str:
 
 
 def _read_text(path: Path) -> str:
-    try:
-        return path.read_text("utf-8", "surrogateescape")
-    except OSError as error:
-        raise InputError(str(path), error.strerror, "a readable file") from None
+    return read_regular_file(path, BYTES_MAX).decode("utf-8", "surrogateescape").replace("\r\n", "\n")
 
 
 def _make_folder(folder: Path) -> None:

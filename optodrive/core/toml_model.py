@@ -57,7 +57,7 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
     """Raise InputError for a file of another format or version."""
     if table.get("format") != expected:
         raise InputError(f"{path}: format", table.get("format", MISSING), f"'{expected}'")
-    if table.get("version") != version or isinstance(table["version"], bool):
+    if type(table.get("version")) is not int or table["version"] != version:
         raise InputError(f"{path}: version", table.get("version", MISSING), f"{version}, the one this release reads")
 
 

@@ -126,7 +126,7 @@ def format_entry(line: str, level: LogLevel, fields: dict[str, object]) -> bytes
     entry_fields |= {f"OPTODRIVE_{name}": value for name, value in fields.items()}
     parts = []
     for name, value in entry_fields.items():
-        data = str(value)[:LINE_MAX].encode()
+        data = str(value)[:LINE_MAX].encode(errors="backslashreplace")
         if b"\n" in data:
             parts.append(name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n")
         else:

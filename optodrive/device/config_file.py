@@ -52,10 +52,10 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
 
 def build_config(path: Path, table: dict[str, Any]) -> Config:
     """Build the configuration of a file's table, with the servo that it states. Raise InputError with one line."""
-    if table.get("format") == FORMAT and table.get("version") in OLD_VERSIONS:
+    if table.get("format") == FORMAT and type(version := table.get("version")) is int and version in OLD_VERSIONS:
         renamed = ", ".join(f"{old} is now {new}" for old, new in RENAMED_KEYS.items())
         expected = f"{VERSION}: {renamed}; `optodrive config migrate` renames them, or lists the lines to change"
-        raise InputError(f"{path}: version", table["version"], expected)
+        raise InputError(f"{path}: version", version, expected)
     check_format(path, table, FORMAT, VERSION)
     check_table(str(path), table, collect_ranges(Config))
     for section, key in list_named_files(table):

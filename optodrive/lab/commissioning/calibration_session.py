@@ -73,7 +73,7 @@ def _read_rows(path: Path, header: dict[str, Any]) -> list[SpotRow]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable file") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise InputError(str(path), "not JSON", "a calibration's session; delete it to start again") from None
     for key, value in header.items():
         stored = document.get(key) if isinstance(document, dict) else None

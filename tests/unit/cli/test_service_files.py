@@ -162,6 +162,17 @@ def test_files_that_the_configuration_names_are_installed_beside_it(install, at,
     assert sorted(each.name for each in at(folder).iterdir() if each.is_file()) == ["installed.json", "model.toml"]
 
 
+def test_a_named_pipe_or_device_is_refused_without_waiting(install, tmp_path):
+    """A calibrated field is not read before: the command did not end, or took all memory."""
+    path = own_config(tmp_path, scanner__field="field.toml")
+    for make in (os.mkfifo, lambda field: field.symlink_to("/dev/zero")):
+        make(path.parent / "field.toml")
+        error = install("--config", path, status=2).err
+        assert "field.toml: got a" in error
+        assert error.count("\n") == 1
+        (path.parent / "field.toml").unlink()
+
+
 @pytest.mark.parametrize("name", ["../field.toml", "config.toml", "installed.json", "absent.toml"])
 def test_a_named_file_that_cannot_be_installed_is_refused(install, at, tmp_path, name):
     error = install("--config", own_config(tmp_path, scanner__field=name), status=2).err
@@ -253,6 +264,22 @@ def test_a_root_that_may_not_be_written_is_one_line(install, tmp_path):
     (tmp_path / "root").write_text("a file")
     output = install(status=2).err
     assert output.count("\n") == 1
+
+
+def test_an_installation_that_failed_goes_on_with_another_program(install, at):
+    """Each file is remembered as it is written; the unit was taken for somebody else's."""
+    at(USERS_PATH).parent.parent.mkdir(parents=True)
+    at(USERS_PATH).parent.write_text("a file in place of the folder")
+    install(status=2)
+    assert at(UNIT_PATH).exists()
+    at(USERS_PATH).parent.unlink()
+    assert f"{UNIT_PATH}: replaced" in install("--program", "/opt/other/optodrive").out
+
+
+def test_a_list_of_files_that_nests_too_deep_is_refused(install, at):
+    install()
+    at(MANIFEST_PATH).write_text("[" * 100_000)
+    assert install(command="show", status=2).err.count("\n") == 1
 
 
 def test_a_program_that_is_absent_here_is_refused_for_the_service_of_this_computer(tmp_path, capsys, monkeypatch):

@@ -44,6 +44,12 @@ def test_a_value_cannot_forge_another_field():
     assert made["PRIORITY"] == "6"
 
 
+def test_text_that_is_no_unicode_is_written_all_the_same():
+    """A path of other bytes, or a half of a pair of JSON: a failing log must not end the daemon."""
+    made = fields(format_entry("/data/\udcff.h5 \ud800", "info", {"PATH": "\udcff"}))
+    assert made["MESSAGE"] == r"/data/\udcff.h5 \ud800"
+
+
 def test_lines_go_to_the_journal(journal, tmp_path, capsys):
     with closing(DaemonLog(tmp_path / "journal")) as log:
         log.warn("the link went")

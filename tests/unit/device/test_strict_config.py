@@ -67,9 +67,10 @@ def test_no_whole_number_has_a_decimal_point(tmp_path):
             load_with(tmp_path, place, 4.0)
 
 
-def test_no_version_is_a_boolean(tmp_path):
-    with pytest.raises(InputError, match="version: got True"):
-        load_with(tmp_path, ("version",), True)
+@pytest.mark.parametrize("value", [True, 4.0, 3.0, "4"])
+def test_a_version_is_a_whole_number(tmp_path, value):
+    with pytest.raises(InputError, match=f"version: got {value!r}, expected 4, the one this release reads"):
+        load_with(tmp_path, ("version",), value)
 
 
 @pytest.mark.parametrize("value", [1e6, 1e9, 1e12, 1e305])
