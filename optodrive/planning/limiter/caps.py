@@ -1,7 +1,7 @@
 """The caps of the limiter: the single statement of each cap's key, texts, unit, setting and kernel value.
 
-A new cap needs a row and a field here, its setting in `optodrive.device.config.LimitsSection` and its computation in
-`cap_checks`. Messages, telemetry, page and budget derive from the table.
+A new cap needs a row and a field here, its setting in `LimitsSection` of `optodrive.device.config_sections` and its
+computation in `cap_checks`. Messages, telemetry, page and budget derive from the table.
 """
 
 from collections.abc import Mapping
