@@ -8,6 +8,7 @@ import pytest
 from helios.bench import build_display, build_train
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState
+from optodrive.link.helios import heat_memory
 from optodrive.link.helios.heat_memory import ZERO_OFFSET_S, HeatMemory
 from optodrive.planning.limiter.limiter import build_cold_budget_state
 from optodrive.planning.pipeline import plan_sequence
@@ -18,6 +19,7 @@ DAY_S = 1.7e9
 @pytest.fixture
 def memory(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setattr(heat_memory, "read_boot", lambda: ("a run", DAY_S - 100.0))
     return HeatMemory.for_device("Helios 12/../3")
 
 
@@ -72,6 +74,30 @@ def test_a_killed_play_may_still_emit(memory):
     )
 
 
+@pytest.mark.parametrize(("boot", "set_by_s", "passed_s"), [("a run", 3600.0, 1.0), ("the next", 3600.0, 3601.0)])
+def test_a_clock_that_is_set_cools_nothing(memory, monkeypatch, boot, set_by_s, passed_s):
+    """Only after a restart of the computer the time of day says how long it was off."""
+    _, budget = after_a_play()
+    memory.save(budget, DAY_S)
+    monkeypatch.setattr(heat_memory, "read_boot", lambda: (boot, DAY_S - 100.0 + set_by_s))
+    loaded = memory.load(DAY_S + 1.0 + set_by_s, build_cold_budget_state(16))
+    assert loaded.at_s == pytest.approx(budget.at_s - passed_s, abs=1e-6)
+
+
+def test_damaged_numbers_are_refused_by_name(memory):
+    """NaN passes every comparison of the limiter: a third more light was planned than the caps allow."""
+    _, budget = after_a_play()
+    memory.save(budget, DAY_S)
+    with np.load(memory.path) as table:
+        sound = {key: table[key] for key in table.files}
+    for name in sound.keys() - {"format", "boot"}:
+        for damage in (np.full(sound[name].shape, np.nan), np.zeros((3, 3)), np.array("text"), None):
+            damaged = {key: value for key, value in (sound | {name: damage}).items() if value is not None}
+            np.savez(memory.path, **damaged)
+            with pytest.raises(InputError, match=name if name != "rise_k" else "rise_k|pixels"):
+                memory.load(DAY_S, build_cold_budget_state(16))
+
+
 def test_an_unusable_file_is_rejected_by_name(memory):
     _, budget = after_a_play()
     memory.save(budget, DAY_S)
@@ -81,7 +107,7 @@ def test_an_unusable_file_is_rejected_by_name(memory):
         memory.load(DAY_S - 5.0, build_cold_budget_state(16))
     with memory.path.open("wb") as file:
         np.savez(file, format="optodrive-helios-memory", version=0)
-    with pytest.raises(InputError, match="expected optodrive-helios-memory 4"):
+    with pytest.raises(InputError, match="expected optodrive-helios-memory 5"):
         memory.load(DAY_S, build_cold_budget_state(16))
     memory.path.write_bytes(memory.path.read_bytes()[:100])
     with pytest.raises(InputError, match="a file that can be read; remove it once the display has cooled"):
