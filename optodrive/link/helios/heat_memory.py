@@ -71,7 +71,7 @@ class HeatMemory:
             raise InputError(str(self.path), str(error), f"a file that can be read; {REMOVE_WHEN_COLD}") from None
         if (str(arrays.get("format")), str(arrays.get("version"))) != (FORMAT, str(VERSION)):
             raise InputError(f"{self.path}: version", arrays.get("version"), f"{FORMAT} {VERSION}; {REMOVE_WHEN_COLD}")
-        if (pixels := np.size(arrays.get("rise_k"))) != len(cold.rise_k):
+        if (pixels := np.asarray(arrays.get("rise_k")).size) != len(cold.rise_k):
             expected = f"{len(cold.rise_k)}, the configured display's; {REMOVE_WHEN_COLD}"
             raise InputError(f"{self.path}: pixels", pixels, expected)
         columns = {item.name: getattr(cold, item.name) for item in fields(BudgetState)}
