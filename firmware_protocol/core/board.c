@@ -99,25 +99,13 @@ static void advance(struct board *b, uint64_t now_us) {
 
 /* --- the safety tick --- */
 
-static uint8_t unsafe_inputs(uint8_t inputs) { return inputs ^ (INPUT_INTERLOCK | INPUT_KEY); }
-
-/* B9: an input that becomes unsafe is a fault; one that is unsafe at power-up only prevents arming. */
-static void watch_inputs(struct board *b) {
+/* B9: an input that becomes unsafe is a fault; one that is unsafe at power-up only prevents arming. Returns the fault. */
+static enum fault watch_inputs(struct board *b) {
     uint8_t inputs = b->hal.read_inputs(b->hal.context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
-    uint8_t became_unsafe = (uint8_t)(unsafe_inputs(inputs) & ~unsafe_inputs(b->inputs));
+    uint8_t became_unsafe = (uint8_t)(find_unsafe_inputs(inputs) & ~find_unsafe_inputs(b->inputs));
     b->key_turned = b->key_turned || (inputs & ~b->inputs & INPUT_KEY);
     b->inputs = inputs;
-#if MUTANT != 9
-    if (became_unsafe & INPUT_INTERLOCK) {
-        enter_fault(b, FAULT_INTERLOCK);
-    } else if (became_unsafe & INPUT_KEY) {
-        enter_fault(b, FAULT_KEY);
-    } else if (became_unsafe) {
-        enter_fault(b, FAULT_ESTOP);
-    }
-#else
-    (void)became_unsafe;
-#endif
+    return find_input_fault(became_unsafe);
 }
 
 static void watch_tick(struct board *b, uint64_t now_us) {
@@ -126,23 +114,35 @@ static void watch_tick(struct board *b, uint64_t now_us) {
     b->has_ticked = true;
 }
 
-/* Runs before this tick changes the command, so that a gate in transition is not compared. */
+/* Runs before this tick changes the command, so that a gate in transition is not compared. A gate that is stuck agrees
+   with one of its two commands, which says nothing about the other: the time of short dark gaps adds up. */
 static void watch_readback(struct board *b, uint64_t now_us) {
     bool differs = b->hal.read_gate(b->hal.context) != b->gate;
-    if (differs && !b->readback_differs) {
-        b->readback_differs_since_us = now_us;
+    uint64_t *differs_us = &b->readback_differs_us[b->gate];
+    if (differs && b->readback_differs) {
+        *differs_us += now_us - b->readback_at_us;
+    } else if (!differs) {
+        *differs_us = 0;
+        if (MUTANT == 106) {
+            b->readback_differs_us[!b->gate] = 0;
+        }
     }
     b->readback_differs = differs;
-    if (differs && now_us > b->readback_differs_since_us + BOARD_READBACK_US) {
+    b->readback_at_us = now_us;
+    if (differs && *differs_us > BOARD_READBACK_US) {
         enter_fault_at(b, FAULT_READBACK, now_us);
     }
 }
 
+/* The inputs are read before points are carried out, so that no pulse begins in the tick that sees an unsafe one. */
 void board_tick(struct board *b, uint64_t now_us) {
     watch_tick(b, now_us);
     watch_readback(b, now_us);
+    enum fault input_fault = watch_inputs(b);
     advance(b, now_us);
-    watch_inputs(b);
+    if (input_fault != FAULT_NONE) {
+        enter_fault(b, input_fault);
+    }
 #if MUTANT != 15
     if (b->loop_ran)
 #endif

@@ -169,7 +169,8 @@ struct board {
     uint32_t underruns_count, underruns_total;
     uint64_t laser_on_duty_us; /* µs × duty */
 
-    uint64_t last_tick_us, readback_differs_since_us;
+    uint64_t last_tick_us, readback_at_us;
+    uint64_t readback_differs_us[2]; /* by commanded level: how long it has differed since it last agreed */
     bool readback_differs, loop_ran, has_ticked;
 };
 

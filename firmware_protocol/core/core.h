@@ -7,7 +7,8 @@
 
 /* make MUTANT=n disables guard Bn at the one place that enforces it, to prove that the tests detect it; 101 and 102
    remove the bounds checks of the receiver, 103 both what enforces B12: sequence numbers and indices; 104 lets the main
-   loop run through points while the tick is late, which B14 forbids. */
+   loop run through points while the tick is late (B14), 105 a pulse begin in the tick that sees an unsafe input (B9), and
+   106 each agreement of the readback excuse the gate's other level (B14). */
 #ifndef MUTANT
 #define MUTANT 0
 #endif
@@ -93,6 +94,9 @@ enum fault guards_accept_pulse(struct guards *g, const struct board_limits *limi
 /* --- states and points --- */
 
 bool is_leased(uint8_t state);
+/* B9: returns the fault of the first of some unsafe inputs, FAULT_NONE if there are none. */
+enum fault find_input_fault(uint8_t unsafe);
+uint8_t find_unsafe_inputs(uint8_t inputs);
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);
 void trace_gate(struct board *b, bool on, bool is_point, uint32_t index_or_reason);
 void command_gate(struct board *b, bool on, uint16_t duty);

@@ -9,7 +9,7 @@
 #define CAPABILITY_KEY_EDGE 1u
 #define MS 1000u
 
-static bool inputs_safe(const struct board *b) { return b->inputs == (INPUT_INTERLOCK | INPUT_KEY); }
+static bool inputs_safe(const struct board *b) { return find_unsafe_inputs(b->inputs) == 0; }
 
 static bool is_armed(const struct board *b) {
     return STATES_ARMED >> b->state & 1u;

@@ -6,6 +6,15 @@ bool is_leased(uint8_t state) {
     return STATES_LEASED >> state & 1u;
 }
 
+uint8_t find_unsafe_inputs(uint8_t inputs) { return inputs ^ (INPUT_INTERLOCK | INPUT_KEY); }
+
+enum fault find_input_fault(uint8_t unsafe) {
+    if (MUTANT == 9 || unsafe == 0) {
+        return FAULT_NONE;
+    }
+    return unsafe & INPUT_INTERLOCK ? FAULT_INTERLOCK : unsafe & INPUT_KEY ? FAULT_KEY : FAULT_ESTOP;
+}
+
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n) {
     uint8_t wire[WIRE_MAX];
     if (b->link.session) {

@@ -48,6 +48,17 @@ def tick_that_stops_is_a_fault_before_the_watchdog_bites(bench):
 
 
 @scenario("B14")
+def gate_stuck_on_is_a_fault_in_dark_gaps_of_two_ticks(bench):
+    host = bench.ready(act("stick_gate"), **BRIGHT)
+    assert host.play(*[here(10_000, dark_us=200, duty=2000)] * 900, end=False) == []
+    host.wait(host.board.is_gate_on, "light")
+    host.board.next_step()
+    host.wait_for_change("fault")
+    assert host.board.faults() == ["READBACK"]
+    assert is_off_by(host.board, host.board.of("state")[-1])
+
+
+@scenario("B14")
 def gate_stuck_off_is_a_fault_at_the_next_pulse(bench):
     host = bench.ready(act("stick_gate"), **BRIGHT)
     host.board.next_step()

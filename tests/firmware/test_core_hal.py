@@ -67,6 +67,26 @@ def test_each_difference_of_the_gate_counts_by_itself(bench):
     assert core.fault == ""
 
 
+def check_short_gaps(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(*[here(1000, dark_us=200)] * 200, end=False)
+    host.pause(0.01)
+    core, now_us = host.board.core, host.clock.now_us()
+    core.stick(True, True)
+    core.advance(now_us + 10_000)
+    assert core.fault == "READBACK"
+
+
+def test_a_gate_stuck_on_is_noticed_over_dark_gaps_of_two_ticks(bench):
+    check_short_gaps(bench)
+
+
+def test_a_readback_that_each_pulse_excuses_is_detected(libraries, tmp_path):
+    bench = Bench(VirtualKind("c", partial(SeededCBoard, libraries(106))), tmp_path)
+    with pytest.raises(AssertionError):
+        check_short_gaps(bench)
+
+
 # --- B15 ------------------------------------------------------------------------------------------------------------
 
 
@@ -89,6 +109,28 @@ def test_a_watchdog_fed_by_the_tick_alone_is_detected(libraries, tmp_path):
     bench = Bench(VirtualKind("c", partial(SeededCBoard, libraries(15))), tmp_path)
     with pytest.raises(AssertionError, match="fed by the tick alone"):
         check_watchdog(bench)
+
+
+# --- B9 -------------------------------------------------------------------------------------------------------------
+
+
+def check_unsafe_tick(bench):
+    core, board, _ = emit(bench, dark_us=60_000)
+    due_us = board.changes("start")[0]["t_us"] + 60_000
+    core.set_input("interlock", False, due_us - 50)
+    core.tick(due_us + 40)
+    assert core.fault == "INTERLOCK"
+    assert core.gate_edges == []
+
+
+def test_no_pulse_begins_in_the_tick_that_sees_an_unsafe_input(bench):
+    check_unsafe_tick(bench)
+
+
+def test_a_pulse_that_begins_with_an_unsafe_input_is_detected(libraries, tmp_path):
+    bench = Bench(VirtualKind("c", partial(SeededCBoard, libraries(105))), tmp_path)
+    with pytest.raises(AssertionError):
+        check_unsafe_tick(bench)
 
 
 # --- outputs and entropy --------------------------------------------------------------------------------------------

@@ -271,15 +271,18 @@ def start(*arguments, **options):
         ("--pty", None, "--pty"),
         ("--pty", "a file that is no link", "free"),
         ("--baud", 0, "at least 300"),
+        ("--baud", "fast", "argument --baud: invalid int value: 'fast'"),
+        ("--bits", 8, "unrecognized arguments: --bits 8"),
     ],
 )
 def test_bad_options_are_one_line_and_status_2(tmp_path, option, text, says):
     path = tmp_path / ("there.toml" if text else "no/such/file")
-    if isinstance(text, str):
+    is_a_file = option not in ("--baud", "--bits")
+    if text and is_a_file:
         path.write_text(text)
-    value = text if option == "--baud" else path
+    value = path if is_a_file else text
     arguments = ["--pty", tmp_path / "tty"] if option != "--pty" else []
-    board = start(*arguments, option, value if value is not None else path)
+    board = start(*arguments, option, value)
     _, error = board.communicate()
     assert board.returncode == 2
     assert error.startswith("optodrive.link.simulator.board_process: ")

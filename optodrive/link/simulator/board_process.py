@@ -10,6 +10,7 @@ import signal
 import sys
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 from optodrive.core.errors import InputError
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
@@ -23,6 +24,13 @@ from optodrive.link.simulator.sensor_options import add_sensor_options, build_op
 
 BAUD_MIN = 300
 CLOCK_PPM_MAX = 200
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose refusal is one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}\n")
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -39,9 +47,7 @@ def main(
     arguments: list[str] | None = None, build_core: BackendFactory = BoardCore, actions: ScriptActions = NO_ACTIONS
 ) -> int:
     """Run a board until SIGTERM or SIGINT, and return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="optodrive.link.simulator.board_process", description="Simulated board on a pty."
-    )
+    parser = _Parser(prog="optodrive.link.simulator.board_process", description="Simulated board on a pty.")
     parser.add_argument("--pty", type=Path, required=True, metavar="LINK", help="link to create to the pty")
     parser.add_argument("--log", type=Path, help="JSON lines of gate edges, states, faults and pulses")
     parser.add_argument("--limits", type=Path, help="TOML file of the board's own limits")
