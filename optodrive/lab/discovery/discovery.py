@@ -34,7 +34,6 @@ from optodrive.lab.discovery.screening import (
     Filtered,
     Place,
     Screened,
-    differentiate,
     list_places,
     rank_formulas,
     screen,
@@ -207,7 +206,8 @@ class _Search:
             )
             measured = np.isfinite(record.outputs) & np.isfinite(line.predicted) & (line.variance > 0.0)
             weights = np.where(measured, 1.0 / np.sqrt(np.where(measured, line.variance, 1.0)), 0.0)
-            filtered.append(Filtered(record, line, differentiate(line, start), block, weights))
+            columns = line.propagate(line.forcing, line.direct, start)
+            filtered.append(Filtered(record, line, columns, block, weights))
         return filtered
 
     def _fit_filtered(self, point: Point, filtered: Sequence[Filtered], evaluations: int = 15) -> tuple[Point, float]:

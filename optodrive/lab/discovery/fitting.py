@@ -8,7 +8,8 @@ from scipy.optimize import least_squares
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.lab.discovery.integration import STEP, Kernels, Linearisation, allocate_work, build_kernels
+from optodrive.lab.discovery.integration import STEP, Kernels, allocate_work, build_kernels
+from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.model import OdeModel, Record
 
 DIVERGED = 1e3
@@ -97,10 +98,7 @@ class Simulation:
         predicted, states = np.zeros((m, o)), np.zeros((m, n))
         x0 = self.initial_state(record, point.parameters)
         self.kernels.run(
-            record.t_s,
-            record.inputs,
-            record.slopes,
-            record.outputs,
+            (record.t_s, record.inputs, record.slopes, record.outputs),
             x0,
             self.pack(point.parameters[None, :]),
             point.terms.table,
@@ -143,10 +141,7 @@ class Simulation:
             deltas.append(delta)
         out = Linearisation.allocate(len(record.t_s), len(x0), len(noise), len(columns))
         self.kernels.linearise(
-            record.t_s,
-            record.inputs,
-            record.slopes,
-            record.outputs,
+            (record.t_s, record.inputs, record.slopes, record.outputs),
             x0,
             self.pack(np.array(ps)),
             point.terms.table,

@@ -7,8 +7,7 @@ filter the states follow the data, although the model is wrong, so that a term t
 the gains are computed once and then kept, and the prediction errors remain smooth functions of all parameters.
 
 `linearise` also returns, per sample, the derivatives of the next state and of the outputs by states, by an additional
-rate in each equation, and by each parameter, from single perturbed steps. `propagate_term` and `propagate_parameters`
-turn them into the change of all predictions by a term or a parameter: linear recursions, a thousand columns per second.
+rate in each equation, and by each parameter, from single perturbed steps (`linearisation.py`).
 """
 
 import dis
@@ -24,9 +23,10 @@ from numba import literal_unroll
 from numba.core.errors import NumbaError
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from optodrive.core.kernels import array_kernel, compile_here, kernel
+from optodrive.core.kernels import compile_here
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.forms import evaluate_form
+from optodrive.lab.discovery.linearisation import correct, predict_covariance
 
 PLACE, FORM, VARIABLE, FACTOR = range(4)
 """Columns of a table of terms: place (states' equations, then outputs), form, variable, and a variable that multiplies
@@ -43,38 +43,14 @@ _to_tuple: Any = to_fixed_tuple  # its type takes the compiler's context for an 
 class Kernels(NamedTuple):
     """Compiled functions of one model.
 
-    run(t, u, d, y, x0, p, terms, values, h_max, hold, gains, predicted, states);
-    linearise(t, u, d, y, x0, ps, terms, values_s, deltas, scales, h_max, q, r, p0, out)
+    run(samples, x0, p, terms, values, h_max, hold, gains, workspace, predicted, states);
+    linearise(samples, x0, ps, terms, values_s, deltas, scales, h_max, hold, q, r, p0, workspace, out);
+    samples: times, inputs, their slopes and outputs of a record
     """
 
     run: Callable[..., None]
     linearise: Callable[..., None]
     is_compiled: bool
-
-
-class Linearisation(NamedTuple):
-    """Derivatives along one record of m samples: n states, o outputs, q parameters.
-
-    predicted, variance: [m, o] outputs and their expected variance; states: [m, n] corrected; gains: [m, n, o];
-    transition: [m, n, n] from one corrected state to the next predicted one; response: [m, n, n] by a constant rate in
-    each equation meanwhile; forcing: [m, n, q]; observation: [m, o, n]; direct: [m, o, q]
-    """
-
-    predicted: FloatArray
-    variance: FloatArray
-    states: FloatArray
-    gains: FloatArray
-    transition: FloatArray
-    response: FloatArray
-    forcing: FloatArray
-    observation: FloatArray
-    direct: FloatArray
-
-    @classmethod
-    def allocate(cls, m: int, n: int, o: int, q: int) -> "Linearisation":
-        """Return arrays of zeros."""
-        shapes = ((m, o), (m, o), (m, n), (m, n, o), (m, n, n), (m, n, n), (m, n, q), (m, o, n), (m, o, q))
-        return cls(*(np.zeros(shape) for shape in shapes))
 
 
 @lru_cache(maxsize=64)
@@ -90,7 +66,7 @@ def build_kernels(rhs: Any, output: Any, n: int, i: int, o: int, parameters: tup
     for count_references in (False, True):
         kernels = _build(rhs, output, n, i, o, count_references)
         try:
-            kernels.run(t, u, u, y, np.ones(n), p, terms, values, 1.0, 0, gains, work, y.copy(), np.zeros((2, n)))
+            kernels.run((t, u, u, y), np.ones(n), p, terms, values, 1.0, 0, gains, work, y.copy(), np.zeros((2, n)))
         except (NumbaError, TypeError, NotImplementedError):
             continue
         return kernels
@@ -144,8 +120,6 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                 out[j] = each
                 j += 1  # noqa: SIM113
 
-    predict_covariance, correct, form = _predict_covariance, _correct, evaluate_form
-
     @compile_
     def variable(which: int, t: float, x: Any, u: Any) -> float:
         if which < n:
@@ -156,7 +130,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
     def term_value(terms: Any, values: Any, row: int, t: float, x: Any, u: Any) -> float:
         factor = 1.0 if terms[row, FACTOR] < 0 else variable(terms[row, FACTOR], t, x, u)
         z = variable(terms[row, VARIABLE], t, x, u)
-        return float(factor * values[row, 0] * form(terms[row, FORM], z, values[row, 1], values[row, 2]))
+        return float(factor * values[row, 0] * evaluate_form(terms[row, FORM], z, values[row, 1], values[row, 2]))
 
     @compile_
     def rates(t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, values: Any, offset: Any, out: Any) -> None:
@@ -176,27 +150,25 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
 
     @compile_
     def advance(
-        t0: float,
-        t1: float,
-        u0: Any,
-        u1: Any,
-        d0: Any,
-        d1: Any,
+        k: int,
+        samples: Any,
+        h_max: float,
         hold: int,
         ps: Any,
         q: int,
         terms: Any,
         values: Any,
         offset: Any,
-        h_max: float,
         x: Any,
         work: Any,
-        u: Any,
+        held: Any,
     ) -> None:
-        """Advance x in place.
+        """Advance x in place from sample k - 1 to k.
 
-        work: [5, n]; u: [i]; d0, d1: slopes of the inputs; hold: 0, 1 or 2
+        work: [5, n]; held: [i] inputs within a step; hold: 0, 1 or 2
         """
+        t, u, d, _ = samples
+        t0, t1, u0, u1, d0, d1 = t[k - 1], t[k], u[k - 1], u[k], d[k - 1], d[k]
         steps = min(max(1, ceil((t1 - t0) / h_max - 1e-6)), MAX_SUBSTEPS)
         h = (t1 - t0) / steps
         for step in range(steps):
@@ -204,16 +176,16 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
             for stage in range(4):
                 part = at + (0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)) / steps
                 for j in range(i):
-                    u[j] = u0[j]
+                    held[j] = u0[j]
                     if hold > 0:
-                        u[j] += part * (u1[j] - u0[j])
+                        held[j] += part * (u1[j] - u0[j])
                     if hold > 1:
                         rise, back = u1[j] - u0[j], 1.0 - part
-                        u[j] += part * back * (back * ((t1 - t0) * d0[j] - rise) - part * ((t1 - t0) * d1[j] - rise))
+                        held[j] += part * back * (back * ((t1 - t0) * d0[j] - rise) - part * ((t1 - t0) * d1[j] - rise))
                 weight = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
                 for j in range(n):
                     work[4, j] = x[j] + (weight * work[stage - 1, j] if stage > 0 else 0.0)
-                rates(t0 + part * (t1 - t0), work[4], u, ps, q, terms, values, offset, work[stage])
+                rates(t0 + part * (t1 - t0), work[4], held, ps, q, terms, values, offset, work[stage])
             for j in range(n):
                 x[j] += h / 6.0 * (work[0, j] + 2.0 * work[1, j] + 2.0 * work[2, j] + work[3, j])
 
@@ -226,10 +198,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
 
     @compile_
     def run(
-        t: Any,
-        u: Any,
-        d: Any,
-        y: Any,
+        samples: Any,
         x0: Any,
         ps: Any,
         terms: Any,
@@ -241,30 +210,14 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         predicted: Any,
         states: Any,
     ) -> None:
+        t, u, _, y = samples
         work, held, _, _ = workspace
         x, offset = work[5], work[6]
         x[:] = x0
         offset[:] = 0.0
         for k in range(len(t)):
             if k > 0:
-                advance(
-                    t[k - 1],
-                    t[k],
-                    u[k - 1],
-                    u[k],
-                    d[k - 1],
-                    d[k],
-                    hold,
-                    ps,
-                    0,
-                    terms,
-                    values,
-                    offset,
-                    h_max,
-                    x,
-                    work,
-                    held,
-                )
+                advance(k, samples, h_max, hold, ps, 0, terms, values, offset, x, work, held)
             if not is_sound(x):
                 predicted[k:] = np.nan
                 states[k:] = np.nan
@@ -278,10 +231,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
 
     @compile_
     def linearise(
-        t: Any,
-        u: Any,
-        d: Any,
-        y: Any,
+        samples: Any,
         x0: Any,
         ps: Any,
         terms: Any,
@@ -297,6 +247,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         out: Any,
     ) -> None:
         predicted, variance, states, gains, transition, response, forcing, observation, direct = out
+        t, u, _, y = samples
         work, held, y1, half = workspace
         x, offset, before, moved = work[5], work[6], work[7], work[8]
         x[:] = x0
@@ -321,24 +272,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                     elif case > 2 * n:
                         q = case - 2 * n
                         size = deltas[q - 1]
-                    advance(
-                        t[k - 1],
-                        t[k],
-                        u[k - 1],
-                        u[k],
-                        d[k - 1],
-                        d[k],
-                        hold,
-                        ps,
-                        q,
-                        terms,
-                        values[q],
-                        offset,
-                        h_max,
-                        moved,
-                        work,
-                        held,
-                    )
+                    advance(k, samples, h_max, hold, ps, q, terms, values[q], offset, moved, work, held)
                     for s in range(n):
                         if case == 0:
                             x[s] = moved[s]
@@ -374,134 +308,3 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
             states[k] = x
 
     return Kernels(run, linearise, is_compiled)
-
-
-@kernel
-def _correct(
-    x: FloatArray,
-    covariance: FloatArray,
-    observation: FloatArray,
-    noise: FloatArray,
-    y: FloatArray,
-    predicted: FloatArray,
-    variance: FloatArray,
-    gains: FloatArray,
-) -> None:
-    """Correct states and covariance by each output that was measured, and write their joint gains."""
-    n, o = len(x), len(y)
-    for j in range(o):
-        s = noise[j]
-        for a in range(n):
-            for b in range(n):
-                s += observation[j, a] * covariance[a, b] * observation[j, b]
-        variance[j] = s
-        if not (isfinite(y[j]) and isfinite(s) and s > 0.0):
-            continue
-        for a in range(n):
-            total = 0.0
-            for b in range(n):
-                total += covariance[a, b] * observation[j, b]
-            gains[a, j] = total / s
-        # The gains of earlier outputs of this sample already move this output.
-        for other in range(j):
-            moves = 0.0
-            for a in range(n):
-                moves += observation[j, a] * gains[a, other]
-            for a in range(n):
-                gains[a, other] -= gains[a, j] * moves
-        for a in range(n):
-            for b in range(n):
-                covariance[a, b] -= gains[a, j] * s * gains[b, j]
-    for j in range(o):
-        if isfinite(y[j]):
-            for a in range(n):
-                x[a] += gains[a, j] * (y[j] - predicted[j])
-
-
-@kernel
-def _predict_covariance(
-    covariance: FloatArray, half: FloatArray, transition: FloatArray, noise_rate: FloatArray, dt_s: float
-) -> None:
-    """Carry the covariance to the next sample, in place."""
-    n = len(covariance)
-    for a in range(n):
-        for b in range(n):
-            half[a, b] = 0.0
-            for c in range(n):
-                half[a, b] += transition[a, c] * covariance[c, b]
-    for a in range(n):
-        for b in range(n):
-            total = noise_rate[a] * dt_s if a == b else 0.0
-            for c in range(n):
-                total += half[a, c] * transition[b, c]
-            covariance[a, b] = total
-
-
-@array_kernel
-def propagate_term(
-    transition: FloatArray,
-    drive: FloatArray,
-    observation: FloatArray,
-    direct: FloatArray,
-    gains: FloatArray,
-    term: FloatArray,
-) -> FloatArray:
-    """Return the change of the predictions [m, o, c] by terms [m, c] that enter by drive [m, n] and direct [o]."""
-    m, n = drive.shape
-    o, c = len(direct), term.shape[1]
-    out, delta, moved = np.zeros((m, o, c)), np.zeros((n, c)), np.zeros((n, c))
-    for k in range(m):
-        if k > 0:
-            for s in range(n):
-                for col in range(c):
-                    total = drive[k, s] * 0.5 * (term[k - 1, col] + term[k, col])
-                    for j in range(n):
-                        total += transition[k, s, j] * delta[j, col]
-                    moved[s, col] = total
-            delta[:] = moved
-        for j in range(o):
-            for col in range(c):
-                total = direct[j] * term[k, col]
-                for s in range(n):
-                    total += observation[k, j, s] * delta[s, col]
-                out[k, j, col] = total
-        for s in range(n):
-            for j in range(o):
-                for col in range(c):
-                    delta[s, col] -= gains[k, s, j] * out[k, j, col]
-    return out
-
-
-@array_kernel
-def propagate_parameters(
-    transition: FloatArray,
-    forcing: FloatArray,
-    observation: FloatArray,
-    direct: FloatArray,
-    gains: FloatArray,
-    start: FloatArray,
-) -> FloatArray:
-    """Return the derivatives of the predictions [m, o, q] by parameters, from those of the first state [n, q]."""
-    m, n, count = forcing.shape
-    o = direct.shape[1]
-    out, delta, moved = np.zeros((m, o, count)), start.copy(), np.zeros((n, count))
-    for k in range(m):
-        if k > 0:
-            for s in range(n):
-                for q in range(count):
-                    total = forcing[k, s, q]
-                    for j in range(n):
-                        total += transition[k, s, j] * delta[j, q]
-                    moved[s, q] = total
-            delta[:] = moved
-        for j in range(o):
-            for q in range(count):
-                total = direct[k, j, q]
-                for s in range(n):
-                    total += observation[k, j, s] * delta[s, q]
-                out[k, j, q] = total
-        for s in range(n):
-            for j in range(o):
-                for q in range(count):
-                    delta[s, q] -= gains[k, s, j] * out[k, j, q]
-    return out

@@ -17,7 +17,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.discovery.fitting import Point, Simulation
 from optodrive.lab.discovery.forms import Form, list_forms
-from optodrive.lab.discovery.integration import Linearisation, propagate_parameters, propagate_term
+from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.model import Curve, Record
 
 EVEN_NODES = 11
@@ -195,10 +195,10 @@ def _build_grams(
         if at.factor >= 0:
             hats *= variable_values(each, at.factor)[:, None]
         line = each.line
-        drive = line.response[:, :, at.place] if at.place < n else np.zeros(line.states.shape)
-        change = propagate_term(
-            line.transition, np.ascontiguousarray(drive), line.observation, direct, line.gains, hats
-        )
+        forcing = np.zeros((*line.states.shape, len(nodes)))
+        if at.place < n:
+            forcing[1:] = (0.5 * line.response[1:, :, at.place])[:, :, None] * (hats[:-1] + hats[1:])[:, None, :]
+        change = line.propagate(forcing, direct[:, None] * hats[:, None, :], np.zeros((n, len(nodes))))
         error = np.nan_to_num(each.record.outputs - line.predicted)[:, :, None]
         joined = np.concatenate([each.columns, change, error], axis=2) * each.weights[:, :, None]
         for row, block in enumerate(blocks):
@@ -268,8 +268,3 @@ def rank_formulas(found: Screened, count: int) -> list[Candidate]:
         for k in list(best.values())[:count]
         if usable[k]
     ]
-
-
-def differentiate(each: Linearisation, start: FloatArray) -> FloatArray:
-    """Return the derivatives of the predictions [m, o, q] by all fitted numbers."""
-    return propagate_parameters(each.transition, each.forcing, each.observation, each.direct, each.gains, start)
