@@ -39,7 +39,7 @@ MODULES = {
     "support": ("support",),
     "docs": ("docs",),
 }
-"""Commands by module below `optodrive.cli`, in the order of the help."""
+"""Commands by module below `optodrive.cli`, in the order of the help: its functions of these names, or its GROUP."""
 
 
 def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> int:
@@ -81,8 +81,13 @@ def build_app(command: str | None = None) -> typer.Typer:
     """Build the command line with one command, or with all of them if there is none of this name."""
     app = typer.Typer(name="optodrive", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
     app.callback(epilog=SUMMARY)(_select)
-    for module in [name for name, commands in MODULES.items() if command in commands] or MODULES:
-        import_module(f"optodrive.cli.{module}").register(app)
+    for name in [name for name, commands in MODULES.items() if command in commands] or MODULES:
+        module, commands = import_module(f"optodrive.cli.{name}"), MODULES[name]
+        if hasattr(module, "GROUP"):
+            app.add_typer(module.GROUP, name=commands[0])
+            continue
+        for each in commands:
+            app.command(each)(getattr(module, each.replace("-", "_")))
     return app
 
 

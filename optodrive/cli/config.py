@@ -8,22 +8,16 @@ from typing import Annotated, TypeVar
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_answer, print_json
 from optodrive.core.errors import MISSING, InputError
 
 Answer = TypeVar("Answer", int, float, str)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(help="Write, show, check or migrate a configuration.", no_args_is_help=True)
-    group.command("new")(new)
-    group.command("show")(show)
-    group.command("check")(check)
-    group.command("migrate")(migrate)
-    app.add_typer(group, name="config")
+GROUP = typer.Typer(help="Write, show, check or migrate a configuration.", no_args_is_help=True)
 
 
+@GROUP.command()
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="Configuration to write; no file is overwritten.")],
     rows: Annotated[int | None, typer.Option("--rows", min=1, max=200, help="Rows of pixels.")] = None,
@@ -42,7 +36,7 @@ def new(
     ] = None,
 ) -> None:
     """Write a configuration. Ask on the terminal for each value that no option states."""
-    from optodrive.core.files import atomic_write, check_output
+    from optodrive.core.files import check_output, write_text
     from optodrive.device.config_template import NewDisplay, write_template
     from optodrive.planning.display_model import DisplayModel
 
@@ -58,8 +52,7 @@ def new(
     )
     text, config = write_template(display, file)
     DisplayModel.from_config(config)
-    with atomic_write(file) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(file, text)
     print(f"written          {file}: check servo, caps and sizes in it against your own parts")
     print(f"next             optodrive serve --config {file}")
 
@@ -74,6 +67,7 @@ def _ask(option: str, value: Answer | None, question: str, default: Answer) -> A
     return answer
 
 
+@GROUP.command()
 def show(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Show the effective configuration with every pixel and number."""
     from optodrive.device.config_file import load_config
@@ -97,6 +91,7 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
             print(f"{section} = {content}")
 
 
+@GROUP.command()
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Check a configuration file and the files that it names. Tokens are checked only for the daemon's user."""
     from optodrive.daemon.api.tokens import read_private_tokens
@@ -107,12 +102,12 @@ def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     tokens = display.config.daemon.tokens
     if tokens and os.access(tokens, os.R_OK):
         read_private_tokens(Path(tokens))
-    if json:
-        print_json({"name": display.config.name, "pixels": len(display.layout), "ok": True})
-    else:
-        print(f"{display.config.name}: {len(display.layout)} pixels, configuration valid")
+    name, pixels = display.config.name, len(display.layout)
+    line = f"{name}: {pixels} pixels, configuration valid"
+    print_answer({"name": name, "pixels": pixels, "ok": True}, [line], json)
 
 
+@GROUP.command()
 def migrate(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Configuration of an older version.")],
     out: Annotated[
@@ -121,7 +116,7 @@ def migrate(
     json: JsonOption = False,
 ) -> None:
     """Rename the keys of an older configuration, or list the lines that only you can change. FILE stays as it is."""
-    from optodrive.core.files import atomic_write, check_output
+    from optodrive.core.files import check_output, write_text
     from optodrive.device.config_migration import migrate_config
 
     check_output("--out", out, ".toml")
@@ -134,8 +129,7 @@ def migrate(
         expected = f"{len(migration.by_hand)} lines changed by hand, as listed"
         raise InputError(f"{file}: version", migration.version, expected)
     if out is not None:
-        with atomic_write(out) as temporary:
-            temporary.write_text(migration.text, encoding="utf-8")
+        write_text(out, migration.text)
     elif not json:
         print(migration.text, end="")
     if not json:

@@ -24,12 +24,6 @@ STATE_TIMEOUT_S = 2.0
 """Longest wait for the daemon's state after a STOP that the link process has confirmed."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    for command in (status, arm, disarm, dim, pause, resume, reload, stop):
-        app.command()(command)
-
-
 def status(url: UrlOption = DEFAULT_URL, stage: StageOption = None, json: JsonOption = False) -> None:
     """Show the boards, the link with its error counters, the queue, and the limits in effect."""
     from optodrive.client.api_request import READ_CONFIG, READ_STATE

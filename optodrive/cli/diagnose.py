@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optodrive.cli.options import ConfigOption
-from optodrive.cli.output import announce_compilation, print_json, show_step
+from optodrive.cli.output import announce_compilation, print_answer, show_step
 from optodrive.cli.requirements import require_scipy
 from optodrive.cli.signals import end_as_interrupted
 from optodrive.core.errors import InputError
@@ -22,11 +22,6 @@ RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING", h
 STDOUT = "-"
 DEFAULT_BRIDGE_WIDTH_M = 0.4e-3
 """Assumed where the recording states no width; R and C in model.toml then hold for displays of this width only."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("diagnose")(diagnose)
 
 
 @dataclass(frozen=True)
@@ -160,23 +155,19 @@ def _diagnose_per_pixel(
 
 def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) -> None:
     """Write the requested files atomically, then print the narrative or the JSON document."""
-    from optodrive.core.files import create_folder
+    from optodrive.core.files import create_folder, write_text
 
     if json is not None and json != STDOUT:
-        _write_text(Path(json), _dump_json(output.document))
+        write_text(Path(json), _dump_json(output.document))
     if out is not None:
         create_folder(out)
-        _write_text(out / "report.html", output.report_html)
-        _write_text(out / "diagnosis.json", _dump_json(output.document))
+        write_text(out / "report.html", output.report_html)
+        write_text(out / "diagnosis.json", _dump_json(output.document))
         if output.model_toml is not None:
-            _write_text(out / "model.toml", output.model_toml)
-    if json == STDOUT:
-        print_json(output.document)
-        return
-    for line in output.narrative:
-        print(line)
-    if out is not None:
-        print(f"written: {out}/report.html, diagnosis.json" + (", model.toml" if output.model_toml is not None else ""))
+            write_text(out / "model.toml", output.model_toml)
+    model = "" if output.model_toml is None else ", model.toml"
+    written = [] if out is None else [f"written: {out}/report.html, diagnosis.json{model}"]
+    print_answer(output.document, [*output.narrative, *written], json == STDOUT)
 
 
 def _check_output_paths(json: str | None, out: Path | None) -> None:
@@ -207,10 +198,3 @@ def _dump_json(document: dict[str, object]) -> str:
     import json
 
     return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
-
-
-def _write_text(path: Path, text: str) -> None:
-    from optodrive.core.files import atomic_write
-
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")

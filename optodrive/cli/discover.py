@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from optodrive.cli.options import JsonOption
-from optodrive.cli.output import print_json, show_step
+from optodrive.cli.output import print_answer, show_step
 from optodrive.cli.requirements import require_scipy
 from optodrive.cli.signals import end_as_interrupted
 
@@ -19,11 +19,6 @@ RecordsArgument = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("discover")(discover)
-
-
 def discover(model: ModelArgument, records: RecordsArgument, json: JsonOption = False) -> None:
     """Find the terms that a simulation lacks, in measured records of any system."""
     require_scipy()
@@ -34,11 +29,7 @@ def discover(model: ModelArgument, records: RecordsArgument, json: JsonOption = 
     train = [read_record(path, simulation) for path in records]
     with end_as_interrupted(), show_step("reading") as on_progress:
         answer = search(simulation, train, progress=lambda stage, fraction: on_progress(stage))
-    if json:
-        print_json(build_document(answer))
-        return
-    for line in build_lines(answer):
-        print(line)
+    print_answer(build_document(answer), build_lines(answer), json)
 
 
 def build_document(answer: "Discovery") -> dict[str, object]:

@@ -9,16 +9,11 @@ from typing import Annotated
 import typer
 
 from optodrive.cli.options import JsonOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_answer
 from optodrive.core.errors import InputError, suggest_near_name
 
 FOLDERS = ("docs", "firmware_protocol")
 PAGE_SUFFIX = ".md"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(docs)
 
 
 def docs(
@@ -41,17 +36,13 @@ def docs(
         check_output("--out", out, folder=True)
         for name, root in roots.items():
             _copy_tree(root, out / name)
-        print_json({"out": str(out)}) if json else print(f"written          {out}: {', '.join(FOLDERS)}")
+        print_answer({"out": str(out)}, [f"written          {out}: {', '.join(FOLDERS)}"], json)
         return
     pages = {path: item for name, root in roots.items() for path, item in _list_pages(root, name)}
     if page is not None:
         print(pages[_find_page(page, list(pages))].read_text(encoding="utf-8"), end="")
         return
-    if json:
-        print_json({"pages": sorted(pages)})
-        return
-    for path in sorted(pages):
-        print(path)
+    print_answer({"pages": sorted(pages)}, sorted(pages), json)
 
 
 def locate_shipped_folder(name: str) -> Traversable:

@@ -18,11 +18,6 @@ if TYPE_CHECKING:
 MARKS = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(doctor)
-
-
 def doctor(
     config: ConfigOption = None,
     stage: StageOption = None,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_answer
 from optodrive.core.errors import MISSING, InputError
 
 if TYPE_CHECKING:
@@ -15,11 +15,6 @@ if TYPE_CHECKING:
 
 POSITION_COLUMNS, CODE_COLUMNS = ("x_m", "y_m"), ("x_code", "y_code")
 POSITION_FORMAT, CODE_FORMAT = "%.10f", "%.4f"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("field")(field)
 
 
 def field(
@@ -63,14 +58,12 @@ def field(
             result = _convert(
                 calibrated_field, _require_option("--points", points), _require_option("--out", out), inverse
             )
-    if json:
-        print_json(result)
-    else:
-        print(f"written          {result['out']}" + (f", {result['points']} points" if "points" in result else ""))
-        if result.get("outside"):
-            print(
-                f"outside          {result['outside']} points lie outside the calibrated region, where sigma is unknown"
-            )
+    lines = [f"written          {result['out']}" + (f", {result['points']} points" if "points" in result else "")]
+    if result.get("outside"):
+        lines.append(
+            f"outside          {result['outside']} points lie outside the calibrated region, where sigma is unknown"
+        )
+    print_answer(result, lines, json)
 
 
 def _require_option(option: str, path: Path | None) -> Path:
@@ -129,7 +122,7 @@ def _export(calibrated_field: "CalibratedField", export: Path) -> dict[str, Any]
 
 
 def _import(grid: Path, out: Path, config: str | None) -> dict[str, Any]:
-    from optodrive.core.files import atomic_write
+    from optodrive.core.files import write_text
     from optodrive.device.config_file import load_config
     from optodrive.device.field_file import format_field, strip_toml_specials
     from optodrive.lab.calibration.correction_grid import fit_correction_grid
@@ -139,6 +132,5 @@ def _import(grid: Path, out: Path, config: str | None) -> dict[str, Any]:
     metadata: dict[str, str | float | int] = {
         "source": strip_toml_specials(f"{grid}, a correction grid without uncertainties")
     }
-    with atomic_write(out) as temporary:
-        temporary.write_text(format_field(calibrated_field, metadata), encoding="utf-8")
+    write_text(out, format_field(calibrated_field, metadata))
     return {"out": str(out), "sigma_max_um": 1e6 * float(calibrated_field.sigma_grid_m.max())}

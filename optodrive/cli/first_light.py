@@ -11,11 +11,6 @@ from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("first-light")(first_light)
-
-
 def first_light(
     power_mw: Annotated[
         float | None,

@@ -15,7 +15,7 @@ from optodrive.cli.options import (
     ModelOption,
     load_run_config,
 )
-from optodrive.cli.output import announce_compilation, print_json, show_progress
+from optodrive.cli.output import announce_compilation, print_answer, show_progress
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.cli.push_options import add_push_options
 from optodrive.core.errors import OptodriveError
@@ -42,16 +42,10 @@ class _TerminatedError(OptodriveError):
     exit_status = 130
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(
-        help="Play on a Helios laser DAC; see docs/how-to/use-a-helios-dac.md first.", no_args_is_help=True
-    )
-    group.command("info")(info)
-    group.command("play")(add_push_options(play))
-    app.add_typer(group, name="helios")
+GROUP = typer.Typer(help="Play on a Helios laser DAC; see docs/how-to/use-a-helios-dac.md first.", no_args_is_help=True)
 
 
+@GROUP.command()
 def info(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Show the connected Helios and whether it may emit. It is stopped, and its shutter closed."""
     from optodrive.core.clock import MonotonicClock
@@ -65,15 +59,17 @@ def info(config: ConfigOption = None, json: JsonOption = False) -> None:
             "ready": helios.is_ready(),
             "may_emit": board.transport == "helios" and board.interlock_watched,
         }
-    if json:
-        print_json(document)
-        return
-    print(f"name             {document['name']}")
-    print(f"firmware         {document['firmware']}")
-    print(f"ready            {'yes' if document['ready'] else 'no'}")
-    print(f"may emit         {'yes' if document['may_emit'] else 'no: the configuration names no watched interlock'}")
+    lines = [
+        f"name             {document['name']}",
+        f"firmware         {document['firmware']}",
+        f"ready            {'yes' if document['ready'] else 'no'}",
+        f"may emit         {'yes' if document['may_emit'] else 'no: the configuration names no watched interlock'}",
+    ]
+    print_answer(document, lines, json)
 
 
+@GROUP.command()
+@add_push_options
 def play(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")],
     config: ConfigOption = None,
@@ -120,11 +116,8 @@ def play(
             )
     summary = summarize_plan(planned_sequence, feasibility)
     playback_summary = _summarize_playback(display, planned_sequence, verified, playback)
-    if json:
-        print_json({**summary.model_dump(mode="json"), "helios": playback_summary})
-        return
-    for line in [*format_plan_summary(summary), *_format_playback(playback_summary)]:
-        print(line)
+    document = {**summary.model_dump(mode="json"), "helios": playback_summary}
+    print_answer(document, [*format_plan_summary(summary), *_format_playback(playback_summary)], json)
 
 
 @contextmanager

@@ -8,11 +8,6 @@ from optodrive.cli.commissioning_steps import report_steps
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("home")(home)
-
-
 def home(
     config: ConfigOption = None,
     stage: StageOption = None,

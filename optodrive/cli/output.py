@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 TABLE_WIDTH_MAX = 500
@@ -14,6 +15,20 @@ def print_json(document: object) -> None:
     """Print one JSON object on stdout. It may be or contain Pydantic models."""
     json.dump(document, sys.stdout, indent=2, ensure_ascii=False, default=_convert_model)
     sys.stdout.write("\n")
+
+
+def print_answer(document: object, lines: Iterable[str], as_json: bool) -> None:
+    """Print the answer of a command as one JSON object, or as lines of text."""
+    if as_json:
+        print_json(document)
+        return
+    for line in lines:
+        print(line)
+
+
+def list_written(path: Path | None) -> list[str]:
+    """Return the line that names a written file, none without one."""
+    return [] if path is None else [f"written          {path}"]
 
 
 def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], numeric: frozenset[str] = frozenset()) -> None:

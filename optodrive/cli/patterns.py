@@ -1,23 +1,19 @@
 """`optodrive patterns`: list the named patterns, or write one as frames."""
 
 import json as json_format
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_answer
 from optodrive.cli.pattern_parameters import parse_parameters
 from optodrive.core.errors import MISSING, InputError
 
 if TYPE_CHECKING:
     from optodrive.planning.stimuli.pattern import PatternDescription, PatternParameter
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(patterns)
 
 
 def patterns(
@@ -43,37 +39,30 @@ def patterns(
         raise InputError("--out", MISSING, f"--out FRAMES.json for {values[0]}")
     name = None if pattern is None else find_pattern(pattern).name
     descriptions = [item for item in describe_patterns() if name in (None, item.name)]
-    if json:
-        print_json({"patterns": descriptions})
-        return
-    for item in descriptions:
-        _print_description(item)
+    print_answer({"patterns": descriptions}, [line for item in descriptions for line in _describe(item)], json)
 
 
 def _write_pattern(pattern: str, values: list[str], out: Path, config: str | None, json: bool) -> None:
-    from optodrive.core.files import atomic_write, check_output
+    from optodrive.core.files import check_output, write_text
     from optodrive.device.config_file import load_config
     from optodrive.planning.stimuli.pattern_registry import build_pattern, find_pattern
     from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
     check_output("--out", out, ".json")
     sequence = build_pattern(pattern, parse_parameters("patterns", pattern, values), load_config(config))
-    with atomic_write(out) as temporary:
-        temporary.write_text(json_format.dumps(sequence_to_json(sequence)) + "\n", encoding="utf-8")
+    write_text(out, json_format.dumps(sequence_to_json(sequence)) + "\n")
     policy = find_pattern(pattern).policy
-    if json:
-        counts = {"frames": len(sequence.frames), "trains": len(sequence.trains)}
-        print_json({"out": str(out), "pattern": pattern, "policy": policy, **counts})
-        return
+    counts = {"frames": len(sequence.frames), "trains": len(sequence.trains)}
     treated = "" if policy == "trim" else f"; played as a pattern its policy is {policy}: --policy {policy}"
-    print(f"written          {out}: {len(sequence.frames)} frames, {len(sequence.trains)} trains{treated}")
+    line = f"written          {out}: {counts['frames']} frames, {counts['trains']} trains{treated}"
+    print_answer({"out": str(out), "pattern": pattern, "policy": policy, **counts}, [line], json)
 
 
-def _print_description(item: "PatternDescription") -> None:
-    print(f"{item.name}: {item.summary}")
+def _describe(item: "PatternDescription") -> Iterator[str]:
+    yield f"{item.name}: {item.summary}"
     for parameter in item.parameters:
         default = "" if parameter.default is None else f"={parameter.default}"
-        print(f"    {parameter.name}{default}{_format_bounds(parameter)}  {parameter.description}")
+        yield f"    {parameter.name}{default}{_format_bounds(parameter)}  {parameter.description}"
 
 
 def _format_bounds(parameter: "PatternParameter") -> str:

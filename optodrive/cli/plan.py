@@ -15,7 +15,7 @@ from optodrive.cli.options import (
     PixelMapOption,
     load_run_config,
 )
-from optodrive.cli.output import announce_compilation, print_json, show_progress
+from optodrive.cli.output import announce_compilation, list_written, print_answer, show_progress
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.cli.push_options import add_push_options
 from optodrive.core.types.push_options import PushOptions
@@ -23,11 +23,7 @@ from optodrive.core.types.push_options import PushOptions
 FramesArgument = Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("plan")(add_push_options(plan))
-
-
+@add_push_options
 def plan(
     frames: FramesArgument,
     out: Annotated[
@@ -45,7 +41,7 @@ def plan(
     **options: Unpack[PushOptions],
 ) -> None:
     """Plan and limit frames. Report feasibility, pulses, beam time, trimmed pulses and predicted displacement."""
-    from optodrive.core.files import atomic_write, check_output
+    from optodrive.core.files import check_output, write_text
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.plan_picture import draw_plan
@@ -62,16 +58,9 @@ def plan(
         )
     if out is not None:
         if out.suffix.lower() == ".svg":
-            with atomic_write(out) as temporary:
-                temporary.write_text(draw_plan(planned_sequence, display), encoding="utf-8")
+            write_text(out, draw_plan(planned_sequence, display))
         else:
             write_plan_csv(out, planned_sequence, display)
     document = summarize_plan(planned_sequence, feasibility)
-    if json:
-        print_json(document)
-    else:
-        for line in format_plan_summary(document):
-            print(line)
-        if out is not None:
-            print(f"written          {out}")
+    print_answer(document, [*format_plan_summary(document), *list_written(out)], json)
     exit_unless_fits(feasibility)

@@ -35,12 +35,7 @@ DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Plan and limit on
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the plan has been shown.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    for command in (push, play):
-        app.command()(add_push_options(command))
-
-
+@add_push_options
 def push(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")],
     url: UrlOption = DEFAULT_URL,
@@ -69,6 +64,7 @@ def push(
     exit_unless_fits(plan.summary.feasibility)
 
 
+@add_push_options
 def play(
     pattern: Annotated[str, typer.Argument(metavar="PATTERN", help="A name that `optodrive patterns` lists.")],
     values: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Pattern parameters.")] = None,

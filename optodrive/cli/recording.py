@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optodrive.cli.options import JsonOption
-from optodrive.cli.output import print_json, print_table
+from optodrive.cli.output import list_written, print_answer, print_json, print_table
 from optodrive.cli.recording_trials import describe_trials, print_trials, trials
 from optodrive.core.quantity import format_number, format_quantity
 
@@ -14,18 +14,10 @@ if TYPE_CHECKING:
     from optodrive.core.types.measurements import Measurement
 
 RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="An HDF5 file, or a folder of CSV files.")]
+GROUP = typer.Typer(help="Inspect recordings, convert them, or merge them with a session.", no_args_is_help=True)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(help="Inspect recordings, convert them, or merge them with a session.", no_args_is_help=True)
-    group.command("convert")(convert)
-    group.command("show")(show)
-    group.command("merge")(merge)
-    group.command("trials")(trials)
-    app.add_typer(group, name="recording")
-
-
+@GROUP.command()
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="An HDF5 file, or a folder of CSV files.")],
     target: Annotated[
@@ -41,14 +33,11 @@ def convert(
     check_output("OUT", target, *HDF5_SUFFIXES, folder=True)
     measurement = convert_recording(source, target)
     samples = sum(len(signal.t_s) for run in measurement.runs for signal in run.signals.values())
-    if json:
-        print_json({"written": str(target), "runs": len(measurement.runs), "samples": samples})
-    else:
-        print(f"runs             {len(measurement.runs)}")
-        print(f"samples          {samples}")
-        print(f"written          {target}")
+    lines = [f"runs             {len(measurement.runs)}", f"samples          {samples}", *list_written(target)]
+    print_answer({"written": str(target), "runs": len(measurement.runs), "samples": samples}, lines, json)
 
 
+@GROUP.command()
 def show(
     recording: RecordingArgument,
     out: Annotated[
@@ -87,6 +76,7 @@ def show(
         print(f"written          {out}{part}")
 
 
+@GROUP.command()
 def merge(
     session: Annotated[Path, typer.Argument(metavar="SESSION.h5", help="Output of `serve --record-session`.")],
     measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="A recording of the same runs, without pulses.")],
@@ -108,12 +98,11 @@ def merge(
     measurement = merge_session(session, measured, time_offset_s)
     write_recording(out, measurement)
     pulses = sum(len(run.pulses) for run in measurement.runs)
-    if json:
-        print_json({"written": str(out), "runs": len(measurement.runs), "pulses": pulses})
-    else:
-        print(f"runs             {len(measurement.runs)}")
-        print(f"pulses           {pulses}")
-        print(f"written          {out}")
+    lines = [f"runs             {len(measurement.runs)}", f"pulses           {pulses}", *list_written(out)]
+    print_answer({"written": str(out), "runs": len(measurement.runs), "pulses": pulses}, lines, json)
+
+
+GROUP.command()(trials)
 
 
 def _draw_signals(out: Path, measurement: "Measurement") -> int:

@@ -24,14 +24,13 @@ def trials(
     json: JsonOption = False,
 ) -> None:
     """List the trials of a session: labels, requested and executed onset on three clocks, and outcome."""
-    from optodrive.core.files import atomic_write, check_output
+    from optodrive.core.files import check_output, write_text
     from optodrive.lab.recording.trials import format_csv, read_trials
 
     check_output("--out", out, ".csv")
     found = read_trials(session)
     if out is not None:
-        with atomic_write(out) as temporary:
-            temporary.write_text(format_csv(found), encoding="utf-8")
+        write_text(out, format_csv(found))
     if json:
         print_json(
             {"session": str(session), "trials": describe_trials(found), "written": None if out is None else str(out)}

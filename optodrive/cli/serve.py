@@ -12,11 +12,6 @@ if TYPE_CHECKING:
     from optodrive.device.config import Config
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(serve)
-
-
 def serve(
     config: ConfigOption = None,
     model: ModelOption = None,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_answer
 from optodrive.core.errors import InputError
 
 RootOption = Annotated[
@@ -16,14 +16,10 @@ RootOption = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(help="Manage the files of the systemd service; no command starts it.", no_args_is_help=True)
-    for command in (install, remove, show):
-        group.command()(command)
-    app.add_typer(group, name="service")
+GROUP = typer.Typer(help="Manage the files of the systemd service; no command starts it.", no_args_is_help=True)
 
 
+@GROUP.command()
 def install(
     config: ConfigOption = None,
     root: RootOption = Path("/"),
@@ -45,10 +41,8 @@ def install(
         raise InputError("--program", str(started), "an executable file; without --root the service starts it here")
     loaded, files = build_service_files(source, started)
     actions = installation.install(files)
-    if json:
-        print_json({"files": [{"path": str(path), "action": action} for path, action in actions]})
+    if _print_files("action", actions, json):
         return
-    _print_files(actions)
     if loaded.board.vendor_id is None and loaded.board.transport == "serial":
         print(f"no udev rules: set [board] vendor_id and product_id to get {DEVICE_LINK} and keep ModemManager away")
     elif loaded.board.transport == "serial" and loaded.board.port != DEVICE_LINK:
@@ -63,36 +57,29 @@ def install(
     print("The laser stays off: only `optodrive arm` arms the board, the daemon never does.")
 
 
+@GROUP.command()
 def remove(root: RootOption = Path("/"), json: JsonOption = False) -> None:
     """Remove the installed files, except edited ones."""
     from optodrive.cli.service_files import Installation
 
     actions = Installation(root).remove()
-    if json:
-        print_json({"files": [{"path": str(path), "action": action} for path, action in actions]})
-        return
-    _print_files(actions)
-    if not actions:
-        print("nothing is installed")
-    else:
+    if not _print_files("action", actions, json) and actions:
         print("stop the service if it is running: systemctl disable --now optodrive; then systemctl daemon-reload")
         print("kept: /var/lib/optodrive (tokens, audit file), the user optodrive")
 
 
+@GROUP.command()
 def show(root: RootOption = Path("/"), json: JsonOption = False) -> None:
     """List the installed files, and whether they were edited."""
     from optodrive.cli.service_files import Installation
 
     installation = Installation(root)
     statuses = [(path, str(installation.file_status(path))) for path in installation.installed_files()]
-    if json:
-        print_json({"files": [{"path": str(path), "status": status} for path, status in statuses]})
-        return
-    _print_files(statuses)
-    if not statuses:
-        print("nothing is installed")
+    _print_files("status", statuses, json)
 
 
-def _print_files(lines: list[tuple[Path, str]]) -> None:
-    for path, what in lines:
-        print(f"{path}: {what}")
+def _print_files(kind: str, files: list[tuple[Path, str]], json: bool) -> bool:
+    """Print the files with an action or a status each. Return whether that is all to print, as one JSON object."""
+    document = {"files": [{"path": str(path), kind: text} for path, text in files]}
+    print_answer(document, [f"{path}: {text}" for path, text in files] or ["nothing is installed"], json)
+    return json

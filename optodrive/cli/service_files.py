@@ -11,7 +11,7 @@ from typing import Literal
 
 from optodrive.cli.service_program import check_program
 from optodrive.core.errors import InputError, RefusedError
-from optodrive.core.files import atomic_write, lock_folder, read_regular_file
+from optodrive.core.files import lock_folder, read_regular_file, write_text
 from optodrive.core.toml_file import parse_toml
 from optodrive.device.config import Config
 from optodrive.device.config_file import DEFAULT_CONFIG, build_config, list_named_files, load_config, locate_shipped
@@ -188,8 +188,7 @@ class Installation:
             target = self.resolve(file.path)
             action = "replaced" if target.exists() else "written"
             _make_folder(target.parent)
-            with atomic_write(target) as temporary:
-                temporary.write_text(file.text, encoding="utf-8")
+            write_text(target, file.text)
         self._save_digests()  # for each: an installation that fails at the next file knows this one as its own
         return action
 
@@ -239,9 +238,8 @@ class Installation:
             target.unlink(missing_ok=True)
             return
         _make_folder(target.parent)
-        with atomic_write(target) as temporary:
-            document = {"format": FORMAT, "version": VERSION, "sha256": self._digests}
-            temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+        document = {"format": FORMAT, "version": VERSION, "sha256": self._digests}
+        write_text(target, json.dumps(document, indent=2) + "\n")
 
 
 def _compute_digest(text: str) -> str:

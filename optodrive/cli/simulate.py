@@ -1,5 +1,6 @@
 """`optodrive simulate`: run a plan on the simulated board and write the simulated measurements."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +16,7 @@ from optodrive.cli.options import (
     PixelMapOption,
     load_run_config,
 )
-from optodrive.cli.output import announce_compilation, print_json, show_progress
+from optodrive.cli.output import announce_compilation, list_written, print_answer, show_progress
 from optodrive.cli.plan import FramesArgument
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.cli.simulated_recording import InstrumentSettings, record_traces
@@ -35,11 +36,6 @@ if TYPE_CHECKING:
 
 PIXELS_RECORDED_MAX = 16
 """Maximum number of pixels recorded without --pixels; those with the highest displacements are selected."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("simulate")(simulate)
 
 
 def simulate(
@@ -130,29 +126,24 @@ def simulate(
     report = _build_report(display, planned_sequence, feasibility, incident, traces, true_display)
     report["truth"] = {"terms": true_terms, "ignored_terms": ignored_terms}
     report |= {"noise": None if out is None else noise, "repeats": repeats, "group": group}
-    if json:
-        print_json(report)
-    else:
-        _print_report(report, truth, [] if out is None else [*instruments.describe(), f"written          {out}"])
+    written = [] if out is None else [*instruments.describe(), *list_written(out)]
+    print_answer(report, [*_format_report(report, truth), *written], json)
     exit_unless_fits(feasibility)
 
 
-def _print_report(report: dict[str, Any], truth: Path | None, recording_lines: list[str]) -> None:
-    for line in format_plan_summary(report["summary"]):
-        print(line)
+def _format_report(report: dict[str, Any], truth: Path | None) -> Iterator[str]:
+    yield from format_plan_summary(report["summary"])
     if truth is not None:
         terms, ignored = report["truth"]["terms"], report["truth"]["ignored_terms"]
-        print(f"truth            {', '.join(terms) or 'the nominal pixel, without terms'}")
+        yield f"truth            {', '.join(terms) or 'the nominal pixel, without terms'}"
         if ignored:
-            print(f"                 not simulated: {', '.join(ignored)} of its base set (not in planner_terms)")
-    print(f"executed         {report['executed']} of {report['planned']} planned")
+            yield f"                 not simulated: {', '.join(ignored)} of its base set (not in planner_terms)"
+    yield f"executed         {report['executed']} of {report['planned']} planned"
     for item in report["pixels"]:
-        print(
+        yield (
             f"pixel {item['pixel']:<10} {item['measured_max_um']:.1f} µm measured, {item['predicted_max_um']:.1f} µm "
             f"predicted, absorber up to {item['absorber_max_c']:.1f} °C"
         )
-    for line in recording_lines:
-        print(line)
 
 
 def _select_true_terms(config: "Config", truth: Path | None) -> tuple[list[str], list[str]]:

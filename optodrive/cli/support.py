@@ -11,11 +11,6 @@ from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.files import atomic_write, check_output
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(support)
-
-
 def support(
     config: ConfigOption = None,
     url: UrlOption = DEFAULT_URL,

@@ -10,11 +10,6 @@ from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.quantity import format_quantity, format_range
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("terms")(terms)
-
-
 def terms(
     name: Annotated[str | None, typer.Argument(metavar="TERM", help="Show this term with its parameters.")] = None,
     json: JsonOption = False,

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_answer, print_json
 from optodrive.core.errors import MISSING, InputError
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of the holder; it appears in the audit file.")]
@@ -19,14 +19,10 @@ FileOption = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(help="Add, list or revoke tokens; a running daemon takes them on reload.", no_args_is_help=True)
-    for name, command in (("add", add), ("list", list_tokens), ("revoke", revoke)):
-        group.command(name)(command)
-    app.add_typer(group, name="token")
+GROUP = typer.Typer(help="Add, list or revoke tokens; a running daemon takes them on reload.", no_args_is_help=True)
 
 
+@GROUP.command()
 def add(
     name: NameArgument,
     role: Annotated[str, typer.Option("--role", metavar="ROLE", help="viewer, operator or armer.")],
@@ -69,18 +65,17 @@ def add(
     _print_next(f"{name}, {role}: added to {path}" + (f", and written to {out}" if out is not None else ""))
 
 
+@GROUP.command("list")
 def list_tokens(file: FileOption = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """List names and roles, without secrets."""
     from optodrive.daemon.api.tokens import read_private_tokens
 
     tokens = read_private_tokens(_locate(file, config)).all
-    if json:
-        print_json({"tokens": [{"name": token.name, "role": token.role} for token in tokens]})
-        return
-    for token in tokens:
-        print(f"{token.name:<20} {token.role}")
+    document = {"tokens": [{"name": token.name, "role": token.role} for token in tokens]}
+    print_answer(document, [f"{token.name:<20} {token.role}" for token in tokens], json)
 
 
+@GROUP.command()
 def revoke(name: NameArgument, file: FileOption = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Remove a token. A reload ends everything begun with it at once, also while the board is armed."""
     from optodrive.daemon.api.token_file import remove_token

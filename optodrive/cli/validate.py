@@ -9,11 +9,6 @@ from optodrive.cli.options import JsonOption, check_model_path
 from optodrive.core.errors import InputError
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("validate")(validate)
-
-
 def validate(
     json: JsonOption = False,
     diagnose: Annotated[

@@ -5,6 +5,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 
+from optodrive.cli.output import print_json
 from optodrive.lab.validation.extended_outcomes import simulate_outcomes
 from optodrive.lab.validation.paper_outcomes import (
     DERIVED_FROM_FITTED,
@@ -102,8 +103,6 @@ def print_validation(json: bool = False, model: Path | None = None) -> None:
     """Print the table, or one JSON object. `model` is a further parameter set to compare."""
     rows = build_validation_rows(model)
     if json:
-        from optodrive.cli.output import print_json
-
         print_json(build_document(rows))
     else:
         _print_table(rows)

@@ -21,14 +21,10 @@ INVALID_SHOWN_BYTES = 32
 CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Output of `optodrive serve --capture`.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(help="List or replay a capture of the link to a board.", no_args_is_help=True)
-    group.command("dump")(dump)
-    group.command("replay")(replay)
-    app.add_typer(group, name="wire")
+GROUP = typer.Typer(help="List or replay a capture of the link to a board.", no_args_is_help=True)
 
 
+@GROUP.command()
 def dump(file: CaptureArgument, json: JsonOption = False) -> None:
     """List every message with its time, then totals. With --json, print one object per line."""
     from optodrive.link.protocol.transcript import Transcript
@@ -95,6 +91,7 @@ def _shorten(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
 
 
+@GROUP.command()
 def replay(
     file: CaptureArgument,
     board: Annotated[str, typer.Option("--board", metavar="PORT", help="A serial port, or `simulated`.")],

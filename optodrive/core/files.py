@@ -33,6 +33,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically, in UTF-8. Raise InputError with the path if it cannot be written."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def check_output(option: str, path: Path | None, *suffixes: str, folder: bool = False, may_exist: bool = False) -> None:
     """Raise InputError unless a new output can be written at this path, before anything is computed for it.
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field as Item
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.files import atomic_write
+from optodrive.core.files import write_text
 from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format, parse_table
@@ -166,8 +166,7 @@ def write_pixel_map(path: Path, pixel_map: PixelMap, config: Config, about: dict
     lines += ["", "[model] # the parameter set that the gains refer to", f'parameters = "{pixel_map.model}"']
     lines += ["", "[map]", "pixels = ["]
     lines += [f"  {{ {_format_entry(pixel_map, index)} }}," for index in range(len(pixel_map))]
-    with atomic_write(path) as temporary:
-        temporary.write_text("\n".join([*lines, "]"]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([*lines, "]"]) + "\n")
 
 
 def _format_entry(pixel_map: PixelMap, index: int) -> str:

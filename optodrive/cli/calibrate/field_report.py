@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.output import print_json
+from optodrive.cli.output import list_written, print_answer
 
 if TYPE_CHECKING:
     from optodrive.lab.calibration.field_fit import FieldFit
@@ -52,13 +52,8 @@ def write_calibration(calibration: FieldCalibration, out: Path | None, report: P
         write_field(out, calibration.fit, source)
     if report is not None:
         _write_report(report, calibration.fit, source, lines)
-    if json:
-        print_json(stats | {name: str(path) for name, path in written.items()})
-        return
-    for line in lines:
-        print(line)
-    for path in written.values():
-        print(f"written          {path}")
+    lines += [line for path in written.values() for line in list_written(path)]
+    print_answer(stats | {name: str(path) for name, path in written.items()}, lines, json)
 
 
 def format_fit(stats: dict[str, Any], first_line: int) -> list[str]:
@@ -84,7 +79,7 @@ def format_fit(stats: dict[str, Any], first_line: int) -> list[str]:
 
 
 def _write_report(path: Path, fit: "FieldFit", source: str, lines: list[str]) -> None:
-    from optodrive.core.files import atomic_write
+    from optodrive.core.files import write_text
     from optodrive.core.html_page import render_page, render_table
     from optodrive.lab.calibration.fit_summary import draw_residuals, draw_sigma_map
 
@@ -105,7 +100,4 @@ def _write_report(path: Path, fit: "FieldFit", source: str, lines: list[str]) ->
         "<h2>Parameters</h2><p>Parameters are correlated: the field is better determined than its parameters.</p>",
         render_table(("parameter", "value", "sigma"), rows, frozenset({1, 2}), "Parameters"),
     ]
-    with atomic_write(path) as temporary:
-        temporary.write_text(
-            render_page(f"Calibration from {source}", "field", ["Calibrated field"], body), encoding="utf-8"
-        )
+    write_text(path, render_page(f"Calibration from {source}", "field", ["Calibrated field"], body))

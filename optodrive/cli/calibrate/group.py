@@ -10,10 +10,6 @@ from optodrive.cli.calibrate.servo import servo
 from optodrive.cli.calibrate.steps import steps
 from optodrive.cli.calibrate.sweep import sweep
 
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    group = typer.Typer(help="Calibrate the scan field, the galvo servos or the pixels.", no_args_is_help=True)
-    for command in (field, camera, board, steps, servo, sweep, pixels):
-        group.command()(command)
-    app.add_typer(group, name="calibrate")
+GROUP = typer.Typer(help="Calibrate the scan field, the galvo servos or the pixels.", no_args_is_help=True)
+for command in (field, camera, board, steps, servo, sweep, pixels):
+    GROUP.command()(command)

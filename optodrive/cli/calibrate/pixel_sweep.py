@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from optodrive.cli.options import load_run_config
-from optodrive.cli.output import print_json
+from optodrive.cli.output import print_answer
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 
@@ -21,26 +21,25 @@ def write_sweep(folder: Path, config: str | None, json: bool) -> None:
 
     Raises InputError where a cell is too small for the offsets or the folder cannot be created.
     """
-    from optodrive.core.files import atomic_write, check_output
+    from optodrive.core.files import check_output, write_text
     from optodrive.lab.calibration.pixels.sweep import compute_pulse
 
     check_output("--sweep", folder, folder=True)
     loaded, aims, counts = write_sweep_files(folder, config)
-    with atomic_write(folder / README) as temporary:
-        temporary.write_text("\n".join(_format_instructions(aims, loaded.name)) + "\n", encoding="utf-8")
+    write_text(folder / README, "\n".join(_format_instructions(aims, loaded.name)) + "\n")
     pulses = [dict(zip(PULSE_FIELDS, compute_pulse(loaded, aim), strict=True)) for aim in aims]
-    if json:
-        described = [
-            aim._asdict() | pulse | {"pulses": count} for aim, pulse, count in zip(aims, pulses, counts, strict=True)
-        ]
-        print_json({"folder": str(folder), "aims": described, "pulses": counts[0]})
-        return
-    print(f"aims             {len(aims)}, one file per aim, {counts[0]} pulses per file")
+    described = [
+        aim._asdict() | pulse | {"pulses": count} for aim, pulse, count in zip(aims, pulses, counts, strict=True)
+    ]
+    lines = [f"aims             {len(aims)}, one file per aim, {counts[0]} pulses per file"]
     if min(counts) < counts[0]:
-        print(f"out of range     up to {counts[0] - min(counts)} pixels per aim, which get no pulse there")
-    for pulse, label in zip(pulses[:2], ("centre", "across edges"), strict=True):
-        print(f"{label:<17}{format_quantity(pulse['pulse_width_s'], 's')} at {format_quantity(pulse['power_w'], 'W')}")
-    print(f"written          {folder}; {README} lists what to play and what to record")
+        lines.append(f"out of range     up to {counts[0] - min(counts)} pixels per aim, which get no pulse there")
+    lines += [
+        f"{label:<17}{format_quantity(pulse['pulse_width_s'], 's')} at {format_quantity(pulse['power_w'], 'W')}"
+        for pulse, label in zip(pulses[:2], ("centre", "across edges"), strict=True)
+    ]
+    lines.append(f"written          {folder}; {README} lists what to play and what to record")
+    print_answer({"folder": str(folder), "aims": described, "pulses": counts[0]}, lines, json)
 
 
 def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[Aim], list[int]]":
@@ -51,7 +50,7 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
     """
     from json import dumps
 
-    from optodrive.core.files import atomic_write, create_folder
+    from optodrive.core.files import create_folder, write_text
     from optodrive.core.types.stimuli import FrameSequence
     from optodrive.device.field_loader import load_scan_field
     from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
@@ -77,8 +76,7 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
     reached = [is_reachable(loaded, field, aim) for aim in aims]
     for aim, pixels in zip(aims, reached, strict=True):
         text = dumps(sequence_to_json(FrameSequence((), build_sweep(loaded, aim, pixels)))) + "\n"
-        with atomic_write(folder / f"{aim.name}.json") as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(folder / f"{aim.name}.json", text)
         about: dict[str, str | float | int] = {"source": f"sweep, aim {aim.name}"}
         write_pixel_map(folder / f"{aim.name}.pixels.toml", build_aim_map(aim, pixels), loaded, about)
     return loaded, aims, [int(pixels.sum()) for pixels in reached]

@@ -1,6 +1,5 @@
 """`optodrive calibrate servo`: identify the galvo servos from a recording of mirror steps."""
 
-from importlib.util import find_spec
 from math import pi
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,8 @@ from typing import Annotated
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import list_written, print_answer
+from optodrive.cli.requirements import require_scipy
 from optodrive.core.errors import MISSING, InputError
 
 
@@ -26,8 +26,7 @@ def servo(
     json: JsonOption = False,
 ) -> None:
     """Identify both mirror servos from steps or any excitation, and tell whether one linear servo suffices."""
-    if find_spec("scipy") is None:
-        raise InputError("scipy", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
+    require_scipy()
     from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.plausible_units import check_recording_units
@@ -65,13 +64,8 @@ def servo(
     report = build_report(mirrors, common, loaded, mirror_effects)
     if out is not None:
         write_mirrors(out, report, source)
-    if json:
-        print_json(report | ({} if out is None else {"mirrors": str(out)}))
-        return
-    for line in format_report_lines(report):
-        print(line)
-    if out is not None:
-        print(f"written          {out}")
+    document = report | ({} if out is None else {"mirrors": str(out)})
+    print_answer(document, [*format_report_lines(report), *list_written(out)], json)
 
 
 def _assess_responses(path: Path, sample_rate_hz: float | None, out: Path | None, json: bool) -> None:
@@ -102,8 +96,4 @@ def _assess_responses(path: Path, sample_rate_hz: float | None, out: Path | None
         lines = [
             f"axis {axis}           {describe_linearity(each['linearity'])}" for axis, each in enumerate(report["axes"])
         ]
-    if json:
-        print_json(report)
-        return
-    for line in lines:
-        print(line)
+    print_answer(report, lines, json)

@@ -7,7 +7,7 @@ import typer
 
 from optodrive.cli.board_access import confirm_emission
 from optodrive.cli.options import ConfigOption, JsonOption
-from optodrive.cli.output import print_json, show_progress
+from optodrive.cli.output import print_answer, show_progress
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,10 +67,9 @@ def sweep(
     write_recording(
         out / RECORDING, build_runs(journal.pulses, aims, loaded.name, displays[0][1].ambient_k), "calibrate sweep"
     )
-    if json:
-        print_json({"recording": str(out / RECORDING), "journal": str(journal.path), "pulses": len(journal.pulses)})
-        return
-    print(f"written          {out / RECORDING}: {len(journal.pulses)} runs, one per pixel and aim")
+    document = {"recording": str(out / RECORDING), "journal": str(journal.path), "pulses": len(journal.pulses)}
+    line = f"written          {out / RECORDING}: {len(journal.pulses)} runs, one per pixel and aim"
+    print_answer(document, [line], json)
 
 
 def _build_displays(out: Path, config: str | None, aims: "list[Aim]") -> "tuple[list[tuple[Aim, DisplayModel]], int]":

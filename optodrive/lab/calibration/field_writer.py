@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.files import atomic_write
+from optodrive.core.files import write_text
 from optodrive.device.field_file import format_field, strip_toml_specials
 from optodrive.lab.calibration.field_fit import FieldFit
 
@@ -22,5 +22,4 @@ def write_field(path: Path, fit: FieldFit, source: str = "") -> None:
         "noise_um": round(1e6 * fit.noise_m, 3),
         "surface_um": round(1e6 * fit.surface_m, 3),
     }
-    with atomic_write(path) as temporary:
-        temporary.write_text(format_field(fit.field, metadata), encoding="utf-8")
+    write_text(path, format_field(fit.field, metadata))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from optodrive.core.files import atomic_write
+from optodrive.core.files import write_text
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config import Config
 from optodrive.device.config_file import MIRRORS_FORMAT, MIRRORS_VERSION
@@ -152,8 +152,7 @@ def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
         ]
     for name, axis in report["axes"].items():
         text += ["", f"[axes.{name}] # as measured, for information", *_format_pairs(axis)]
-    with atomic_write(path) as temporary:
-        temporary.write_text("\n".join(text) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(text) + "\n")
 
 
 def _format_effect(effect: dict[str, Any]) -> list[str]:

@@ -1,13 +1,10 @@
 """The command line as a whole: version, addresses, and the lists that its commands print."""
 
 import socket
-from importlib import import_module
 from importlib.metadata import version
 
 import pytest
-import typer
 
-from optodrive.cli.commands import MODULES
 from optodrive.cli.main import run
 from optodrive.client.endpoint import Endpoint
 from optodrive.core.daemon_url import read_default_url
@@ -23,14 +20,6 @@ def tokenless(monkeypatch, tmp_path):
 def test_the_version_is_printed(capsys):
     assert run(["--version"]) == 0
     assert capsys.readouterr().out == f"optodrive {version('optodrive')}\n"
-
-
-def test_every_module_registers_the_commands_by_which_it_is_found():
-    for module, names in MODULES.items():
-        app = typer.Typer()
-        import_module(f"optodrive.cli.{module}").register(app)
-        commands = [command.name or command.callback.__name__ for command in app.registered_commands]
-        assert tuple(commands + [group.name for group in app.registered_groups]) == names
 
 
 def test_without_a_daemon_no_token_is_asked_for(tokenless, capsys):
