@@ -11,6 +11,7 @@ from foreign_systems import motor_model, motor_record, pendulum_model, pendulum_
 from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.lab.discovery import OdeModel, Parameter, Record, discover
+from optodrive.lab.discovery.input_files import read_record
 
 SILVERBOX = os.environ.get("OPTODRIVE_SILVERBOX")
 SAMPLE_RATE_HZ = 610.35
@@ -127,8 +128,11 @@ def test_the_command(tmp_path, capsys):
     assert capsys.readouterr().err.strip().endswith("expected a column measured")
 
 
-def test_a_record_that_does_not_fit_is_refused():
+def test_a_record_that_does_not_fit_is_refused(tmp_path):
     with pytest.raises(InputError, match="increasing times"):
         Record(np.zeros(10), np.zeros((10, 1)), np.zeros((10, 1)))
     with pytest.raises(InputError, match="1 columns: voltage"):
         discover(motor_model(), [Record(np.arange(100.0), np.zeros((100, 2)), np.zeros((100, 1)))])
+    (tmp_path / "record.csv").write_text("t_s,voltage,encoder\n0,0," + "1" * 200_000)
+    with pytest.raises(InputError, match=r"record\.csv: got 'field larger than field limit .*expected a CSV file"):
+        read_record(tmp_path / "record.csv", motor_model())

@@ -39,6 +39,8 @@ def read_record(path: Path, model: OdeModel) -> Record:
             rows = list(csv.reader(file))
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+    except csv.Error as error:
+        raise InputError(str(path), str(error), "a CSV file") from None
     except UnicodeDecodeError:
         raise InputError(str(path), "not text", "a CSV file, UTF-8") from None
     header = [name.strip() for name in rows[0]] if rows else []

@@ -149,7 +149,8 @@ def natural_sort_key(name: str) -> tuple[object, ...]:
 def normalize_attribute(value: Any) -> str | float | None:
     """Return an attribute as str, int or float, or None for any other type.
 
-    Writers store one attribute as a scalar, as an array of one element, as bytes or as text.
+    Writers store one attribute as a scalar, as an array of one element, as bytes or as text. A boolean becomes text, so
+    that none counts as a number.
     """
     if isinstance(value, np.ndarray):
         return normalize_attribute(value.reshape(-1)[0]) if value.size == 1 else None
@@ -157,7 +158,9 @@ def normalize_attribute(value: Any) -> str | float | None:
         return _decode_text(value)
     if isinstance(value, str):
         return _decode_text(value.encode("utf-8", "replace"))
-    if isinstance(value, bool | np.bool_ | int | np.integer):
+    if isinstance(value, bool | np.bool_):
+        return str(value).lower()
+    if isinstance(value, int | np.integer):
         return int(value) if INTEGER_MIN <= int(value) <= INTEGER_MAX else None
     if isinstance(value, float | np.floating):
         return float(value)

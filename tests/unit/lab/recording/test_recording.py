@@ -95,7 +95,7 @@ def test_attributes_of_any_tool_become_text_and_numbers(path):
         file["runs/run2/displacement_m"].attrs["pixel"] = np.array([17.0])
         file.attrs["version"] = np.float64(1.0)
     run = read_recording(path).runs[0]
-    kept = {"bytes": "Muster", "latin": "\ufffdm", "of one": 2.5, "text of one": "x", "small": 0.5, "yes": 1}
+    kept = {"bytes": "Muster", "latin": "\ufffdm", "of one": 2.5, "text of one": "x", "small": 0.5, "yes": "true"}
     assert {key: run.attributes[key] for key in kept} == kept
     assert run.attributes.keys() == kept.keys() | recording().runs[0].attributes.keys()
     assert run.ambient_k == 300.0
@@ -276,6 +276,10 @@ REFUSALS = {
     "pixel below 0": (setting(HEIGHT, "pixel", -1), ["displacement_m: pixel", "-1"]),
     "pixel NaN": (setting(HEIGHT, "pixel", np.nan), ["displacement_m: pixel", "nan"]),
     "pixel text": (setting(HEIGHT, "pixel", "17"), ["displacement_m: pixel", "'17'"]),
+    "pixel true": (setting(HEIGHT, "pixel", True), ["displacement_m: pixel", "'true'"]),
+    "sigma true": (setting(HEIGHT, "sigma", True), ["displacement_m: sigma", "'true'"]),
+    "version true": (setting("/", "version", True), ["version", "'true'", "1, the one this release reads"]),
+    "pulses true": (data(RUN, "pulses", np.ones((1, 4), bool)), ["/runs/run2/pulses", "bool", "numbers"]),
     "sigma below 0": (setting(HEIGHT, "sigma", -1.0), ["displacement_m: sigma", "-1.0", "positive"]),
     "sigma infinite": (setting(HEIGHT, "sigma", np.inf), ["displacement_m: sigma", "inf"]),
     "sigma text": (setting(HEIGHT, "sigma", "small"), ["displacement_m: sigma", "'small'"]),
