@@ -4,6 +4,7 @@ import base64
 from pathlib import Path
 
 from optodrive.core.errors import InputError
+from optodrive.core.files import read_bounded
 
 
 def parse_parameters(command: str, pattern: str, values: list[str]) -> dict[str, str]:
@@ -26,12 +27,6 @@ def parse_parameters(command: str, pattern: str, values: list[str]) -> dict[str,
         parsed[key] = content
     for parameter in known:
         if parameter.kind == "file" and parameter.name in parsed:
-            parsed[parameter.name] = _encode_file(Path(parsed[parameter.name]))
+            file = read_bounded(Path(parsed[parameter.name]))
+            parsed[parameter.name] = base64.b64encode(file).decode("ascii")
     return parsed
-
-
-def _encode_file(path: Path) -> str:
-    try:
-        return base64.b64encode(path.read_bytes()).decode("ascii")
-    except OSError as error:
-        raise InputError(str(path), error.strerror, "a readable file") from None

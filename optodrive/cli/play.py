@@ -21,6 +21,7 @@ from optodrive.cli.plan_text import format_plan_summary
 from optodrive.cli.push_options import add_push_options
 from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError
+from optodrive.core.files import read_bounded
 from optodrive.core.types.push_options import PushOptions
 
 if TYPE_CHECKING:
@@ -50,10 +51,7 @@ def push(
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import build_push_request
 
-    try:
-        body = frames.read_bytes()
-    except OSError as error:
-        raise InputError(str(frames), error.strerror, "a readable file") from None
+    body = read_bounded(frames)
     content = add_labels(str(frames), body, label) if label else body
     request = build_push_request(content, options, dry_run)
     client = DaemonClient(url)

@@ -11,6 +11,9 @@ from typing import BinaryIO
 
 from optodrive.core.errors import InputError, Unquoted
 
+REQUEST_BYTES_MAX = 64_000_000
+"""Largest file of frames or of a picture, bytes: that of a daemon's largest request body."""
+
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
@@ -107,6 +110,18 @@ def read_regular_file(path: Path, bytes_max: int, *, private: bool = False) -> b
     """
     with _open_regular_file(path, private) as file:
         content = file.read(bytes_max + 1)
+    if len(content) > bytes_max:
+        raise InputError(str(path), Unquoted("a larger file"), f"at most {bytes_max} bytes")
+    return content
+
+
+def read_bounded(path: Path, bytes_max: int = REQUEST_BYTES_MAX) -> bytes:
+    """Return the content of a file of bounded size, for which a caller may wait: a pipe, too. Raise InputError."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(bytes_max + 1)
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
     if len(content) > bytes_max:
         raise InputError(str(path), Unquoted("a larger file"), f"at most {bytes_max} bytes")
     return content

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.files import read_bounded
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.core.units import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
@@ -20,23 +21,10 @@ TRAINS_MAX = 10_000
 TARGETS_MAX = 20_000_000
 """Largest number of frames × pixels of a sequence: 160 MB of targets."""
 
-FILE_MAX_BYTES = 64_000_000
-"""Largest size of a sequence file, bytes."""
-
 
 def load_sequence(path: str | Path, config: Config) -> FrameSequence:
-    """Read FRAMES.json.
-
-    Raises InputError as `parse_sequence`, or if the file cannot be read (no_file, too_many).
-    """
-    try:
-        with Path(path).open("rb") as file:
-            body = file.read(FILE_MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file", code="no_file") from None
-    if len(body) > FILE_MAX_BYTES:
-        raise InputError(str(path), "a larger file", f"at most {FILE_MAX_BYTES} bytes", code="too_many")
-    return parse_sequence(body, config, Path(path).name)
+    """Read FRAMES.json. Raise InputError as `parse_sequence`, or if the file cannot be read."""
+    return parse_sequence(read_bounded(Path(path)), config, Path(path).name)
 
 
 def parse_json(body: bytes | str, where: str) -> object:

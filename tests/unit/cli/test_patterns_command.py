@@ -53,3 +53,10 @@ def test_refusals(tmp_path, monkeypatch, capsys, arguments, says):
     assert says in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["push"], ["plan"], ["play", "image"], ["patterns", "image", "--out", "f.json"]])
+def test_a_file_without_end_is_refused_before_a_daemon_is_asked(tmp_path, monkeypatch, capsys, arguments):
+    monkeypatch.chdir(tmp_path)
+    assert run([*arguments, "/dev/zero"]) == 2
+    assert capsys.readouterr().err == "optodrive: /dev/zero: got a larger file, expected at most 64000000 bytes\n"

@@ -262,14 +262,6 @@ def test_files_are_read(tmp_path):
         load_sequence(path, CONFIG)
 
 
-def test_a_file_too_large_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(sequence_file, "FILE_MAX_BYTES", 10)
-    path = tmp_path / "frames.json"
-    path.write_text(json.dumps(body([{}])))
-    with pytest.raises(InputError, match="at most 10 bytes"):
-        load_sequence(path, CONFIG)
-
-
 def test_parse_json_decodes_text():
     assert parse_json('{"a": [1, 2.5]}', "body") == {"a": [1, 2.5]}
     with pytest.raises(InputError, match="valid JSON"):
