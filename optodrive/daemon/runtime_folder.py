@@ -13,9 +13,9 @@ from optodrive.core.files import lock_folder
 
 SOCKET_PATH_MAX_BYTES = 100
 """Longest path of a socket; the kernel allows 107."""
-PREFIX = "optodrive-"
+FOLDER_PREFIX = "optodrive-"
 """Start of the name of a folder in the folder for temporary files."""
-KNOWN_PREFIX = "daemon-"
+LOOKUP_PREFIX = "daemon-"
 """Start of the name under which commands find it; the TCP port follows."""
 FOLDER_FLAGS = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 LINK_MODE, SHARED_LINK_MODE = 0o600, 0o660
@@ -26,13 +26,14 @@ class RuntimeFolder:
     """The sockets of the daemon's processes.
 
     path: the folder, of mode 0700; link_socket: beside the configured Unix socket if there is one, so that its group
-    reaches it; lock: descriptor whose lock marks the folder as in use, which every forked process inherits
+    reaches it; lookup_path: where commands look for the folder, a link where a socket's path would be too long
+    lock: descriptor whose lock marks the folder as in use, which every forked process inherits
     """
 
     path: Path
     link_socket: Path
     link_socket_mode: int
-    known_as: Path
+    lookup_path: Path
     lock: int | None = None
 
     @property
@@ -57,7 +58,7 @@ class RuntimeFolder:
 
     def remove(self) -> None:
         """Remove the folder and the link socket."""
-        for path in {self.link_socket, self.known_as} - {self.path}:
+        for path in {self.link_socket, self.lookup_path} - {self.path}:
             with suppress(OSError):
                 path.unlink()
         shutil.rmtree(self.path, ignore_errors=True)
@@ -69,7 +70,7 @@ def find_link_socket(port: int | None, unix: Path | None) -> Path:
     """Return the socket of the link process of a daemon, by its TCP port or its Unix socket."""
     if unix is not None:
         return unix.with_name(f"{unix.stem}-link.sock")
-    return Path(os.path.realpath(_build_known_path(port or 0))) / "link.sock"
+    return Path(os.path.realpath(_build_lookup_path(port or 0))) / "link.sock"
 
 
 def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
@@ -77,32 +78,32 @@ def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
 
     unix: the configured Unix socket. InputError if the folder cannot be created.
     """
-    known_as = _build_known_path(port)
+    lookup_path = _build_lookup_path(port)
     if unix is not None and len(os.fsencode(find_link_socket(None, unix))) > SOCKET_PATH_MAX_BYTES:
         raise InputError("daemon.socket", str(unix), "a shorter path, because the link's socket lies beside it")
     try:
-        known_as.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with lock_folder(known_as.parent):  # no other daemon is between creation and lock of its own folder
-            path, lock = _create_folder(known_as)
-            _remove_unused(known_as)
+        lookup_path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with lock_folder(lookup_path.parent):  # no other daemon is between creation and lock of its own folder
+            path, lock = _create_folder(lookup_path)
+            _remove_unused(lookup_path)
         if unix is not None:  # a command that knows only the TCP port finds it here
             (path / "link.sock").symlink_to(find_link_socket(None, unix.absolute()))
     except OSError as error:
-        raise InputError(str(known_as), error.strerror, "a folder that can be created") from None
+        raise InputError(str(lookup_path), error.strerror, "a folder that can be created") from None
     if unix is None:
-        return RuntimeFolder(path, path / "link.sock", LINK_MODE, known_as, lock)
-    return RuntimeFolder(path, find_link_socket(None, unix), SHARED_LINK_MODE, known_as, lock)
+        return RuntimeFolder(path, path / "link.sock", LINK_MODE, lookup_path, lock)
+    return RuntimeFolder(path, find_link_socket(None, unix), SHARED_LINK_MODE, lookup_path, lock)
 
 
-def _create_folder(known_as: Path) -> tuple[Path, int]:
+def _create_folder(lookup_path: Path) -> tuple[Path, int]:
     """Create the folder, or one where a socket fits and a link to it. Return its path and its lock."""
-    _remove_left_behind(known_as)
-    if len(os.fsencode(known_as / "acceptor.sock")) <= SOCKET_PATH_MAX_BYTES:
-        known_as.mkdir(mode=0o700)
-        path = known_as
+    _remove_left_behind(lookup_path)
+    if len(os.fsencode(lookup_path / "acceptor.sock")) <= SOCKET_PATH_MAX_BYTES:
+        lookup_path.mkdir(mode=0o700)
+        path = lookup_path
     else:  # a socket does not fit there
-        path = Path(tempfile.mkdtemp(prefix=PREFIX))
-        known_as.symlink_to(path)
+        path = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX))
+        lookup_path.symlink_to(path)
     lock = os.open(path, FOLDER_FLAGS)
     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return path, lock
@@ -110,11 +111,11 @@ def _create_folder(known_as: Path) -> tuple[Path, int]:
 
 def _remove_unused(own: Path) -> None:
     """Remove the folders, and the tokens, of daemons on other ports of which no process is left."""
-    for known_as in set(own.parent.glob(f"{KNOWN_PREFIX}[0-9]*")) - {own}:
+    for lookup_path in set(own.parent.glob(f"{LOOKUP_PREFIX}[0-9]*")) - {own}:
         try:
-            lock = os.open(known_as, FOLDER_FLAGS)
+            lock = os.open(lookup_path, FOLDER_FLAGS)
         except OSError:  # a link to nothing
-            _remove_left_behind(known_as)
+            _remove_left_behind(lookup_path)
             continue
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -122,21 +123,21 @@ def _remove_unused(own: Path) -> None:
             continue
         finally:
             os.close(lock)
-        _remove_left_behind(known_as)
-        known_as.with_name(f"token-{known_as.name.removeprefix(KNOWN_PREFIX)}").unlink(missing_ok=True)
+        _remove_left_behind(lookup_path)
+        lookup_path.with_name(f"token-{lookup_path.name.removeprefix(LOOKUP_PREFIX)}").unlink(missing_ok=True)
 
 
-def _build_known_path(port: int) -> Path:
+def _build_lookup_path(port: int) -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
-    return Path(runtime) / "optodrive" / f"{KNOWN_PREFIX}{port}"
+    return Path(runtime) / "optodrive" / f"{LOOKUP_PREFIX}{port}"
 
 
-def _remove_left_behind(known_as: Path) -> None:
+def _remove_left_behind(lookup_path: Path) -> None:
     """Remove the folder of a killed daemon: of one on the caller's own TCP port, or of one whose lock is free."""
-    if known_as.is_symlink():
-        target = known_as.readlink()
-        if target.name.startswith(PREFIX):
+    if lookup_path.is_symlink():
+        target = lookup_path.readlink()
+        if target.name.startswith(FOLDER_PREFIX):
             shutil.rmtree(target, ignore_errors=True)
-        known_as.unlink()
-    elif known_as.exists():
-        shutil.rmtree(known_as)
+        lookup_path.unlink()
+    elif lookup_path.exists():
+        shutil.rmtree(lookup_path)

@@ -20,7 +20,7 @@ from optodrive.planning.budget_setup import build_budget
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import build_cold_budget_state
 from optodrive.planning.scheduler.scan_head import ScanHead
-from optodrive.planning.scheduler.stage_assignment import LightEstimate, StageAssignment
+from optodrive.planning.scheduler.stage_assignment import PulseWidthEstimate, StageAssignment
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,15 +102,15 @@ class DisplayModel:
         return self.build_cold_heat(), build_cold_budget_state(len(self.pixels), stage_count=len(self.scan_heads))
 
     @cached_property
-    def light(self) -> LightEstimate | None:
-        """Estimate of the light that a height takes, by which pixels are shared among stages. None with one stage."""
+    def pulse_widths(self) -> PulseWidthEstimate | None:
+        """Estimated pulse widths by target, by which pixels are shared among stages. None with one stage."""
         if len(self.scan_heads) == 1:
             return None
-        return LightEstimate.from_cold(self.build_cold_heat(), self.max_displacement_m, self.scan_head.drive)
+        return PulseWidthEstimate.from_cold(self.build_cold_heat(), self.max_displacement_m, self.scan_head.drive)
 
     def build_assignment(self, sequence: FrameSequence) -> StageAssignment:
         """Return the assignment of pixels to stages for a plan of a sequence."""
-        return StageAssignment(sequence, self.scan_heads, self.reach, self.light)
+        return StageAssignment(sequence, self.scan_heads, self.reach, self.pulse_widths)
 
 
 def build_scan_head(config: Config) -> ScanHead:

@@ -21,7 +21,7 @@ from optodrive.lab.diagnosis.fitting import fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_file import build_model_toml
-from optodrive.lab.diagnosis.model_selection import select_from
+from optodrive.lab.diagnosis.model_selection import select_from_single_causes
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import assign_bins
@@ -163,7 +163,7 @@ def test_a_pair_is_not_named_for_a_cause_whose_own_fit_had_ended_elsewhere():
     singles.sort(key=lambda item: item.chi2)
     assert singles[0].causes == ("membrane_creep",)
     detection = detect(problem, base, hypotheses)
-    verdict = select_from(problem, base, hypotheses, detection, singles, SearchLog())
+    verdict = select_from_single_causes(problem, base, hypotheses, detection, singles, SearchLog())
     assert (verdict.verdict, verdict.causes) == ("cause", ("wall_heating",))
 
 

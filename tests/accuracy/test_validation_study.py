@@ -14,7 +14,7 @@ from optodrive.lab.validation.cause_search import CauseSearch
 from optodrive.lab.validation.contradictions import find_contradictions
 from optodrive.lab.validation.corrected_model import MAX_PULSE_S, CorrectedModel
 from optodrive.lab.validation.extended_outcomes import simulate_outcomes
-from optodrive.lab.validation.measured_facts import EXCLUDED, GROUPS, MEASURED_IDS, RATE_HEIGHTS_M, build_data
+from optodrive.lab.validation.measured_facts import EXCLUDED, GROUPS, MEASURED_IDS, RATE_HEIGHTS_M, build_measured_facts
 from optodrive.lab.validation.narrative import build_rows, build_study_answer, describe_findings, describe_predictions
 from optodrive.lab.validation.paper_outcomes import FULL_POWER_W, OUTCOMES
 from optodrive.lab.validation.stimulus_response import width_to_reach_s
@@ -46,7 +46,7 @@ def generate_facts(parameters, seed):
     """Generate facts from a set, each with its error. For rates, the error is that of the height."""
     rng = np.random.default_rng(seed)
     facts = dict(load_paper_facts())
-    for datum in build_data(facts, LITERAL):
+    for datum in build_measured_facts(facts, LITERAL):
         noise = float(np.exp(datum.sigma * rng.standard_normal()))
         fact = facts[datum.id]
         if datum.id in RATE_HEIGHTS_M:
@@ -65,7 +65,7 @@ def rate(parameters, height_m):
 
 
 def named(facts):
-    return set(CauseSearch(LITERAL, build_data(facts, LITERAL)).choose().keys)
+    return set(CauseSearch(LITERAL, build_measured_facts(facts, LITERAL)).choose().keys)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -184,7 +184,7 @@ def test_held_out_facts_do_not_leak(found, group, name):
     facts = dict(load_paper_facts())
     wrong = facts[name]
     facts[name] = replace(wrong, value=7.0 * wrong.value)
-    again = predict_held_out(LITERAL, build_data(facts, LITERAL), group, GROUPS[group], found.named)
+    again = predict_held_out(LITERAL, build_measured_facts(facts, LITERAL), group, GROUPS[group], found.named)
     first = next(item for item in found.group_predictions if item.label == group)
     assert again.causes == first.causes
     for fact, before, after in zip(first.facts, first.extended, again.extended, strict=True):
@@ -250,7 +250,7 @@ def test_it_needs_no_extra():
 @pytest.mark.parametrize("count", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_causes_that_fit_equally_well_are_chosen_by_their_order_and_not_by_rounding(count):
     """Of two causes of the one force that remains, the last digits differ between processors."""
-    data = [datum for datum in build_data(load_paper_facts(), LITERAL) if datum.id != "F_peak_w020"]
+    data = [datum for datum in build_measured_facts(load_paper_facts(), LITERAL) if datum.id != "F_peak_w020"]
     generator = np.random.default_rng(1)
     for _ in range(count):
         rounded = [replace(datum, value=datum.value * (1.0 + 1e-13 * generator.normal())) for datum in data]

@@ -12,13 +12,13 @@ from optodrive.daemon.server.timed_socket import TimedSocket
 from optodrive.daemon.server.waiting_room import Waiting
 
 BEAT = b"beat"
-_CONNECTION = struct.Struct("<QBd")
+_CONNECTION_RECORD = struct.Struct("<QBd")
 NUMBER = struct.Struct("<Q")
 
 
 def send_connection(link: socket.socket, waiting: Waiting) -> None:
     """Send a connection, of which the caller keeps its own descriptor. Raise OSError if it cannot be sent now."""
-    packet = _CONNECTION.pack(waiting.number, waiting.rank, waiting.since_s)
+    packet = _CONNECTION_RECORD.pack(waiting.number, waiting.rank, waiting.since_s)
     socket.send_fds(link, [packet], [waiting.sock.fileno()])
 
 
@@ -29,5 +29,5 @@ def receive_packet(link: socket.socket) -> Waiting | bytes:
         return data
     sock = TimedSocket(fileno=descriptors[0])
     sock.setblocking(False)
-    number, rank, since_s = _CONNECTION.unpack(data)
+    number, rank, since_s = _CONNECTION_RECORD.unpack(data)
     return Waiting(sock, since_s, Rank(rank), number)

@@ -260,7 +260,7 @@ def _revise_noise(
     that changes from run to run makes them differ indeed, and passes for jitter.
     """
     scores = detect(problem, base, hypotheses, log).scores
-    changes = bool(scores) and scores[0].ratio > MIN_CHANGE_RATIO and scores[0].hypothesis.key in _list_changing()
+    changes = bool(scores) and scores[0].ratio > MIN_CHANGE_RATIO and scores[0].hypothesis.key in _list_varying_causes()
     if not changes and not has_replicate_excess(problem):
         return problem, base
     best = next(iter(refit_strongest(problem, base, (), scores, log)), None)
@@ -275,7 +275,7 @@ def _revise_noise(
     return other, fit(other, base.point)
 
 
-def _list_changing() -> set[str]:
+def _list_varying_causes() -> set[str]:
     """Return the causes whose effect changes from run to run."""
     return {key for key, term in discover_terms().items() if term.varies_between_runs}
 

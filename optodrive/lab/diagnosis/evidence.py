@@ -46,7 +46,7 @@ BIN_VARIANCES = tuple(np.geomspace(0.1, 1e5, 13).tolist())
 FORM_REST, BINS_REST, PAIR_REST, REST_POWER = 0.4, 0.03, 0.03, 4.0
 """Share of the excess left over at which a rest, taken by other forms, by bins, or by a second cause that leaves a rest
 too, is as likely another cause's."""
-MAX_SHARE = 0.95
+MAX_FORM_PROBABILITY = 0.95
 """Largest probability that the second cause of a pair only mends the form of the first one."""
 UNIFORM_VARIANCE = 1.0 / 12.0
 """Variance of a uniform distribution over a unit range."""

@@ -32,7 +32,7 @@ from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.evidence import (
     BINS_REST,
     FORM_REST,
-    MAX_SHARE,
+    MAX_FORM_PROBABILITY,
     OTHER_ODDS,
     PAIR_REST,
     PRIOR_NO_EFFECT,
@@ -126,10 +126,10 @@ def select_causes(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothes
         probabilities = Probabilities(1.0 - CERTAIN, CERTAIN, {(item.key,): 0.0 for item in hypotheses})
         return Verdict("unexplained", (), probabilities, None, (), nominal_detection, base.chi2)
     singles = refit_strongest(problem, base, (), nominal_detection.scores, log)
-    return select_from(problem, base, hypotheses, nominal_detection, singles, log)
+    return select_from_single_causes(problem, base, hypotheses, nominal_detection, singles, log)
 
 
-def select_from(
+def select_from_single_causes(
     problem: FitProblem,
     base: ModelFit,
     hypotheses: list[Hypothesis],
@@ -152,7 +152,7 @@ def select_from(
             pairs = refit_pairs(problem, hypotheses, select_near(base, singles), residual_detection, log)
             restarted = refit_alone(problem, base, pairs[0], singles, log) if pairs else singles
             if restarted[0].log_evidence > singles[0].log_evidence + RESTART_GAIN:
-                return select_from(problem, base, hypotheses, nominal_detection, restarted, log, examined)
+                return select_from_single_causes(problem, base, hypotheses, nominal_detection, restarted, log, examined)
         for item in select_near(base, pairs)[:EXAMINED_PAIRS]:
             _examine(problem, base, hypotheses, item, examined, log)
     explanations = _list_explanations(problem, base, hypotheses, nominal_detection, [*singles, *pairs], examined)
@@ -269,7 +269,7 @@ def _find_sufficient_single(
         if len(item.causes) == 2 and len(other.causes) == 1 and other.causes[0] in item.causes and other in examined
     ]
     best, share = max(singles, key=lambda pair: pair[1], default=(None, 0.0))
-    return (best, min(share, MAX_SHARE)) if share > 0.0 else (None, 0.0)
+    return (best, min(share, MAX_FORM_PROBABILITY)) if share > 0.0 else (None, 0.0)
 
 
 def _build_verdict(

@@ -30,7 +30,7 @@ ASSUMED_NOISE = {
     2: ColouredNoise(0.2e-3, (0.1e-3, 0.1e-3), (1e-2, 1.0)),
 }
 """Noise of a signal that was not measured yet, by kind: a thermal camera, an interferometer, a load cell."""
-ASSUMED_TEXT = {0: "1 K", 1: "0.5 µm", 2: "0.2 mN"}
+ASSUMED_NOISE_TEXT = {0: "1 K", 1: "0.5 µm", 2: "0.2 mN"}
 
 
 def propose_experiment(
@@ -56,7 +56,7 @@ def propose_experiment(
         kinds = tuple(sorted((*measured, extra)))
         proposal = _search_grid(replace(problem, noise=noise), first, second, labels, kinds)
         if proposal is not None:
-            assumed = f"; needs {SIGNALS[extra]}, measured to {ASSUMED_TEXT[extra]}"
+            assumed = f"; needs {SIGNALS[extra]}, measured to {ASSUMED_NOISE_TEXT[extra]}"
             proposals.append(replace(proposal, description=proposal.description + assumed))
     return min(proposals, key=lambda item: item.lab_time_s, default=None)
 

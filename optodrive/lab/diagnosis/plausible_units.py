@@ -26,7 +26,7 @@ PLAUSIBLE = RECORDING
 WEAK_POWER_W = 5.0
 """Powers that respond a hundred times too weakly are taken for mW above this value."""
 LENGTHS = ("bridge_width_m", "aim_x_m", "aim_y_m")
-CHANGES = ("displacement_m", "force_N")
+CHANGE_SIGNALS = ("displacement_m", "force_N")
 """Signals whose change is judged by its size, with or without a drive of their own pixel."""
 MIRROR_SAMPLING_MAX_S = 5e-3
 """Longest median time between samples of a mirror; slower ones show nothing of a servo."""
@@ -122,7 +122,7 @@ def _check_pixel_signal(
             _refuse_size(f"{where}/{name}", f"a response {ratio:.3g} times too large", ratio, UNITS[name])
         if stated <= SHAPE_AGREES:
             ratio = None
-    if name in CHANGES:
+    if name in CHANGE_SIGNALS:
         low, median, high = np.quantile(value, [0.01, 0.5, 0.99])
         change = float(max(high - median, median - low))
         if change > PLAUSIBLE[name].high:

@@ -15,7 +15,7 @@ LEVEL_TOLERANCE = 1.15
 HELD_OUT_SHARE = 1.0 / 3.0
 """Part held out of the only run of an amplitude: its end."""
 SAMPLES_MIN = 200
-DIFFERENCES = (2, 4, 6, 8)
+DIFFERENCE_ORDERS = (2, 4, 6, 8)
 """Orders of differences from which the noise is estimated: a response is smooth, white noise is not."""
 NOISE_MIN = 1e-5
 RANGE_MAX = 8000
@@ -90,7 +90,7 @@ def _keep_every_nth(use: BoolArray) -> BoolArray:
 def estimate_noise(value: FloatArray) -> float:
     """Return the rms noise of a sample, the least of estimates from differences of several orders."""
     estimates = []
-    for order in DIFFERENCES:
+    for order in DIFFERENCE_ORDERS:
         weights = np.ones(1)
         for _ in range(order):
             weights = np.convolve(weights, [1.0, -1.0])

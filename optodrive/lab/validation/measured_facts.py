@@ -70,7 +70,7 @@ def compute_scatter(parameters: ParameterSet) -> float:
     return sqrt(shares[0] * shares[1])
 
 
-def build_data(facts: Mapping[str, PaperFact], parameters: ParameterSet) -> tuple[Datum, ...]:
+def build_measured_facts(facts: Mapping[str, PaperFact], parameters: ParameterSet) -> tuple[Datum, ...]:
     """Return the measured facts in the order of GROUPS."""
     scatter = compute_scatter(parameters)
     return tuple(_build_datum(facts[name], group, scatter) for group, names in GROUPS.items() for name in names)

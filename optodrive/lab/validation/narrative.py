@@ -39,7 +39,7 @@ def describe_findings(result: StudyResult) -> list[str]:
         lines.append("No cause is needed: it agrees with the facts within their errors.")
     else:
         lines += ["", "Causes:"]
-        lines += [line for item in result.named for line in _describe_named(item)]
+        lines += [line for item in result.named for line in _describe_named_cause(item)]
         lines += [
             "",
             f"With {'it' if len(result.named) == 1 else 'these'} the factor is "
@@ -55,7 +55,7 @@ def describe_findings(result: StudyResult) -> list[str]:
     return lines
 
 
-def _describe_named(item: NamedCause) -> list[str]:
+def _describe_named_cause(item: NamedCause) -> list[str]:
     cause = CAUSES_BY_KEY[item.key]
     value, low, high = (format_value(item.key, number) for number in (item.value, item.low, item.high))
     lines = [

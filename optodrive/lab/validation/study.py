@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
 from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST, CauseFit, CauseSearch
 from optodrive.lab.validation.contradictions import Contradiction, find_contradictions
-from optodrive.lab.validation.measured_facts import GROUPS, Datum, build_data
+from optodrive.lab.validation.measured_facts import GROUPS, Datum, build_measured_facts
 from optodrive.physics.paper_facts import PaperFact
 from optodrive.physics.parameters import ParameterSet
 
@@ -125,7 +125,7 @@ def run_study(
     facts: Mapping[str, PaperFact], base: ParameterSet, on_progress: Callable[[str], None] = lambda stage: None
 ) -> StudyResult:
     """Diagnose a parameter set by the paper's facts."""
-    data = build_data(facts, base)
+    data = build_measured_facts(facts, base)
     on_progress("choosing causes")
     search = CauseSearch(base, data)
     chosen = search.choose()

@@ -14,7 +14,7 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.scheduler.scan_head import ScanHead
-from optodrive.planning.scheduler.stage_balance import FrameLight, balance, find_drawing_s
+from optodrive.planning.scheduler.stage_balance import FrameLoads, balance, find_drawing_s
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 
 NOBODY = -1
@@ -31,7 +31,7 @@ TRAIN_SHARE = 0.5
 """Share of the beam time that a train takes, as half duty does."""
 
 
-class LightEstimate(NamedTuple):
+class PulseWidthEstimate(NamedTuple):
     """Width of a pulse by its target: max_m [p], and widths on a cold pixel at SHARES of it, s.
 
     saved: share of the width that the same target does not need COOLING_S after a pulse for it
@@ -42,7 +42,7 @@ class LightEstimate(NamedTuple):
     saved: FloatArray
 
     @classmethod
-    def from_cold(cls, cold: ThermalState, max_m: FloatArray, drive: DriveRange) -> "LightEstimate":
+    def from_cold(cls, cold: ThermalState, max_m: FloatArray, drive: DriveRange) -> "PulseWidthEstimate":
         """Tabulate the tallest pixel. Others are alike at equal shares of their largest displacement."""
         pixel = int(np.argmax(max_m))
         widths_s = [0.0]
@@ -97,20 +97,26 @@ class StageAssignment:
     """
 
     def __init__(
-        self, sequence: FrameSequence, scan_heads: tuple[ScanHead, ...], reach: BoolArray, light: LightEstimate | None
+        self,
+        sequence: FrameSequence,
+        scan_heads: tuple[ScanHead, ...],
+        reach: BoolArray,
+        pulse_widths: PulseWidthEstimate | None,
     ) -> None:
         """Assign trains and recurring pixels.
 
-        reach: [k, p] whether a stage reaches a pixel; light: None with one stage
+        reach: [k, p] whether a stage reaches a pixel; pulse_widths: None with one stage
         """
-        self._sequence, self._first, self._reach, self._light = sequence, scan_heads[0], reach, light
+        self._sequence, self._first, self._reach, self._pulse_widths = sequence, scan_heads[0], reach, pulse_widths
         first = self._first
-        self._step_s = first.settling.settling_us(first.settling.pitch_rad, 0.0) * 1e-6 if light else 0.0
-        self.stage_of = _assign_trains(sequence.trains, reach) if light else np.zeros(reach.shape[1], dtype=np.int64)
-        if light:
-            self._assign_recurring(light)
+        self._step_s = first.settling.settling_us(first.settling.pitch_rad, 0.0) * 1e-6 if pulse_widths else 0.0
+        self.stage_of = (
+            _assign_trains(sequence.trains, reach) if pulse_widths else np.zeros(reach.shape[1], dtype=np.int64)
+        )
+        if pulse_widths:
+            self._assign_recurring(pulse_widths)
 
-    def _assign_recurring(self, light: LightEstimate) -> None:
+    def _assign_recurring(self, pulse_widths: PulseWidthEstimate) -> None:
         """Assign the pixels that several frames light over the whole plan, if it is then drawn in clearly less time."""
         frames = self._sequence.frames[: max(2, BALANCED_MAX // len(self.stage_of))]
         target_m = np.array([frame.target_m for frame in frames]).reshape(len(frames), len(self.stage_of))
@@ -120,36 +126,36 @@ class StageAssignment:
         if not len(recurring):
             return
         show_at_s = np.array([frame.show_at_s for frame in frames])
-        cost_s = light.compute_frames_s(target_m, show_at_s, drawing, self._step_s)
+        cost_s = pulse_widths.compute_frames_s(target_m, show_at_s, drawing, self._step_s)
         overlap_s = np.append(0.0, cost_s.sum(axis=1) / np.maximum(np.count_nonzero(is_drawn, axis=1), 1))[:-1]
-        light_s = FrameLight(np.zeros((len(frames), stages)), np.zeros(len(frames)), show_at_s, overlap_s)
-        self._try_by_frame(light_s, cost_s, is_carried=True)
-        by_frame_s = find_drawing_s(light_s)
-        if by_frame_s <= (1.0 + GAIN_ENOUGH) * light_s.loads_s.sum() / drawing:
+        loads = FrameLoads(np.zeros((len(frames), stages)), np.zeros(len(frames)), show_at_s, overlap_s)
+        self._assign_by_frame(loads, cost_s, is_carried=True)
+        by_frame_s = find_drawing_s(loads)
+        if by_frame_s <= (1.0 + GAIN_ENOUGH) * loads.loads_s.sum() / drawing:
             return
-        stage = self._try_by_frame(light_s, cost_s, is_carried=False)
+        stage = self._assign_by_frame(loads, cost_s, is_carried=False)
         is_free[recurring] = False
         for frame, each_s in enumerate(np.where(is_free, cost_s, 0.0)):
-            light_s.loads_s[frame] -= np.bincount(stage, each_s, stages)
-            light_s.shared_s[frame] = each_s.sum()
+            loads.loads_s[frame] -= np.bincount(stage, each_s, stages)
+            loads.shared_s[frame] = each_s.sum()
         share = stage[recurring]
-        balance(light_s, cost_s[:, recurring], share, self._reach[:, recurring])
-        if by_frame_s > (1.0 + GAIN_ENOUGH) * find_drawing_s(light_s):
+        balance(loads, cost_s[:, recurring], share, self._reach[:, recurring])
+        if by_frame_s > (1.0 + GAIN_ENOUGH) * find_drawing_s(loads):
             self.stage_of[recurring] = share
 
-    def _try_by_frame(self, light_s: FrameLight, cost_s: FloatArray, is_carried: bool) -> IntArray:
-        """Assign frame by frame in the model of the plan. Return the stages [p]. This modifies light_s.loads_s.
+    def _assign_by_frame(self, loads: FrameLoads, cost_s: FloatArray, is_carried: bool) -> IntArray:
+        """Assign frame by frame in the model of the plan. Return the stages [p]. This modifies loads.loads_s.
 
         cost_s: [f, p] beam time of each pixel in each frame; is_carried: whether a frame levels what the one before
         left uneven, as in the plan, or each begins level
         """
         given, free_s = self.stage_of.copy(), np.zeros(len(self._reach))
-        for source, (pixels_s, loads_s) in enumerate(zip(cost_s, light_s.loads_s, strict=True)):
-            begin_s = max(light_s.show_at_s[source], free_s.max() - light_s.overlap_s[source])
+        for source, (pixels_s, loads_s) in enumerate(zip(cost_s, loads.loads_s, strict=True)):
+            begin_s = max(loads.show_at_s[source], free_s.max() - loads.overlap_s[source])
             free_s = np.maximum(free_s, begin_s) if is_carried else np.zeros(len(free_s))
             self.assign(source, free_s)
             frame, active = self._sequence.frames[source], np.flatnonzero(pixels_s)
-            loads_s[:] = _compute_train_light_s(self._sequence.trains, frame, self.stage_of, len(free_s))
+            loads_s[:] = _compute_train_beam_s(self._sequence.trains, frame, self.stage_of, len(free_s))
             loads_s += np.bincount(self.stage_of[active], pixels_s[active], len(free_s))
             free_s = free_s + loads_s
         stage, self.stage_of = np.maximum(self.stage_of, 0), given  # pixels that no frame lights have no stage
@@ -165,13 +171,13 @@ class StageAssignment:
 
         Returns each stage's stretch of a short path over the frame; None if some pixels had a stage, or with one stage.
         """
-        if self._light is None:
+        if self._pulse_widths is None:
             return None
         frame = self._sequence.frames[source]
         active = np.flatnonzero(frame.target_m > 0)
-        cost_s = self._light.compute_s(frame.target_m)[active] + self._step_s
+        cost_s = self._pulse_widths.compute_s(frame.target_m)[active] + self._step_s
         known = self.stage_of[active] != NOBODY
-        busy_s = free_s + _compute_train_light_s(self._sequence.trains, frame, self.stage_of, len(free_s))
+        busy_s = free_s + _compute_train_beam_s(self._sequence.trains, frame, self.stage_of, len(free_s))
         busy_s += np.bincount(self.stage_of[active[known]], cost_s[known], len(free_s))
         path = self._order_path(active[~known])
         stages = self.stage_of[path] = _cut(cost_s[np.searchsorted(active, path)], busy_s, self._reach[:, path])
@@ -219,7 +225,7 @@ def _assign_trains(trains: tuple[Train, ...], reach: BoolArray) -> IntArray:
     return stage_of
 
 
-def _compute_train_light_s(
+def _compute_train_beam_s(
     trains: tuple[Train, ...], frame: TactileFrame, stage_of: IntArray, stages: int
 ) -> FloatArray:
     """Return the beam time that trains take on each stage during a frame, [k]."""

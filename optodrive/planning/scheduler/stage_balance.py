@@ -18,7 +18,7 @@ LEVEL_WEIGHT = 0.1
 GAIN_MIN = 1e-7
 
 
-class FrameLight(NamedTuple):
+class FrameLoads(NamedTuple):
     """Beam time of the frames of a plan [f], s.
 
     loads_s: [f, k] of the pixels whose stage is decided; shared_s: of those that are shared later, so that the stages
@@ -31,20 +31,20 @@ class FrameLight(NamedTuple):
     overlap_s: FloatArray
 
 
-def balance(light: FrameLight, cost_s: FloatArray, stage: IntArray, reach: BoolArray) -> None:
-    """Move and exchange pixels [n] between stages while the plan ends earlier. This modifies stage and light.loads_s.
+def balance(loads: FrameLoads, cost_s: FloatArray, stage: IntArray, reach: BoolArray) -> None:
+    """Move and exchange pixels [n] between stages while the plan ends earlier. This modifies stage and loads.loads_s.
 
     cost_s: [f, n] beam time of each pixel in each frame; stage: [n]; reach: [k, n]
     """
-    _search(*light, np.ascontiguousarray(cost_s.T), stage, reach, np.zeros(len(reach)), np.zeros(len(cost_s)))
+    _search(*loads, np.ascontiguousarray(cost_s.T), stage, reach, np.zeros(len(reach)), np.zeros(len(cost_s)))
 
 
-def find_drawing_s(light: FrameLight) -> float:
+def find_drawing_s(loads: FrameLoads) -> float:
     """Return the time in which frames are drawn, without the waits for the begin of the next, s."""
-    frames, stages = light.loads_s.shape
+    frames, stages = loads.loads_s.shape
     ends_s = np.zeros(frames)
-    _find_end_s(*light, np.zeros(stages), ends_s)
-    begins_s = np.maximum(light.show_at_s, np.append(0.0, ends_s[:-1]))
+    _find_end_s(*loads, np.zeros(stages), ends_s)
+    begins_s = np.maximum(loads.show_at_s, np.append(0.0, ends_s[:-1]))
     return float((ends_s - begins_s).clip(min=0.0).sum())
 
 

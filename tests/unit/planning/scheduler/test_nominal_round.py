@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
-from optodrive.planning.scheduler.stage_assignment import LightEstimate, StageAssignment
+from optodrive.planning.scheduler.stage_assignment import PulseWidthEstimate, StageAssignment
 
 
 class PulseByPulse:
@@ -26,8 +26,10 @@ def plan_batches(display, frames, heat, initial_pixel, pause_count, stage_count)
     """Return the batches of a scheduler, the first ones with pauses, and the pulses that it skipped."""
     sequence, scan_heads = FrameSequence(frames), display.scan_heads * stage_count
     reach = np.ones((stage_count, len(display.pixels)), dtype=bool)
-    light = LightEstimate.from_cold(display.build_cold_heat(), display.max_displacement_m, display.scan_head.drive)
-    assignment = StageAssignment(sequence, scan_heads, reach, light)
+    pulse_widths = PulseWidthEstimate.from_cold(
+        display.build_cold_heat(), display.max_displacement_m, display.scan_head.drive
+    )
+    assignment = StageAssignment(sequence, scan_heads, reach, pulse_widths)
     initial_pixels = None if initial_pixel is None else (initial_pixel,) * stage_count
     scheduler = Scheduler(scan_heads, assignment, sequence, display.build_cold_heat, initial_pixels=initial_pixels)
     batches, pauses = [], []
