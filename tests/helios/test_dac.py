@@ -32,6 +32,11 @@ def test_open_identifies_and_stops_the_dac():
     assert bench.emulated.alternate == 0
 
 
+def test_a_name_that_would_clear_a_terminal_is_escaped():
+    with Bench(name="Helios \x1b[2J").helios as helios:
+        assert helios.name == r"Helios \x1b[2J"
+
+
 def test_open_discards_a_stale_answer_before_its_queries():
     bench = Bench()
     bench.device.answer = b"\x83\x01"

@@ -12,7 +12,7 @@ import usb.core
 import usb.util
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import InputError, LinkError, LocalProtocolError
+from optodrive.core.errors import InputError, LinkError, LocalProtocolError, escape_unprintable
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
 from optodrive.link.helios.frames import HOST_LOSS_EMISSION_MAX_S, HeliosFrame
@@ -93,7 +93,7 @@ class Helios:
         self._drain()
         self.version = int.from_bytes(self._query(VERSION, 4)[:4], "little")
         self._command(HOST_VERSION, PROTOCOL_VERSION)
-        self.name = self._query(NAME, 1).split(b"\0")[0].decode("ascii", "replace")
+        self.name = escape_unprintable(self._query(NAME, 1).split(b"\0")[0].decode("ascii", "replace"))
         if self.board.uid and self.board.uid != self.name:
             raise InputError("board.uid", self.name, f"{self.board.uid}, the configured Helios", "board")
         self.stop()

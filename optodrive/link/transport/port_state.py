@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from optodrive.core.errors import escape_unprintable
+
 ROOT = Path("/")
 SERIAL_NAMES = ("ttyACM*", "ttyUSB*")
 PortStatus = Literal["not_a_file", "available", "missing", "denied", "in_use"]
@@ -72,9 +74,9 @@ def _list_open_files(process: Path) -> set[str]:
 
 
 def read_command_name(pid: int, root: Path = ROOT) -> str:
-    """Return the command name of a process."""
+    """Return the command name of a process, with escapes, because a process chooses it freely."""
     try:
-        return join_root(root, f"/proc/{pid}/comm").read_text(errors="replace").strip()
+        return escape_unprintable(join_root(root, f"/proc/{pid}/comm").read_text(errors="replace").strip())
     except OSError:
         return "a process"
 

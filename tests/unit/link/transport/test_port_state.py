@@ -96,6 +96,16 @@ def test_a_folder_can_represent_the_root(tmp_path):
     assert read_port_state("/dev/ttyACM1", tmp_path) == PortState("missing", (), ("/dev/ttyACM0", "/dev/ttyUSB1"))
 
 
+def test_a_holder_that_calls_itself_a_line_of_the_log_is_shown_in_one_line(tmp_path):
+    """Any user's process may: the name is in doctor, in the log and in the cause of a lost link."""
+    for folder in ("dev", "proc/77/fd"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "dev/ttyACM0").touch()
+    (tmp_path / "proc/77/fd/4").symlink_to("/dev/ttyACM0")
+    (tmp_path / "proc/77/comm").write_text("x\nopto:\x1b[2J\n")
+    assert str(read_port_state("/dev/ttyACM0", tmp_path).holders[0]) == r"x\nopto:\x1b[2J, process 77"
+
+
 def test_a_port_in_a_folder_without_access(tmp_path):
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o700)
