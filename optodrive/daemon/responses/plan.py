@@ -7,10 +7,10 @@ from optodrive.planning.summary_schema import PlanSummary, PulseColumns
 
 
 class PlanLatency(JsonModel):
-    """Seconds from the request's arrival to three events of its plan, None before the event.
+    """Seconds on the board's clock from the request's arrival to three events of its plan, None before the event.
 
     arrival: when the kernel received the head of a request, or the first byte of a WebSocket's message
-    planned_s: accepted into the queue; first_byte_s: handed to the link; first_light_s: gate on by the board's clock
+    planned_s: accepted into the queue; first_byte_s: handed to the link; first_light_s: gate on as the board reports it
     """
 
     planned_s: float | None
