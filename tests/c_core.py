@@ -107,7 +107,7 @@ def load(path):
     library = ctypes.CDLL(str(path))
     handle, u64, u32, size = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint32, ctypes.c_size_t
     signatures = {
-        "shim_new": ([ctypes.c_char_p, ctypes.c_char_p, u32, u32, u32], handle),
+        "shim_new": ([ctypes.c_char_p, ctypes.c_char_p, *[u32] * 5], handle),
         "shim_free": ([handle], None),
         "shim_entropy": ([handle, ctypes.POINTER(u32), size], None),
         "shim_init": ([handle, u32, u64], None),
@@ -149,6 +149,8 @@ class CBoard:
             bytes.fromhex(settings.uid),
             settings.cell_codes,
             settings.queue_points,
+            settings.cells,
+            settings.window_pulses,
             settings.key_edge,
         )
         source = random.Random(1)

@@ -11,7 +11,7 @@ from optodrive.link.simulator.memory_link import MemoryLink
 
 NAMES = {
     "HELLO_REPLY": "major minor host_nonce session firmware uid capabilities tick_hz queue_points rx_window cell_codes "
-    "reset_cause " + " ".join(f"limits.{item.name}" for item in fields(m.Limits)),
+    "cells window_pulses reset_cause " + " ".join(f"limits.{item.name}" for item in fields(m.Limits)),
     "EXECUTED": "first_index base_tick record.offset record.on_ticks record.duty",
 }
 """Fields of the messages that are more than one structure, in the order of the bytes."""

@@ -143,6 +143,7 @@ void board_tick(struct board *b, uint64_t now_us) {
     if (input_fault != FAULT_NONE) {
         enter_fault(b, input_fault);
     }
+    guards_tick(&b->guards, &b->limits, &b->config, b->now_us);
 #if MUTANT != 15
     if (b->loop_ran)
 #endif

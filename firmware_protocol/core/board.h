@@ -19,11 +19,12 @@
 #define BOARD_RECORDS EXECUTED_RING /* 16 bytes each */
 #endif
 #ifndef BOARD_PULSES
-#define BOARD_PULSES 8192u /* pulses within a second, 16 bytes each; more: fault MEAN_POWER */
+#define BOARD_PULSES 8192u /* pulses within a second, 8 bytes each; more: fault PULSES */
 #endif
 #ifndef BOARD_CELLS
-#define BOARD_CELLS 1024u /* warm cells in each of four grids, 32 bytes each, a power of two; more: fault SPOT */
+#define BOARD_CELLS 2048u /* warm cells in each of four grids, 20 bytes each, at most 65534; more: fault CELLS */
 #endif
+#define BOARD_BUCKETS 1024u /* of the hash table of each grid, 2 bytes each, a power of two */
 
 #define BOARD_TICK_US 100u       /* maximum period of board_tick */
 #ifndef BOARD_TICK_LATE_US
@@ -74,6 +75,7 @@ struct board_config {
     uint32_t firmware;
     uint16_t cell_codes;   /* at least 1 */
     uint16_t queue_points; /* DATA_ITEMS_MAX to BOARD_QUEUE_POINTS */
+    uint16_t cells, window_pulses; /* 1 to BOARD_CELLS, 1 to BOARD_PULSES */
     bool key_edge;
 };
 
@@ -101,21 +103,31 @@ struct records {
     uint32_t total, reported; /* counts of the session */
 };
 
+/* The times of pulses and cells are the low words of µs: guards_tick removes or moves them long before they wrap. */
 struct pulse {
-    uint64_t start_us;
+    uint32_t start_us;
     uint16_t on_us, duty;
 };
 
 struct cell {
-    uint64_t ended_us, since_us;
-    uint32_t key, on_us, level_uj;
+    uint32_t since_us; /* begin of the last pulse */
+    uint32_t key, level_uj;
+    uint16_t on_us, last_on_us;
+    uint16_t next; /* place of the next cell in the bucket, or of the next free one; 0: none */
     bool used;
 };
 
+/* The cells of one grid: a hash table whose buckets are lists. A place is the index in cells + 1. */
+struct grid {
+    struct cell cells[BOARD_CELLS];
+    uint16_t buckets[BOARD_BUCKETS];
+    uint16_t touched, free, count, swept; /* places ever used; first free one; cells in use; last one swept */
+};
+
 struct guards {
-    struct cell cells[4][BOARD_CELLS];
+    struct grid grids[4];
     struct pulse pulses[BOARD_PULSES];
-    uint32_t first, count;
+    uint32_t first, count, turn;
     uint64_t sum;
 };
 

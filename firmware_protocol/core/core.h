@@ -88,8 +88,10 @@ void limits_tighten(struct board_limits *limits, const struct board_limits *requ
 /* B4, B5, B8: returns the fault that queueing the point causes, FAULT_NONE if it is permitted. */
 enum fault guards_check_point(const struct board_limits *limits, const struct point *point);
 /* B4 to B6: returns the fault that the point's pulse causes now; a permitted pulse is added to the accounts. */
-enum fault guards_accept_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
-                       const struct point *point, uint64_t now_us);
+enum fault guards_accept_pulse(struct guards *g, const struct board_limits *limits, const struct board_config *config,
+                               const struct point *point, uint64_t now_us);
+/* Forgets old pulses, and gives back the account of a cold cell of a grid that is more than half full, one at a time. */
+void guards_tick(struct guards *g, const struct board_limits *limits, const struct board_config *config, uint64_t now_us);
 
 /* --- states and points --- */
 

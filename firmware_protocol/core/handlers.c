@@ -48,6 +48,8 @@ void on_hello(struct board *b, const struct frame *frame) {
     put_u16(body + HELLO_REPLY_QUEUE_POINTS_AT, b->config.queue_points);
     put_u16(body + HELLO_REPLY_RX_WINDOW_AT, RX_WINDOW);
     put_u16(body + HELLO_REPLY_CELL_CODES_AT, b->config.cell_codes);
+    put_u16(body + HELLO_REPLY_CELLS_AT, b->config.cells);
+    put_u16(body + HELLO_REPLY_WINDOW_PULSES_AT, b->config.window_pulses);
     body[HELLO_REPLY_RESET_CAUSE_AT] = b->reset_cause;
     limits_encode(&b->limits, body + HELLO_REPLY_LIMITS_AT);
     send_message(b, MESSAGE_HELLO_REPLY, body, sizeof body);

@@ -38,7 +38,7 @@ static void begin_point(struct board *b) {
 static void begin_pulse(struct board *b) {
     enum fault fault = MUTANT == 105 ? FAULT_NONE : find_input_fault(find_unsafe_inputs(b->inputs));
     if (fault == FAULT_NONE) {
-        fault = guards_accept_pulse(&b->guards, &b->limits, b->config.cell_codes, &b->current_point, b->now_us);
+        fault = guards_accept_pulse(&b->guards, &b->limits, &b->config, &b->current_point, b->now_us);
     }
     if (fault != FAULT_NONE) {
         enter_fault(b, fault);

@@ -21,6 +21,8 @@ CAP_MARGIN = 1.05
 FIELD_MARGIN_CODES = 64
 SIMULATED_CELL_MAX_CODES = 1300
 """Size of the spot guards' cells on a simulated board whose pixels do not need smaller ones."""
+SIMULATED_CELLS = 2048
+"""Number of cells for which a simulated board has accounts if the display does not need more."""
 WIRE_MAX = 0xFFFF
 """Largest number that the message of limits holds for the settling, 16 bits."""
 MIRROR_RANGE = ("x_min", "x_max", "y_min", "y_max")
@@ -38,6 +40,7 @@ def build_port_settings(config: Config) -> PortSettings:
         limits = permit_retiming(requirements.limits)
         own_settings = {name: value for name, value in asdict(limits).items() if name not in MIRROR_RANGE}
         own_settings["cell_codes"] = min(SIMULATED_CELL_MAX_CODES, requirements.cell_max_codes)
+        own_settings["cells"] = max(SIMULATED_CELLS, requirements.pixels)
     address = {field.name: getattr(board, field.name) for field in fields(PortSettings) if hasattr(board, field.name)}
     return PortSettings(**address, own_settings=own_settings)
 
@@ -72,6 +75,7 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
     return BoardRequirements(
         limits=_build_limits(config, scale, codes, margin_codes),
         cell_max_codes=_compute_cell_max(codes, list_adjacent_pixels(layout), scale, config),
+        pixels=len(layout),
         scale=scale,
         lease_s=config.board.lease_s,
         baud=config.board.baud,

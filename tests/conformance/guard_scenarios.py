@@ -223,6 +223,17 @@ def mean_power_over_any_second(bench, case):
     assert len(host.board.pulse_numbers()) == (10 if allowed == 5 else 4)
 
 
+@scenario("B5")
+def more_pulses_in_a_second_than_the_board_remembers(bench):
+    host = bench.host(bench.board(window_pulses=8, **INSTANT, **PATIENT))
+    assert host.hello().window_pulses == 8
+    host.arm()
+    host.play(*[here(100, dark_us=1000, duty=99)] * 8, *[here(0, dark_us=60_000)] * 17, *[here(100, duty=99)] * 9)
+    wait_for_log(host, lambda board: board.of("fault"), "the fault")
+    assert host.board.faults() == ["PULSES"]
+    assert len(host.board.pulse_numbers()) == 16
+
+
 # --- B6 -------------------------------------------------------------------------------------------------------------
 
 BUCKETS = {
@@ -245,6 +256,18 @@ def energy_of_a_cell(bench, case):
     host.play(*points)
     wait_for_log(host, lambda board: board.states()[-1][1] in ("fault", "job done"), "the end")
     assert host.board.faults() == [fault] * bool(fault)
+    assert len(host.board.pulse_numbers()) == count
+
+
+@scenario("B6", {"warm": (0, ["CELLS"], 4), "cold": (30_000, [], 6)})
+def more_cells_than_the_board_has_accounts_for(bench, case):
+    dark_us, faults, count = case
+    host = bench.host(bench.board(cells=4, **INSTANT, **PATIENT))
+    assert host.hello().cells == 4
+    host.arm()
+    host.play(*[here(100, x=1000 + 2000 * k, dark_us=dark_us) for k in range(6)])
+    wait_for_log(host, lambda board: board.states()[-1][1] in ("fault", "job done"), "the end")
+    assert host.board.faults() == faults
     assert len(host.board.pulse_numbers()) == count
 
 

@@ -30,11 +30,11 @@ HOST = {
 }
 SEQUENCED = ("LIMITS", "DATA", "START", "END", "ARM_REQ", "ARM_CONFIRM", "DISARM", "CLEAR_FAULT", "FLUSH")
 HELLO_REPLY = ("major", "minor", "host_nonce", "session", "firmware", "uid", "capabilities", "tick_hz", "queue_points")
-HELLO_REPLY += ("rx_window", "cell_codes", "reset_cause", *LIMITS)
+HELLO_REPLY += ("rx_window", "cell_codes", "cells", "window_pulses", "reset_cause", *LIMITS)
 STATUS = ("state", "fault", "inputs", "tick", "done_index", "queued", "crc_errors", "format_errors", "seq_errors")
 STATUS += ("underruns", "laser_on_us", "temperature_dc")
 BOARD = {
-    0x81: ("HELLO_REPLY", "BBIHI12sIIHHHB" + LIMITS_CODES, HELLO_REPLY),
+    0x81: ("HELLO_REPLY", "BBIHI12sIIHHHHHB" + LIMITS_CODES, HELLO_REPLY),
     0x83: ("CLOCK_REPLY", "IQ", ("host_t", "tick")),
     0x90: ("ACK", "BHIB", ("next_seq", "free_points", "done_index", "state")),
     0x91: ("NAK", "BB", ("next_seq", "reason")),
@@ -45,7 +45,7 @@ BOARD = {
 EXECUTED = 0x99
 STATES = ("BOOT", "DISARMED", "ARMING", "ARMED", "RUNNING", "HOLD", "FAULT")
 FAULTS = ("", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP")
-FAULTS += ("TICK", "READBACK")
+FAULTS += ("TICK", "READBACK", "CELLS", "PULSES")
 REASONS = ("", "boot", "hello", "arm requested", "armed", "start", "job done", "queue empty", "refilled")
 REASONS += ("hold too long", "disarm", "abort", "link lost", "arming timed out", "fault", "fault cleared", "flush")
 NAKS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")

@@ -81,7 +81,7 @@ static void trace(void *context, const struct board_trace *event) {
 }
 
 struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_codes, uint32_t queue_points,
-                      uint32_t key_edge) {
+                      uint32_t cells, uint32_t window_pulses, uint32_t key_edge) {
     struct shim *s = calloc(1, sizeof *s);
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
     s->hal = (struct board_hal){s,         set_gate,     read_gate,           move_mirrors, read_inputs,    set_indicator,
@@ -92,6 +92,8 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
     s->config.firmware = 0x00010000u;
     s->config.cell_codes = (uint16_t)cell_codes;
     s->config.queue_points = (uint16_t)queue_points;
+    s->config.cells = (uint16_t)(cells < BOARD_CELLS ? cells : BOARD_CELLS);
+    s->config.window_pulses = (uint16_t)(window_pulses < BOARD_PULSES ? window_pulses : BOARD_PULSES);
     s->config.key_edge = key_edge;
     return s;
 }
@@ -162,6 +164,10 @@ static uint64_t fingerprint(const struct shim *s) {
     memcpy(b, &s->board, sizeof *b);
     memset(&b->link.receiver, 0, sizeof b->link.receiver);
     b->loop_ran = false;
+    b->guards.turn = 0;
+    for (size_t k = 0; k < 4; k++) {
+        b->guards.grids[k].swept = 0;
+    }
     uint64_t hash = 14695981039346656037ull;
     for (size_t k = 0; k < sizeof *b; k++) {
         hash = (hash ^ ((const uint8_t *)b)[k]) * 1099511628211ull;

@@ -167,7 +167,7 @@ def test_more_records_than_are_kept(library):
             both.send(m.Start(1, 0, 0, 1))
         both.wait(40)
     both.wait(10_000)
-    for first in (0, 1000, 24 * 400 - 8192 - 1, 24 * 400 - 8192, 24 * 400 - 8192 + 1, 24 * 400 - 3, 24 * 400):
+    for first in (0, 1000, 24 * 400 - 4096 - 1, 24 * 400 - 4096, 24 * 400 - 4096 + 1, 24 * 400 - 3, 24 * 400):
         both.send(m.GetExecuted(first))
     assert both.received[-1].first_index == 24 * 400 - 3
 

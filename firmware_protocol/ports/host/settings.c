@@ -26,6 +26,8 @@ void settings_default(struct board_config *config) {
         .firmware = FIRMWARE,
         .cell_codes = 1300,
         .queue_points = 4096,
+        .cells = 2048,
+        .window_pulses = BOARD_PULSES,
     };
     memcpy(config->uid, "host board 1", sizeof config->uid);
 }
@@ -65,6 +67,10 @@ static bool read_entry(struct board_config *config, const char *path, const stru
         config->cell_codes = (uint16_t)read_integer(path, entry, 1, UINT16_MAX);
     } else if (strcmp(entry->key, "queue_points") == 0) {
         config->queue_points = (uint16_t)read_integer(path, entry, DATA_ITEMS_MAX, BOARD_QUEUE_POINTS);
+    } else if (strcmp(entry->key, "cells") == 0) {
+        config->cells = (uint16_t)read_integer(path, entry, 1, BOARD_CELLS);
+    } else if (strcmp(entry->key, "window_pulses") == 0) {
+        config->window_pulses = (uint16_t)read_integer(path, entry, 1, BOARD_PULSES);
     } else if (strcmp(entry->key, "uid") == 0) {
         read_uid(config, path, entry);
     } else if (strcmp(entry->key, "key_edge") == 0) {
@@ -88,7 +94,7 @@ void settings_read(struct board_config *config, const char *path) {
         if (toml->entries[k].table || !read_entry(config, path, &toml->entries[k])) {
 #define NAME(name, bits, at, way) #name ", "
             bad_input(path, toml->entries[k].key,
-                      "a known key: one of " LIMITS_FIELDS(NAME) "uid, cell_codes, queue_points, key_edge");
+                      "a known key: one of " LIMITS_FIELDS(NAME) "uid, cell_codes, queue_points, cells, window_pulses, key_edge");
         }
     }
     if (toml->tables) {

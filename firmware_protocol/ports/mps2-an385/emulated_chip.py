@@ -171,8 +171,9 @@ class EmulatedChip:
         self._output.clear()
         settings = self._settings
         seed = os.urandom(4) if self._seed is None else struct.pack("<I", self._seed)
-        head = struct.pack("<4sI12sHHBB", seed, FIRMWARE, bytes.fromhex(settings.uid), settings.cell_codes,
-                           settings.queue_points, settings.key_edge, self._inputs)  # fmt: skip
+        head = struct.pack("<4sI12sHHHHBB", seed, FIRMWARE, bytes.fromhex(settings.uid), settings.cell_codes,
+                           settings.queue_points, settings.cells, settings.window_pulses,
+                           settings.key_edge, self._inputs)  # fmt: skip
         data = head + settings.limits.encode_body()
         self._commands.write(COMMAND.pack(0, len(data), 0, data))
         self._commands.flush()

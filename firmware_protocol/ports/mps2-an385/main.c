@@ -152,7 +152,7 @@ static void receive(const uint8_t *bytes, size_t n) {
 static struct board_config config;
 
 /* The configuration as the bench packs it: u32 seed, u32 firmware, u8[12] uid, u16 cell_codes, u16 queue_points,
-   u8 key_edge, u8 inputs, then the limits as in LIMITS. */
+   u16 cells, u16 window_pulses, u8 key_edge, u8 inputs, then the limits as in LIMITS. */
 static uint16_t get_u16(const uint8_t *at) { return (uint16_t)(at[0] | at[1] << 8); }
 static uint32_t get_u32(const uint8_t *at) { return get_u16(at) | (uint32_t)get_u16(at + 2) << 16; }
 
@@ -166,9 +166,11 @@ static void configure(void) {
     memcpy(config.uid, bytes + 8, 12);
     config.cell_codes = get_u16(bytes + 20);
     config.queue_points = get_u16(bytes + 22);
-    config.key_edge = bytes[24] != 0;
-    inputs = bytes[25];
-    const uint8_t *at = bytes + 26;
+    config.cells = get_u16(bytes + 24);
+    config.window_pulses = get_u16(bytes + 26);
+    config.key_edge = bytes[28] != 0;
+    inputs = bytes[29];
+    const uint8_t *at = bytes + 30;
 #define DECODE(name, bits, offset, way) \
     config.limits.name = (uint##bits##_t)(bits == 16 ? get_u16(at + (offset)) : get_u32(at + (offset)));
     LIMITS_FIELDS(DECODE)

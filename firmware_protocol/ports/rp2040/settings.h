@@ -34,6 +34,8 @@ static const struct board_config SETTINGS = {
     .firmware = FIRMWARE,
     .cell_codes = 1300,
     .queue_points = BOARD_QUEUE_POINTS,
+    .cells = BOARD_CELLS,
+    .window_pulses = BOARD_PULSES,
     .key_edge = true,
 };
 

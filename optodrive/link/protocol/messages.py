@@ -29,6 +29,8 @@ FAULTS = (
     "ESTOP",
     "TICK",
     "READBACK",
+    "CELLS",
+    "PULSES",
 )
 NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
 NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
@@ -111,7 +113,7 @@ class HelloReply(Message):
 
     NAME = "HELLO_REPLY"
     TYPE = 0x81
-    LAYOUT = struct.Struct("<BBIHI12sIIHHHB")
+    LAYOUT = struct.Struct("<BBIHI12sIIHHHHHB")
     major: int
     minor: int
     host_nonce: int
@@ -123,6 +125,8 @@ class HelloReply(Message):
     queue_points: int
     rx_window: int
     cell_codes: int
+    cells: int
+    window_pulses: int
     reset_cause: int
     limits: Limits
 

@@ -34,12 +34,14 @@ class BoardRequirements:
     """Requirements of one configuration.
 
     limits: the limits that the host requests; cell_max_codes: largest cell of its spot guards that no two pixels share
+    pixels: number of pixels that its spot guards must tell apart
     lease_s: time for which the board may emit without a renewal by the host
     baud: bit rate of the port, 1/s; uid: the only board that is accepted, hexadecimal, '' for any
     """
 
     limits: m.Limits
     cell_max_codes: int
+    pixels: int
     scale: WireScale
     lease_s: float
     baud: int
@@ -92,6 +94,9 @@ class BoardRequirements:
             distance = f"{self.cell_max_codes}, the distance of neighbouring pixels"
             expected = f"a board whose cell_codes are at most {distance}; this one's are {peer.cell_codes}"
             raise InputError("display.pitch_m", values.pitch_m, expected, "board")
+        if peer.cells < self.pixels:
+            expected = f"at most {peer.cells}, the spots that this board can guard"
+            raise InputError("display pixels", self.pixels, expected, "board")
         for axis in ("x", "y"):
             low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
             if getattr(requested, f"{axis}_min") < low or getattr(requested, f"{axis}_max") > high:

@@ -6,6 +6,8 @@ FAULT_HINTS = {
     "ON_TIME": "one point, or several on one spot, kept the gate on longer than the board permits",
     "DUTY": "a point requested more duty than the board permits",
     "MEAN_POWER": "the mean power of the last second exceeded the board's cap",
+    "CELLS": "more spots were warm at once than the board can guard",
+    "PULSES": "more pulses came in a second than the board can guard",
     "SPOT": "one spot received more energy than the board permits",
     "UNDERRUN": "the queue ran empty three times within ten seconds: the host or the link is too slow",
     "INTERLOCK": "the interlock opened: close the enclosure",

@@ -63,7 +63,7 @@ class ReportCheck:
             self._check_executed(message, now_s)
 
     def _check_hello_reply(self, reply: m.HelloReply) -> None:
-        for name in ("session", "queue_points", "rx_window", "cell_codes"):
+        for name in ("session", "queue_points", "rx_window", "cell_codes", "cells", "window_pulses"):
             value = getattr(reply, name)
             _require(reply, name, value, value > 0, "at least 1")
         self.queue_points, self._newest_tick = reply.queue_points, 0

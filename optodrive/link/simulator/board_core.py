@@ -209,6 +209,8 @@ class BoardCore:
                 queue_points=self._settings.queue_points,
                 rx_window=WINDOW,
                 cell_codes=self._settings.cell_codes,
+                cells=self._settings.cells,
+                window_pulses=self._settings.window_pulses,
                 reset_cause=self._reset_cause,
                 limits=self.machine.limits,
             )

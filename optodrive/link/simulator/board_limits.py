@@ -29,7 +29,9 @@ FIELD_MAX = {"H": 0xFFFF, "I": 0xFFFF_FFFF}
 SETTING_RANGES = {
     item.name: (0, FIELD_MAX[code]) for item, code in zip(fields(Limits), Limits.LAYOUT.format[1:], strict=True)
 }
+CELLS_MAX, WINDOW_PULSES_MAX = 8192, 8192
 SETTING_RANGES |= {"cell_codes": (1, 0xFFFF), "queue_points": (POINTS_MAX, 0xFFFF)}
+SETTING_RANGES |= {"cells": (1, CELLS_MAX), "window_pulses": (1, WINDOW_PULSES_MAX)}
 UPPER_LIMITS = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "x_max", "y_max", "lease_ms")
 LOWER_LIMITS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
 
@@ -43,17 +45,22 @@ def tighten(current: Limits, requested: Limits) -> Limits:
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """Settings of a simulated board: its own limits, its identity, and the cell size of its spot guards in codes."""
+    """Settings of a simulated board: its own limits, its identity, and the sizes of its guards.
+
+    cell_codes: of a cell, in codes; cells: accounts in each grid; window_pulses: pulses in a second
+    """
 
     limits: Limits = DEFAULT_LIMITS
     uid: str = "73696d756c61746564303031"
     cell_codes: int = 1300
     queue_points: int = 4096
+    cells: int = 2048
+    window_pulses: int = WINDOW_PULSES_MAX
     key_edge: bool = False
 
 
 def load_settings(path: Path) -> BoardSettings:
-    """Load settings from a TOML file: any field of the limits, and uid, cell_codes, queue_points, key_edge.
+    """Load settings from a TOML file: any field of the limits, and of the settings besides.
 
     Raise InputError for an unknown key or a value out of range.
     """

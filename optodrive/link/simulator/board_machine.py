@@ -70,7 +70,7 @@ class BoardMachine:
         self.lease_until_us = 0
         self.laser_on_duty_us = 0
         self.underruns_total = 0
-        self._guards = EmissionGuards(self._settings.cell_codes)
+        self._guards = EmissionGuards(self._settings.cell_codes, self._settings.cells, self._settings.window_pulses)
         self._position = (CENTRE_CODE, CENTRE_CODE)
         self._mirror_sink(*self._position, self.now_us)
         self._settled_us = self.now_us

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from optodrive.link.protocol import messages as m
 
-RING_RECORDS = 8192
+RING_RECORDS = 4096
 
 
 class ExecutionRecord(NamedTuple):

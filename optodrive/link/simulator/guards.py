@@ -7,15 +7,21 @@ from optodrive.link.protocol.messages import Limits
 WINDOW_US = 1_000_000
 DUTY_FULL = 65535
 
+GRIDS = 4
+
 Cell = tuple[int, int, int]
 """Index of the grid (0 to 3), column, row."""
 
 
 class EmissionGuards:
-    """Accounts of gate-on time, mean power and energy of one board, with times in µs."""
+    """Accounts of gate-on time, mean power and energy of one board, with times in µs.
 
-    def __init__(self, cell_codes: int) -> None:
-        self._cell_codes = cell_codes
+    cell_codes: size of a cell; cells: number of accounts in each grid; window_pulses: number of pulses in a second
+    """
+
+    def __init__(self, cell_codes: int, cells: int, window_pulses: int) -> None:
+        self._cell_codes, self._cells, self._window_pulses = cell_codes, cells, window_pulses
+        self._accounts = [0] * GRIDS
         self._on_time: dict[Cell, tuple[int, int]] = {}
         self._bucket: dict[Cell, tuple[int, int]] = {}
         self._recent_pulses: deque[tuple[int, int, int]] = deque()
@@ -37,6 +43,8 @@ class EmissionGuards:
     def check_pulse(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> str:
         """Return the fault that a pulse causes, '' if the guards permit it."""
         cells = self.find_cells(x, y)
+        if not all(self._has_room(limits, cell, start_us) for cell in cells):
+            return "CELLS"
         if max(self.on_time_us(limits, cell, start_us) for cell in cells) + on_us > limits.max_on_us:
             return "ON_TIME"
         if self.max_window_duty_us(start_us, on_us, duty) > WINDOW_US * limits.mean_duty:
@@ -44,12 +52,24 @@ class EmissionGuards:
         level_uj = max(self.bucket_uj(limits, cell, start_us) for cell in cells)
         if level_uj + energy_uj(limits, on_us, duty) > limits.spot_uj:
             return "SPOT"
-        return ""
+        return "PULSES" if len(self._recent_pulses) >= self._window_pulses else ""
+
+    def _has_room(self, limits: Limits, cell: Cell, at_us: int) -> bool:
+        """Return whether a cell has an account or can have one, that of a cold cell if all are in use."""
+        grid = cell[0]
+        if cell in self._bucket or self._accounts[grid] < self._cells:
+            return True
+        for other in [other for other in self._bucket if other[0] == grid]:
+            if not self.on_time_us(limits, other, at_us) and not self.bucket_uj(limits, other, at_us):
+                del self._bucket[other], self._on_time[other]
+                self._accounts[grid] -= 1
+        return self._accounts[grid] < self._cells
 
     def record_pulse(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> None:
         """Add a pulse to the accounts."""
         energy = energy_uj(limits, on_us, duty)
         for cell in self.find_cells(x, y):
+            self._accounts[cell[0]] += cell not in self._bucket
             self._on_time[cell] = self.on_time_us(limits, cell, start_us) + on_us, start_us + on_us
             self._bucket[cell] = self.bucket_uj(limits, cell, start_us) + energy, start_us
         self._recent_pulses.append((start_us, on_us, duty))

@@ -33,13 +33,13 @@ static struct oracle *const o = &driver.oracle;
     .rest_us = 500, .lease_ms = 100, __VA_ARGS__}
 #pragma clang diagnostic ignored "-Winitializer-overrides"
 static const struct board_config BOARDS_LIMITS[] = {
-    {.limits = OWN(.lease_ms = 100), .cell_codes = 1300, .queue_points = 64},
-    {.limits = OWN(.lease_ms = 60000), .cell_codes = 1300, .queue_points = 64},
+    {.limits = OWN(.lease_ms = 100), .cell_codes = 1300, .queue_points = 64, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES},
+    {.limits = OWN(.lease_ms = 60000), .cell_codes = 1300, .queue_points = 64, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES},
     {.limits = OWN(.lease_ms = 60000, .mean_duty = 1500, .settle_us = 0, .settle_ns_per_code = 0), .cell_codes = 1300,
-     .queue_points = 64},
-    {.limits = OWN(.lease_ms = 60000, .spot_uj = 20000, .rest_us = 0), .cell_codes = 7, .queue_points = 30},
-    {.limits = OWN(.lease_ms = 60000, .spot_leak_uw = 0, .max_on_us = 65535), .cell_codes = 65535, .queue_points = 24},
-    {.limits = OWN(.lease_ms = 1000, .x_max = 50000, .settle_ns_per_code = 2000), .cell_codes = 1, .queue_points = 64,
+     .queue_points = 64, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES},
+    {.limits = OWN(.lease_ms = 60000, .spot_uj = 20000, .rest_us = 0), .cell_codes = 7, .queue_points = 30, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES},
+    {.limits = OWN(.lease_ms = 60000, .spot_leak_uw = 0, .max_on_us = 65535), .cell_codes = 65535, .queue_points = 24, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES},
+    {.limits = OWN(.lease_ms = 1000, .x_max = 50000, .settle_ns_per_code = 2000), .cell_codes = 1, .queue_points = 64, .cells = BOARD_CELLS, .window_pulses = BOARD_PULSES,
      .key_edge = true},
 };
 

@@ -10,7 +10,7 @@ LIMITS = m.Limits(*range(14))
 
 
 def hello_reply(nonce, session=SESSION):
-    return m.HelloReply(1, 0, nonce, session, 1, bytes(12), 0, 1_000_000, 4096, 8, 1300, 0, LIMITS)
+    return m.HelloReply(1, 0, nonce, session, 1, bytes(12), 0, 1_000_000, 4096, 8, 1300, 2048, 8192, 0, LIMITS)
 
 
 def wire(message, session=SESSION, seq=0):

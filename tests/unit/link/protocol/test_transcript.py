@@ -42,7 +42,7 @@ def test_description_of_messages():
     limits = describe(m.Limits(*range(1, 15)))
     assert limits["max_duty_fraction"] == pytest.approx(2 / 65535)
     assert limits["lease_ms"] == 14
-    reply = m.HelloReply(1, 0, 1, 2, 0x10000, bytes(12), 0, 1_000_000, 256, 8, 300, 3, m.Limits(*range(1, 15)))
+    reply = m.HelloReply(1, 0, 1, 2, 0x10000, bytes(12), 0, 1_000_000, 256, 8, 300, 99, 999, 3, m.Limits(*range(1, 15)))
     assert (describe(reply)["reset_cause"], describe(reply)["firmware"]) == ("watchdog", "1.0")
     assert describe(reply)["limits"] == limits
     assert describe_reset_cause(8) == "unknown cause 8"

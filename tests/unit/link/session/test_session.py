@@ -180,6 +180,7 @@ def changed(section, **values):
             changed("display", pitch_m=2.5e-3),
             "display.pitch_m: got 0.0025, expected a board whose cell_codes are at most 1066, the distance of",
         ),
+        (BoardSettings(cells=15), CONFIG, "display pixels: got 16, expected at most 15, the spots that this board can"),
     ],
 )
 def test_an_incompatible_board_is_rejected_with_the_key(settings, config, says):
@@ -194,7 +195,9 @@ def test_an_incompatible_board_is_rejected_with_the_key(settings, config, says):
 def test_another_protocol_or_tick_is_rejected(field, value):
     requirements = build_board_requirements(CONFIG)
     fits = dict(major=1, minor=9, host_nonce=0, session=1, firmware=0, uid=bytes(12), capabilities=0, tick_hz=1_000_000)
-    fits |= dict(queue_points=99, rx_window=8, cell_codes=1, reset_cause=0, limits=DEFAULT_LIMITS)
+    fits |= dict(
+        queue_points=99, rx_window=8, cell_codes=1, cells=16, window_pulses=1, reset_cause=0, limits=DEFAULT_LIMITS
+    )
     requirements.check_board(m.HelloReply(**fits))
     with pytest.raises(InputError, match=f"{value}"):
         requirements.check_board(m.HelloReply(**{**fits, field: value}))

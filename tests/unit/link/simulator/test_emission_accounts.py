@@ -34,7 +34,7 @@ def in_second_before(end_us, pulses):
 def test_mean_account_is_the_fullest_second_of_all():
     rng = random.Random(4)
     for _ in range(20):
-        guards, pulses, at_us = EmissionGuards(1300), [], 0
+        guards, pulses, at_us = EmissionGuards(1300, 9, 999), [], 0
         for _ in range(60):
             at_us += rng.randrange(0, 60_000)
             on_us, duty = rng.randrange(1, 50_000), rng.choice([100, 20_000, DUTY_FULL])
