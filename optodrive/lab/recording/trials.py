@@ -110,6 +110,7 @@ def _read_time_s(place: str, attributes: Attributes, name: str, otherwise: float
 def _read_object(place: str, text: str) -> dict[str, Any]:
     with convert_errors(place, "one JSON object"):
         value = json.loads(text, parse_constant=lambda name: _refuse_constant(place, name))
+        json.dumps(value, ensure_ascii=False).encode()  # half of a surrogate pair cannot be written
         if not isinstance(value, dict):
             raise InputError(place, Unquoted(f"a {type(value).__name__}"), "one JSON object")
         return value

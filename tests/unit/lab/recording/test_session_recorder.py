@@ -167,6 +167,10 @@ def test_a_recording_without_plans_has_no_trials(tmp_path, capsys):
         (lambda plan: plan.attrs.__setitem__("requested_board_s", "soon"), "got 'soon', expected a time"),
         (lambda plan: plan.__setitem__("labels", "[" * 100_000), "/plans/p1/labels: got"),
         (lambda plan: plan.__setitem__("labels", '{"a": NaN}'), "/plans/p1/labels: got NaN, expected finite numbers"),
+        (
+            lambda plan: plan.__setitem__("labels", r'{"a": "\ud800"}'),
+            "surrogates not allowed, expected one JSON object",
+        ),
         (lambda plan: plan.__setitem__("labels", "[1]"), "/plans/p1/labels: got a list, expected one JSON object"),
         (lambda plan: plan.__setitem__("labels", [1.0]), "/plans/p1/labels: got entries of type float64"),
         (lambda plan: plan.__setitem__("executed", np.zeros((2, 3))), "/plans/p1/executed: got the shape (2, 3)"),
