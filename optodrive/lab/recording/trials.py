@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -17,6 +18,7 @@ CLOCKS = ("board_s", "monotonic_s", "unix_s")
 """Clocks of an onset: the board's, the host's monotonic one, and Unix time."""
 TIME_MAX_S = 1e11
 LABEL_PREFIX = "label_"
+SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,8 @@ def _read_time_s(place: str, attributes: Attributes, name: str, otherwise: float
 def _read_object(place: str, text: str) -> dict[str, Any]:
     with convert_errors(place, "one JSON object"):
         value = json.loads(text, parse_constant=lambda name: _refuse_constant(place, name))
-        json.dumps(value, ensure_ascii=False).encode()  # half of a surrogate pair cannot be written
+        if SURROGATE.search(json.dumps(value, ensure_ascii=False)):
+            raise InputError(place, Unquoted("half of a surrogate pair"), "Unicode text, which a file can hold")
         if not isinstance(value, dict):
             raise InputError(place, Unquoted(f"a {type(value).__name__}"), "one JSON object")
         return value

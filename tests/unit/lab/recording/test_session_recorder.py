@@ -169,7 +169,7 @@ def test_a_recording_without_plans_has_no_trials(tmp_path, capsys):
         (lambda plan: plan.__setitem__("labels", '{"a": NaN}'), "/plans/p1/labels: got NaN, expected finite numbers"),
         (
             lambda plan: plan.__setitem__("labels", r'{"a": "\ud800"}'),
-            "surrogates not allowed, expected one JSON object",
+            "labels: got half of a surrogate pair, expected Unicode",
         ),
         (lambda plan: plan.__setitem__("labels", "[1]"), "/plans/p1/labels: got a list, expected one JSON object"),
         (lambda plan: plan.__setitem__("labels", [1.0]), "/plans/p1/labels: got entries of type float64"),
