@@ -191,11 +191,12 @@ def test_held_out_facts_do_not_leak(found, group, name):
         assert after * (7.0 if fact == name else 1.0) == pytest.approx(before, rel=1e-12)
 
 
-def test_ranges_map_both_ways_and_exclusions_are_known():
+def test_ranges_are_met_at_both_ends_and_exclusions_are_known():
     for cause in CAUSES_BY_KEY.values():
         assert all(other in CAUSES_BY_KEY for other in cause.excludes)
-        assert cause.low < cause.high
-        assert cause.compute_fraction(cause.compute_value(0.3)) == pytest.approx(0.3)
+        low, middle, high = (cause.parameter.compute_value(fraction) for fraction in (0.0, 0.3, 1.0))
+        assert cause.parameter.low == pytest.approx(low)
+        assert low < middle < high == pytest.approx(cause.parameter.high)
 
 
 def test_the_answer_as_json(found):

@@ -258,17 +258,20 @@ class EffectFits:
         """Fit a form: the effect's parameters alone, or all of them."""
         period_s = 2.0 * np.pi / float(np.exp(self.base[0]))
         unit = np.array([1.0, 1.0, period_s])
-        size = np.array([self.scales[name] for name in form.scales])
-        free = np.array([True] * 3 + [low < high for low, high in zip(form.low, form.high, strict=True)])
+        spans = (form.first, form.second)
+        size = np.array([self.scales[each.scale] for each in spans])
+        free = np.array([True] * 3 + [each.low < each.high for each in spans])
         free[:3] &= completely
-        is_log = np.array([low > 0.0 for low in form.low])
+        is_log = np.array([each.low > 0.0 for each in spans])
 
         def pack(pair: Sequence[float] | FloatArray) -> FloatArray:
             packed: FloatArray = np.where(is_log, np.log(np.where(is_log, pair, 1.0)), pair)
             return packed
 
-        low = np.concatenate([[-0.7, 0.02 - self.base[1], -self.base[2] / period_s], pack(form.low)])
-        high = np.concatenate([[1.2, 1.0, 0.5], pack(form.high)])
+        low = np.concatenate(
+            [[-0.7, 0.02 - self.base[1], -self.base[2] / period_s], pack([each.low for each in spans])]
+        )
+        high = np.concatenate([[1.2, 1.0, 0.5], pack([each.high for each in spans])])
         shifts = FREQUENCY_SHIFTS if form.effect in (LINEAR, SLEW_LIMIT, SATURATION) else (0.0,)
         starts = [np.array([at, 0.0, 0.0, *pack(pair)]) for pair in form.starts for at in shifts]
         if start is not None:

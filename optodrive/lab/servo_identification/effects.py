@@ -6,6 +6,7 @@ All effects are odd. Their amplitudes are in the unit of the command: a torque i
 
 from dataclasses import dataclass
 from math import exp, tanh
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,122 +28,95 @@ NONE, SLEW, VELOCITY, CLIP, SOFT_CLIP, TORQUE, ACCELERATION, STOP = range(8)
 COULOMB, STRIBECK, PRESLIDING, BACKLASH, INPUT_LAG, RAYLEIGH, SPRING_LAG, SPRING, SMOOTH_LAG = range(8, 17)
 
 
+class Span(NamedTuple):
+    """One parameter of an effect: starts of a fit and bounds, as fractions of the scale that is named."""
+
+    scale: str
+    starts: tuple[float, ...]
+    low: float
+    high: float
+
+
+FIXED = Span("one", (1.0,), 1.0, 1.0)
+_THRESHOLD = (0.35, 0.6, 0.85), 0.02, 1.5
+
+
 @dataclass(frozen=True)
 class Form:
-    """One form of an effect.
-
-    starts: initial (first, second) parameters, each as a fraction of its scale, whose name follows; bounds: of both, as
-    fractions likewise. A second parameter with equal bounds is fixed.
-    """
+    """One form of an effect, with its parameters. A start of the second is of all starts of the first, or of one."""
 
     name: str
     effect: str
     kind: int
-    scales: tuple[str, str]
-    starts: tuple[tuple[float, float], ...]
-    low: tuple[float, float]
-    high: tuple[float, float]
+    first: Span
+    second: Span = FIXED
+
+    @property
+    def starts(self) -> list[tuple[float, float]]:
+        """Starts of both parameters together."""
+        first, second = self.first.starts, self.second.starts
+        return list(zip(first, second if len(second) > 1 else second * len(first), strict=True))
 
 
-LINEAR_FORM = Form("linear", "linear", NONE, ("one", "one"), ((1.0, 1.0),), (1.0, 1.0), (1.0, 1.0))
-_THRESHOLD = ((0.35, 1.0), (0.6, 1.0), (0.85, 1.0))
-_ONE = (0.02, 1.0), (1.5, 1.0)
+LINEAR_FORM = Form("linear", "linear", NONE, FIXED)
 FORMS = (
-    Form("slew limit of the command", SLEW_LIMIT, SLEW, ("slope", "one"), _THRESHOLD, *_ONE),
-    Form("velocity limit of the mirror", SLEW_LIMIT, VELOCITY, ("speed", "one"), _THRESHOLD, *_ONE),
-    Form("clipped command", SATURATION, CLIP, ("command", "one"), _THRESHOLD, *_ONE),
-    Form(
-        "gradually saturating command",
-        SATURATION,
-        SOFT_CLIP,
-        ("command", "one"),
-        ((0.7, 1.0), (2.0, 1.0)),
-        (0.1, 1.0),
-        (20.0, 1.0),
-    ),
-    Form("saturated control torque", SATURATION, TORQUE, ("error", "one"), _THRESHOLD, *_ONE),
-    Form("saturated acceleration", SATURATION, ACCELERATION, ("acceleration", "one"), _THRESHOLD, *_ONE),
-    Form("end stops", SATURATION, STOP, ("angle", "one"), _THRESHOLD, *_ONE),
-    Form(
-        "Coulomb friction",
-        FRICTION,
-        COULOMB,
-        ("angle", "one"),
-        ((0.005, 1.0), (0.03, 1.0), (0.15, 1.0)),
-        (1e-5, 1.0),
-        (1.0, 1.0),
-    ),
+    Form("slew limit of the command", SLEW_LIMIT, SLEW, Span("slope", *_THRESHOLD)),
+    Form("velocity limit of the mirror", SLEW_LIMIT, VELOCITY, Span("speed", *_THRESHOLD)),
+    Form("clipped command", SATURATION, CLIP, Span("command", *_THRESHOLD)),
+    Form("gradually saturating command", SATURATION, SOFT_CLIP, Span("command", (0.7, 2.0), 0.1, 20.0)),
+    Form("saturated control torque", SATURATION, TORQUE, Span("error", *_THRESHOLD)),
+    Form("saturated acceleration", SATURATION, ACCELERATION, Span("acceleration", *_THRESHOLD)),
+    Form("end stops", SATURATION, STOP, Span("angle", *_THRESHOLD)),
+    Form("Coulomb friction", FRICTION, COULOMB, Span("angle", (0.005, 0.03, 0.15), 1e-5, 1.0)),
     Form(
         "Coulomb friction with the Stribeck effect",
         FRICTION,
         STRIBECK,
-        ("angle", "one"),
-        ((0.02, 0.5), (0.08, 0.5)),
-        (1e-5, 0.0),
-        (1.0, 2.0),
+        Span("angle", (0.02, 0.08), 1e-5, 1.0),
+        Span("one", (0.5,), 0.0, 2.0),
     ),
     Form(
         "friction with presliding",
         FRICTION,
         PRESLIDING,
-        ("angle", "angle"),
-        ((0.01, 0.01), (0.08, 0.01)),
-        (1e-5, 0.001),
-        (1.0, 0.04),
+        Span("angle", (0.01, 0.08), 1e-5, 1.0),
+        Span("angle", (0.01,), 0.001, 0.04),
     ),
-    Form(
-        "backlash of the command",
-        HYSTERESIS,
-        BACKLASH,
-        ("command", "one"),
-        ((0.01, 1.0), (0.05, 1.0), (0.2, 1.0)),
-        (1e-4, 1.0),
-        (0.9, 1.0),
-    ),
+    Form("backlash of the command", HYSTERESIS, BACKLASH, Span("command", (0.01, 0.05, 0.2), 1e-4, 0.9)),
     Form(
         "Bouc–Wen hysteresis of the command",
         HYSTERESIS,
         INPUT_LAG,
-        ("one", "command"),
-        ((0.1, 0.2), (-0.1, 0.2)),
-        (-0.9, 0.03),
-        (5.0, 2.0),
+        Span("one", (0.1, -0.1), -0.9, 5.0),
+        Span("command", (0.2,), 0.03, 2.0),
     ),
     Form(
         "Rayleigh hysteresis of the command",
         HYSTERESIS,
         RAYLEIGH,
-        ("one", "command"),
-        ((0.1, 1.0), (-0.1, 1.0)),
-        (-0.9, 0.1),
-        (9.0, 2.0),
+        Span("one", (0.1, -0.1), -0.9, 9.0),
+        Span("command", (1.0,), 0.1, 2.0),
     ),
     Form(
         "smooth Bouc–Wen hysteresis of the command",
         HYSTERESIS,
         SMOOTH_LAG,
-        ("one", "command"),
-        ((0.1, 0.2), (-0.1, 0.2)),
-        (-0.9, 0.03),
-        (5.0, 2.0),
+        Span("one", (0.1, -0.1), -0.9, 5.0),
+        Span("command", (0.2,), 0.03, 2.0),
     ),
     Form(
         "Bouc–Wen hysteresis of the suspension",
         HYSTERESIS,
         SPRING_LAG,
-        ("one", "angle"),
-        ((0.2, 0.2), (0.05, 0.5)),
-        (0.0, 0.08),
-        (5.0, 2.0),
+        Span("one", (0.2, 0.05), 0.0, 5.0),
+        Span("angle", (0.2, 0.5), 0.08, 2.0),
     ),
     Form(
         "stiffness that changes with the deflection",
         STIFFNESS,
         SPRING,
-        ("one", "one"),
-        ((0.1, 3.0), (-0.05, 3.0)),
-        (-0.9, 1.5),
-        (20.0, 6.0),
+        Span("one", (0.1, -0.05), -0.9, 20.0),
+        Span("one", (3.0,), 1.5, 6.0),
     ),
 )
 

@@ -44,7 +44,7 @@ class CauseFit:
     def values(self) -> dict[str, float]:
         """Parameters of the causes, SI."""
         return {
-            key: CAUSES_BY_KEY[key].compute_value(fraction)
+            key: CAUSES_BY_KEY[key].parameter.compute_value(fraction)
             for key, fraction in zip(self.keys, self.fractions, strict=True)
         }
 
@@ -134,7 +134,7 @@ class CauseSearch:
         low, high = np.clip(
             [fit.fractions[index] - 1.96 * sigma, fit.fractions[index] + 1.96 * sigma], 0.0, 1.0
         ).tolist()
-        return CAUSES_BY_KEY[key].compute_value(low), CAUSES_BY_KEY[key].compute_value(high)
+        return CAUSES_BY_KEY[key].parameter.compute_value(low), CAUSES_BY_KEY[key].parameter.compute_value(high)
 
     def compute_max_chi2_increase(self, fit: CauseFit, key: str) -> float:
         """Return the largest increase of χ² by a further cause at the limits of its range, all else as fitted."""
@@ -151,7 +151,7 @@ class CauseSearch:
 
     def _compute_residuals(self, keys: tuple[str, ...], fractions: FloatArray) -> FloatArray:
         values = {
-            key: CAUSES_BY_KEY[key].compute_value(fraction)
+            key: CAUSES_BY_KEY[key].parameter.compute_value(fraction)
             for key, fraction in zip(keys, fractions.tolist(), strict=True)
         }
         return np.asarray(CorrectedModel(self.base, values).compute_log_errors(self.data) / self._sigma)

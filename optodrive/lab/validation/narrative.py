@@ -23,7 +23,7 @@ HEADINGS = ("held out", "causes chosen without", "nominal", "extended", "error f
 
 def format_value(key: str, value: float) -> str:
     """Return the parameter of a cause in readable units."""
-    unit = CAUSES_BY_KEY[key].unit
+    unit = CAUSES_BY_KEY[key].parameter.unit
     scale, name = SCALED_UNITS.get(unit, (1.0, ""))
     return f"{value * scale:.3g} {name}" if name else format_quantity(value, unit)
 
@@ -60,7 +60,8 @@ def _describe_named_cause(item: NamedCause) -> list[str]:
     value, low, high = (format_value(item.key, number) for number in (item.value, item.low, item.high))
     lines = [
         f"- {cause.description} ({item.key}).",
-        f"  {cause.symbol} = {value} (95 %: {low} to {high}); without it χ² grows by {item.chi2_reduction:.0f}.",
+        f"  {cause.parameter.symbol} = {value} (95 %: {low} to {high}); "
+        f"without it χ² grows by {item.chi2_reduction:.0f}.",
     ]
     lines += [
         f"  Or: {CAUSES_BY_KEY[other].description} ({other}); the facts cannot decide." for other in item.alternatives
@@ -212,9 +213,9 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
             {
                 "cause": item.key,
                 "description": CAUSES_BY_KEY[item.key].description,
-                "parameter": CAUSES_BY_KEY[item.key].symbol,
+                "parameter": CAUSES_BY_KEY[item.key].parameter.symbol,
                 "value": item.value,
-                "unit": CAUSES_BY_KEY[item.key].unit,
+                "unit": CAUSES_BY_KEY[item.key].parameter.unit,
                 "ci95": [item.low, item.high],
                 "chi2_reduction": item.chi2_reduction,
                 "evidence": list(item.evidence),
@@ -229,7 +230,7 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
                 "description": CAUSES_BY_KEY[item.key].description,
                 "verdict": item.verdict,
                 "value": item.value,
-                "unit": CAUSES_BY_KEY[item.key].unit,
+                "unit": CAUSES_BY_KEY[item.key].parameter.unit,
                 "chi2_reduction_alone": item.chi2_reduction_alone,
                 "chi2_reduction_added": item.chi2_reduction_added,
                 "replaces": item.replaces,
