@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, SkipValidation
 from pydantic_core import to_json
@@ -27,6 +27,11 @@ class JsonModel(BaseModel):
         allow_inf_nan=False,
         json_schema_serialization_defaults_required=True,
     )
+
+    @classmethod
+    def from_object(cls, source: object, /, **members: Any) -> Self:
+        """Build it from the attributes of an object, and from the members that this has not or has otherwise."""
+        return cls(**{name: getattr(source, name) for name in cls.model_fields if name not in members}, **members)
 
 
 def iterate_json(model: BaseModel) -> Iterator[bytes]:

@@ -10,7 +10,6 @@ from optodrive.core.units import m_to_um
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FeasibilityReport
 from optodrive.planning.planned_sequence import PlannedSequence, Shortfall, describe_lateness
-from optodrive.planning.scheduler.interleaving import SimultaneousFrame
 from optodrive.planning.summary_schema import (
     DeadPixelSummary,
     DelaySummary,
@@ -51,12 +50,7 @@ def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | No
         headroom_min_k=float(plan.headroom_k.min()),
         trimmed=_summarize_trimming(planned),
         shortfall=None if planned.shortfall is None else _summarize_shortfall(planned.shortfall),
-        delays=[
-            DelaySummary(
-                source=_name_source(planned, delay.source), pixel=delay.pixel, cap=delay.cap, wait_s=delay.wait_s
-            )
-            for delay in planned.delays
-        ],
+        delays=[DelaySummary.from_object(each, source=_name_source(planned, each.source)) for each in planned.delays],
         dead=DeadPixelSummary(
             pixels=list(planned.dead_pixels),
             count=len(planned.dead_pixels),
@@ -94,39 +88,15 @@ def describe_dead_pixels(dead: tuple[int, ...]) -> str | None:
 
 
 def _summarize_shortfall(shortfall: Shortfall) -> ShortfallSummary:
-    return ShortfallSummary(
-        pixel=shortfall.pixel,
-        cap=shortfall.cap,
-        margin_j=shortfall.margin_j,
-        fits_after_s=_finite_or_none(shortfall.fits_after_s),
-    )
+    return ShortfallSummary.from_object(shortfall, fits_after_s=_finite_or_none(shortfall.fits_after_s))
 
 
 def _summarize_frames(planned: PlannedSequence) -> list[FrameSummary]:
-    simultaneous = {item.source: _summarize_simultaneity(item) for item in planned.simultaneous}
+    simultaneous = {item.source: SimultaneitySummary.from_object(item) for item in planned.simultaneous}
     return [
-        FrameSummary(
-            frame=timing.frame_id,
-            show_at_s=timing.show_at_s,
-            first_pulse_s=timing.first_pulse_s,
-            end_s=timing.end_s,
-            deadline_s=timing.deadline_s,
-            late_s=timing.late_s,
-            pulses=timing.pulses,
-            on_time=timing.on_time,
-            simultaneous=simultaneous.get(timing.source),
-        )
+        FrameSummary.from_object(timing, frame=timing.frame_id, simultaneous=simultaneous.get(timing.source))
         for timing in planned.frames
     ]
-
-
-def _summarize_simultaneity(frame: SimultaneousFrame) -> SimultaneitySummary:
-    return SimultaneitySummary(
-        interleaved_rounds=frame.interleaved_rounds,
-        simultaneity=frame.simultaneity,
-        simultaneity_single_pulse=frame.simultaneity_single_pulse,
-        extra_s=frame.extra_s,
-    )
 
 
 def _name_source(planned: PlannedSequence, source: int) -> str:

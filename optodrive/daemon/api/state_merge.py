@@ -6,6 +6,7 @@ from typing import Any
 from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.daemon.responses.state import (
     BoardReport,
+    ControlReport,
     LimitsReport,
     LinkReport,
     PlannerReport,
@@ -13,7 +14,6 @@ from optodrive.daemon.responses.state import (
     PulseTotals,
     QueueReport,
     StateReport,
-    build_control_report,
     build_stage_reports,
 )
 from optodrive.device.config import Config
@@ -63,17 +63,15 @@ def merge_state(
     ends_in_s = status["pause"]["ends_in_s"] if status is not None and status["connected"] else None
     control = status["control"] if status is not None and status["connected"] else None
     planner = planner or NO_PLANNER
-    return StateReport(
+    return StateReport.from_object(
+        planner,
         display=config.name,
         pixels=pixels,
         link=link,
         board=BoardReport(**board),
         stages=build_stage_reports(_list_unknown_stages(config) if status is None else status["stages"]),
-        control=build_control_report(control),
+        control=None if control is None else ControlReport.model_validate(control, extra="ignore"),
         queue=_merge_queue(planner.queue, ends_in_s),
-        totals=planner.totals,
-        planner=planner.planner,
-        limits=planner.limits,
     )
 
 

@@ -172,26 +172,18 @@ class PlanRecord:
         pulses: whether the report lists them one by one; clocks: give the onset of a plan that has not begun
         """
         execution = self.execution
-        return PlanReport(
+        return PlanReport.from_object(
+            self,
             plan=self.plan_id,
-            name=self.name,
-            caller=self.caller,
-            labels=self.labels,
-            parameters=self.parameters,
-            status=self.status,
-            error=self.error,
             starts_in_s=self.start_s + self.delay_s - board_now_s,
             planned=self.pulse_count,
-            sent=self.sent,
             executed=self.executed_count,
-            dropped=self.dropped,
             latency=PlanLatency(
                 planned_s=self.planned_after_s,
                 first_byte_s=self.first_byte_after_s,
                 first_light_s=self.first_light_after_s,
             ),
             onset=self._report_onset(clocks),
-            timing_error=self.timing_error,
             summary=PlanSummary.model_validate_json(self.summary_json),
             pulses=self.pulses.to_columns() if pulses and self.pulses is not None else None,
             simulated_max_um=None if execution is None else _to_um(execution.simulated_max_m),

@@ -1,5 +1,7 @@
 """Report of the plan queue, a part of the daemon's state."""
 
+from typing import Any
+
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.responses.plan_status import PlanStatus
@@ -20,27 +22,15 @@ def build_queue_report(plan_queue: PlanQueue, recent: list[PlanRecord], board_no
         paused=pause.ends_in_s is not None,
         pause_ends_in_s=pause.ends_in_s,
         active=[_build_queued(record, times_at_s) for record in (*running, *waiting)],
-        plans=[_build_recent(record) for record in recent],
+        plans=[RecentPlan.from_object(record, **_name_counts(record)) for record in recent],
     )
 
 
-def _build_recent(record: PlanRecord) -> RecentPlan:
-    return RecentPlan(
-        plan=record.plan_id,
-        name=record.name,
-        caller=record.caller,
-        status=record.status,
-        planned=record.pulse_count,
-        executed=record.executed_count,
-        error=record.error,
-    )
+def _name_counts(record: PlanRecord) -> dict[str, Any]:
+    return {"plan": record.plan_id, "planned": record.pulse_count, "executed": record.executed_count}
 
 
 def _build_queued(record: PlanRecord, board_now_s: float) -> QueuedPlan:
     starts_in_s = record.start_s + record.delay_s - board_now_s
-    return QueuedPlan(
-        **dict(_build_recent(record)),
-        duration_s=record.duration_s,
-        starts_in_s=starts_in_s,
-        ends_in_s=None if record.status == PlanStatus.PAUSED else max(0.0, starts_in_s + record.duration_s),
-    )
+    ends_in_s = None if record.status == PlanStatus.PAUSED else max(0.0, starts_in_s + record.duration_s)
+    return QueuedPlan.from_object(record, **_name_counts(record), starts_in_s=starts_in_s, ends_in_s=ends_in_s)

@@ -164,13 +164,6 @@ class StateReport(JsonModel):
     limits: LimitsReport
 
 
-def build_control_report(control: Mapping[str, Any] | None) -> ControlReport | None:
-    """Build the report from the status of the link process, which has further fields. Return None while not armed."""
-    if control is None:
-        return None
-    return ControlReport(caller=control["caller"], armed_for_s=control["armed_for_s"], hold=control["hold"])
-
-
 def build_stage_reports(stages: Sequence[Mapping[str, Any]]) -> list[StageReport]:
     """Build the reports of several stages from the status of the link process."""
     return [StageReport(**{**stage, "board": BoardReport(**stage["board"])}) for stage in stages]
