@@ -87,15 +87,15 @@ def commands(random, size_rad, count=16):
     return np.column_stack([at_s, np.append(0.0, x_rad), np.append(0.0, y_rad)])
 
 
-def recording(servos, random, rate_hz=5e4, noise=0.003, sizes_rad=SIZES_RAD):
-    """Build a recording with one run per step size.
+def recording(servos, random, rate_hz=5e4, noise=0.003, sizes_rad=SIZES_RAD, count=16):
+    """Build a recording with one run of so many steps per step size.
 
     noise: relative to the step
     servos: of x and y
     """
     runs = []
     for number, size_rad in enumerate(sizes_rad):
-        table = commands(random, size_rad)
+        table = commands(random, size_rad, count)
         t_s = np.arange(0.0, table[-1, 0] + 0.015, 1.0 / rate_hz)
         angles = [servo.follow(table[:, 0], table[:, 1 + axis], t_s) for axis, servo in enumerate(servos)]
         signals = {

@@ -109,6 +109,7 @@ class ServoData:
         self.areas = [np.concatenate([[0.0], np.cumsum(np.diff(each.at_s) * each.command[:-1])]) for each in records]
         self.target = np.concatenate([(each.value / each.noise)[each.use] for each in records])
         self.drives = lru_cache(maxsize=6)(self._drives)
+        self.sample_times_s = lru_cache(maxsize=2)(self._sample_times_s)
 
     def _area(self, row: int, t_s: FloatArray) -> FloatArray:
         """Return the integral of a record's command from its beginning, also before and after it."""
@@ -122,6 +123,12 @@ class ServoData:
         edges = [np.append(grid - self.h_s, grid[-1]) - delay_s for grid in self.grids]
         return [np.diff(self._area(row, each)) / self.h_s for row, each in enumerate(edges)]
 
+    def _sample_times_s(self, stride: int) -> list[FloatArray]:
+        """Return the times of every stride-th of all used samples, by record."""
+        used_s = [each.t_s[each.use] for each in self.records]
+        begins = np.cumsum([0, *map(len, used_s)]).tolist()
+        return [t_s[-begin % stride :: stride] for begin, t_s in zip(begins, used_s, strict=False)]
+
     def integrate(self, form: Form, base: FloatArray, effect: tuple[float, float], scale: float) -> list[FloatArray]:
         """Return the angle on the grid of each record."""
         omega, zeta = float(np.exp(base[0])), float(base[1])
@@ -134,12 +141,18 @@ class ServoData:
         return angles
 
     def simulate(
-        self, form: Form, base: FloatArray, effect: tuple[float, float], scale: float, taps: int = FORM_TAPS
+        self,
+        form: Form,
+        base: FloatArray,
+        effect: tuple[float, float],
+        scale: float,
+        taps: int = FORM_TAPS,
+        stride: int = 1,
     ) -> FloatArray:
-        """Return the angles at all used samples, and each tap earlier, in units of their noise, [m, taps]."""
+        """Return the angles at every stride-th used sample, and each tap earlier, in units of noise, [m, taps]."""
         parts = []
-        for each, grid, angle in zip(self.records, self.grids, self.integrate(form, base, effect, scale), strict=True):
-            t_s = each.t_s[each.use]
+        angles, times_s = self.integrate(form, base, effect, scale), self.sample_times_s(stride)
+        for each, grid, angle, t_s in zip(self.records, self.grids, angles, times_s, strict=True):
             shifted = [np.interp(t_s - at * self.tap_s, grid, angle) for at in range(taps)]
             parts.append(np.column_stack(shifted) / each.noise)
         return np.concatenate(parts)
@@ -157,12 +170,13 @@ class ServoData:
 def fit_linear(records: list[ServoRecord], omega: float) -> FloatArray:
     """Fit a linear second-order servo with delay, gain and offset from about omega: log ω, ζ, delay in s."""
     data = ServoData(records, omega)
-    rows = slice(None, None, max(1, len(data.target) // FIT_SAMPLES_MAX))
-    constant = np.concatenate([np.full(each.use.sum(), 1.0 / each.noise) for each in records])[rows]
+    stride = max(1, len(data.target) // FIT_SAMPLES_MAX)
+    constant = np.concatenate([np.full(each.use.sum(), 1.0 / each.noise) for each in records])[::stride]
+    target = data.target[::stride]
 
     def residual(base: FloatArray) -> FloatArray:
-        model = np.column_stack([constant, data.simulate(LINEAR_FORM, base, (1.0, 1.0), 1.0, 1)[rows]])
-        return np.asarray(data.target[rows] - model @ np.linalg.lstsq(model, data.target[rows], rcond=None)[0])
+        model = np.column_stack([constant, data.simulate(LINEAR_FORM, base, (1.0, 1.0), 1.0, 1, stride)])
+        return np.asarray(target - model @ np.linalg.lstsq(model, target, rcond=None)[0])
 
     period_s = 2.0 * np.pi / omega
     low, high = [np.log(omega / 6.0), 0.02, 0.0], [np.log(omega * 6.0), 3.0, period_s]
@@ -233,10 +247,10 @@ class EffectFits:
         self.train, self.test = ServoData(train, omega), ServoData(test, omega)
         self.columns, self.test_columns = self.train.free_response(base), self.test.free_response(base)
         self.scales = self._measure_scales()
-        self.rows = slice(None, None, max(1, len(self.columns) // FIT_SAMPLES_MAX))
-        u, singular, _ = np.linalg.svd(self.columns[self.rows], full_matrices=False)
+        self.stride = max(1, len(self.columns) // FIT_SAMPLES_MAX)
+        u, singular, _ = np.linalg.svd(self.columns[:: self.stride], full_matrices=False)
         self.q = u[:, singular > 1e-7 * singular[0]]
-        y = self.train.target[self.rows]
+        y = self.train.target[:: self.stride]
         self.y = y - self.q @ (self.q.T @ y)
 
     def _measure_scales(self) -> dict[str, float]:
@@ -282,7 +296,7 @@ class EffectFits:
             return self.base + x[:3] * unit, (float(first), float(second))
 
         def residual(x: FloatArray) -> FloatArray:
-            simulated = self.train.simulate(form, *unpack(x), self.scales["angle"])[self.rows]
+            simulated = self.train.simulate(form, *unpack(x), self.scales["angle"], stride=self.stride)
             if not np.abs(simulated).max() < UNSTABLE:
                 return np.append(self.y, x[:3] * 1e3)
             simulated = simulated - self.q @ (self.q.T @ simulated)

@@ -120,15 +120,15 @@ def identify_excitation(
     start = found.fits[SLEW_LIMIT]
     base = np.array(start.base) if limited else found.linear
     data = ServoData(records, float(np.exp(base[0])))
-    rows = slice(None, None, max(1, len(data.target) // FIT_SAMPLES_MAX))
-    constant = np.concatenate([np.full(each.use.sum(), 1.0 / each.noise) for each in records])[rows]
+    stride = max(1, len(data.target) // FIT_SAMPLES_MAX)
+    constant = np.concatenate([np.full(each.use.sum(), 1.0 / each.noise) for each in records])[::stride]
     form = next(each for each in FORMS if each.kind == SLEW) if limited else LINEAR_FORM
-    y = data.target[rows]
+    y = data.target[::stride]
 
     def solve(packed: FloatArray) -> tuple[FloatArray, float, float]:
         servo = _unpack(packed)
         core = np.array([np.log(2.0 * np.pi * servo.frequency), servo.damping, servo.delay])
-        model = np.column_stack([constant, data.simulate(form, core, (servo.slew, 1.0), 1.0, 1)[rows]])
+        model = np.column_stack([constant, data.simulate(form, core, (servo.slew, 1.0), 1.0, 1, stride)])
         offset, gain = np.linalg.lstsq(model, y, rcond=None)[0]
         return np.asarray(y - model @ [offset, gain]), float(gain), float(offset)
 
