@@ -10,6 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
+from math import isfinite
 from pathlib import Path
 from queue import Full, Queue
 from typing import BinaryIO, NamedTuple
@@ -124,6 +125,8 @@ class LinkCapture:
         _, version, self.host_s, self.unix_s = HEADER.unpack(header)
         if version != VERSION:
             raise InputError(f"{path}: version", version, f"{VERSION}, the one this release reads")
+        if not (isfinite(self.host_s) and isfinite(self.unix_s)):
+            raise InputError(f"{path}: start", (self.host_s, self.unix_s), "finite times")
 
     def _open(self) -> BinaryIO:
         try:
@@ -147,7 +150,7 @@ def _read_entry(file: BinaryIO) -> CaptureEntry | None:
     if len(header) < ENTRY.size:
         return None
     kind, host_s, length = ENTRY.unpack(header)
-    if kind >= len(KINDS) or length > DATA_MAX:
+    if kind >= len(KINDS) or length > DATA_MAX or not isfinite(host_s):
         return None
     data, crc_bytes = file.read(length), file.read(CRC.size)
     if len(crc_bytes) < CRC.size or CRC.unpack(crc_bytes)[0] != crc32(header + data):

@@ -1,3 +1,4 @@
+import math
 import os
 import stat
 import subprocess
@@ -86,6 +87,17 @@ def test_a_capture_truncated_or_damaged_anywhere_yields_the_complete_entries_bef
         damaged[cut] ^= 1 << data.draw(st.integers(0, 7))
         path.write_bytes(damaged)
         assert list(LinkCapture(path).read_entries()) == entries[:kept]
+
+
+def test_times_that_are_no_numbers_are_damage(tmp_path):
+    """A dump in JSON had NaN, which is no JSON."""
+    entries = [CaptureEntry(OPENED, 1.0), CaptureEntry(TO_BOARD, math.nan, b"x"), CaptureEntry(CLOSED, 2.0)]
+    assert list(write_capture(tmp_path / "capture", entries).read_entries()) == entries[:1]
+    for number, start in enumerate([(math.inf, 0.0), (0.0, math.nan)]):
+        path = tmp_path / f"start{number}"
+        path.write_bytes(HEADER.pack(MAGIC, VERSION, *start))
+        with pytest.raises(InputError, match=r"start: got .*expected finite times"):
+            LinkCapture(path)
 
 
 def test_no_file_is_overwritten_and_other_files_are_rejected_by_name(tmp_path):
