@@ -88,7 +88,7 @@ def commands(random, size_rad, count=16):
 
 
 def recording(servos, random, rate_hz=5e4, noise=0.003, sizes_rad=SIZES_RAD, count=16):
-    """Build a recording with one run of so many steps per step size.
+    """Build a recording with one run of `count` steps per step size.
 
     noise: relative to the step
     servos: of x and y

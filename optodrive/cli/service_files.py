@@ -128,7 +128,7 @@ def _render_rules(config: Config) -> str:
 
 
 class Installation:
-    """The installed files below a root, and the digests of their installed content."""
+    """The installed files below a root, and the digests of their installed content and, after it, of the one before."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -152,7 +152,8 @@ class Installation:
         target = self.resolve(path)
         if not target.exists() and not target.is_symlink():
             return "missing"
-        return "as installed" if _compute_digest(_read_text(target)) == self._digests.get(str(path)) else "edited"
+        known = self._digests.get(str(path), "").split()
+        return "as installed" if _compute_digest(_read_text(target)) in known else "edited"
 
     def installed_files(self) -> Iterator[Path]:
         """Yield the paths of the installed files."""
@@ -176,20 +177,20 @@ class Installation:
                 f"{', '.join(obstacles)}: edited, or not written by `optodrive service install`; nothing was "
                 "written. Move it away, and put changes to the unit into a drop-in (systemctl edit optodrive)"
             )
-        return [(file.path, self._install_file(file, file in edited)) for file in files]
+        written = [file for file in files if not (file in edited and file.preserve_edits)]
+        for file in written:
+            before = self._digests.get(str(file.path), "").split()[:1]
+            self._digests[str(file.path)] = " ".join(dict.fromkeys([_compute_digest(file.text), *before]))
+        self._save_digests()  # first: wherever the installation ends, the next one knows old and new files as its own
+        return [(file.path, self._install_file(file) if file in written else "edited, kept") for file in files]
 
-    def _install_file(self, file: ServiceFile, edited: bool) -> str:
-        if edited and file.preserve_edits:
-            return "edited, kept"
-        self._digests[str(file.path)] = _compute_digest(file.text)
+    def _install_file(self, file: ServiceFile) -> str:
         if self._is_current(file):
-            action = "unchanged"
-        else:
-            target = self.resolve(file.path)
-            action = "replaced" if target.exists() else "written"
-            _make_folder(target.parent)
-            write_text(target, file.text)
-        self._save_digests()  # for each: an installation that fails at the next file knows this one as its own
+            return "unchanged"
+        target = self.resolve(file.path)
+        action = "replaced" if target.exists() else "written"
+        _make_folder(target.parent)
+        write_text(target, file.text)
         return action
 
     def remove(self) -> list[tuple[Path, str]]:

@@ -1,9 +1,11 @@
 """`optodrive service install | remove | show` below a temporary root."""
 
+import contextlib
 import fcntl
 import json
 import os
 import re
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +19,7 @@ from optodrive.cli.service_files import (
     Installation,
     ServiceFile,
 )
+from optodrive.core.errors import RefusedError
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.pixel_map import PixelMap, write_pixel_map
 from optodrive.planning.display_model import DisplayModel
@@ -267,13 +270,38 @@ def test_a_root_that_may_not_be_written_is_one_line(install, tmp_path):
 
 
 def test_an_installation_that_failed_goes_on_with_another_program(install, at):
-    """Each file is remembered as it is written; the unit was taken for somebody else's."""
+    """The files are remembered before they are written; the unit was taken for somebody else's."""
     at(USERS_PATH).parent.parent.mkdir(parents=True)
     at(USERS_PATH).parent.write_text("a file in place of the folder")
     install(status=2)
     assert at(UNIT_PATH).exists()
     at(USERS_PATH).parent.unlink()
     assert f"{UNIT_PATH}: replaced" in install("--program", "/opt/other/optodrive").out
+
+
+@pytest.mark.parametrize("writes", range(4))
+def test_an_upgrade_that_was_killed_anywhere_is_made_again_by_any_version(tmp_path, monkeypatch, writes):
+    def upgrade(version):
+        return Installation(tmp_path).install(
+            [ServiceFile(UNIT_PATH, f"unit {version}\n"), ServiceFile(USERS_PATH, f"users {version}\n")]
+        )
+
+    left, replace = [None] * writes, Path.replace
+
+    def replace_or_die(*arguments):
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        return replace(*arguments)
+
+    upgrade(1)
+    with monkeypatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
+        patch.setattr(Path, "replace", replace_or_die)
+        upgrade(2)
+    assert {action for _, action in upgrade(3)} == {"replaced"}
+    (tmp_path / UNIT_PATH.relative_to("/")).write_text("unit 1\n# mine\n")
+    with pytest.raises(RefusedError, match="edited"):
+        upgrade(4)
 
 
 def test_a_list_of_files_that_nests_too_deep_is_refused(install, at):
