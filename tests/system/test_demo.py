@@ -1,6 +1,7 @@
 """The demonstration of the README: a caller that comes before the announcement may arm at its first answer."""
 
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -32,6 +33,9 @@ def test_every_planned_pulse_is_executed(tmp_path):
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "pulses planned 624, sent 624, executed 624" in ended.stdout
     assert "left out" not in ended.stdout
+    [of_the_highest_target_um] = re.findall(r"([\d.]+) +│$", ended.stdout, re.M)
+    [largest_um] = re.findall(r"largest membrane displacement ([\d.]+) µm, in showcase", ended.stdout)
+    assert float(largest_um) > float(of_the_highest_target_um)  # by a train that states a power
 
 
 def test_a_small_display_shows_the_patterns_that_it_has_the_space_for(tmp_path):
