@@ -26,7 +26,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from optodrive.core.kernels import compile_here
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.forms import evaluate_form
-from optodrive.lab.discovery.linearisation import correct, predict_covariance
+from optodrive.lab.discovery.linearisation import copy, correct, predict_covariance
 
 PLACE, FORM, VARIABLE, FACTOR = range(4)
 """Columns of a table of terms: place (states' equations, then outputs), form, variable, and a variable that multiplies
@@ -213,7 +213,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         t, u, _, y = samples
         work, held, _, _ = workspace
         x, offset = work[5], work[6]
-        x[:] = x0
+        copy(x0, x)
         offset[:] = 0.0
         for k in range(len(t)):
             if k > 0:
@@ -227,7 +227,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                 if isfinite(y[k, j]):
                     for s in range(n):
                         x[s] += gains[k, s, j] * (y[k, j] - predicted[k, j])
-            states[k] = x
+            copy(x, states[k])
 
     @compile_
     def linearise(
@@ -250,7 +250,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         t, u, _, y = samples
         work, held, y1, half = workspace
         x, offset, before, moved = work[5], work[6], work[7], work[8]
-        x[:] = x0
+        copy(x0, x)
         offset[:] = 0.0
         covariance = half[0]
         covariance[:] = 0.0
@@ -258,11 +258,11 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
             covariance[s, s] = start_variance[s]
         for k in range(len(t)):
             if k > 0:
-                before[:] = x
+                copy(x, before)
                 # Unperturbed, then each state, each rate and each number moved a little.
                 for case in range(1 + 2 * n + len(deltas)):
                     q, j, size = 0, (case - 1) % n, 1.0
-                    moved[:] = before
+                    copy(before, moved)
                     if 1 <= case <= n:
                         size = STEP * scales[j]
                         moved[j] += size
@@ -290,7 +290,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                 return
             for case in range(1 + n + len(deltas)):
                 q, size = max(case - n, 0), 1.0
-                moved[:] = x
+                copy(x, moved)
                 if 1 <= case <= n:
                     size = STEP * scales[case - 1]
                     moved[case - 1] += size
@@ -305,6 +305,6 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                     else:
                         direct[k, j, q - 1] = (y1[j] - predicted[k, j]) / size
             correct(x, covariance, observation[k], noise, y[k], predicted[k], variance[k], gains[k])
-            states[k] = x
+            copy(x, states[k])
 
     return Kernels(run, linearise, is_compiled)

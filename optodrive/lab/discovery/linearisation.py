@@ -48,6 +48,13 @@ class Linearisation(NamedTuple):
 
 
 @kernel
+def copy(values: FloatArray, out: FloatArray) -> None:
+    """Copy one vector to another: to compile a slice assignment takes seconds, most of them for its error message."""
+    for j in range(len(out)):
+        out[j] = values[j]
+
+
+@kernel
 def correct(
     x: FloatArray,
     covariance: FloatArray,
@@ -129,7 +136,8 @@ def _propagate(
                     for j in range(n):
                         total += transition[k, s, j] * delta[j, q]
                     moved[s, q] = total
-            delta[:] = moved
+            for s in range(n):
+                copy(moved[s], delta[s])
         for j in range(o):
             for q in range(count):
                 total = direct[k, j, q]
