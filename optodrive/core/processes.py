@@ -9,14 +9,3 @@ def is_suspended(pid: int | None) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
     except (OSError, IndexError):
         return False
-
-
-def list_children() -> set[int]:
-    """Return the process ids of this process's children, whichever thread started them."""
-    found: set[int] = set()
-    for task in Path("/proc/self/task").iterdir():
-        try:
-            found.update(map(int, (task / "children").read_text().split()))
-        except OSError:  # the thread has just ended
-            continue
-    return found

@@ -50,11 +50,21 @@ def start(recording, tmp_path):
         process.stderr.close()
 
 
-def find_workers(pid):
-    """Return the process ids of the workers that a process has started, by any of its threads."""
+def list_children(pid):
+    """Return the process ids of the children that a process has started, by any of its threads."""
     threads = os.listdir(f"/proc/{pid}/task") if is_alive(pid) else []  # noqa: PTH208
-    children = [child for thread in threads for child in read_proc(pid, f"task/{thread}/children").split()]
-    return [int(child) for child in children if "spawn_main" in read_proc(child, "cmdline")]
+    return [int(child) for thread in threads for child in read_proc(pid, f"task/{thread}/children").split()]
+
+
+def find_clusters(pid):
+    """Return the process id of the local cluster of a diagnosis, once it runs."""
+    return [child for child in list_children(pid) if "local_cluster" in read_proc(child, "cmdline")]
+
+
+def find_workers(pid):
+    """Return the process ids of the workers that a process or its local cluster has started."""
+    children = [child for each in (pid, *find_clusters(pid)) for child in list_children(each)]
+    return [child for child in children if "spawn_main" in read_proc(child, "cmdline")]
 
 
 def has_reached(stage, process):
@@ -79,16 +89,24 @@ def test_an_interrupted_diagnosis_ends_with_its_processes(start, tmp_path, numbe
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_worker_that_is_lost_at_the_start_ends_the_diagnosis(start, tmp_path, number):
+def test_the_others_do_the_work_of_a_worker_that_is_lost_at_the_start(start, tmp_path, number):
     process = start("--workers", "2")
-    with signalling() as send:
-        wait_for(lambda: has_reached("starting", process), "the workers")
-        workers = find_workers(process.pid)
-        send(number, workers[:1])
-        errors = wait_for_end(process)
-    assert "did not start" in assert_one_line(errors)
-    assert process.returncode == 1
+    wait_for(lambda: has_reached("starting", process), "the workers")
+    workers = find_workers(process.pid)
+    os.kill(workers[0], number)
+    wait_for_end(process)
+    assert process.returncode == 0
     wait_for(lambda: not any(map(is_alive, workers)), "the end of the workers")
+    assert (tmp_path / "out" / "report.html").exists()
+
+
+@pytest.mark.slow
+def test_a_cluster_that_is_lost_at_the_start_ends_the_diagnosis(start, tmp_path):
+    process = start("--workers", "2")
+    wait_for(lambda: find_clusters(process.pid), "the cluster")
+    os.kill(find_clusters(process.pid)[0], signal.SIGKILL)
+    assert "did not start" in assert_one_line(wait_for_end(process))
+    assert process.returncode == 1
     assert not (tmp_path / "out").exists()
 
 

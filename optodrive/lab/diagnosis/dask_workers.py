@@ -1,18 +1,21 @@
 """Execution of many tasks on Dask, in local processes or on a cluster, with recovery from lost workers."""
 
 import logging
+import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from multiprocessing import resource_tracker
+from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Timer
 from typing import Any, TypeVar
 from uuid import uuid4
 
 from optodrive.core.errors import MISSING, InputError, OptodriveError
-from optodrive.lab.diagnosis.local_workers import LocalWorkers
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -23,21 +26,10 @@ CHECK_PERIOD_S, CHECK_TIMEOUT_S, IMPORT_TIMEOUT_S = 0.5, 2.5, 30.0
 """Interval of the questions whether a scheduler is alive, and time for its answer: the first one comes after it has
 imported what the tasks need."""
 POLL_S = 0.02
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLOSE_TIMEOUT_S = 0.5
-WORKER_TIMEOUT_S = 30.0
-"""Time within which a scheduler must have a worker."""
-DASK_SETTINGS = {
-    # A task whose worker was lost returns at once and runs again alone, which shows whether it is at fault.
-    "distributed.scheduler.allowed-failures": 0,
-    "distributed.scheduler.worker-saturation": 1.0,
-    # Results are small: spilling frees no memory, and a paused worker would never resume.
-    "distributed.worker.memory.target": False,
-    "distributed.worker.memory.spill": False,
-    "distributed.worker.memory.pause": False,
-    "distributed.worker.memory.terminate": 0.95,
-    "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
-    "distributed.admin.system-monitor.gil.enabled": False,
-}
+WORKER_TIMEOUT_S, LOCAL_TIMEOUT_S = 30.0, 120.0
+"""Times within which a scheduler must have a worker, and a local one after its start."""
 
 
 @contextmanager
@@ -46,9 +38,9 @@ def open_client(
 ) -> Iterator[Any]:
     """Yield a Dask client of the scheduler at an address, or of local processes, by default one per core.
 
-    max_workers: upper limit of useful processes. Local processes listen on loopback only; an exception, also Ctrl-C,
-    kills them. Raises InputError if the address is invalid or no scheduler answers there, OptodriveError if the local
-    processes do not start.
+    max_workers: upper limit of useful processes. Local processes listen on loopback only, and are killed at the end.
+    Raises InputError if the address is invalid or no scheduler answers there, OptodriveError if no local process
+    starts.
     """
     try:
         import dask
@@ -62,48 +54,46 @@ def open_client(
         if address is not None:
             yield _connect(distributed, address, stack)
             return
-        stack.enter_context(dask.config.set(DASK_SETTINGS))
         count = workers or dask.system.CPU_COUNT
-        scratch = stack.enter_context(TemporaryDirectory(prefix="optodrive-"))
-        with _block_sigint():
-            local = stack.enter_context(LocalWorkers())
+        address = stack.enter_context(_start_local_cluster(min(count, max_workers or count)))
         try:
-            cluster = distributed.LocalCluster(
-                loop=local.loop,
-                n_workers=min(count, max_workers or count),
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=None,
-                worker_dashboard_address=None,
-                local_directory=scratch,
-                silence_logs=logging.CRITICAL,
-            )
-        except RuntimeError as error:
-            raise OptodriveError(f"the worker processes of Dask did not start: {_format_error(error)}") from None
-        local.has_started = True
-        client = distributed.Client(cluster, set_as_default=False)
-        try:
-            yield client
-        except BaseException:
-            client.status = "closed"  # closing it would need the loop, which now ends
-            raise
-        client.close()
-        cluster.close()
+            client = _connect(distributed, address, stack, LOCAL_TIMEOUT_S)
+        except InputError:
+            raise OptodriveError("the worker processes of Dask did not start") from None
+        yield client
 
 
 @contextmanager
-def _block_sigint() -> Iterator[None]:
-    """Block SIGINT in threads started within the block and in their processes. This process ends them."""
-    resource_tracker.ensure_running()  # a later start would unblock SIGINT in the calling thread
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _start_local_cluster(workers: int) -> Iterator[str]:
+    """Yield the address of a cluster of local processes, which are killed at the end of the block."""
+    with TemporaryDirectory(prefix="optodrive-") as folder, (Path(folder) / "errors").open("w+") as errors:
+        cluster = subprocess.Popen(
+            [sys.executable, "-P", "-m", "optodrive.lab.diagnosis.local_cluster", str(workers), folder],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,  # Ctrl-C ends this process, which kills the group
+        )
+        watch = Timer(LOCAL_TIMEOUT_S, cluster.kill)  # one that is suspended would say nothing
+        watch.start()
+        try:
+            address = cluster.stdout.readline().strip() if cluster.stdout is not None else ""
+            watch.cancel()
+            if not address:
+                errors.seek(0)
+                reason = errors.read().strip().rpartition("\n")[2] or "their scheduler has ended"
+                raise OptodriveError(f"the worker processes of Dask did not start: {reason}")
+            yield address
+        finally:
+            watch.cancel()
+            with suppress(ProcessLookupError):
+                os.killpg(cluster.pid, signal.SIGKILL)
+            cluster.communicate()
 
 
-def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
+def _connect(distributed: Any, address: str, stack: ExitStack, worker_timeout_s: float = WORKER_TIMEOUT_S) -> Any:
     """Connect to a scheduler. The stack disconnects."""
     expected = "a Dask scheduler's address, as tcp://host:8786"
     if not re.fullmatch(r"(tcp|tls)://([^\s/:\[\]]+|\[[0-9a-fA-F:]+\]):[0-9]{1,5}", address):
@@ -111,15 +101,19 @@ def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
     secured = distributed.Security().get_connection_args("client").get("ssl_context") is not None
     if address.startswith("tls:") and not secured:
         raise InputError("--dask", address, "certificates in Dask's configuration: distributed.comm.tls")
+    # A client of which an interrupt leaves a part waits seconds for its own end, and says so.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     try:
         client = distributed.Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
+        stack.callback(client.close, timeout=CLOSE_TIMEOUT_S)
     except (OSError, ValueError, OverflowError):
         raise InputError("--dask", address, f"{expected}, that answers within {SCHEDULER_TIMEOUT_S:g} s") from None
-    stack.callback(client.close, timeout=CLOSE_TIMEOUT_S)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
-        client.wait_for_workers(1, timeout=WORKER_TIMEOUT_S)
+        client.wait_for_workers(1, timeout=worker_timeout_s)
     except TimeoutError:
-        raise InputError("--dask", address, f"a scheduler with a worker within {WORKER_TIMEOUT_S:g} s") from None
+        raise InputError("--dask", address, f"a scheduler with a worker within {worker_timeout_s:g} s") from None
     return client
 
 
@@ -175,8 +169,6 @@ def _iterate_completed(client: Any, futures: Iterable[Any]) -> Iterator[Any]:
 
 
 def _check_scheduler(client: Any, timeout_s: float) -> None:
-    if client.cluster is not None:  # the scheduler is in this process
-        return
     with suppress(OSError):  # a closed connection, of which the futures tell
         try:
             client.sync(client.scheduler.identity, callback_timeout=timeout_s)
