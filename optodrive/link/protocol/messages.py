@@ -5,7 +5,9 @@ generators; a test compares the two.
 """
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 from optodrive.core.errors import RemoteProtocolError
@@ -46,11 +48,16 @@ RECORD = struct.Struct("<IHH")
 RECORDS_MAX = 28
 
 
+BOARD_TYPE = 0x80
+"""Smallest type of a message of the board."""
+MESSAGES_BY_TYPE: "dict[int, type[Message]]" = {}
+
+
 class Message:
-    """Base class of all messages.
+    """Base class of all messages. A subclass states its class variables where it is defined, and its fields.
 
     NAME: message name in PROTOCOL.md
-    TYPE: type byte in the frame header
+    TYPE: type byte in the frame header, from BOARD_TYPE on for those of the board
     LAYOUT: struct of the fixed-size part of the body
     SEQUENCED: whether the message passes through the go-back-N window
     ENUMS: names for each field that holds an index; a body whose index has no name is rejected
@@ -59,8 +66,20 @@ class Message:
     NAME: ClassVar[str]
     TYPE: ClassVar[int]
     LAYOUT: ClassVar[struct.Struct]
-    SEQUENCED: ClassVar[bool] = False
-    ENUMS: ClassVar[dict[str, tuple[str, ...]]] = {}
+    SEQUENCED: ClassVar[bool]
+    ENUMS: ClassVar[Mapping[str, tuple[str, ...]]]
+
+    def __init_subclass__(
+        cls,
+        name: str,
+        type_id: int,
+        layout: str,
+        sequenced: bool = False,
+        enums: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
+    ) -> None:
+        cls.NAME, cls.TYPE, cls.LAYOUT = name, type_id, struct.Struct(layout)
+        cls.SEQUENCED, cls.ENUMS = sequenced, enums
+        MESSAGES_BY_TYPE[type_id] = cls
 
     def encode_body(self) -> bytes:
         """Return the body as bytes."""
@@ -75,22 +94,18 @@ class Message:
 
 
 @dataclass(frozen=True)
-class Hello(Message):
+class Hello(Message, name="HELLO", type_id=0x01, layout="<BBI"):
     """Begin a new session. The board aborts the current one."""
 
-    NAME = "HELLO"
-    TYPE, LAYOUT = 0x01, struct.Struct("<BBI")
     major: int
     minor: int
     host_nonce: int
 
 
 @dataclass(frozen=True)
-class Limits(Message):
+class Limits(Message, name="LIMITS", type_id=0x02, layout="<HHHIIIHHHHHHHH", sequenced=True):
     """Safety limits: the board's own in HELLO_REPLY, or the tighter ones that a host requests."""
 
-    NAME = "LIMITS"
-    TYPE, LAYOUT, SEQUENCED = 0x02, struct.Struct("<HHHIIIHHHHHHHH"), True
     max_on_us: int
     max_duty: int
     mean_duty: int
@@ -108,12 +123,9 @@ class Limits(Message):
 
 
 @dataclass(frozen=True)
-class HelloReply(Message):
+class HelloReply(Message, name="HELLO_REPLY", type_id=0x81, layout="<BBIHI12sIIHHHHHB"):
     """Identity, capabilities and limits of the board, in answer to HELLO."""
 
-    NAME = "HELLO_REPLY"
-    TYPE = 0x81
-    LAYOUT = struct.Struct("<BBIHI12sIIHHHHHB")
     major: int
     minor: int
     host_nonce: int
@@ -146,40 +158,31 @@ class HelloReply(Message):
 
 
 @dataclass(frozen=True)
-class ClockRequest(Message):
+class ClockRequest(Message, name="CLOCK", type_id=0x03, layout="<I"):
     """Request the board's clock."""
 
-    NAME = "CLOCK"
-    TYPE, LAYOUT = 0x03, struct.Struct("<I")
     host_t: int
 
 
 @dataclass(frozen=True)
-class ClockReply(Message):
+class ClockReply(Message, name="CLOCK_REPLY", type_id=0x83, layout="<IQ"):
     """Board tick at which the board received CLOCK."""
 
-    NAME = "CLOCK_REPLY"
-    TYPE, LAYOUT = 0x83, struct.Struct("<IQ")
     host_t: int
     tick: int
 
 
 @dataclass(frozen=True)
-class Lease(Message):
+class Lease(Message, name="LEASE", type_id=0x04, layout="<H"):
     """Permit the board to emit for another `ms` milliseconds."""
 
-    NAME = "LEASE"
-    TYPE, LAYOUT = 0x04, struct.Struct("<H")
     ms: int
 
 
 @dataclass(frozen=True)
-class Data(Message):
+class Data(Message, name="DATA", type_id=0x10, layout="<I", sequenced=True):
     """Append points to the board's queue."""
 
-    NAME = "DATA"
-    TYPE, SEQUENCED = 0x10, True
-    LAYOUT = struct.Struct("<I")
     first_index: int
     points: bytes
 
@@ -198,15 +201,13 @@ class Data(Message):
 
 
 @dataclass(frozen=True)
-class Start(Message):
+class Start(Message, name="START", type_id=0x11, layout="<IIQH", sequenced=True):
     """Start a job at start_tick, or immediately if that tick has passed.
 
     first_index: index of the job's first point
     watermark: number of points that the board must have queued before it starts
     """
 
-    NAME = "START"
-    TYPE, LAYOUT, SEQUENCED = 0x11, struct.Struct("<IIQH"), True
     job: int
     first_index: int
     start_tick: int
@@ -214,99 +215,72 @@ class Start(Message):
 
 
 @dataclass(frozen=True)
-class End(Message):
+class End(Message, name="END", type_id=0x12, layout="<II", sequenced=True):
     """End a job: its last point is the one before end_index."""
 
-    NAME = "END"
-    TYPE, LAYOUT, SEQUENCED = 0x12, struct.Struct("<II"), True
     job: int
     end_index: int
 
 
 @dataclass(frozen=True)
-class Abort(Message):
+class Abort(Message, name="ABORT", type_id=0x13, layout="<"):
     """Turn the gate off, drop the queue and go to DISARMED. The board accepts it in any session."""
 
-    NAME = "ABORT"
-    TYPE, LAYOUT = 0x13, struct.Struct("<")
-
 
 @dataclass(frozen=True)
-class ArmReq(Message):
+class ArmReq(Message, name="ARM_REQ", type_id=0x14, layout="<I", sequenced=True):
     """Request arming. The board answers with ARM_CHALLENGE."""
 
-    NAME = "ARM_REQ"
-    TYPE, LAYOUT, SEQUENCED = 0x14, struct.Struct("<I"), True
     host_nonce: int
 
 
 @dataclass(frozen=True)
-class ArmChallenge(Message):
+class ArmChallenge(Message, name="ARM_CHALLENGE", type_id=0x94, layout="<II"):
     """Nonce that the host must return once, in ARM_CONFIRM."""
 
-    NAME = "ARM_CHALLENGE"
-    TYPE, LAYOUT = 0x94, struct.Struct("<II")
     host_nonce: int
     board_nonce: int
 
 
 @dataclass(frozen=True)
-class ArmConfirm(Message):
+class ArmConfirm(Message, name="ARM_CONFIRM", type_id=0x15, layout="<II", sequenced=True):
     """Confirm arming with both nonces of the challenge."""
 
-    NAME = "ARM_CONFIRM"
-    TYPE, LAYOUT, SEQUENCED = 0x15, struct.Struct("<II"), True
     host_nonce: int
     board_nonce: int
 
 
 @dataclass(frozen=True)
-class Disarm(Message):
+class Disarm(Message, name="DISARM", type_id=0x16, layout="<", sequenced=True):
     """Turn the gate off, drop the queue and go to DISARMED."""
 
-    NAME = "DISARM"
-    TYPE, LAYOUT, SEQUENCED = 0x16, struct.Struct("<"), True
-
 
 @dataclass(frozen=True)
-class ClearFault(Message):
+class ClearFault(Message, name="CLEAR_FAULT", type_id=0x17, layout="<", sequenced=True):
     """Acknowledge a fault whose cause is gone. The board goes to DISARMED."""
 
-    NAME = "CLEAR_FAULT"
-    TYPE, LAYOUT, SEQUENCED = 0x17, struct.Struct("<"), True
-
 
 @dataclass(frozen=True)
-class Get(Message):
+class Get(Message, name="GET", type_id=0x18, layout="<"):
     """Request STATUS."""
 
-    NAME = "GET"
-    TYPE, LAYOUT = 0x18, struct.Struct("<")
-
 
 @dataclass(frozen=True)
-class Flush(Message):
+class Flush(Message, name="FLUSH", type_id=0x19, layout="<", sequenced=True):
     """Turn the gate off, drop the queue and go to ARMED."""
 
-    NAME = "FLUSH"
-    TYPE, LAYOUT, SEQUENCED = 0x19, struct.Struct("<"), True
-
 
 @dataclass(frozen=True)
-class GetExecuted(Message):
+class GetExecuted(Message, name="GET_EXECUTED", type_id=0x1A, layout="<I"):
     """Request the executed records from first_index again."""
 
-    NAME = "GET_EXECUTED"
-    TYPE, LAYOUT = 0x1A, struct.Struct("<I")
     first_index: int
 
 
 @dataclass(frozen=True)
-class Ack(Message):
+class Ack(Message, name="ACK", type_id=0x90, layout="<BHIB", enums={"state": STATES}):
     """Acknowledge every sequenced frame before next_seq."""
 
-    NAME = "ACK"
-    TYPE, LAYOUT, ENUMS = 0x90, struct.Struct("<BHIB"), {"state": STATES}
     next_seq: int
     free_points: int
     done_index: int
@@ -314,22 +288,23 @@ class Ack(Message):
 
 
 @dataclass(frozen=True)
-class Nak(Message):
+class Nak(Message, name="NAK", type_id=0x91, layout="<BB", enums={"reason": NAK_REASONS}):
     """Refuse a sequenced frame. next_seq acknowledges as in ACK."""
 
-    NAME = "NAK"
-    TYPE, LAYOUT, ENUMS = 0x91, struct.Struct("<BB"), {"reason": NAK_REASONS}
     next_seq: int
     reason: int
 
 
 @dataclass(frozen=True)
-class Event(Message):
+class Event(
+    Message,
+    name="EVENT",
+    type_id=0x92,
+    layout="<BBBQ",
+    enums={"state": STATES, "fault": FAULTS, "reason": EVENT_REASONS},
+):
     """Report a change of state."""
 
-    NAME = "EVENT"
-    TYPE, LAYOUT = 0x92, struct.Struct("<BBBQ")
-    ENUMS: ClassVar = {"state": STATES, "fault": FAULTS, "reason": EVENT_REASONS}
     state: int
     fault: int
     reason: int
@@ -337,12 +312,9 @@ class Event(Message):
 
 
 @dataclass(frozen=True)
-class Status(Message):
+class Status(Message, name="STATUS", type_id=0x98, layout="<BBBQIHHHHHQh", enums={"state": STATES, "fault": FAULTS}):
     """Report state, inputs and counters of the board."""
 
-    NAME = "STATUS"
-    TYPE, LAYOUT = 0x98, struct.Struct("<BBBQIHHHHHQh")
-    ENUMS: ClassVar = {"state": STATES, "fault": FAULTS}
     state: int
     fault: int
     inputs: int
@@ -358,15 +330,12 @@ class Status(Message):
 
 
 @dataclass(frozen=True)
-class Executed(Message):
+class Executed(Message, name="EXECUTED", type_id=0x99, layout="<IQ"):
     """Report executed points from first_index on.
 
     records: (tick of gate on, gate-on time in ticks, duty) per point
     """
 
-    NAME = "EXECUTED"
-    TYPE = 0x99
-    LAYOUT = struct.Struct("<IQ")
     first_index: int
     records: tuple[tuple[int, int, int], ...]
 
@@ -391,34 +360,8 @@ class Executed(Message):
         return cls(first_index, records)
 
 
-HOST_MESSAGES: tuple[type[Message], ...] = (
-    Hello,
-    Limits,
-    ClockRequest,
-    Lease,
-    Data,
-    Start,
-    End,
-    Abort,
-    ArmReq,
-    ArmConfirm,
-    Disarm,
-    ClearFault,
-    Get,
-    Flush,
-    GetExecuted,
-)
-BOARD_MESSAGES: tuple[type[Message], ...] = (
-    HelloReply,
-    ClockReply,
-    ArmChallenge,
-    Ack,
-    Nak,
-    Event,
-    Status,
-    Executed,
-)
-MESSAGES_BY_TYPE: dict[int, type[Message]] = {kind.TYPE: kind for kind in HOST_MESSAGES + BOARD_MESSAGES}
+HOST_MESSAGES = tuple(kind for kind in MESSAGES_BY_TYPE.values() if kind.TYPE < BOARD_TYPE)
+BOARD_MESSAGES = tuple(kind for kind in MESSAGES_BY_TYPE.values() if kind.TYPE >= BOARD_TYPE)
 
 
 def parse_message(type_id: int, body: bytes) -> Message:
