@@ -72,12 +72,7 @@ class ExclusiveBoard(ArmedBoard):
         on_reported: called with the job when further pulses are reported; it must not block. Raises OverBudgetError if
         the plan never fits, and BoardFaultError if the board kept the gate on for another time than planned.
         """
-        self._require_ready()
-        limited, before, after, start_s = self._limit_when_feasible(plan)
-        points = quantise(limited, self.session.scale)
-        self._verify_encoded(points, limited, before, len(limited))
-        self._state, self._timeline_zero_s = after, start_s
-        self._timeline_zero_s += self._stream(points, limited, start_s, gate_on=True, on_reported=on_reported)
+        self._emit(plan, self.display.budget, gate_on=True, on_reported=on_reported)
 
     def play_gate_off(self, plan: PulsePlan, points: WirePoints) -> IntArray:
         """Play points that never turn the gate on, and return the board tick at the end of each point, [n].
@@ -87,13 +82,11 @@ class ExclusiveBoard(ArmedBoard):
         OverBudgetError if the moves never fit the galvo cap.
         """
         self._require_ready()
-        limited, before, after, start_s = self._limit_when_feasible(plan)
-        self._verify_encoded(points, limited, before, 0)
-        self._state, self._timeline_zero_s = after, start_s
+        *_, start_s = self._account(plan, self.display.budget, 0, points)
         job = self._run_job(points, start_s)
         end_tick: IntArray = job.read_reported(0, len(points)).on_tick
         planned_end = job.start_tick + points.compute_end_ticks()
-        self._timeline_zero_s += max(0.0, float(end_tick[-1] - planned_end[-1]) * self.session.scale.tick_s)
+        self._timeline_zero_s = start_s + max(0.0, float(end_tick[-1] - planned_end[-1]) * self.session.scale.tick_s)
         return end_tick
 
     @property
@@ -119,15 +112,8 @@ class ExclusiveBoard(ArmedBoard):
 
     def _execute_point(self, x_code: int, y_code: int, power_w: float, gate_on: bool) -> None:
         self.check_range(x_code, y_code)
-        self._require_ready()
-        scale = self.session.scale
-        x_rad, y_rad = scale.to_angles_rad(np.array([x_code, y_code]))
-        plan = self._plan(x_rad, y_rad, power_w)
-        limited, before, after, start_s = self._limit_when_feasible(plan, self._point_budget)
-        points = quantise(limited, scale)
-        self._verify_encoded(points, limited, before, int(gate_on), self._point_budget)
-        self._state, self._timeline_zero_s = after, start_s
-        self._timeline_zero_s += self._stream(points, limited, start_s, gate_on)
+        x_rad, y_rad = self.session.scale.to_angles_rad(np.array([x_code, y_code]))
+        self._emit(self._plan(x_rad, y_rad, power_w), self._point_budget, gate_on)
 
     def check_range(self, x_code: int, y_code: int) -> None:
         """Raise InputError for codes beyond the display and its margin."""
@@ -159,50 +145,57 @@ class ExclusiveBoard(ArmedBoard):
         limits = self.requirements.limits
         return np.clip(codes, [limits.x_min, limits.y_min], [limits.x_max, limits.y_max])
 
-    def _limit_when_feasible(
-        self, plan: PulsePlan, budget: Budget | None = None
-    ) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
-        """Wait until the limiter passes the plan. Return it with the state before and after, and its start, s."""
+    def _account(
+        self, plan: PulsePlan, budget: Budget, pulses: int, points: WirePoints | None = None
+    ) -> tuple[LimitedPlan, WirePoints, float]:
+        """Wait until the limiter passes a plan, verify its encoded points, and account for it.
+
+        pulses: number of points with the gate on; points: the plan on the wire, unless its own. Returns plan and points
+        as they may be sent, and the start, s.
+        """
         while True:
             start_s = self.session.board_s() + START_LEAD_S
-            before = shift_state(
-                self._state, (start_s if self._timeline_zero_s is None else self._timeline_zero_s) - start_s
-            )
+            zero_s = start_s if self._timeline_zero_s is None else self._timeline_zero_s
+            before = shift_state(self._state, zero_s - start_s)
             try:
-                limited, after = limit(plan, before, budget or self.display.budget, "refuse")
+                limited, after = limit(plan, before, budget, "refuse")
+                break
             except OverBudgetError as error:
                 if error.fits_after_s == inf:
                     raise
                 self.wait(error.fits_after_s)
-                continue
-            return limited, before, after, start_s
+        points = quantise(limited, self.session.scale) if points is None else points
+        self._verify_encoded(points, limited, before, pulses, budget)
+        self._state, self._timeline_zero_s = after, start_s
+        return limited, points, start_s
 
     def _verify_encoded(
-        self, points: WirePoints, plan: LimitedPlan, before: BudgetState, pulses: int, budget: Budget | None = None
+        self, points: WirePoints, plan: LimitedPlan, before: BudgetState, pulses: int, budget: Budget
     ) -> None:
         """Decode the encoded points and verify them against the budget."""
         decoded = decode(points.encode_payload(), self.session.scale)
         if len(decoded.index) != pulses:
             raise LocalProtocolError(f"{len(decoded.index)} points with the gate on, expected {pulses}")
-        verify(plan, points.row[decoded.index], decoded, before, budget or self.display.budget)
+        verify(plan, points.row[decoded.index], decoded, before, budget)
 
-    def _stream(
+    def _emit(
         self,
-        points: WirePoints,
-        plan: LimitedPlan,
-        start_s: float,
+        plan: PulsePlan,
+        budget: Budget,
         gate_on: bool,
         on_reported: Callable[[PlanJob], None] = ignore_reports,
-    ) -> float:
-        """Stream points, wait for their reports, and return their delay, s."""
+    ) -> None:
+        """Send a plan once it fits all caps, and wait for its reports. Their delay shifts what follows."""
+        self._require_ready()
+        limited, points, start_s = self._account(plan, budget, len(plan) if gate_on else 0)
         job = self._run_job(points, start_s, on_reported)
-        executed = job.build_executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
-        if gate_on and not np.allclose(executed.width_s, plan.width_s):
+        executed = job.build_executed(limited, self.session.scale.full_power_w, self.session.scale.tick_s)
+        if gate_on and not np.allclose(executed.width_s, limited.width_s):
             raise BoardFaultError(
-                f"the board kept the gate on for {executed.width_s.sum():g} s; expected {plan.width_s.sum():g} s"
+                f"the board kept the gate on for {executed.width_s.sum():g} s; expected {limited.width_s.sum():g} s"
             )
         ended_s = float(executed.start_s[-1] + executed.width_s[-1])
-        return max(0.0, ended_s - float(plan.start_s[-1] + plan.width_s[-1]))
+        self._timeline_zero_s = start_s + max(0.0, ended_s - float(limited.start_s[-1] + limited.width_s[-1]))
 
 
 def find_weakest_pixel(display: DisplayModel) -> int:
