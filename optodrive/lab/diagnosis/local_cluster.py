@@ -29,7 +29,7 @@ SETTINGS = {
 
 
 def main(workers: int, folder: str) -> None:
-    """Run a cluster of so many processes of one thread on loopback, with its files in a folder, until stdin ends."""
+    """Run a cluster of processes with one thread each on loopback, with its files in a folder, until stdin ends."""
     with dask.config.set(SETTINGS):
         cluster = LocalCluster(
             n_workers=0,
