@@ -185,7 +185,10 @@ class ExclusiveBoard(ArmedBoard):
         gate_on: bool,
         on_reported: Callable[[PlanJob], None] = ignore_reports,
     ) -> None:
-        """Send a plan once it fits all caps, and wait for its reports, whose delay shifts what follows."""
+        """Send a plan once it fits all caps, and wait for its reports.
+
+        Their delay shifts what follows.
+        """
         self._require_ready()
         limited, points, start_s = self._account(plan, budget, len(plan) if gate_on else 0)
         job = self._run_job(points, start_s, on_reported)
