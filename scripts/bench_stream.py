@@ -7,17 +7,23 @@ bodies at the same rate under the same load; its latency is the part that the we
 
 import json
 import os
+import struct
 import subprocess
 import sys
+import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import httpx
 import numpy as np
 from frame_stream import measure_full_frames
 from measuring import LEASE_S, Row, build_display, build_frames, measure_times_s, running_daemon, to_ms
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import connect
 
+from process_memory import list_processes  # of the tests
 from rig import TOKEN, read_role_tokens  # of the tests
 from stop_rig import FloodProcess
 
@@ -27,12 +33,14 @@ LOAD_HZ = 1250.0
 """Requests of the other clients per second. At 0, the load is what server and clients can do."""
 LOAD = "kept alive GETs"
 LEAD_S = 0.03
+ENDING_S = 0.7
+"""Time after the last frame, in which it is drawn."""
 OPTIONS = {
     "--minutes": {"type": float, "default": 1.0, "help": "time of the full frames beside busy loops"},
     "--hours": {"type": float, "help": "the same in hours"},
     "--load-hz": {"type": float, "default": LOAD_HZ, "help": "requests per second of other clients, 0: no bound"},
     "--lead-s": {"type": float, "default": LEAD_S, "help": "board.stream_lead_s, for the latency"},
-    "--only": {"choices": ("planning", "latency", "frames"), "help": "one part"},
+    "--only": {"choices": ("planning", "latency", "websocket", "frames"), "help": "one part"},
 }
 UNLIMITED_RATES = "[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000"
 """The daemon must serve the load; its rate limit must not reject it."""
@@ -165,21 +173,34 @@ def bare_server(port):
         process.wait()
 
 
+@contextmanager
+def under_load(url, tokens, load_hz):
+    """Let other clients request the state during this block. Yield a list, in which it ends with their rate.
+
+    load_hz: requests per second, 0 for no bound, None for no load
+    """
+    rates_hz = []
+    if load_hz is None:
+        yield rates_hz
+        rates_hz.append(0.0)
+        return
+    interval_s = CLIENTS / load_hz if load_hz else 0.0
+    load, begin_s = FloodProcess(LOAD, url, tokens, PIXELS, CLIENTS, interval_s), time.monotonic()
+    try:
+        yield rates_hz
+    finally:
+        duration_s = time.monotonic() - begin_s
+        rates_hz.append(load.finish()["200"] / duration_s)
+
+
 def push_frames_under_load(url, tokens, load_hz, seconds):
     """Push frames while other clients request the state.
 
     Return the result of push_frames, and the answers per second.
     """
-    if load_hz is None:
-        return push_frames(url, seconds), 0.0
-    interval_s = CLIENTS / load_hz if load_hz else 0.0
-    load, begin_s = FloodProcess(LOAD, url, tokens, PIXELS, CLIENTS, interval_s), time.monotonic()
-    try:
+    with under_load(url, tokens, load_hz) as rates_hz:
         results = push_frames(url, seconds)
-    finally:
-        duration_s = time.monotonic() - begin_s
-        counts = load.finish()
-    return results, counts["200"] / duration_s
+    return results, rates_hz[0]
 
 
 @dataclass
@@ -200,6 +221,60 @@ class Streaming:
     @property
     def latencies(self):
         return [plan["latency"] for plan in self.plans if plan["latency"]["first_light_s"] is not None]
+
+
+def read_cpu_s(pid):
+    """Return the processor time that a process has used so far, s."""
+    return sum(int(path.read_text().split()[0]) for path in Path(f"/proc/{pid}/task").glob("*/schedstat")) * 1e-9
+
+
+def stream_frames(daemon, seconds):
+    """Stream frames over a WebSocket. Return the final answers of those that were shown, and the planner's cores."""
+    rng, answers = np.random.default_rng(7), []
+    planner = list_processes(daemon.process.pid)["opto-planner"]
+    url, header = daemon.url.replace("http", "ws") + "/v1/stream", {"Authorization": f"Bearer {TOKEN}"}
+    with connect(url, additional_headers=header, proxy=None, compression=None) as link:
+
+        def read():
+            with suppress(WebSocketException):
+                answers.extend(json.loads(text) for text in link)
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        begin_s, begin_cpu_s = time.monotonic(), read_cpu_s(planner)
+        for number in range(int(RATE_HZ * seconds)):
+            heights = np.zeros(PIXELS, dtype="<u2")
+            heights[rng.choice(PIXELS, ACTIVE, replace=False)] = 600
+            link.send(struct.pack("<4sI", b"ODF1", number) + heights.tobytes())
+            time.sleep(max(0.0, begin_s + (number + 1) / RATE_HZ - time.monotonic()))
+        cores = (read_cpu_s(planner) - begin_cpu_s) / (time.monotonic() - begin_s)
+        time.sleep(ENDING_S)
+        link.close()
+        reader.join()
+    return [answer for answer in answers if answer["status"] in ("done", "superseded") and "latency" in answer], cores
+
+
+def measure_websocket(load_hz=LOAD_HZ, lead_s=LEAD_S):
+    """Measure frames over a WebSocket under load, and bodies at the same rate at a bare FastAPI. Yield the rows."""
+    with bare_server(8459) as url:
+        (bare_trips, *_), _ = push_frames_under_load(url, {"viewer": TOKEN}, load_hz, SECONDS)
+    with running_daemon("display-1511", LEASE_S, f"stream_lead_s = {lead_s}\n{UNLIMITED_RATES}") as (_, daemon):
+        daemon.arm()
+        with under_load(daemon.url, read_role_tokens(daemon), load_hz):
+            answers, cores = stream_frames(daemon, SECONDS)
+        underruns = daemon.state()["board"]["underruns"]
+    yield "WebSocket: frames shown of those sent", len(answers) / (RATE_HZ * SECONDS), "1"
+    yield "WebSocket: processor time of the planner process per second", cores, "core"
+    yield Row("WebSocket: round trip of a body to a bare FastAPI", to_ms(bare_trips))
+    for key, name in (("planned_s", "plan accepted"), ("first_byte_s", "first byte"), ("first_light_s", "first light")):
+        times_s = [answer["latency"][key] for answer in answers if answer["latency"][key] is not None]
+        yield Row(
+            f"WebSocket: arrival to {name}",
+            to_ms(times_s),
+            reference="a bare FastAPI",
+            reference_values=to_ms(bare_trips),
+        )
+    yield "WebSocket: underruns", underruns, "1"
 
 
 def stream_under_load(load_hz=LOAD_HZ, lead_s=LEAD_S, seconds=SECONDS):
@@ -244,5 +319,7 @@ def measure(minutes=1.0, hours=None, load_hz=LOAD_HZ, lead_s=LEAD_S, only=None):
         yield from measure_superseding()
     if only in (None, "latency"):
         yield from measure_latency(load_hz, lead_s)
+    if only in (None, "websocket"):
+        yield from measure_websocket(load_hz, lead_s)
     if only in (None, "frames"):
         yield from measure_full_frames(60.0 * minutes if hours is None else 3600.0 * hours)

@@ -158,6 +158,14 @@ class ServiceRig:
         fields |= {"kept_points": [kept_points], "crc": zlib.crc32(payload)}
         return number, self.find_result(PLANNER, self.request(PLANNER, "splice", payload, **fields))
 
+    def extend(self, number, points, epoch=None, pause=None, crc=None):
+        """Append points to a job. Return the result."""
+        payload = points.encode_payload()
+        fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "counts": [len(points)]}
+        fields |= {"pause": self.pause_number if pause is None else pause}
+        fields |= {"crc": zlib.crc32(payload) if crc is None else crc}
+        return self.find_result(PLANNER, self.request(PLANNER, "extend", payload, **fields))
+
     def list_emitted(self):
         """Return (time in s, duty) of all pulses that the board has emitted."""
         return [(event["on_us"] * 1e-6, event["duty"]) for event in self.log if event["event"] == "pulse"]

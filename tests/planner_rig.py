@@ -110,12 +110,21 @@ class PlannerRig(ServiceRig):
         if shift_s is not None:
             self.queue.on_board_restarted(shift_s)
         self.queue.update_jobs(self.remote.pop_refusal())
-        self.planner.follow_pause()
+        self.planner.follow_queue()
         self.queue.start_next()
 
-    def submit(self, sequence, epoch, streamed=False, caller="", options=MappingProxyType({}), caller_left=NEVER):
-        """Plan a sequence. Return its future."""
-        push = Push("push", options, self.clock.now_s(), epoch, caller, streamed)
+    def submit(
+        self,
+        sequence,
+        epoch,
+        streamed=False,
+        caller="",
+        options=MappingProxyType({}),
+        caller_left=NEVER,
+        lists_pulses=True,
+    ):
+        """Plan a sequence. Return its future. A streamed one grows unless its answer lists its pulses."""
+        push = Push("push", options, self.clock.now_s(), epoch, caller, streamed, lists_pulses)
         request = PlanningRequest(lambda: BuiltRequest(sequence), push, self.remote.board_s(), caller_left)
         return self.planner.submit(request)
 

@@ -69,15 +69,9 @@ def plan_sequence(
     initial_pixels: tuple[int, ...] | None = None,
     visiting_orders: Mapping[int, IntArray] | None = None,
 ) -> PlannedSequence:
-    """Plan and limit a whole sequence, as `SequencePlanner` does.
-
-    Raises RefusedError under policy "refuse" for a missed deadline too.
-    """
+    """Plan and limit a whole sequence, as `SequencePlanner` does."""
     planner = SequencePlanner(display, sequence, heat, budget, policy, on_progress, initial_pixels, visiting_orders)
-    planned = planner.plan_until()
-    if policy == "refuse":
-        _refuse_late(planned)
-    return planned
+    return planner.plan_until()
 
 
 class SequencePlanner:
@@ -87,11 +81,12 @@ class SequencePlanner:
     by itself, a frame as a whole.
 
     on_progress: receives the completed fraction, 0 to 1; may be replaced between two parts
+    display: by whose caps it limits; is_complete: whether all is planned
     initial_pixels: pixel on which each stage's mirrors stand at the plan's start, None while unknown
     visiting_orders: by source, visiting orders that replace the scheduler's own
 
     Raises InputError for an unreachable height or peak-to-peak value. Raises RefusedError under "refuse" for a pulse
-    above a cap, and under "delay" for a pulse that never fits.
+    above a cap or a missed deadline, and under "delay" for a pulse that never fits.
     """
 
     def __init__(
@@ -107,9 +102,10 @@ class SequencePlanner:
     ) -> None:
         self.on_progress = on_progress
         self.is_complete = False
-        self._display = display
+        self.display = display
         self._sequence, self._dead_pixels = remove_dead_pixels(display, sequence)
         self._heat = heat
+        self._policy = policy
         self._done = 0.0
         check_targets_reachable(display, self._sequence)
         COLD_START.begin(display.budget, budget)
@@ -147,7 +143,10 @@ class SequencePlanner:
             if batch.end_s >= until_s:
                 self.is_complete = False
                 break
-        return self._build_planned(self._concatenate([*self._limited, *self._recent]))
+        planned = self._build_planned(self._concatenate([*self._limited, *self._recent]))
+        if self._policy == "refuse":
+            _refuse_late(planned)
+        return planned
 
     def _build_planned(self, plan: LimitedPlan) -> PlannedSequence:
         self._report_progress()
@@ -170,7 +169,7 @@ class SequencePlanner:
         )
 
     def _concatenate(self, batches: list[LimitedPlan]) -> LimitedPlan:
-        return concatenate(batches, self._limiter.state, self._display.budget)
+        return concatenate(batches, self._limiter.state, self.display.budget)
 
     def _report_progress(self) -> None:
         if self.on_progress is not None:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan
 from optodrive.core.types.stimuli import FrameSequence
@@ -93,6 +95,11 @@ class PlannedSequence:
     def duration_s(self) -> float:
         """Time from the plan's start to the end of its last pulse, s."""
         return self.plan.end_s
+
+    @property
+    def sequence_target_m(self) -> FloatArray:
+        """Largest target of each pixel in the frames, m, [p]."""
+        return np.asarray(np.max([frame.target_m for frame in self.sequence.frames], axis=0), dtype=np.float64)
 
     @property
     def train_lateness_max_s(self) -> float:

@@ -46,7 +46,7 @@ class Interleaving:
     def __init__(self, seed):
         self.random = random.Random(seed)
         self.rig = ServiceRig(link_type=CuttableLink, settings=SETTINGS, requirements=PATIENT).hello_all()
-        self.accepted, self.waiting, self.last_count = {}, [], 0
+        self.accepted, self.waiting, self.last_count, self.last_job = {}, [], 0, 0
         self.epochs = [(0.0, self.rig.epoch)]
         self.built, self.pauses = {}, [(0.0, 0, False)]
         self.rig.connect()
@@ -87,7 +87,8 @@ class Interleaving:
             ahead_s = self.random.choice((None, SEND_AHEAD_S))
             self.last_count = self.random.choice((1, 5, 60))
             points = build_points(self.last_count, duty)
-            self.rig.begin(points, epoch, self.random.choice((0.005, 0.05)), ahead_s, pause=self.build(duty))
+            start_in_s, pause = self.random.choice((0.005, 0.05)), self.build(duty)
+            self.last_job = self.rig.begin(points, epoch, start_in_s, ahead_s, pause=pause)
 
     def build(self, duty):
         """Return the pause after which the planner has built points, which may be an earlier one."""
@@ -101,11 +102,18 @@ class Interleaving:
             kept_points = self.random.randint(0, self.last_count)
             try:
                 points = build_points(20, duty)
-                _, result = self.rig.splice(points, kept_points, epoch, SEND_AHEAD_S, pause=self.build(duty))
+                number, result = self.rig.splice(points, kept_points, epoch, SEND_AHEAD_S, pause=self.build(duty))
             except IpcError:  # more than the last job's points: the process ends such a planner's connection
                 self.lose_planner()
                 return
-            self.last_count = 20 if result["error"] is None and result["start_tick"] is not None else self.last_count
+            if result["error"] is None and result["start_tick"] is not None:
+                self.last_count, self.last_job = 20, number
+
+    def extend(self):
+        if self.waiting:
+            duty, epoch = self.waiting.pop(self.random.randrange(len(self.waiting)))
+            result = self.rig.extend(self.last_job, build_points(20, duty), epoch, pause=self.build(duty))
+            self.last_count += 20 if result["error"] is None and result["done"] else 0
 
     def truncate(self):
         self.rig.request(PLANNER, "truncate", kept_points=[self.random.choice((0, 20, 50))])
@@ -221,9 +229,10 @@ class Interleaving:
 
 
 WEIGHTS = {
-    "accept": 8,
+    "accept": 11,
     "hand_over": 8,
     "splice": 3,
+    "extend": 3,
     "truncate": 1,
     "flush": 1,
     "pause": 3,

@@ -6,6 +6,7 @@ was answered, and no plan is lit beyond its pulses. All parts are real; time is 
 """
 
 import random
+from functools import partial
 from typing import NamedTuple
 
 import pytest
@@ -19,7 +20,7 @@ from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.preview.jobs import plan_dry_run
 from optodrive.daemon.push import Push
 from optodrive.planning.stimuli.pattern_registry import build_pattern
-from planner_rig import DISPLAY, PlannerRig
+from planner_rig import DISPLAY, PlannerRig, build_frame
 
 SEEDS = range(12)
 OPERATIONS = 100
@@ -51,7 +52,8 @@ class Interleaving:
 
     answered_epoch: epoch when the latest command was answered; pushes of older ones must be refused from then on
     pauses: (board time, whether a pause lasts) at each answered pause and each end of one
-    epochs: (board time, epoch) at each begin of an epoch; epochs_by_duty: of the accepted pushes with such a pulse
+    epochs: (board time, epoch) at each begin of an epoch; plans: the accepted ones, of which some grow later
+    epochs_by_duty: of the accepted plans with such a pulse
     """
 
     def __init__(self, monkeypatch, seed, queue_type=PlanQueue):
@@ -59,7 +61,8 @@ class Interleaving:
         self.rig = PlannerRig(monkeypatch, queue_type=queue_type).ready()
         self.waiting = []
         self.epochs = [(0.0, self.rig.epoch)]
-        self.epochs_by_duty = {}
+        self.plans, self.epochs_by_duty = [], {}
+        self.rig.queue.commit = partial(self.commit, self.rig.queue.commit)
         self.pauses = [(0.0, False)]
         self.answered_epoch = 0
         self.accepted = 0
@@ -90,6 +93,8 @@ class Interleaving:
         self.serial += 1
         if self.random.random() < 0.3:
             sequence = build_pattern("vibration", {"height_um": 30 + self.serial, "seconds": 0.2}, DISPLAY.config)
+        elif self.random.random() < 0.3:
+            sequence = build_frame(150.0 + self.serial)
         else:
             power_w = 1.0 + 0.01 * self.serial  # tells the light of one push from that of another
             sequence = FrameSequence((), (PulseTrain(self.serial % 16, 0.0, 0.3, 0.005, 0.005, power_w),))
@@ -102,16 +107,23 @@ class Interleaving:
             return
         push = self.waiting.pop(self.random.randrange(len(self.waiting)))
         try:
-            report = self.rig.submit(push.sequence, push.epoch, push.streamed).result()
+            self.rig.submit(push.sequence, push.epoch, push.streamed, lists_pulses=not push.streamed).result()
         except NotReadyError:
             return
         assert push.epoch >= self.answered_epoch, "a push of an older epoch was answered 201"
         self.accepted += 1
-        queue = self.rig.queue
-        accepted = (*queue.waiting, *(run.plan for run in queue.running))
-        (points,) = (plan.points for plan in accepted if plan.record.plan_id == report.plan)
-        for duty in points.stages[0].table[:, 4].tolist():
-            self.epochs_by_duty.setdefault(duty, set()).add(push.epoch)
+
+    def commit(self, commit, plan, *arguments):
+        """Note what the queue accepts: the plans of pushes, and of what a frame's rest became if it came too late."""
+        if not commit(plan, *arguments):
+            return False
+        self.plans.append(plan)
+        self.note_duties(plan)
+        return True
+
+    def note_duties(self, plan):
+        for duty in plan.points.stages[0].table[:, 4].tolist():
+            self.epochs_by_duty.setdefault(duty, set()).add(plan.epoch)
 
     def run(self):
         self.rig.run(self.random.choice((0.002, 0.1, 0.4)))
@@ -190,6 +202,8 @@ class Interleaving:
 
     def check_light(self):
         """Compare every pulse in the board's log with the epochs of the pushes that contain such a pulse."""
+        for plan in self.plans:  # some have grown
+            self.note_duties(plan)
         for at_s, duty in self.rig.list_emitted():
             allowed = {self.find_epoch(at_s), self.find_epoch(at_s - DARK_WITHIN_S)}
             assert self.epochs_by_duty[duty] & allowed, f"a push of an older epoch was lit at {at_s} s"

@@ -10,7 +10,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import plan_making
 from optodrive.daemon.engine.planner import SPLICE_TRIES
 from optodrive.daemon.engine.planning_time import FACTOR
-from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.pipeline import SequencePlanner
 from rig import ended, wait_for
 
 RESERVED_S = 1.0
@@ -83,9 +83,9 @@ def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
         """Take longer than the time reserved from the plan before."""
         tries.append(0.05 + armed._planner._planning_time.compute_reserved_s(len(tries)))
         time.sleep(tries[-1] if len(tries) <= SPLICE_TRIES else 0.0)
-        return plan_sequence(*arguments, **more)
+        return SequencePlanner(*arguments, **more)
 
-    monkeypatch.setattr(plan_making, "plan_sequence", slowly)
+    monkeypatch.setattr(plan_making, "SequencePlanner", slowly)
     second = stream(armed, frame(range(40, 60)))
     records = [ended(armed, answer) for answer in (first, second)]
     assert len(tries) in (3, 4)  # once more if the running plan was late, which changed the heat

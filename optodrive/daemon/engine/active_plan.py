@@ -12,6 +12,7 @@ from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.listed_pulses import ListedPulses
+from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.planned_sequence import PlannedSequence
 
 
@@ -22,6 +23,7 @@ class ActivePlan:
     heat_before, budget_before: initial state of the plan, on its own time line
     epoch: in which the request arrived; the board executes nothing of an older one
     crc: CRC-32 of the verified bytes of the points
+    growth: plans the rest once it is due, None for a whole plan
     refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
     first_row: first row that was not executed when the plan was interrupted last
     zero_s: time of the plan at which its points begin; origin_s: the same, or when the light went off meanwhile
@@ -38,6 +40,7 @@ class ActivePlan:
     budget_before: BudgetState
     epoch: int
     crc: int
+    growth: SequencePlanner | None = None
     refreshed: BoolArray | None = None
     first_row: int = 0
     zero_s: float = 0.0
@@ -57,6 +60,23 @@ class ActivePlan:
     def rest_count(self) -> int:
         """Number of rows from first_row on."""
         return len(self.planned.plan) - self.first_row
+
+    @property
+    def unplanned_pixels(self) -> IntArray:
+        """Pixels of a streamed frame whose pulses are not planned yet."""
+        if self.growth is None:
+            return np.zeros(0, dtype=np.int64)
+        skipped = [pulse.pixel for pulse in self.planned.skipped]
+        planned = np.concatenate([self.planned.plan.pixel, np.array(skipped, dtype=np.int64)])
+        return np.setdiff1d(np.flatnonzero(self.planned.sequence_target_m), planned)
+
+    def replace_rows(self, planned: PlannedSequence, points: StagePoints, crc: int, summary_json: bytes) -> None:
+        """Replace all that follows from the rows, by those of a plan to which nothing is to be added."""
+        record = self.record
+        self.planned, self.points, self.crc, self.growth = planned, points, crc, None
+        record.pulse_count, record.duration_s = len(planned.plan), planned.duration_s
+        record.pulses, record.largest_target = ListedPulses.from_planned(planned), LargestTarget.from_planned(planned)
+        record.summary_json = summary_json
 
     def add_executed(self, executed: ExecutedPulses, rows: IntArray) -> None:
         """Add the executed pulses that the board reports since the last interruption."""

@@ -122,10 +122,10 @@ class Engine:
         """Run one loop iteration, which waits at most wait_s for messages and commands."""
         self.commands.run_pending()
         self._session.connect_if_due()
-        self.message_loop.poll(wait_s)
+        self.message_loop.poll(min(wait_s, self._planner.growth_due_in_s))
         self._follow_link()
         self._plan_queue.update_jobs(self._session.pop_refusal())
-        self._planner.follow_pause()
+        self._planner.follow_queue()
         self._save_thermal_state()  # before a plan starts, so that a successor of this process knows its heat
         self._plan_queue.start_next()
         self._beat()

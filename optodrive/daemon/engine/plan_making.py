@@ -3,10 +3,12 @@
 import threading
 import zlib
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import NamedTuple
 
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_growth import may_grow
 from optodrive.daemon.engine.plan_record import LargestTarget, PlanRecord
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.request_body import BuiltRequest
@@ -15,12 +17,10 @@ from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.stage_points import StagePoints, decode_stages
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
-from optodrive.planning.feasibility.report import FeasibilityReport
 from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.listed_pulses import ListedPulses
-from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
-from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
 
 NEVER = threading.Event()
@@ -48,15 +48,27 @@ def make_plan(
     snapshot: PlanningSnapshot,
     plan_id: str,
     on_progress: Callable[[float], None],
+    horizon_s: float = inf,
 ) -> ActivePlan:
     """Plan a sequence, quantise the plan, and verify the decoded bytes against the budget.
 
+    horizon_s: time of the plan up to which it is planned, if `may_grow` permits, and the plan to grow
     Raises InputError and RefusedError as `plan_sequence` and `check_feasibility` do, and what on_progress raises.
     """
     push = request.push
-    planned, feasibility = _plan(display, push, built.sequence, snapshot, on_progress)
+    growth, feasibility = None, None
+    if push.streamed:
+        growth = _begin_streamed(display, push, built.sequence, snapshot, on_progress)
+        planned = growth.plan_until(horizon_s if may_grow(push, built.sequence, len(scales)) else inf)
+    else:
+        heat, budget = snapshot.heat, snapshot.budget
+        planned, feasibility = check_feasibility(display, built.sequence, heat, budget, on_progress, **push.options)
     on_progress(1.0)
     points = StagePoints.from_plan(planned.plan, scales, display.draws)
+    if growth is not None and not growth.is_complete and not points.ends_with_gate_on:
+        # The mirrors would point at the next lit pulse already, which is not planned yet.
+        planned = growth.plan_until()
+        points = StagePoints.from_plan(planned.plan, scales, display.draws)
     on_progress(1.0)
     payload = points.encode_payload()
     row, decoded = decode_stages(payload, points, scales)
@@ -86,22 +98,21 @@ def make_plan(
         budget_before=snapshot.budget,
         epoch=push.epoch,
         crc=zlib.crc32(payload),
+        growth=None if growth is None or growth.is_complete else growth,
         refreshed=snapshot.refreshed,
     )
 
 
-def _plan(
+def _begin_streamed(
     display: DisplayModel,
     push: Push,
     sequence: FrameSequence,
     snapshot: PlanningSnapshot,
     on_progress: Callable[[float], None],
-) -> tuple[PlannedSequence, FeasibilityReport | None]:
-    """Plan the sequence, with a feasibility check unless it is streamed."""
-    heat, budget = snapshot.heat, snapshot.budget
-    if not push.streamed:
-        return check_feasibility(display, sequence, heat, budget, on_progress, **push.options)
+) -> SequencePlanner:
+    """Begin to plan a streamed sequence."""
     if snapshot.refreshed is not None and can_split(sequence):
         sequence = stale_pixels_first(sequence, snapshot.refreshed)
     policy, pixels = push.options.get("policy", "trim"), snapshot.initial_pixels
-    return plan_sequence(display, sequence, heat, budget, policy, on_progress, initial_pixels=pixels), None
+    heat, budget = snapshot.heat, snapshot.budget
+    return SequencePlanner(display, sequence, heat, budget, policy, on_progress, initial_pixels=pixels)

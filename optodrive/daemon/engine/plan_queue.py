@@ -188,8 +188,10 @@ class PlanQueue(QueuedPlans):
         with self.lock:
             run = self.running.popleft()
             record = run.plan.record
-            self.conclude(run, PlanStatus.SUPERSEDED if record.dropped else PlanStatus.DONE, None)
+            is_partial = record.dropped or run.plan.growth is not None
+            self.conclude(run, PlanStatus.SUPERSEDED if is_partial else PlanStatus.DONE, None)
             self.delay_all(record.delay_s)
+            self.stream.keep_unfinished(run.plan)
 
     def end_epoch(self, reason: str, clock_shift_s: float = 0.0) -> None:
         """End all plans of an epoch that has ended.

@@ -11,7 +11,6 @@ import numpy as np
 
 from optodrive.core.types.plans import BudgetState, LimitedPlan
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.engine.plan_record import LargestTarget
 from optodrive.daemon.engine.rest_sequence import build_rest_sequence
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.link.protocol.quantisation import WireScale
@@ -20,7 +19,6 @@ from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.limiter.rest import delay_rest, limit_rest, replace_rest
-from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.planned_sequence import PlannedSequence
@@ -61,12 +59,9 @@ class RestartedPlan:
         else:  # nothing was executed: the plan begins anew
             record.start_s = self.start_s + delay_s
             plan.heat_before, plan.budget_before = self.before.shift_to_plan(self.start_s)
-        plan.planned, plan.points, plan.crc, plan.is_interrupted = planned, self.points, self.crc, False
+        plan.replace_rows(planned, self.points, self.crc, self.summary_json)
+        plan.is_interrupted = False
         plan.zero_s = plan.origin_s = zero_s
-        record.pulse_count, record.duration_s = len(planned.plan), planned.duration_s
-        record.pulses = ListedPulses.from_planned(planned)
-        record.largest_target = LargestTarget.from_planned(planned)
-        record.summary_json = self.summary_json
 
 
 def restart_plans(
@@ -100,6 +95,9 @@ def _restart(
     on_progress: Callable[[], None],
 ) -> RestartedPlan:
     first, planned = plan.first_row, plan.planned
+    if plan.growth is not None:
+        plan.growth.on_progress = lambda _: on_progress()
+        planned = plan.growth.plan_until()
     heat, budget = before.shift_to_plan(start_s)
     if display.draws.all() or (first and _is_made_for(display, plan)):
         rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)

@@ -10,14 +10,17 @@ from time import thread_time
 from typing import Any, Protocol, TypeVar
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import BusyError, InputError, LinkError, StoppedError
+from optodrive.core.errors import BusyError, InputError, LinkError, NotReadyError, StoppedError
 from optodrive.core.scheduling import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
-from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
+from optodrive.daemon.engine.plan_growth import build_rest_frame, grow_plan
+from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest, make_plan
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.planning_time import FACTOR, PlanningTime
+from optodrive.daemon.engine.planning_time import FACTOR, PlanningTime, StreamHorizon
+from optodrive.daemon.engine.queue_stream import GROWTH_MARGIN_S
 from optodrive.daemon.engine.request_body import BuiltRequest
+from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
@@ -76,8 +79,9 @@ class Planner:
         self._ids = count(1)
         self._pending_count = 0
         self._progress_at_s = clock.now_s()
-        self._planning_time, self._restart_time = PlanningTime(), PlanningTime()
-        self._restarting: Future[None] | None = None
+        self._planning_time, self._restart_time, self._growth_time = PlanningTime(), PlanningTime(), PlanningTime()
+        self._horizon = StreamHorizon()
+        self._own_work: Future[None] | None = None
 
     @property
     def is_busy(self) -> bool:
@@ -109,17 +113,82 @@ class Planner:
         with self._lock:
             self._pending_count -= 1
 
-    def follow_pause(self) -> None:
-        """Let the queue go on when a pause has ended, without a lost stage. The loop calls it in every iteration."""
+    def follow_queue(self) -> None:
+        """Let the queue go on when a pause has ended, without a lost stage, and plan the rest of a streamed frame.
+
+        The loop calls it in every iteration.
+        """
         lost = self._session.lost
         self._dimmer.set_lost_stage(None if lost is None else lost.stage)
-        if self._plan_queue.pause.can_restart and (self._restarting is None or self._restarting.done()):
+        if self._is_at_own_work:
+            return
+        work = None
+        if self._plan_queue.pause.can_restart:
+            work = self._restart
+        elif self.growth_due_in_s <= 0.0:
+            work = self._grow
+        if work is not None:
             with self._lock:
                 if self._pending_count == 0:
                     self._progress_at_s = self._clock.now_s()
                 self._pending_count += 1
-            self._restarting = self._executor.submit(self._restart)
-            self._restarting.add_done_callback(self._on_done)
+            self._own_work = self._executor.submit(work)
+            self._own_work.add_done_callback(self._on_done)
+
+    @property
+    def _is_at_own_work(self) -> bool:
+        return self._own_work is not None and not self._own_work.done()
+
+    @property
+    def growth_due_in_s(self) -> float:
+        """Time until the rest of the running plan must be planned, infinity if it has none, or is being planned."""
+        if self._is_at_own_work:
+            return inf
+        return self._plan_queue.stream.compute_due_in_s(self._growth_time.compute_reserved_s(0))
+
+    def _grow(self) -> None:
+        """Plan the rest of the streamed frame that was accepted last, unless nobody waits for it any more."""
+        plan = self._plan_queue.stream.find_growing()
+        if plan is None:
+            self._plan_queue.stream.forget_unfinished()
+            return
+        set_realtime_priority(PLANNING)
+        check = self._build_check(plan.epoch, NEVER, streamed=True)
+        try:
+            if not self._extend(plan, check):
+                self._plan_rest(plan, check)
+        except (NotReadyError, LinkError):  # it was stopped or paused, and a stream shows the present
+            self._plan_queue.stream.forget_unfinished()
+        except Exception as error:  # of any kind: what cannot be proven is not played
+            reason = f"the rest of a streamed frame could not be planned: {error}"
+            with suppress(LinkError):
+                self._run_in_loop(lambda: self._plan_queue.end_all(PlanStatus.FAILED, reason))
+        finally:
+            use_usual_priority()
+            self._progress_at_s = self._clock.now_s()
+
+    def _extend(self, plan: ActivePlan, check: Callable[[float], None]) -> bool:
+        """Append the rest of a plan to it. Return False if it is too late, or the display was dimmed."""
+        growth, display, began_s = plan.growth, self._dimmer.display, self._clock.now_s()
+        if growth is None or growth.display is not display:
+            return False
+        grown = grow_plan(plan, growth, self._session.scales, check)
+        self._growth_time.record(self._clock.now_s() - began_s)
+
+        def commit() -> bool:
+            return self._dimmer.display is display and self._plan_queue.stream.extend(plan, grown)
+
+        return self._run_in_loop(commit)
+
+    def _plan_rest(self, plan: ActivePlan, check: Callable[[float], None]) -> None:
+        """Plan the pixels that a plan has not drawn as a frame of its own, behind it."""
+        if self._plan_queue.stream.find_growing() is not plan:
+            return
+        self._run_in_loop(self._plan_queue.stream.withdraw)
+        self._plan_queue.stream.forget_unfinished()
+        record, built = plan.record, BuiltRequest(build_rest_frame(plan))
+        push = Push(record.name, {}, self._clock.now_s(), plan.epoch, record.caller, streamed=True, lists_pulses=False)
+        self._plan_until_committed(built, PlanningRequest(lambda: built, push, record.arrived_s), check)
 
     def _restart(self) -> None:
         """Limit and prove the waiting plans again, until that holds or the light is paused or stopped again."""
@@ -163,21 +232,7 @@ class Planner:
             use_usual_priority()
 
     def _plan(self, request: PlanningRequest) -> PlanReport:
-        began_s = thread_time()
-
-        def check(_fraction: float) -> None:
-            """Record progress, and end the work on a request that nobody waits for or that takes too long."""
-            self._progress_at_s = self._clock.now_s()
-            used_s = thread_time() - began_s
-            if request.push.streamed and used_s > REALTIME_MAX_S:
-                use_usual_priority()
-            if used_s > PLANNING_MAX_S:
-                expected = f"a sequence that is planned within {PLANNING_MAX_S:g} s of processor time; send it in parts"
-                raise InputError("body", "a longer computation", expected, "too_slow")
-            self._plan_queue.require_epoch(request.push.epoch)
-            if request.caller_left.is_set():
-                raise StoppedError("the caller has left")
-
+        check = self._build_check(request.push.epoch, request.caller_left, request.push.streamed)
         try:
             check(0.0)
             plan = self._plan_until_committed(request.build(), request, check)
@@ -186,10 +241,33 @@ class Planner:
         finally:
             self._progress_at_s = self._clock.now_s()
 
+    def _build_check(self, epoch: int, caller_left: threading.Event, streamed: bool) -> Callable[[float], None]:
+        """Return a function that records progress, and ends work that nobody waits for or that takes too long."""
+        began_s = thread_time()
+
+        def check(_fraction: float) -> None:
+            self._progress_at_s = self._clock.now_s()
+            used_s = thread_time() - began_s
+            if streamed and used_s > REALTIME_MAX_S:
+                use_usual_priority()
+            if used_s > PLANNING_MAX_S:
+                expected = f"a sequence that is planned within {PLANNING_MAX_S:g} s of processor time; send it in parts"
+                raise InputError("body", "a longer computation", expected, "too_slow")
+            self._plan_queue.require_epoch(epoch)
+            if caller_left.is_set():
+                raise StoppedError("the caller has left")
+
+        return check
+
     def _plan_until_committed(
         self, built: BuiltRequest, request: PlanningRequest, check: Callable[[float], None]
     ) -> ActivePlan:
-        late_count, took_s, plan_id = 0, 0.0, f"p{next(self._ids)}"
+        late_count, took_s, plan_id, horizon_s = 0, 0.0, f"p{next(self._ids)}", inf
+        if request.push.streamed:
+            reserved_s = self._growth_time.compute_reserved_s(0) + GROWTH_MARGIN_S
+            horizon_s = max(self._horizon.follow(request.arrived_s), self._plan_queue.stream.lead_s) + reserved_s
+        else:
+            self._grow()  # what is pushed goes behind the whole of a frame
         while True:
             check(0.0)
             self._require_armed()
@@ -199,7 +277,7 @@ class Planner:
                 self._run_in_loop(lambda: self._preempt(request))
             began_s = self._clock.now_s()
             reserved_s = self._compute_reserved_s(request, late_count, took_s)
-            plan = self._plan_once(built, request, plan_id, late_count, reserved_s, check)
+            plan = self._plan_once(built, request, plan_id, late_count, reserved_s, horizon_s, check)
             if plan is not None:
                 return plan
             took_s = self._clock.now_s() - began_s
@@ -226,13 +304,14 @@ class Planner:
         plan_id: str,
         late_count: int,
         reserved_s: float,
+        horizon_s: float,
         check: Callable[[float], None],
     ) -> ActivePlan | None:
         """Plan once. Return None if the plan is late, the snapshot stale, or the display was dimmed meanwhile."""
         began_s, display = self._clock.now_s(), self._dimmer.display
         cooling_max_m = COOLING_MAX_M if late_count < LATE_MAX else inf
         snapshot = self._plan_queue.make_snapshot(request.push.streamed, reserved_s)
-        plan = make_plan(display, self._session.scales, request, built, snapshot, plan_id, check)
+        plan = make_plan(display, self._session.scales, request, built, snapshot, plan_id, check, horizon_s)
         if request.push.streamed:
             self._planning_time.record(self._clock.now_s() - began_s)
 

@@ -80,7 +80,7 @@ def build_cut_snapshot(
 def mark_refreshed(truncated: ActivePlan, cut_row: int) -> BoolArray:
     """Return the pixels that a refresh cycle has drawn when its plan is truncated, [p].
 
-    All pixels are unmarked if the dropped pulses contain no pixel that is still to be drawn: a new cycle starts.
+    All pixels are unmarked if what is left contains no pixel that is still to be drawn: a new cycle starts.
     """
     pixel = truncated.planned.plan.pixel
     if truncated.refreshed is None:
@@ -88,4 +88,5 @@ def mark_refreshed(truncated: ActivePlan, cut_row: int) -> BoolArray:
     else:
         refreshed = truncated.refreshed.copy()
     refreshed[pixel[:cut_row]] = True
-    return refreshed if not refreshed[pixel[cut_row:]].all() else np.zeros_like(refreshed)
+    left = np.concatenate([pixel[cut_row:], truncated.unplanned_pixels])
+    return refreshed if not refreshed[left].all() else np.zeros_like(refreshed)

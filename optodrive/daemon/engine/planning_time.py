@@ -1,11 +1,29 @@
-"""Time that is reserved for the planning of a streamed plan."""
+"""Time that is reserved for the planning of a streamed plan, and time of a frame that is planned at once."""
 
 from collections import deque
+from math import inf
 
 INITIAL_S = 0.01
 RECENT_MAX = 8
 FACTOR = 1.25
 """Time reserved per time expected, for a plan that takes longer than the recent ones."""
+
+HORIZON_MIN_S, HORIZON_MAX_S = 0.05, 0.1
+"""Light of a frame that is planned at once, at least and at most."""
+HORIZON_INTERVALS = 1.5
+"""The same, in intervals between two frames: a frame that comes somewhat later than expected finds it unspent."""
+
+
+class StreamHorizon:
+    """Time of a streamed frame's light that is planned at once, from the interval between the last two frames."""
+
+    def __init__(self) -> None:
+        self._arrived_s = -inf
+
+    def follow(self, arrived_s: float) -> float:
+        """Return the time for the frame that arrived now, s."""
+        interval_s, self._arrived_s = arrived_s - self._arrived_s, arrived_s
+        return min(HORIZON_MAX_S, max(HORIZON_MIN_S, HORIZON_INTERVALS * interval_s))
 
 
 class PlanningTime:

@@ -86,8 +86,9 @@ class QueuePause:
                 left = record.pulse_count - record.executed_count
                 if record.streamed or not left:
                     record.dropped = left
-                    error = "the light was paused, and a stream shows the present" if left else None
-                    plans.conclude(run, PlanStatus.SUPERSEDED if left else PlanStatus.DONE, error)
+                    is_left = left or plan.growth is not None
+                    error = "the light was paused, and a stream shows the present" if is_left else None
+                    plans.conclude(run, PlanStatus.SUPERSEDED if is_left else PlanStatus.DONE, error)
                     continue
                 plans.accounts.collect_executed(run)
                 delay_s = record.delay_s

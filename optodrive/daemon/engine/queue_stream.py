@@ -6,10 +6,16 @@ leave only `lead_s` before they are due; a newer plan cuts the running one at th
 because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is refused
 by link, and the plan is made again; after two such plans `truncate` cuts the running one at once, and the third begins
 behind it without a deadline.
+
+A plan may grow: its rest is planned when the points behind it must leave, unless a newer plan came (`plan_growth.py`).
+If that is too late, because the computer stalled, the rest becomes a frame of its own behind it.
 """
+
+from math import inf
 
 from optodrive.core.types.arrays import BoolArray
 from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_growth import GrownPlan
 from optodrive.daemon.engine.planning_snapshot import (
     PlanningSnapshot,
     RefreshCycle,
@@ -29,6 +35,10 @@ SHARED_STREAM_LEAD_S = 0.04
 """Least lead of a stream if the link process has no real-time scheduling."""
 
 
+GROWTH_MARGIN_S = 0.01
+"""Time reserved for the loop and the hand-over of a plan's rest, besides its planning."""
+
+
 class QueueStream:
     """Replacement of unsent pulses by a streamed plan. Any thread may read lead_s and must_preempt."""
 
@@ -37,6 +47,7 @@ class QueueStream:
         self._display = display
         self._session = session
         self._refresh_cycle: RefreshCycle | None = None
+        self._unfinished: tuple[ActivePlan, ThermalEstimate] | None = None
 
     @property
     def lead_s(self) -> float:
@@ -107,6 +118,69 @@ class QueueStream:
             estimate = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
             self._plans.thermal.set(estimate, snapshot.start_s)
             self._refresh_cycle = RefreshCycle(estimate, mark_refreshed(last, snapshot.cut.row))
+
+    # --- growing plans ------------------------------------------------------------------------------------------
+
+    def compute_due_in_s(self, planning_time_s: float) -> float:
+        """Return the time until the rest of the running plan must be planned, infinity if it has none.
+
+        planning_time_s: time that this takes
+        """
+        if self._unfinished is not None:
+            return 0.0
+        plan = self.find_running()
+        if plan is None or plan.growth is None:
+            return inf
+        rows = plan.planned.plan
+        last_point_s = float(rows.start_s[-2] + rows.width_s[-2]) if len(rows) > 1 else 0.0
+        due_s = plan.record.start_s + plan.zero_s + last_point_s - self.lead_s - planning_time_s - GROWTH_MARGIN_S
+        return due_s - self._session.board_s()
+
+    def find_growing(self) -> ActivePlan | None:
+        """Return the plan accepted last if it is still to grow, and runs, waits, or has ended without its rest."""
+        with self._plans.lock:
+            if self._plans.waiting:
+                plan = self._plans.waiting[-1]
+            elif self._plans.running:
+                plan = self._plans.running[-1].plan
+            elif self._unfinished is not None and self._unfinished[1] is self._plans.thermal.estimate:
+                plan = self._unfinished[0]
+            else:
+                return None
+            return plan if plan.growth is not None and not plan.record.dropped else None
+
+    def keep_unfinished(self, plan: ActivePlan) -> None:
+        """Keep a plan that has ended although no newer one came before its rest was planned."""
+        if plan.growth is not None and not self._plans.is_busy:
+            self._unfinished = plan, self._plans.thermal.estimate
+
+    def forget_unfinished(self) -> None:
+        """Give up the plan that has ended without its rest."""
+        self._unfinished = None
+
+    def extend(self, plan: ActivePlan, grown: GrownPlan) -> bool:
+        """Append the rest of a plan to it. Return False, unchanged, if it is too late or a newer plan came."""
+        self._session.connection.receive()
+        with self._plans.lock:
+            if self.find_growing() is not plan or self._unfinished is not None:
+                return False
+            if not self._plans.waiting:
+                job = self._plans.running[-1].job
+                if not self._session.extend(job, grown.added, plan.epoch, grown.added_crc):
+                    return False
+            self._plans.accounts.totals["planned"] += len(grown.planned.plan) - plan.record.pulse_count
+            plan.replace_rows(grown.planned, grown.points, grown.crc, grown.summary_json)
+            self._plans.thermal.append(plan)
+            return True
+
+    def withdraw(self) -> None:
+        """Withdraw the points of the newest plan that have not left, before its rest becomes a frame of its own."""
+        if self._plans.waiting:
+            self.preempt()
+        else:
+            self.truncate()
+
+    # --- refresh cycle ------------------------------------------------------------------------------------------
 
     def find_refreshed(self, thermal: ThermalEstimate) -> BoolArray | None:
         """Return the pixels that the current refresh cycle has drawn, [p], None if another plan has come in between."""

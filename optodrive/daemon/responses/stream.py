@@ -18,7 +18,8 @@ class FrameResult(JsonModel):
     frame: None if the daemon could not read the frame
     superseded_by: the newer frame, if that arrived before this one was planned
     problem: why the frame was refused; error: why its plan failed, was stopped or was cancelled
-    pulses, skipped, trimmed, starts_in_s, duration_s: of its plan, with status "planned"
+    pulses, skipped, trimmed, starts_in_s, duration_s: of its plan so far, with status "planned"; the rest of a frame is
+    planned only if no newer one comes
     planned, executed, dropped, simulated_max_um: of its plan, once that has ended
     """
 

@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 
+from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.arrays import BoolArray, IntArray
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.link.protocol.quantisation import DecodedPulses, WirePoints, WireScale, decode, quantise
@@ -60,6 +61,18 @@ class StagePoints:
     def count_before(self, row: int) -> list[int]:
         """Return the number of points of each stage up to its last pulse before the plan's row `row`."""
         return [points.count_before(row) for points in self.stages]
+
+    @property
+    def ends_with_gate_on(self) -> bool:
+        """Whether the last point of each stage turns the gate on, so that the mirrors do not stand at a later pulse."""
+        return all(len(points) and points.table[-1, 3] for points in self.stages)
+
+    def split_behind(self, first: Self) -> Self:
+        """Return the points behind those of a first part. Raise LocalProtocolError unless that is how they begin."""
+        pairs = list(zip(self.stages, first.stages, strict=True))
+        if not all(np.array_equal(one.table[: len(before)], before.table) for one, before in pairs):
+            raise LocalProtocolError("the points of a plan's first part differ from those handed over")
+        return type(self)(tuple(WirePoints(one.table[len(b) :], one.row[len(b) :]) for one, b in pairs))
 
     def add_pauses(self, ticks: Sequence[int]) -> Self:
         """Return the points of each stage behind a further pause of `ticks`, with the gate off."""

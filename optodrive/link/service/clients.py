@@ -10,7 +10,7 @@ from optodrive.link.service.settings import OnWebLoss
 BEAT_AGE_MAX_S = 1.0
 """Age of a beat beyond which its sender counts as stalled."""
 PERMISSIONS = {
-    "planner": {"stop", "beat", "begin", "splice", "truncate", "flush", "delay"},
+    "planner": {"stop", "beat", "begin", "splice", "extend", "truncate", "flush", "delay"},
     "web": {"stop", "beat", "arm", "disarm", "pause", "resume", "revoke", "hold", "release"},
     "acceptor": {"stop"},
     "supervisor": {"stop", "disarm"},

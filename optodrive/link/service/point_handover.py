@@ -111,6 +111,7 @@ class PointHandover:
         {
             "begin": self._begin,
             "splice": self._splice,
+            "extend": self._extend,
             "truncate": self._truncate,
             "flush": self._flush,
             "delay": self._delay,
@@ -143,6 +144,16 @@ class PointHandover:
             self._jobs[int(fields["job"])] = job
             outcome = {"start_tick": job.zero_tick, "first_index": [part.first_index for part in job.parts]}
         self._send(build_result(int(fields["id"]), error, outcome))
+
+    def _extend(self, message: Message) -> None:
+        fields, points = message.fields, _parse_points(message)
+        job, error, done = self._jobs.get(int(fields["job"])), None, False
+        try:
+            self._require_allowed(message)
+            done = job is not None and self._boards.extend(job, points)
+        except OptodriveError as refusal:
+            error = refusal
+        self._send(build_result(int(fields["id"]), error, {"done": done}))
 
     def _require_allowed(self, message: Message) -> None:
         """Raise NotReadyError for points of another epoch, of a board that is not armed, or that were damaged."""

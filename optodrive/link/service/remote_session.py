@@ -16,6 +16,7 @@ from optodrive.link.protocol.stage_points import DAMAGED_POINTS, StagePoints
 from optodrive.link.service.link_connection import LinkConnection, ResultHandler, ignore_result
 from optodrive.link.service.link_status import LinkStatus
 from optodrive.link.service.remote_job import RemoteJob
+from optodrive.link.session.staged_job import StagedJob
 
 REPLY_TIMEOUT_S = 0.6
 """Longest wait for the link process: longer than a stall of a busy computer, which is for the lease to judge, and
@@ -193,6 +194,26 @@ class RemoteSession(LinkStatus):
 
         self._request("splice", fields | _build_points_fields(points, payload, send_ahead_s, crc), payload, add_job)
         return added[0] if added and self.connection.is_open else None
+
+    def extend(self, job: StagedJob, points: StagePoints, epoch: int, crc: int) -> bool:
+        """Append points to the last job without a pause. Arguments and result as for `begin` and `truncate`."""
+        last = self._find_last_job()
+        if last is None or last is not job:
+            return False
+        fields = {
+            "job": last.number,
+            "epoch": epoch,
+            "pause": self._drained_number,
+            "counts": points.counts,
+            "crc": crc,
+        }
+
+        def extend(result: dict[str, Any]) -> None:
+            if result["done"]:
+                last.extend(points)
+
+        result = self._request("extend", fields, points.encode_payload(), extend)
+        return result is not None and bool(result["done"])
 
     def truncate(self, kept_points: Sequence[int]) -> bool:
         """Truncate the last job to `kept_points` points of each stage. Return False, unchanged, if more were sent."""

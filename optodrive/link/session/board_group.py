@@ -432,6 +432,18 @@ class BoardGroup:
             parts.append(part)
         return StagedJob(parts, parts[0].start_tick)
 
+    def extend(self, job: StagedJob, points: StagePoints) -> bool:
+        """Append points to the last job without a pause. Return False, with nothing changed, if it is too late.
+
+        Several boards end each job at the same time, with the gate off, so theirs are not extended.
+        """
+        session = self.sessions[0]
+        if self.has_several or not session.can_extend(job.parts[0]):
+            return False
+        job.extend(points)
+        session.follow_extended()
+        return True
+
     def truncate(self, kept_points: Sequence[int]) -> bool:
         """Truncate the last job to `kept_points` points of each stage. Return False, unchanged, if more were sent."""
         pairs = [pair for pair in zip(self.sessions, kept_points, strict=True) if pair[0] in self._present]

@@ -193,6 +193,30 @@ class PlanJob:
             self._reported_count += 1
 
     @property
+    def is_truncated(self) -> bool:
+        """Whether the job was truncated."""
+        return self._count < len(self._table)
+
+    def extend(self, points: WirePoints) -> None:
+        """Append points behind the last one, with rows of the same plan. The job must not be truncated.
+
+        Other threads may read reports meanwhile: nothing that they read of the earlier points changes.
+        """
+        ends, fill = points.compute_end_ticks(), np.zeros(len(points), dtype=np.int64)
+        for name, added in (
+            ("_table", points.table.astype("<u2")),
+            ("_planned_end_tick", ends + (int(self._planned_end_tick[-1]) if self._count else 0)),
+            ("_end_tick", ends + self.end_tick_after(self._count)),
+            ("_on_tick", fill - 1),
+            ("_on_ticks", fill),
+            ("_duty", fill),
+            ("_row", points.row),
+        ):
+            setattr(self, name, np.concatenate([getattr(self, name), added]))
+        self._pulse_points = np.flatnonzero(self._row >= 0)
+        self._count += len(points)
+
+    @property
     def first_unreported(self) -> int | None:
         """First index not yet reported, None if all are."""
         return None if self._reported_count == self._count else self.first_index + self._reported_count

@@ -89,6 +89,15 @@ class PointStream:
         self.truncate(kept_points)
         return self._append(points, self._jobs[-1].end_tick_after(kept_points), send_ahead_ticks, timing)
 
+    def can_extend(self, job: PlanJob, min_end_tick: float) -> bool:
+        """Return whether other points may follow those of a whole job without a pause. min_end_tick: as above."""
+        is_last = self.last is job and not job.is_truncated
+        return is_last and self.can_splice(job.end_index - job.first_index, min_end_tick)
+
+    def follow_extended(self) -> None:
+        """Count the points that were appended to the last job."""
+        self._next_index = self._jobs[-1].end_index
+
     def truncate(self, kept_points: int) -> bool:
         """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
         if not self.can_truncate(kept_points):

@@ -259,6 +259,14 @@ class BoardSession(BoardLink):
             return None
         return self._points.splice(points, kept_points, send_ahead_s / self.scale.tick_s, timing)
 
+    def can_extend(self, job: PlanJob) -> bool:
+        """Return whether it is early enough to append points to a job, which must be the last one, without a pause."""
+        return self._points.can_extend(job, (self.board_s() + SPLICE_LEAD_S) / self.scale.tick_s)
+
+    def follow_extended(self) -> None:
+        """Count the points that were appended to the last job."""
+        self._points.follow_extended()
+
     @property
     def last_job(self) -> PlanJob | None:
         """The last job of those that are not finished."""

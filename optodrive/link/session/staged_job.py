@@ -8,6 +8,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses, PulsePlan
 from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
+from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.session.plan_job import PlanJob
 
 
@@ -31,13 +32,23 @@ class StagedJob:
     def __init__(self, parts: Sequence[PlanJob], zero_tick: int) -> None:
         self.parts = tuple(parts)
         self.zero_tick = zero_tick
+        self._executed_count = 0
+        self._merge_rows()
+
+    def _merge_rows(self) -> None:
+        """Sort the pulses of all parts by their rows in the plan."""
         rows = [part.pulse_rows for part in self.parts]
         row = np.concatenate(rows)
         order = np.argsort(row)
         self._row = row[order]
         self._stage = np.repeat(np.arange(len(rows)), [len(each) for each in rows])[order]
         self._pulse = np.concatenate([np.arange(len(each)) for each in rows])[order]
-        self._executed_count = 0
+
+    def extend(self, points: StagePoints) -> None:
+        """Append points of each stage behind its last one, with rows of the same plan, as `PlanJob.extend`."""
+        for part, one in zip(self.parts, points.stages, strict=True):
+            part.extend(one)
+        self._merge_rows()
 
     def delay(self, ticks: int) -> None:
         """Shift the plan's zero because an earlier job was late."""

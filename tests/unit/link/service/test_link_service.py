@@ -105,6 +105,53 @@ def test_a_splice_continues_the_plan_without_a_pause(rig):
     assert np.diff([at_s for at_s, _ in emitted]) == pytest.approx(0.0022)
 
 
+def test_points_appended_to_a_job_continue_it_without_a_pause(rig):
+    rig.arm()
+    number = rig.begin(build_points(100, DUTY), ahead_s=0.04)
+    rig.run(0.15)
+    assert rig.extend(number, build_points(60, 2 * DUTY))["done"]
+    assert rig.extend(number, build_points(10, 3 * DUTY))["done"]
+    rig.until(lambda: any(m.fields["finished"] and m.fields["job"] == number for m in rig.of_kind(PLANNER, "progress")))
+    emitted = rig.list_emitted()
+    assert [duty for _, duty in emitted] == [DUTY] * 100 + [2 * DUTY] * 60 + [3 * DUTY] * 10
+    assert np.diff([at_s for at_s, _ in emitted]) == pytest.approx(0.0022)
+    reports = b"".join(message.payload for message in rig.of_kind(PLANNER, "executed"))
+    assert len(reports) == 170 * EXECUTED.size
+    assert rig.session.board.underruns == 0
+
+
+def test_points_are_appended_only_to_the_last_job_while_it_has_some_to_send(rig):
+    rig.arm()
+    first = rig.begin(build_points(200, DUTY), ahead_s=0.04)
+    rig.run(0.15)
+    assert not rig.extend(first + 1, build_points(10, 2 * DUTY))["done"]
+    second, _ = rig.splice(build_points(50, DUTY), 150, ahead_s=0.04)
+    assert not rig.extend(first, build_points(10, 2 * DUTY))["done"]
+    assert rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=[40]))["done"]
+    assert not rig.extend(second, build_points(10, 2 * DUTY))["done"]
+    rig.until(lambda: len(rig.list_emitted()) == 190 and rig.session.is_ready)
+    third = rig.begin(build_points(20, DUTY), ahead_s=0.04)
+    rig.until(lambda: len(rig.list_emitted()) > 200)  # the last points have left, and END with them
+    assert not rig.extend(third, build_points(10, 2 * DUTY))["done"]
+    rig.run(0.5)
+    assert {duty for _, duty in rig.list_emitted()} == {DUTY}
+
+
+def test_appended_points_pass_the_gates_of_a_splice(rig):
+    older = rig.epoch
+    rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))
+    rig.arm()
+    number = rig.begin(build_points(100, DUTY), ahead_s=0.04)
+    rig.run(0.1)
+    points = build_points(10, 2 * DUTY)
+    assert "ended by stop" in rig.extend(number, points, epoch=older)["error"]["message"]
+    assert "CRC-32" in rig.extend(number, points, crc=0)["error"]["message"]
+    rig.request(WEB, "pause")
+    assert "paused" in rig.extend(number, points)["error"]["message"]
+    rig.run(0.5)
+    assert {duty for _, duty in rig.list_emitted()} == {DUTY}
+
+
 def test_truncation_ends_the_plan_early(rig):
     rig.arm()
     rig.begin(build_points(200, DUTY), ahead_s=0.04)
@@ -339,6 +386,7 @@ def test_a_second_planner_replaces_the_first_in_the_dark(rig):
         Message("begin", {"job": 1, "epoch": "x", "start_s": 0, "ahead_s": None, "crc": 0}),
         Message("begin", {"job": 1, "epoch": 1, "start_s": 0, "ahead_s": None, "crc": 0}, b"123"),
         Message("splice", {"id": 1}),
+        Message("extend", {"id": 1}),
         Message("truncate", {"id": None}),
         Message("delay", {"job": [], "ticks": 0}),
         Message("beat", {}),
