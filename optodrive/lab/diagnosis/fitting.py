@@ -7,13 +7,18 @@ import numpy as np
 
 from optodrive.core.errors import DivergedError, Unquoted
 from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.diagnosis.dataset import Dataset
+from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
 from optodrive.lab.diagnosis.noise_model import NoiseModel
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve, solve_within
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.physics.hypothesis import FreeParameter
 
 BASE_LOG_STEP = 1e-3
+MOVED_TOGETHER = (("R",), ("C",), ("tau_g",), ("kappa", "phi"))
+"""Base parameters whose derivatives one prediction shows: those of one entry act on different signals."""
+_, DISPLACEMENT, FORCE = PIXEL_KINDS
+ACTS_ON = dict.fromkeys(BASE_PARAMETERS, PIXEL_KINDS) | {"kappa": (DISPLACEMENT,), "phi": (FORCE,)}
+"""Kinds of signal on which each base parameter acts."""
 BASE_LOG_SPAN = 1.8
 """Maximum deviation of a base parameter's logarithm from its prior; a very short gas time constant costs many steps."""
 POWER_STEP, DELAY_STEP_S = 5e-3, 1e-5
@@ -103,12 +108,18 @@ def compute_jacobian(
     problem: FitProblem, point: ParameterPoint, free: Sequence[FreeParameter], prediction: FloatArray
 ) -> FloatArray:
     """Compute derivatives [m, k] with respect to base and free parameters by finite differences."""
-    columns = np.empty((len(prediction), len(BASE_PARAMETERS) + len(free)))
-    for row in range(len(BASE_PARAMETERS)):
-        base = list(point.base)
-        base[row] += BASE_LOG_STEP
-        shifted = replace(point, base=tuple(base))
-        columns[:, row] = (predict(problem.data, shifted, problem.epsilon) - prediction) / BASE_LOG_STEP
+    columns = np.zeros((len(prediction), len(BASE_PARAMETERS) + len(free)))
+    for names in MOVED_TOGETHER:
+        blocks = {name: [each for each in problem.data.blocks if each.kind in ACTS_ON[name]] for name in names}
+        if not any(blocks.values()):
+            continue
+        base = [
+            number + BASE_LOG_STEP * (name in names) for name, number in zip(BASE_PARAMETERS, point.base, strict=True)
+        ]
+        change = predict(problem.data, replace(point, base=tuple(base)), problem.epsilon) - prediction
+        for name in names:
+            for block in blocks[name]:
+                columns[block.part, BASE_PARAMETERS.index(name)] = change[block.part] / BASE_LOG_STEP
     for row, item in enumerate(free):
         number = item.read_value(point.terms)
         for step in (item.step, -item.step):
