@@ -116,10 +116,10 @@ def compute_jacobian(
         base = [
             number + BASE_LOG_STEP * (name in names) for name, number in zip(BASE_PARAMETERS, point.base, strict=True)
         ]
-        change = predict(problem.data, replace(point, base=tuple(base)), problem.epsilon) - prediction
+        difference = predict(problem.data, replace(point, base=tuple(base)), problem.epsilon) - prediction
         for name in names:
             for block in blocks[name]:
-                columns[block.part, BASE_PARAMETERS.index(name)] = change[block.part] / BASE_LOG_STEP
+                columns[block.part, BASE_PARAMETERS.index(name)] = difference[block.part] / BASE_LOG_STEP
     for row, item in enumerate(free):
         number = item.read_value(point.terms)
         for step in (item.step, -item.step):
