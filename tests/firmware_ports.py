@@ -16,6 +16,7 @@ PACKAGES = {
     "make": "make",
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "qemu-system-arm": "qemu-system-arm",
+    "node": "nodejs npm",
 }
 NEEDS = {"host": ("gcc", "make"), "mps2-an385": ("arm-none-eabi-gcc", "qemu-system-arm", "make")}
 

@@ -153,17 +153,42 @@ void board_tick(struct board *b, uint64_t now_us) {
     b->loop_ran = false;
 }
 
-/* --- the main loop --- */
+/* --- the main loop: the tick may interrupt it wherever it does not hold it, above all while it sums up bytes --- */
 
-static void send_reports(struct board *b) {
-    uint8_t body[BODY_MAX];
-    size_t length, count;
+static void hold_tick(struct board *b, bool hold) {
+    if (b->hal.hold_tick) {
+        b->hal.hold_tick(b->hal.context, hold);
+    }
+}
+
+static void advance_held(struct board *b, uint64_t now_us) {
+    hold_tick(b, true);
+    advance(b, now_us);
+    hold_tick(b, false);
+}
+
+/* Takes one report of records; returns its length, 0 if there are none. */
+static size_t take_report(struct board *b, uint8_t *body) {
+    size_t length;
+    hold_tick(b, true);
     if (b->records.reported < records_oldest(&b->records)) {
         b->records.reported = records_oldest(&b->records);
     }
-    while ((count = records_report(&b->records, b->records.reported, body, &length)) > 0) {
-        b->records.reported += (uint32_t)count;
-        send_message(b, MESSAGE_EXECUTED, body, length);
+    size_t count = records_report(&b->records, b->records.reported, body, &length);
+    b->records.reported += (uint32_t)count;
+    hold_tick(b, false);
+    return count > 0 ? length : 0;
+}
+
+static void send_reports(struct board *b) {
+    uint8_t body[BODY_MAX], wire[WIRE_MAX];
+    for (size_t length; (length = take_report(b, body)) > 0;) {
+        size_t n = encode_message(b, wire, MESSAGE_EXECUTED, body, length);
+        hold_tick(b, true);
+        if (n > 0) {
+            b->hal.send(b->hal.context, wire, n);
+        }
+        hold_tick(b, false);
     }
 }
 
@@ -223,11 +248,13 @@ void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now
     struct frame frame;
     uint32_t bad = count_bad_frames(b);
     b->loop_ran = true;
-    advance(b, now_us);
+    advance_held(b, now_us);
     send_reports(b);
     for (size_t k = 0; k < n; k++) {
         if (receiver_feed(&b->link.receiver, bytes[k], &frame)) {
+            hold_tick(b, true);
             handle_frame(b, &frame);
+            hold_tick(b, false);
         }
     }
     if (count_bad_frames(b) != bad && b->hal.trace) {
@@ -236,16 +263,20 @@ void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now
     }
     if (b->link.ack_due) {
         b->link.ack_due = false;
+        hold_tick(b, true);
         send_ack(b);
+        hold_tick(b, false);
     }
-    advance(b, now_us);
+    advance_held(b, now_us);
     send_reports(b);
 }
 
 void board_on_link_lost(struct board *b, uint64_t now_us) {
-    advance(b, now_us);
+    advance_held(b, now_us);
     send_reports(b);
+    hold_tick(b, true);
     disarm(b, REASON_LINK_LOST);
+    hold_tick(b, false);
 }
 
 /* --- power-up --- */

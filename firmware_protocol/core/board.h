@@ -60,6 +60,7 @@ struct board_hal {
     void (*send)(void *context, const uint8_t *frame, size_t length); /* all of the frame or nothing */
     void (*discard_output)(void *context); /* all frames not yet begun */
     void (*feed_watchdog)(void *context);
+    void (*hold_tick)(void *context, bool hold); /* NULL if board_receive is never interrupted by board_tick */
     void (*trace)(void *context, const struct board_trace *event); /* may be NULL */
 };
 

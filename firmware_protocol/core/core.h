@@ -99,6 +99,8 @@ bool is_leased(uint8_t state);
 /* B9: returns the fault of the first of some unsafe inputs, FAULT_NONE if there are none. */
 enum fault find_input_fault(uint8_t unsafe);
 uint8_t find_unsafe_inputs(uint8_t inputs);
+/* Encodes a message of the session; returns the number of bytes, 0 without a session. */
+size_t encode_message(const struct board *b, uint8_t *wire, uint8_t type, const uint8_t *body, size_t n);
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);
 void trace_gate(struct board *b, bool on, bool is_point, uint32_t index_or_reason);
 void command_gate(struct board *b, bool on, uint16_t duty);

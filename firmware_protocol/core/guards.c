@@ -43,6 +43,9 @@ static uint64_t leaked_uj(const struct board_limits *limits, uint32_t us) {
 
 /* B6: level of the bucket. */
 static uint32_t level_uj(const struct cell *cell, const struct board_limits *limits, uint64_t now_us) {
+    if (cell->level_uj == 0) {
+        return 0;
+    }
     uint64_t leaked = leaked_uj(limits, age_us(cell, now_us));
     return leaked >= cell->level_uj ? 0 : (uint32_t)(cell->level_uj - leaked);
 }
@@ -191,13 +194,28 @@ static bool find_accounts(struct guards *g, const struct board_config *config, c
     return true;
 }
 
-static enum fault check_pulse(const struct guards *g, const struct board_limits *limits, struct cell *const cells[GRIDS],
-                          const struct point *point, uint64_t now_us) {
+/* The accounts of a point's four cells before its pulse, and the pulse's energy: each costs a chip a division. */
+struct accounts {
+    uint32_t on_us[GRIDS], level_uj[GRIDS];
+    uint64_t energy_uj;
+};
+
+static struct accounts read_accounts(const struct board_limits *limits, struct cell *const cells[GRIDS],
+                                     const struct point *point, uint64_t now_us) {
+    struct accounts accounts = {.energy_uj = energy_uj(limits, point)};
+    for (uint32_t grid = 0; grid < GRIDS; grid++) {
+        accounts.on_us[grid] = on_time_us(cells[grid], limits, now_us);
+        accounts.level_uj[grid] = level_uj(cells[grid], limits, now_us);
+    }
+    return accounts;
+}
+
+static enum fault check_pulse(const struct guards *g, const struct board_limits *limits, const struct accounts *accounts,
+                              const struct point *point, uint64_t now_us) {
     uint32_t on_us = 0, level = 0;
     for (uint32_t grid = 0; grid < GRIDS; grid++) {
-        uint32_t had_us = on_time_us(cells[grid], limits, now_us), has_uj = level_uj(cells[grid], limits, now_us);
-        on_us = had_us > on_us ? had_us : on_us;
-        level = has_uj > level ? has_uj : level;
+        on_us = accounts->on_us[grid] > on_us ? accounts->on_us[grid] : on_us;
+        level = accounts->level_uj[grid] > level ? accounts->level_uj[grid] : level;
     }
 #if MUTANT == 4
     on_us = 0;
@@ -210,7 +228,7 @@ static enum fault check_pulse(const struct guards *g, const struct board_limits 
     if (MUTANT != 5 && max_window_duty_us(g, point, now_us) > (uint64_t)MEAN_WINDOW_US * limits->mean_duty) {
         return FAULT_MEAN_POWER;
     }
-    return level + energy_uj(limits, point) > limits->spot_uj ? FAULT_SPOT : FAULT_NONE;
+    return level + accounts->energy_uj > limits->spot_uj ? FAULT_SPOT : FAULT_NONE;
 }
 
 enum fault guards_accept_pulse(struct guards *g, const struct board_limits *limits, const struct board_config *config,
@@ -220,14 +238,15 @@ enum fault guards_accept_pulse(struct guards *g, const struct board_limits *limi
     if (!find_accounts(g, config, point, now_us, cells)) {
         return FAULT_CELLS;
     }
-    enum fault fault = check_pulse(g, limits, cells, point, now_us);
+    struct accounts accounts = read_accounts(limits, cells, point, now_us);
+    enum fault fault = check_pulse(g, limits, &accounts, point, now_us);
     if (fault != FAULT_NONE || g->count == config->window_pulses) {
         return fault != FAULT_NONE ? fault : FAULT_PULSES;
     }
     for (uint32_t grid = 0; grid < GRIDS; grid++) {
         struct cell *cell = cells[grid];
-        cell->on_us = (uint16_t)(on_time_us(cell, limits, now_us) + point->on_us); /* at most max_on_us */
-        cell->level_uj = (uint32_t)(level_uj(cell, limits, now_us) + energy_uj(limits, point));
+        cell->on_us = (uint16_t)(accounts.on_us[grid] + point->on_us); /* at most max_on_us */
+        cell->level_uj = (uint32_t)(accounts.level_uj[grid] + accounts.energy_uj);
         cell->last_on_us = point->on_us;
         cell->since_us = (uint32_t)now_us;
     }

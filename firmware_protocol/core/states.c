@@ -15,10 +15,15 @@ enum fault find_input_fault(uint8_t unsafe) {
     return unsafe & INPUT_INTERLOCK ? FAULT_INTERLOCK : unsafe & INPUT_KEY ? FAULT_KEY : FAULT_ESTOP;
 }
 
+size_t encode_message(const struct board *b, uint8_t *wire, uint8_t type, const uint8_t *body, size_t n) {
+    return b->link.session ? frame_encode(wire, type, 0, b->link.session, body, n) : 0;
+}
+
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n) {
     uint8_t wire[WIRE_MAX];
-    if (b->link.session) {
-        b->hal.send(b->hal.context, wire, frame_encode(wire, type, 0, b->link.session, body, n));
+    size_t length = encode_message(b, wire, type, body, n);
+    if (length > 0) {
+        b->hal.send(b->hal.context, wire, length);
     }
 }
 

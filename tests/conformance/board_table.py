@@ -41,7 +41,7 @@ def scenarios_of(guard):
 
 def row(guard):
     """Return a row of the table."""
-    boards = [*(kind.name for kind in PROCESS_KINDS if has_subject(kind.name, guard)), "qemu"]
+    boards = [*(kind.name for kind in PROCESS_KINDS if has_subject(kind.name, guard)), "qemu", "pico"]
     broken = Counter(mutant.board for mutant in MUTANTS if mutant.guard == guard)
     killed = ", ".join(f"{board.replace('c', 'C')} {count}" for board, count in broken.items())
     return f"| {guard} | {ENFORCED[guard]} | {scenarios_of(guard)} | {', '.join(boards)} | {killed} |"

@@ -1,13 +1,19 @@
 """Fixtures of the kinds of boards: cores in this process in virtual time, and processes in real time."""
 
+import sys
 from functools import cache, partial
+from pathlib import Path
 
 import pytest
 
 pytest.register_assert_rewrite(*(f"{name}_scenarios" for name in ("guard", "job", "link", "order", "self", "trust")))
 
 from process_board import PROCESS_KINDS  # noqa: E402
-from virtual_board import EmulatedBoard, VirtualKind  # noqa: E402
+from virtual_board import EmulatedBoard, PicoBoard, VirtualKind  # noqa: E402
+
+sys.path.append(str(Path(__file__).parents[1] / "pico"))
+
+from emulated_pico import EmulatedPico, PicoImage  # noqa: E402
 
 from c_core import SeededCBoard, build_library  # noqa: E402
 from firmware_ports import build_emulated_chip  # noqa: E402
@@ -23,6 +29,10 @@ def virtual(tmp_path_factory):
     def build(name, mutant=0):
         if name == "python":
             return VirtualKind(name, BoardCore)
+        if name == "pico":
+            built = folder / f"pico-{mutant}"
+            built.mkdir()
+            return VirtualKind(name, partial(EmulatedPico, PicoImage(built, mutant)), make_board=PicoBoard)
         if name == "qemu":
             return VirtualKind(name, build_emulated_chip(folder, mutant), make_board=EmulatedBoard)
         return VirtualKind(name, partial(SeededCBoard, build_library(folder, mutant)))

@@ -54,6 +54,14 @@ def test_caught(mutant, virtual, monkeypatch):
     assert_caught(mutant, caught_by(kind, mutant.guard))
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("guard", GUARDS)
+def test_caught_on_the_emulated_pico(guard, virtual):
+    mutant = Mutant("pico", guard, guard.removeprefix("B"))
+    assert_caught(mutant, caught_by(virtual("pico", int(mutant.name)), guard))
+
+
 @pytest.fixture(scope="module")
 def verdicts(request, ready):
     """Return the futures of `caught_by` for the selected mutants as processes."""

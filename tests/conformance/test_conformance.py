@@ -11,6 +11,12 @@ from scenario import GUARDS, audit_output, judge
 from test_conformance_pty import list_cases, name_case
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("case", list_cases("pico"), ids=name_case)
+def test_emulated_pico_conforms(case, virtual):
+    judge(virtual("pico"), case)
+
+
 @pytest.mark.parametrize("case", list_cases("qemu"), ids=name_case)
 def test_emulated_chip_conforms(case, virtual):
     judge(virtual("qemu"), case)

@@ -170,6 +170,15 @@ class EmulatedBoard(VirtualBoard):
         self.core.close()
 
 
+class PicoBoard(EmulatedBoard):
+    """An emulated Pico, whose adapter shows it by a pin whether a host has the port open."""
+
+    def open(self):
+        """Return the host's end of the port."""
+        self.core.open_port(self.clock.now_us())
+        return super().open()
+
+
 class VirtualLine:
     """The host's end of a board's port."""
 

@@ -6,6 +6,7 @@ import pytest
 
 TESTS = Path(__file__).parents[1]
 sys.path.insert(0, str(TESTS / "conformance"))  # the bench of its scenarios
+sys.path.append(str(TESTS / "pico"))
 sys.path.append(str(TESTS / "unit" / "link" / "protocol"))  # the vectors of the Python messages
 
 from c_core import build_library  # noqa: E402

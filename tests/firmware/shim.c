@@ -86,6 +86,7 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
     s->hal = (struct board_hal){s,         set_gate,     read_gate,           move_mirrors, read_inputs,    set_indicator,
                                 set_relay, read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog,
+                                NULL,
                                 trace};
     limits_decode(&s->config.limits, limits);
     memcpy(s->config.uid, uid, sizeof s->config.uid);

@@ -73,7 +73,7 @@ def test_vectors(image, symbols):
     assert stack == RAM_END
     assert stack % 8 == 0
     assert stack - symbols["bss_end"] >= STACK_MIN
-    named = {0: "reset", 1: "halt", 2: "halt", 15: "timer_isr", 15 + 20: "uart_isr"}
+    named = {0: "reset", 1: "halt", 2: "halt", 14: "systick_isr", 15: "timer_isr", 15 + 20: "uart_isr"}
     assert {k: handlers[k] for k in named} == {k: symbols[name] | 1 for k, name in named.items()}
     assert all(handler in (0, symbols["halt"] | 1) for k, handler in enumerate(handlers) if k not in named)
 
@@ -81,7 +81,7 @@ def test_vectors(image, symbols):
 def test_everything_that_runs_in_time_stands_in_ram(symbols):
     in_flash = {name for name, address in symbols.items() if FLASH <= address < FLASH + IMAGE_MAX}
     assert in_flash - {"$t", "$d"} <= {"boot2", "reset", "halt", "vectors", "data_stored"}
-    for name in ("main", "board_tick", "timer_isr", "uart_isr", "memcpy", "memset"):
+    for name in ("main", "board_tick", "systick_isr", "timer_isr", "uart_isr", "memcpy", "memset"):
         assert RAM <= symbols[name] < RAM_END
 
 

@@ -191,6 +191,18 @@ void chip_discard_output(void) {
     release_uart();
 }
 
+/* --- sleep: the processor's own timer ends it, so that the loop notices ticks that do not come --- */
+
+void systick_isr(void) {}
+
+static void start_systick(void) {
+    REGISTER(SYSTICK_RELOAD) = CLOCK_HZ / 1000000u * CHIP_SLEEP_US - 1u;
+    REGISTER(SYSTICK_VALUE) = 0;
+    REGISTER(SYSTICK_CTRL) = 7; /* on, with its interrupt, from the processor's clock */
+}
+
+void chip_sleep(void) { __asm volatile("wfi" ::: "memory"); }
+
 /* --- watchdog --- */
 
 void chip_start_watchdog(void) {
@@ -237,6 +249,7 @@ void chip_start(void (*on_alarm)(void)) {
     wait_until_set(RESETS_DONE, USED_BLOCKS);
     REGISTER(TIMER_INTE) = 1;
     start_uart();
+    start_systick();
     REGISTER(ADC_CS) = 1u | BIT(1);
     REGISTER(ADC_CS) = 1u | BIT(1) | BIT(3) | 4u << 12; /* temperature, free-running */
     for (uint32_t k = 0; k < NOISE_BITS; k++) {

@@ -10,6 +10,7 @@
 #include "board.h"
 
 #define CLOCK_HZ 125000000u
+#define CHIP_SLEEP_US 250u
 
 /* Initialises clocks, peripherals and the UART, but not the outputs. on_alarm: called from the alarm's interrupt. */
 void chip_start(void (*on_alarm)(void));
@@ -34,6 +35,9 @@ bool chip_pop_break(void);
 void chip_send(const uint8_t *frame, size_t n);
 /* Discards queued frames; a partly sent frame is completed. */
 void chip_discard_output(void);
+
+/* Sleeps until an interrupt, at most for CHIP_SLEEP_US even if the alarm has failed. */
+void chip_sleep(void);
 
 /* Starts the watchdog, which resets the chip after 40 ms without a feed. */
 void chip_start_watchdog(void);

@@ -1,5 +1,5 @@
 /* The board's core on a Raspberry Pi Pico: the safety tick runs in the timer interrupt, the rest in the main loop.
-   docs/how-to/wire-a-board.md shows the circuit. Compiled, but not yet run on hardware. */
+   docs/how-to/wire-a-board.md shows the circuit. Run in an emulator of the chip, but not yet on hardware. */
 
 #include "board.h"
 #include "chip.h"
@@ -60,6 +60,15 @@ static void feed_watchdog(void *context) {
     chip_feed_watchdog();
 }
 
+static void hold_tick(void *context, bool hold) {
+    (void)context;
+    if (hold) {
+        chip_hold_alarm();
+    } else {
+        chip_release_alarm();
+    }
+}
+
 static const struct board_hal HAL = {
     .set_gate = set_gate,
     .read_gate = read_gate,
@@ -72,6 +81,7 @@ static const struct board_hal HAL = {
     .send = send,
     .discard_output = discard_output,
     .feed_watchdog = feed_watchdog,
+    .hold_tick = hold_tick,
 };
 
 /* --- the tick --- */
@@ -99,19 +109,20 @@ static bool host_disconnected(void) {
     return chip_pop_break() || left;
 }
 
-/* The alarm is held while the few bytes of one iteration are processed. */
-static void run_loop_once(void) {
+/* Returns whether there were any bytes. The core holds the alarm where it must. */
+static bool run_loop_once(void) {
     uint8_t bytes[LOOP_BYTES_MAX];
     size_t n = chip_read(bytes, sizeof bytes);
     bool left = host_disconnected();
     chip_collect_entropy();
-    chip_hold_alarm();
     if (left) {
         board_on_link_lost(&board, chip_now_us());
     }
     board_receive(&board, bytes, outputs_get(PIN_HOST_CLOSED) ? 0 : n, chip_now_us());
+    chip_hold_alarm();
     set_alarm();
     chip_release_alarm();
+    return n > 0;
 }
 
 int main(void) {
@@ -124,6 +135,8 @@ int main(void) {
     set_alarm();
     chip_release_alarm();
     for (;;) {
-        run_loop_once();
+        if (!run_loop_once()) {
+            chip_sleep();
+        }
     }
 }

@@ -111,6 +111,9 @@
 #define ROSC_RANDOM_BIT 0x4006001cu
 
 /* --- the processor --- */
+#define SYSTICK_CTRL 0xe000e010u
+#define SYSTICK_RELOAD 0xe000e014u
+#define SYSTICK_VALUE 0xe000e018u
 #define VTOR 0xe000ed08u
 #define NVIC_ENABLE 0xe000e100u
 #define NVIC_DISABLE 0xe000e180u

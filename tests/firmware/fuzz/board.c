@@ -92,7 +92,7 @@ static void feed_watchdog(void *context) {
 
 static const struct board_hal HAL = {NULL,      set_gate,     read_gate,           move_mirrors, read_inputs,    set_indicator,
                                      set_relay, read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog,
-                                     NULL};
+                                     NULL, NULL};
 
 /* --- time --- */
 

@@ -1,0 +1,259 @@
+"""The firmware's image for the Raspberry Pi Pico, run by rp2040js: the very UF2, with other settings if asked for.
+
+The interface is that of `EmulatedChip`. The image writes no log: a witness beside the emulator makes one of the pins,
+of the SPI words and of what the core's functions are called with. Mirrors are those that the DAC was told.
+"""
+
+import json
+import os
+import re
+import struct
+import subprocess
+import sys
+import tempfile
+import weakref
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+
+from firmware_ports import require
+from optodrive.link.protocol import messages as m
+
+HERE = Path(__file__).parent
+PORT = HERE.parents[1] / "firmware_protocol" / "ports" / "rp2040"
+CORE = PORT.parents[1] / "core"
+MODULES = Path(sys.prefix).parent / ".node"
+EMULATOR = MODULES / "node_modules" / "rp2040js" / "dist" / "esm" / "index.js"
+SETTINGS = struct.Struct("<3H2x3I8H12sI4H?3x")
+"""struct board_config of the port."""
+FIRMWARE = 0x0001_0000
+BLOCK = struct.Struct("<8I476sI")
+FLASH = 0x1000_0000
+OFFSETS = ("now_us", "state", "fault", "index", "x", "y", "duty", "crc_errors", "format_errors")
+SYMBOLS = ("board", "change_state", "outputs_set_gate", "chip_read", "SETTINGS", "data_begin", "data_stored")
+INPUT_PINS = {"interlock": 10, "key": 9, "estop": 8}
+HOST_CLOSED = 2
+PWM_STEPS = 2500
+BY_POINT, BY_RESET = -1, -2
+LATE_TICK_US = 700
+LOOP_US = 300
+"""The port's main loop turns within this time."""
+
+
+def require_emulator():
+    """Raise AssertionError with the way to install the emulator."""
+    require("arm-none-eabi-gcc", "make", "node")
+    assert EMULATOR.exists(), f"the RP2040's tests need: npm install --prefix {MODULES} --no-save rp2040js@1.4.1"
+
+
+def read_symbols(elf):
+    """Return the addresses of an image's symbols by name."""
+    listed = subprocess.run(["arm-none-eabi-nm", elf], capture_output=True, text=True, check=True).stdout
+    return {name: int(address, 16) for address, _, name in map(str.split, listed.splitlines())}
+
+
+def read_offsets(folder):
+    """Return where the port's compiler places what the witness reads of struct board."""
+    sizes = re.search(r"SIZES := (.*)", (PORT / "Makefile").read_text())[1].split()
+    built, raw = folder / "offsets.o", folder / "offsets.bin"
+    flags = ["-mcpu=cortex-m0plus", "-mthumb", "-ffreestanding", f"-I{CORE}", *sizes]
+    subprocess.run(["arm-none-eabi-gcc", *flags, "-c", HERE / "offsets.c", "-o", built], check=True)
+    subprocess.run(["arm-none-eabi-objcopy", "-O", "binary", "-j", ".offsets", built, raw], check=True)
+    return dict(zip(OFFSETS, (value for (value,) in struct.iter_unpack("<I", raw.read_bytes())), strict=True))
+
+
+def read_uf2(path):
+    """Return the bytes that a UF2 file puts into the flash, from its first address on."""
+    blocks = [BLOCK.unpack_from(path.read_bytes(), at) for at in range(0, path.stat().st_size, BLOCK.size)]
+    assert [block[3] for block in blocks] == [FLASH + block[4] * k for k, block in enumerate(blocks)]
+    return b"".join(block[8][: block[4]] for block in blocks)
+
+
+class PicoImage:
+    """The port as `make` builds it in a folder.
+
+    mutant: number of the disabled guard
+    """
+
+    def __init__(self, folder, mutant=0):
+        require_emulator()
+        build = ["make", "-s", "-C", PORT, f"BUILD={folder}", f"MUTANT={mutant}"]
+        subprocess.run(build, check=True, stdout=subprocess.DEVNULL)
+        self.flash = read_uf2(folder / "board.uf2")
+        self.symbols = {name: read_symbols(folder / "board.elf")[name] for name in SYMBOLS}
+        self.offsets = read_offsets(folder)
+
+    def with_settings(self, settings):
+        """Return the flash's bytes with the settings of a board, as an edited settings.h places them."""
+        symbols = self.symbols
+        at = symbols["data_stored"] + symbols["SETTINGS"] - symbols["data_begin"] - FLASH
+        limits = vars(settings.limits).values()
+        uid = bytes.fromhex(settings.uid)
+        sizes = settings.cell_codes, settings.queue_points, settings.cells, settings.window_pulses
+        packed = SETTINGS.pack(*limits, uid, FIRMWARE, *sizes, settings.key_edge)
+        return self.flash[:at] + packed + self.flash[at + len(packed) :]
+
+
+class EmulatedPico:
+    """A Pico with its circuit. settings: None for those of the image. sink: receives each log event."""
+
+    lease_until_us = 0
+    FAULTS = ("stop_loop", "stop_tick", "late_tick", "stick_gate")
+
+    def __init__(self, image, settings, sink, seed=None):
+        self._sink, self._now_us, self.chip_us = sink, 0, 0.0
+        self._output, self._frame = deque(), b""
+        self._emission = None
+        self.state, self.gate, self.inputs = "BOOT", False, {"interlock": True, "key": True, "estop": False}
+        self.pins, self.mirrors, self.dac = [], [], []
+        self.ticks_us = (0.0, 0.0)
+        flash = image.with_settings(settings) if settings else image.flash
+        setup = {"emulator": str(EMULATOR), "image": flash.hex(), "symbols": image.symbols, "offsets": image.offsets}
+        setup |= {"seed": int.from_bytes(os.urandom(4)) if seed is None else seed + 1, "lateNanos": LATE_TICK_US * 1000}
+        with tempfile.NamedTemporaryFile("w", suffix=".json", delete=False) as file:
+            json.dump(setup, file)
+        self._process = subprocess.Popen(
+            ["node", HERE / "bench.mjs", file.name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        self.close = weakref.finalize(self, _end, self._process, file.name)
+        self._command("pin", HOST_CLOSED, True)
+        for name, value in self.inputs.items():
+            self._command("pin", INPUT_PINS[name], value != (name == "estop"))
+
+    # --- backend of a board -------------------------------------------------------------------------------------
+
+    def advance(self, now_us):
+        """Let the chip run until a time."""
+        self._now_us = now_us
+        if self.chip_us < now_us:
+            self._command("run", now_us)
+
+    def receive(self, data, now_us):
+        """Send bytes of the host, which need their time on the line."""
+        self.advance(now_us)
+        if data:
+            self._command("bytes", data.hex())
+
+    def bytes_to_send(self):
+        """Return the bytes for the host that have arrived by now."""
+        data = b""
+        while self._output and self._output[0][0] <= self._now_us:
+            data += self._output.popleft()[1]
+        return data
+
+    def open_port(self, now_us):
+        """Let a host open the adapter's port: DTR# goes low."""
+        self.advance(now_us)
+        self._command("pin", HOST_CLOSED, False)
+        self._command("run", self.chip_us + LOOP_US)
+
+    def on_link_lost(self, now_us):
+        """Close the adapter's port: DTR# goes high."""
+        self.advance(now_us)
+        self._command("pin", HOST_CLOSED, True)
+        self._command("run", self.chip_us + LOOP_US)
+
+    def set_input(self, name, value, now_us):
+        """Change the level of an input's pin."""
+        self.advance(now_us)
+        self.inputs[name] = value
+        self._sink({"t_us": round(self.chip_us), "event": "input", "input": name, "value": value})
+        self._command("pin", INPUT_PINS[name], value != (name == "estop"))
+
+    def reset(self, now_us):
+        """Pull the pin RUN low for a moment."""
+        self.advance(now_us)
+        self._command("reset")
+        self._output.clear()
+
+    def send_break(self, now_us):
+        """Send a BREAK on the line."""
+        self.advance(now_us)
+        self._command("break")
+
+    def next_event_us(self):
+        """Return None: the chip has its own time."""
+        return
+
+    def inject_fault(self, name):
+        """Break a part of the board: one of FAULTS."""
+        self._command("inject", name)
+
+    def measure_ticks(self):
+        """Return the longest tick and the longest time between two since the last call, µs."""
+        self._command("ticks")
+        return self.ticks_us
+
+    # --- the emulator -------------------------------------------------------------------------------------------
+
+    def _command(self, *values):
+        self._process.stdin.write(json.dumps(values).encode() + b"\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError("the emulator has ended")
+        for name, *fields in json.loads(line):
+            getattr(self, f"_on_{name}")(*fields)
+
+    def _on_done(self, now_us):
+        self.chip_us = now_us
+
+    def _on_byte(self, at_us, byte):
+        self._frame += bytes([byte])
+        if byte == 0:
+            self._output.append((at_us, self._frame))
+            self._frame = b""
+
+    def _on_pin(self, at_us, on, compare):
+        self.gate = on
+        self.pins.append((at_us, on, compare))
+
+    def _on_mirrors(self, at_us, x, y):
+        self.mirrors.append((at_us, x, y))
+
+    def _on_dac(self, at_us, command, value):
+        self.dac.append((at_us, command, value))
+
+    def _on_ticks(self, longest_us, apart_us):
+        self.ticks_us = longest_us, apart_us
+
+    def _on_rx_error(self, at_us, count):
+        self._sink({"t_us": round(at_us), "event": "rx_error", "bad_frames": count})
+
+    def _on_reset(self, at_us, cause):
+        self._frame = b""
+        self.state = "BOOT"
+
+    def _on_fault(self, at_us, fault):
+        self._sink({"t_us": round(at_us), "event": "fault", "fault": m.FAULTS[fault]})
+
+    def _on_state(self, at_us, state, before, reason):
+        self.state = m.STATES[state]
+        words = {"state": self.state, "before": m.STATES[before], "reason": m.EVENT_REASONS[reason]}
+        self._sink({"t_us": round(at_us), "event": "state", **words})
+
+    def _on_gate(self, at_us, on, index, reason, x, y, duty):
+        """Log an edge, and the pulse that it ends, at the place that the DAC was told before it began."""
+        at_us = round(at_us)
+        if on:
+            self._emission = at_us, index, *self.mirrors[-1][1:], duty
+            self._sink({"t_us": at_us, "event": "gate", "on": True, "reason": f"point {index}"})
+            return
+        point = f"point {index} done" if reason == BY_POINT else "reset"
+        self._sink(
+            {"t_us": at_us, "event": "gate", "on": False, "reason": m.EVENT_REASONS[reason] if reason >= 0 else point}
+        )
+        on_us, index, x, y, duty = self._emission
+        if reason != BY_RESET:
+            pulse = {"index": index, "x": x, "y": y, "duty": duty, "on_us": on_us, "off_us": at_us}
+            self._sink({"t_us": at_us, "event": "pulse", **pulse})
+
+
+def _end(process, path):
+    process.kill()
+    with suppress(BrokenPipeError):
+        process.communicate()
+    Path(path).unlink()
