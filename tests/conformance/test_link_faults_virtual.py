@@ -6,6 +6,7 @@ from functools import partial
 from math import inf
 
 import pytest
+from emulated_pico import EmulatedPico, PicoImage
 from mutants import MUTANTS
 from session_rig import configured
 from virtual_rig import VirtualRig
@@ -24,6 +25,10 @@ FAULT_RATES += [
 ]
 FAULTS_EACH = 25_000
 CHIP_FAULTS = 5_000
+PICO_FAULTS = 1_000
+OFF_LATE_MAX_US = 100
+LINE_US = 30_000
+"""Time in which all that a host has sent arrives."""
 ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 
 
@@ -59,6 +64,34 @@ def test_the_emulated_chip_emits_each_pulse_as_sent_once_and_in_order(virtual):
     rig = VirtualRig(6, 0.05, extra=0.6, pauses=0.001, make_core=virtual("qemu").make_core)
     _, pulses = run_fault_sessions(rig, CHIP_FAULTS)
     assert pulses > 0
+    rig.core.close()
+
+
+class OpenPico(EmulatedPico):
+    """A Pico whose port stays open, as the link in memory does; its loss is a BREAK behind what is on the line."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.open_port(0)
+
+    def on_link_lost(self, now_us):
+        """Send a BREAK and let it arrive."""
+        self.send_break(now_us)
+        self.advance(now_us + LINE_US)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_emulated_pico_emits_each_pulse_as_sent_once_and_in_order(tmp_path):
+    rig = VirtualRig(6, 0.05, extra=0.6, pauses=0.001, make_core=partial(OpenPico, PicoImage(tmp_path)))
+    rig.points.make(26)  # whose duty is less than a step of the PWM
+    _, pulses = run_fault_sessions(rig, PICO_FAULTS)
+    assert pulses > 0
+    pins, logged = rig.core.pins, rig.core.nominal_us
+    late_us = [at_us - due_us for (at_us, on, _), due_us in zip(pins, logged, strict=True) if not on]
+    print(f"{pulses} pulses; gate off at most {max(late_us):.0f} µs late")
+    assert min(late_us) >= 0
+    assert max(late_us) <= OFF_LATE_MAX_US
     rig.core.close()
 
 

@@ -33,7 +33,7 @@ OFFSETS = ("now_us", "state", "fault", "index", "x", "y", "duty", "crc_errors", 
 SYMBOLS = ("board", "change_state", "outputs_set_gate", "chip_read", "SETTINGS", "data_begin", "data_stored")
 INPUT_PINS = {"interlock": 10, "key": 9, "estop": 8}
 HOST_CLOSED = 2
-PWM_STEPS = 2500
+PWM_STEPS, DUTY_FULL = 2500, 65535
 BY_POINT, BY_RESET = -1, -2
 LATE_TICK_US = 700
 LOOP_US = 300
@@ -106,6 +106,8 @@ class EmulatedPico:
         self._emission = None
         self.state, self.gate, self.inputs = "BOOT", False, {"interlock": True, "key": True, "estop": False}
         self.pins, self.mirrors, self.dac = [], [], []
+        self.nominal_us = []
+        """Times at which the core commanded the edges of `pins`."""
         self.ticks_us = (0.0, 0.0)
         flash = image.with_settings(settings) if settings else image.flash
         setup = {"emulator": str(EMULATOR), "image": flash.hex(), "symbols": image.symbols, "offsets": image.offsets}
@@ -240,6 +242,9 @@ class EmulatedPico:
         at_us = round(at_us)
         if on:
             self._emission = at_us, index, *self.mirrors[-1][1:], duty
+        if self._emission[-1] * PWM_STEPS // DUTY_FULL:  # else no step of the PWM, so no edge
+            self.nominal_us.append(at_us)
+        if on:
             self._sink({"t_us": at_us, "event": "gate", "on": True, "reason": f"point {index}"})
             return
         point = f"point {index} done" if reason == BY_POINT else "reset"
