@@ -1,7 +1,6 @@
 """A stream of frames, of which the newest wins, with a blocking interface."""
 
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from optodrive.client.async_stream import AsyncStream
@@ -39,9 +38,7 @@ class Stream:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *details: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -82,33 +82,33 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     routes = RoleRoutes(app)
     add_page_routes(routes)
 
-    @routes.get("/v1/health", None)
+    @routes("GET /v1/health", None)
     async def get_health() -> HealthReport:
         """Return whether the daemon runs. This needs no token."""
         return HealthReport(version=__version__)
 
-    @routes.get("/v1/state", "viewer", response_model=StateReport)
+    @routes("GET /v1/state", "viewer", response_model=StateReport)
     async def get_state() -> Response:
         """Return the state of board, link, queue and planner."""
         return _send_state(daemon)
 
-    @routes.get("/v1/me", "viewer")
+    @routes("GET /v1/me", "viewer")
     async def get_me(request: Request) -> CallerReport:
         """Return name and role of the token that the request presented, and the routes that the role may not call."""
         token: Token = request.scope[CALLER]
         return CallerReport(name=token.name, role=token.role, refused=table.list_refused(token.role))
 
-    @routes.get("/metrics", "viewer", response_class=PlainTextResponse)
+    @routes("GET /metrics", "viewer", response_class=PlainTextResponse)
     async def get_metrics() -> Response:
         """Return metrics for Prometheus."""
         return _relay(await daemon.planner.call("metrics"), CONTENT_TYPE)
 
-    @routes.get("/v1/config", "viewer", response_model=EffectiveConfig)
+    @routes("GET /v1/config", "viewer", response_model=EffectiveConfig)
     async def get_config() -> Response:
         """Return the effective configuration, as `optodrive config show --json`."""
         return Response(config_json, media_type="application/json")
 
-    @routes.post("/v1/arm", "armer", response_model=StateReport)
+    @routes("POST /v1/arm", "armer", response_model=StateReport)
     async def arm(request: Request) -> Response:
         """Arm the board. Its indicator is on for at least two seconds before it emits."""
         await daemon.link.arm(request.scope[CALLER].name)
@@ -119,8 +119,8 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Arm the board for as long as the connection lasts and its client sends a message every second."""
         await HoldSocket(daemon.link, socket, socket.scope[CALLER].name).run()
 
-    @routes.put(
-        "/v1/dim",
+    @routes(
+        "PUT /v1/dim",
         "operator",
         response_model=StateReport,
         openapi_extra=build_request_body("the share of full power, 0 to 1", DIM_SCHEMA, DIM_EXAMPLE, True),
@@ -133,25 +133,25 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         result = await daemon.planner.call("dim", share=share, may_raise=may_raise)
         return _send_state(daemon) if result.fields["status"] == 200 else _relay(result)
 
-    @routes.post("/v1/disarm", "operator", response_model=StateReport)
+    @routes("POST /v1/disarm", "operator", response_model=StateReport)
     async def disarm() -> Response:
         """Disarm the board. This also acknowledges a fault whose cause is gone."""
         await daemon.link.command("disarm")
         return _send_state(daemon)
 
-    @routes.post("/v1/pause", "operator", response_model=StateReport)
+    @routes("POST /v1/pause", "operator", response_model=StateReport)
     async def pause() -> Response:
         """Switch the gate off. The board stays armed and plans wait, for five minutes at most."""
         await daemon.link.command("pause")
         return _send_state(daemon)
 
-    @routes.post("/v1/resume", "operator", response_model=StateReport)
+    @routes("POST /v1/resume", "operator", response_model=StateReport)
     async def resume() -> Response:
         """Play the pulses left at the pause, limited again from the heat that is left, and the plans that wait."""
         await daemon.link.command("resume")
         return _send_state(daemon)
 
-    @routes.post("/v1/reload", "armer", response_model=ReloadReport)
+    @routes("POST /v1/reload", "armer", response_model=ReloadReport)
     async def reload() -> Response:
         """Read configuration and tokens again, and apply changes that need no restart, as SIGHUP does for a service."""
         result = await daemon.reloads.request()
@@ -159,14 +159,14 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
             return Response(result.to_json(), result.status, media_type=MEDIA_TYPE)
         return Response(result.model_dump_json(), media_type="application/json")
 
-    @routes.post("/v1/stop", "viewer", response_model=StateReport)
+    @routes("POST /v1/stop", "viewer", response_model=StateReport)
     async def stop() -> Response:
         """Switch the gate off, drop everything queued, disarm the board."""
         await daemon.link.command("stop")
         return _send_state(daemon)
 
-    @routes.post(
-        "/v1/plans",
+    @routes(
+        "POST /v1/plans",
         "operator",
         status_code=201,
         response_model=PlanReport,
@@ -188,29 +188,29 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Show streamed frames, of which the newest wins, and send the result of each."""
         await LiveStream(daemon, socket, policy, socket.scope[CALLER].name).run()
 
-    @routes.get("/v1/telemetry", "viewer", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
+    @routes("GET /v1/telemetry", "viewer", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
     async def stream_telemetry(rate_hz: RateQuery = DEFAULT_RATE_HZ) -> EventStream:
         """Send server-sent events until the client disconnects: state, display, pulses, budget, fault."""
         daemon.hub.require_capacity()
         return EventStream(daemon.hub.stream_events(rate_hz))
 
-    @routes.get("/v1/plans/{plan_id}", "viewer", response_model=PlanReport)
+    @routes("GET /v1/plans/{plan_id}", "viewer", response_model=PlanReport)
     async def get_plan(plan_id: PlanId, pulses: PulsesQuery = True) -> Response:
         """Return one plan with its planned, sent and executed pulses."""
         return _relay(await daemon.planner.call("get_plan", plan=plan_id, pulses=pulses))
 
-    @routes.delete("/v1/plans/{plan_id}", "operator", response_model=PlanReport)
+    @routes("DELETE /v1/plans/{plan_id}", "operator", response_model=PlanReport)
     async def cancel_plan(plan_id: PlanId) -> Response:
         """Remove a plan from the queue, or end it if it runs. The board stays armed."""
         return _relay(await daemon.planner.call("cancel", plan=plan_id))
 
-    @routes.get("/v1/patterns", "viewer", response_model=PatternList)
+    @routes("GET /v1/patterns", "viewer", response_model=PatternList)
     async def list_patterns() -> Response:
         """Return the named patterns and their parameters."""
         return Response(patterns_json, media_type="application/json")
 
-    @routes.post(
-        "/v1/patterns/{name}",
+    @routes(
+        "POST /v1/patterns/{name}",
         "operator",
         status_code=201,
         response_model=PlanReport,
@@ -231,7 +231,7 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     def encode_openapi() -> bytes:
         return json.dumps(app.openapi(), ensure_ascii=False).encode()
 
-    @routes.get("/openapi.json", "viewer", include_in_schema=False)
+    @routes("GET /openapi.json", "viewer", include_in_schema=False)
     async def get_openapi() -> Response:
         """Return the OpenAPI document."""
         # Its first encoding takes a tenth of a second, for which STOP must not wait.

@@ -27,21 +27,10 @@ class RoleRoutes:
     def __init__(self, app: FastAPI) -> None:
         self._app = app
 
-    def get(self, path: str, min_role: Role | None, **options: Any) -> Callable[[Endpoint], Endpoint]:
-        """Declare a GET route. options: as of `FastAPI.get`."""
-        return self._declare(min_role, self._app.get(path, **options))
-
-    def post(self, path: str, min_role: Role | None, **options: Any) -> Callable[[Endpoint], Endpoint]:
-        """Declare a POST route. options: as of `FastAPI.post`."""
-        return self._declare(min_role, self._app.post(path, **options))
-
-    def put(self, path: str, min_role: Role | None, **options: Any) -> Callable[[Endpoint], Endpoint]:
-        """Declare a PUT route. options: as of `FastAPI.put`."""
-        return self._declare(min_role, self._app.put(path, **options))
-
-    def delete(self, path: str, min_role: Role | None, **options: Any) -> Callable[[Endpoint], Endpoint]:
-        """Declare a DELETE route. options: as of `FastAPI.delete`."""
-        return self._declare(min_role, self._app.delete(path, **options))
+    def __call__(self, route: str, min_role: Role | None, **options: Any) -> Callable[[Endpoint], Endpoint]:
+        """Declare a route, such as "GET /v1/state". options: as of `FastAPI.api_route`."""
+        method, path = route.split()
+        return self._declare(min_role, self._app.api_route(path, methods=[method], **options))
 
     def websocket(self, path: str, min_role: Role | None) -> Callable[[Endpoint], Endpoint]:
         """Declare a WebSocket."""

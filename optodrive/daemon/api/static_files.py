@@ -64,7 +64,7 @@ def add_page_routes(routes: RoleRoutes) -> None:
     """Serve the page at `/` and its files below `/page/`. All are read beforehand, so that no path leads elsewhere."""
     contents = dict(_read_files(_get_page_folder(), ""))
 
-    @routes.get("/", "viewer", include_in_schema=False)
+    @routes("GET /", "viewer", include_in_schema=False)
     async def get_index() -> Response:
         return _build_response("index.html", contents["index.html"])
 
@@ -73,9 +73,9 @@ def add_page_routes(routes: RoleRoutes) -> None:
         return _build_response(name, contents[name])
 
     for path in LOGIN_PATHS:
-        routes.get(path, None, include_in_schema=False)(get_login_file)
+        routes(f"GET {path}", None, include_in_schema=False)(get_login_file)
 
-    @routes.get("/page/{name:path}", "viewer", include_in_schema=False)
+    @routes("GET /page/{name:path}", "viewer", include_in_schema=False)
     async def get_file(name: str) -> Response:
         if name not in contents:
             raise HTTPException(404)

@@ -6,7 +6,6 @@
 import gc
 import sys
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from optodrive.core.clock import Clock
@@ -51,9 +50,7 @@ class ArmedBoard:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *details: object) -> None:
         self.close()
 
     def connect(self) -> None:

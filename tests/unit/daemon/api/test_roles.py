@@ -65,8 +65,8 @@ def test_routes_of_one_handler_keep_their_own_roles():
     async def handler():
         return None
 
-    routes.get("/a", None)(handler)
-    routes.post("/a", "armer")(handler)
+    routes("GET /a", None)(handler)
+    routes("POST /a", "armer")(handler)
     assert RouteTable(app.routes).roles == {"GET /a": None, "POST /a": "armer"}
 
 
