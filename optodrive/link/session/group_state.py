@@ -1,4 +1,7 @@
-"""What the boards of several stages report, as the state of one: `board_group.py` says how they are one."""
+"""State of the boards of several stages as that of one.
+
+`board_group.py` says why they act as one.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
