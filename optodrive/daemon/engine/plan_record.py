@@ -163,8 +163,8 @@ class PlanRecord:
     @property
     def nbytes(self) -> int:
         """Size of everything that grows with the plan, bytes."""
-        columns = (self.pulses, self.execution)
-        return len(self.summary_json) + sum(item.nbytes for item in columns if item is not None)
+        listed_bytes = 0 if self.pulses is None else self.pulses.nbytes
+        return len(self.summary_json) + listed_bytes + (0 if self.execution is None else self.execution.nbytes)
 
     def build_report(self, board_now_s: float, pulses: bool = True, clocks: ClockReading | None = None) -> PlanReport:
         """Report the plan.

@@ -126,7 +126,7 @@ class QueueStream:
 
         planning_time_s: time that this takes
         """
-        if self._unfinished is not None:
+        if self._find_unfinished() is not None:
             return 0.0
         plan = self.find_running()
         if plan is None or plan.growth is None:
@@ -143,11 +143,17 @@ class QueueStream:
                 plan = self._plans.waiting[-1]
             elif self._plans.running:
                 plan = self._plans.running[-1].plan
-            elif self._unfinished is not None and self._unfinished[1] is self._plans.thermal.estimate:
-                plan = self._unfinished[0]
             else:
-                return None
+                return self._find_unfinished()
             return plan if plan.growth is not None and not plan.record.dropped else None
+
+    def _find_unfinished(self) -> ActivePlan | None:
+        """Return the plan that has ended without its rest if nothing has come since."""
+        with self._plans.lock:
+            if self._unfinished is None or self._plans.is_busy:
+                return None
+            plan, thermal = self._unfinished
+            return plan if thermal is self._plans.thermal.estimate else None
 
     def keep_unfinished(self, plan: ActivePlan) -> None:
         """Keep a plan that has ended although no newer one came before its rest was planned."""
@@ -162,7 +168,7 @@ class QueueStream:
         """Append the rest of a plan to it. Return False, unchanged, if it is too late or a newer plan came."""
         self._session.connection.receive()
         with self._plans.lock:
-            if self.find_growing() is not plan or self._unfinished is not None:
+            if not self._plans.is_busy or self.find_growing() is not plan:
                 return False
             if not self._plans.waiting:
                 job = self._plans.running[-1].job

@@ -77,8 +77,11 @@ class QueueThermal:
         return SavedThermalState(host_s, self._session.board_s(), self.estimate, plans)
 
     def build_saved_key(self, active: Sequence[ActivePlan]) -> object:
-        """Return a value that changes whenever build_saved_state() would return another state."""
-        records = [plan.record for plan in active]
+        """Return a value that changes whenever build_saved_state() would return another state.
+
+        It leaves out that a plan has ended while the next one runs: the state before both counts the same pulses.
+        """
+        records = [plan.record for plan in active[-1:]]
         return id(self.estimate), tuple((record.plan_id, record.dropped, record.start_s) for record in records)
 
     def restore(self, saved: SavedThermalState, host_s: float) -> None:

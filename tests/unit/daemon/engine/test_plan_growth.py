@@ -22,9 +22,9 @@ from optodrive.daemon.push import Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.planning.batch_limiter import BatchLimiter
-from planner_rig import build_frame, build_train
+from planner_rig import PlannerRig, build_frame, build_train
 
-FRAMES = 250
+FRAMES, PLAYED = 250, 20
 STREAM = Push("frame", {}, 0.0, 0, streamed=True, lists_pulses=False)
 
 
@@ -194,16 +194,27 @@ def test_a_frame_grows_while_it_plays_and_is_one_plan(rig):
     assert rig.session.board.underruns == 0
 
 
-def test_the_board_emits_what_it_would_of_a_whole_plan(rig, monkeypatch):
-    finish(rig, stream(rig))
-    in_parts = list_emitted(rig)
-    rig.log.clear()
-    rig.run(60.0)  # the display is cold again
-    monkeypatch.setattr(StreamHorizon, "follow", lambda self, arrived_s: inf)
-    record = stream(rig)
-    assert record.pulse_count == 16
-    finish(rig, record)
-    assert in_parts == list_emitted(rig)
+def test_the_board_emits_what_it_would_of_whole_plans(monkeypatch):
+    """Random frames one after another, on two boards in step."""
+    logs = []
+    for horizon_s in (0.0, inf):
+        monkeypatch.setattr(StreamHorizon, "follow", lambda self, arrived_s, horizon_s=horizon_s: horizon_s)
+        rig, rng, grown = PlannerRig(monkeypatch).ready(), np.random.default_rng(4), 0
+        rig.arm()
+        for _ in range(PLAYED):
+            target_m = rng.uniform(20e-6, 300e-6, 16) * (rng.random(16) < 0.8)
+            sequence = FrameSequence((TactileFrame("f", 0.0, 3600.0, target_m),))
+            record = rig.store.find(
+                rig.submit(sequence, rig.remote.epoch, streamed=True, lists_pulses=False).result().plan
+            )
+            planned_at_once = record.pulse_count
+            finish(rig, record)
+            assert record.status == "done"
+            grown += record.pulse_count > planned_at_once
+        logs.append((list_emitted(rig), grown))
+    (in_parts, grown), (whole, none) = logs
+    assert in_parts == whole
+    assert (grown > 0.8 * PLAYED, none) == (True, 0)
 
 
 @pytest.mark.parametrize("executed", range(17))
@@ -244,6 +255,19 @@ def test_a_newer_frame_that_comes_after_a_late_end_leaves_no_rest(rig):
     rig.run(1.0)
     assert (first.status, second.status) == ("superseded", "done")
     assert len(list_emitted(rig)) == first.executed_count + 16
+
+
+def test_a_newer_frame_that_comes_before_the_rest_of_an_ended_one_is_one_plan(rig):
+    first = stream(rig)
+    stall_until(rig, lambda: not rig.boards.has_points and len(rig.list_emitted()) == first.pulse_count)
+    rig.remote.connection.receive()
+    rig.queue.update_jobs(None)  # the loop sees the end before the planning thread begins with the rest
+    assert first.has_ended
+    second = stream(rig, 250.0)
+    finish(rig, second)
+    rig.run(0.2)
+    assert (second.status, second.executed_count) == ("done", 16)
+    assert rig.store.list_recent() == [first, second]
 
 
 @pytest.mark.parametrize("kind", ["stop", "pause"])
