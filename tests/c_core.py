@@ -108,6 +108,7 @@ def load(path):
     handle, u64, u32, size = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint32, ctypes.c_size_t
     signatures = {
         "shim_new": ([ctypes.c_char_p, ctypes.c_char_p, *[u32] * 5], handle),
+        "shim_interrupt": ([handle, u32], None),
         "shim_free": ([handle], None),
         "shim_entropy": ([handle, ctypes.POINTER(u32), size], None),
         "shim_init": ([handle, u32, u64], None),
@@ -262,3 +263,11 @@ class SeededCBoard(CBoard):
     def __init__(self, library, settings, sink, seed):
         entropy = random.Random(seed)
         super().__init__(library, settings, sink, [entropy.getrandbits(32) for _ in range(4096)])
+
+
+class InterruptedCBoard(SeededCBoard):
+    """A C core whose main loop a tick interrupts wherever it may."""
+
+    def __init__(self, library, settings, sink, seed):
+        super().__init__(library, settings, sink, seed)
+        library.shim_interrupt(self._handle, 1)

@@ -15,7 +15,7 @@ sys.path.append(str(Path(__file__).parents[1] / "pico"))
 
 from emulated_pico import EmulatedPico, PicoImage  # noqa: E402
 
-from c_core import SeededCBoard, build_library  # noqa: E402
+from c_core import InterruptedCBoard, SeededCBoard, build_library  # noqa: E402
 from firmware_ports import build_emulated_chip  # noqa: E402
 from optodrive.link.simulator.board_core import BoardCore  # noqa: E402
 
@@ -35,6 +35,8 @@ def virtual(tmp_path_factory):
             return VirtualKind(name, partial(EmulatedPico, PicoImage(built, mutant)), make_board=PicoBoard)
         if name == "qemu":
             return VirtualKind(name, build_emulated_chip(folder, mutant), make_board=EmulatedBoard)
+        if name == "interrupted":
+            return VirtualKind(name, partial(InterruptedCBoard, build_library(folder, mutant)))
         return VirtualKind(name, partial(SeededCBoard, build_library(folder, mutant)))
 
     return build

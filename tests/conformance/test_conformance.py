@@ -11,6 +11,11 @@ from scenario import GUARDS, audit_output, judge
 from test_conformance_pty import list_cases, name_case
 
 
+@pytest.mark.parametrize("case", list_cases("interrupted"), ids=name_case)
+def test_a_core_with_ticks_wherever_they_may_interrupt_conforms(case, virtual):
+    judge(virtual("interrupted"), case)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", list_cases("pico"), ids=name_case)
 def test_emulated_pico_conforms(case, virtual):

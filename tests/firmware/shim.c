@@ -20,7 +20,7 @@ struct shim {
     struct board board;
     uint64_t now_us, fed_us;
     uint8_t inputs;
-    uint8_t stuck, stuck_on, gate_on, indicator, relay;
+    uint8_t stuck, stuck_on, gate_on, indicator, relay, interrupted;
     uint16_t x, y;
     uint8_t out[OUT_MAX];
     size_t out_length;
@@ -73,6 +73,13 @@ static void feed_watchdog(void *context) {
     struct shim *s = context;
     s->fed_us = s->now_us;
 }
+/* An interrupt that has waited runs as soon as the main loop lets it. */
+static void hold_tick(void *context, bool hold) {
+    struct shim *s = context;
+    if (s->interrupted && !hold) {
+        board_tick(&s->board, s->now_us);
+    }
+}
 static void trace(void *context, const struct board_trace *event) {
     struct shim *s = context;
     if (s->traces_count < TRACES_MAX) {
@@ -86,8 +93,7 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
     s->hal = (struct board_hal){s,         set_gate,     read_gate,           move_mirrors, read_inputs,    set_indicator,
                                 set_relay, read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog,
-                                NULL,
-                                trace};
+                                hold_tick, trace};
     limits_decode(&s->config.limits, limits);
     memcpy(s->config.uid, uid, sizeof s->config.uid);
     s->config.firmware = 0x00010000u;
@@ -98,6 +104,8 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
     s->config.key_edge = key_edge;
     return s;
 }
+
+void shim_interrupt(struct shim *s, uint32_t interrupted) { s->interrupted = (uint8_t)interrupted; }
 
 void shim_free(struct shim *s) { free(s); }
 
@@ -126,8 +134,11 @@ void shim_run(struct shim *s, uint64_t now_us) {
 }
 
 void shim_loop(struct shim *s, uint64_t now_us) {
+    uint8_t interrupted = s->interrupted;
     s->now_us = now_us;
+    s->interrupted = false; /* no ticks */
     board_receive(&s->board, NULL, 0, now_us);
+    s->interrupted = interrupted;
 }
 
 void shim_receive(struct shim *s, const uint8_t *bytes, size_t n) { board_receive(&s->board, bytes, n, s->now_us); }
