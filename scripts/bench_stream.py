@@ -14,6 +14,7 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
 import httpx
@@ -28,6 +29,7 @@ from rig import TOKEN, read_role_tokens  # of the tests
 from stop_rig import FloodProcess
 
 RUNS, SUPERSEDING = 50, 200
+HORIZON_S = 0.1
 PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
 LOAD_HZ = 1250.0
 """Requests of the other clients per second. At 0, the load is what server and clients can do."""
@@ -110,21 +112,22 @@ def measure_superseding():
     from optodrive.link.board_setup import build_scales
 
     display = build_display()
-    scales = build_scales(display.config)
-    thermal = ThermalEstimate(*display.build_cold_state())
-    snapshot = PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
-    push, rng, times = Push("bench", {}, 0.0, 0, streamed=True), np.random.default_rng(7), []
-    for number in range(SUPERSEDING):
-        built = BuiltRequest(draw_frame(rng, ACTIVE))
-        request = PlanningRequest(lambda: built, push)
-        begin_s = time.process_time()
-        plan = make_plan(display, scales, request, built, snapshot, f"p{number}", lambda fraction: None)
-        planned_s = time.process_time()
-        snapshot = build_cut_snapshot(plan, thermal, (number + 1) / RATE_HZ, display.budget, scales[0].tick_s)
-        times.append((planned_s - begin_s, time.process_time() - planned_s))
-    for what, times_s in zip(("plan", "state at the cut"), np.transpose(times[10:]), strict=True):
-        name = f"frame of {ACTIVE} pixels that truncates the one before it: {what}"
-        yield Row(name, to_ms(times_s.tolist()))
+    scales, push = build_scales(display.config), Push("bench", {}, 0.0, 0, streamed=True, lists_pulses=False)
+    for planned, horizon_s in (("whole", inf), (f"its first {1e3 * HORIZON_S:g} ms", HORIZON_S)):
+        thermal = ThermalEstimate(*display.build_cold_state())
+        snapshot = PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
+        rng, times = np.random.default_rng(7), []
+        for number in range(SUPERSEDING):
+            built = BuiltRequest(draw_frame(rng, ACTIVE))
+            request = PlanningRequest(lambda built=built: built, push)
+            begin_s = time.process_time()
+            plan = make_plan(display, scales, request, built, snapshot, f"p{number}", lambda fraction: None, horizon_s)
+            planned_s = time.process_time()
+            snapshot = build_cut_snapshot(plan, thermal, (number + 1) / RATE_HZ, display.budget, scales[0].tick_s)
+            times.append((planned_s - begin_s, time.process_time() - planned_s))
+        for what, times_s in zip(("plan", "state at the cut"), np.transpose(times[10:]), strict=True):
+            name = f"frame of {ACTIVE} pixels that truncates the one before it, {planned}: {what}"
+            yield Row(name, to_ms(times_s.tolist()))
 
 
 def push_frames(url, seconds):
