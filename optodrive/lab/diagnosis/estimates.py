@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from math import exp
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from optodrive.core.quantity import format_range
 from optodrive.core.types.arrays import FloatArray
@@ -26,7 +26,7 @@ def compute_estimates(data: Dataset, final: ModelFit, covariance: FloatArray) ->
     """
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     out: dict[str, Estimate] = {}
-    t_quantile = float(student.ppf(0.975, count_noise_degrees(data)))
+    t_quantile = float(stdtrit(count_noise_degrees(data), 0.975))
     if any(kind < 3 for kind in data.kinds):
         for row, name in enumerate(BASE_PARAMETERS):
             log_value, width = final.point.base[row], t_quantile * float(sigma[row])

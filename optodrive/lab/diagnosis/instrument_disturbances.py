@@ -16,7 +16,7 @@ All are subtracted from the data, and the diagnosis goes on without them.
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import InstrumentDisturbance
@@ -95,4 +95,4 @@ def _fit_drift(times: FloatArray, zeros: FloatArray, degree: int) -> tuple[float
     left, total = float(((zeros - fitted(times)) ** 2).sum()), float(((zeros - zeros.mean()) ** 2).sum())
     degrees = len(zeros) - degree - 1
     ratio = (total - left) / degree / max(left / degrees, 1e-300)
-    return float(f_distribution.sf(ratio, degree, degrees)), fitted
+    return float(fdtrc(degree, degrees, ratio)), fitted
