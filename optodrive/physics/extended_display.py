@@ -146,11 +146,7 @@ class ExtendedThermalState:
         return np.array([by_kind[kind] for kind in kinds])
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Return the displacement of a pixel, m, at increasing times t_s [m]. The state does not change.
-
-        pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
-        pixel's last event.
-        """
+        """See `ThermalState.simulate_displacement_m`."""
         acting = self._select_acting(pulses, pixel)
         first_s = min(float(t_s[0]), float(acting[0, 0]) if len(acting) else np.inf)
         context, work, off_s = self._advance_copy(pixel, first_s)
@@ -173,10 +169,7 @@ class ExtendedThermalState:
         return state
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
-        """Return the measured traces of some pixels from the cold state at increasing times t_s [m].
-
-        pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError if the display is not cold.
-        """
+        """See `ThermalState.simulate_traces`. Raises ValueError if the display is not cold."""
         if self._events.states.any():
             raise ValueError("a display with terms is traced from the cold state only")
         # Membrane terms do not act back on the gas: without them, the displacement is proportional to the gas's rise.

@@ -170,11 +170,7 @@ class NominalThermalState:
         return absorber_k, gas_k
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Return the displacement of a pixel, m, at increasing times t_s [m]. The state does not change.
-
-        pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
-        pixel's last event.
-        """
+        """See `ThermalState.simulate_displacement_m`."""
         gas_k = self.simulate_rises_k(pixel, pulses[pulses[:, 3] == pixel, :3], t_s)[1]
         return self.pixels.elements[pixel].kappa_m_per_k * gas_k
 
@@ -185,10 +181,7 @@ class NominalThermalState:
         return state
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
-        """Return the exact traces of some pixels at increasing times t_s [m].
-
-        pulses: [n, 4] start_s, width_s, power_w, pixel in order, after each pixel's last event.
-        """
+        """See `ThermalState.simulate_traces`. They are exact."""
         absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
         for column, index in enumerate(pixels):
             pixel_pulses = pulses[pulses[:, 3] == index, :3]

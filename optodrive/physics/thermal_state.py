@@ -54,13 +54,20 @@ class ThermalState(Protocol):
         """Return the largest displacement that one pulse can reach on each cold pixel, [p]."""
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Return the displacement of a pixel at t_s [m] under pulses [n, 4]. The state does not change."""
+        """Return the displacement of a pixel, m, at increasing times t_s [m]. The state does not change.
+
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
+        pixel's last event.
+        """
 
     def state_at(self, at_s: float) -> DisplayState:
         """Return every pixel at one time, with the gate off since its last event, or at that event if it is later."""
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
-        """Return the traces of some pixels at t_s [m] under pulses [n, 4] start_s, width_s, power_w, pixel."""
+        """Return the traces of some pixels at increasing times t_s [m].
+
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order, after each pixel's last event.
+        """
 
 
 def build_cold_state(config: Config, parameters: ParameterSet, pixels: PixelArray | None = None) -> ThermalState:

@@ -11,7 +11,7 @@ import numpy as np
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.device.calibrated_field import CalibratedField
 from optodrive.device.field_geometry import CENTRE_CODE, FieldGeometry, beam_position_m, compute_parameter_derivatives
-from optodrive.device.field_surface import ORDER, TERM_COUNT, compute_prior_widths, evaluate_terms
+from optodrive.device.field_surface import TERM_COUNT, compute_prior_widths, evaluate_terms
 from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.spots import MeasuredSpots
 
@@ -50,7 +50,6 @@ class FieldFit:
     residual_m: FloatArray
     noise_m: float
     surface_m: float
-    surface_order: int
     parameter_sigma: FloatArray
     covariance: FloatArray
 
@@ -237,7 +236,6 @@ class _FieldFitter:
             residual_m=self.residual_m().T.copy(),
             noise_m=self.scales.noise_m,
             surface_m=self.scales.surface_m,
-            surface_order=ORDER,
             parameter_sigma=self.parameter_sigma,
             covariance=covariance,
         )

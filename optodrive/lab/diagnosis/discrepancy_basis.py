@@ -29,16 +29,9 @@ SIZE_ITERATIONS = 3
 
 
 def compute_discrepancy_basis(
-    problem: FitProblem,
-    fitted: ModelFit,
-    hypotheses: Sequence[Hypothesis],
-    all_hypotheses: Sequence[Hypothesis],
-    separate_signals: bool = True,
+    problem: FitProblem, fitted: ModelFit, hypotheses: Sequence[Hypothesis], all_hypotheses: Sequence[Hypothesis]
 ) -> FloatArray:
-    """Compute basis columns [m, k] for a fit with these hypotheses.
-
-    separate_signals: include another share of the effect in each signal
-    """
+    """Compute basis columns [m, k] for a fit with these hypotheses."""
     data, terms = problem.data, fitted.point.terms
     power, dose, session, heat = (np.zeros(len(data.value)) for _ in range(4))
     for block in data.blocks:
@@ -62,7 +55,7 @@ def compute_discrepancy_basis(
             effect * dose,
             effect * session,
             effect * heat,
-            *(_separate_signals(data, effect) if separate_signals else ()),
+            *_separate_signals(data, effect),
         ]
         alternatives: list[ParameterPoint] = []
         for other in all_hypotheses:

@@ -17,10 +17,9 @@ from optodrive.lab.servo_identification.effects import FORMS, LINEAR_FORM, SLEW,
 from optodrive.lab.servo_identification.step_response import Steps, step_response_rad
 from optodrive.lab.servo_identification.step_trace import AXES, GAIN_TOLERANCE, StepTrace, TraceSegment
 
-PARAMETER_NAMES = ("frequency", "damping", "delay", "slowness")
-"""Fitted parameters: logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
 LOWER_BOUNDS = np.array([np.log(50.0), 0.05, 0.0, 1e-6])
 UPPER_BOUNDS = np.array([np.log(3e4), 0.999, 0.01, 1.0])
+"""Of the fitted parameters: logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
 SCALE = np.array([0.1, 0.1, 1e-5, 1e-3])
 START_SAMPLES_MAX = 3000
 """Maximum number of samples for the comparison of starting points."""
@@ -67,7 +66,7 @@ class IdentifiedServo:
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard deviation of each of PARAMETER_NAMES, [4]."""
+        """Standard deviation of each parameter, [4]."""
         sigma: FloatArray = np.sqrt(np.diag(self.covariance))
         return sigma
 

@@ -63,8 +63,8 @@ class CauseFit:
 class CauseSearch:
     """Search over sets of causes for given facts and a base parameter set, with a cache of all fits."""
 
-    def __init__(self, base: ParameterSet, data: Sequence[Datum], causes: Sequence[CauseHypothesis] = CAUSES) -> None:
-        self.base, self.data, self.causes = base, tuple(data), tuple(causes)
+    def __init__(self, base: ParameterSet, data: Sequence[Datum]) -> None:
+        self.base, self.data = base, tuple(data)
         self._sigma = np.array([datum.sigma for datum in data])
         self._fits: dict[frozenset[str], CauseFit] = {}
         self.nominal = self._evaluate((), np.zeros(0))
@@ -145,7 +145,7 @@ class CauseSearch:
         excluded = {other for key in keys for other in CAUSES_BY_KEY[key].excludes}
         return [
             cause
-            for cause in self.causes
+            for cause in CAUSES
             if cause.key not in keys and cause.key not in excluded and not set(cause.excludes) & set(keys)
         ]
 

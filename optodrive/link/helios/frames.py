@@ -12,7 +12,7 @@ CLOCK_HZ = 112_000_000
 POINT_BYTES = 7
 TRAILER = struct.Struct("<HHB")
 """Points per second, number of points, flags."""
-START_AT_ONCE, PLAY_ONCE, HOST_ONLY = 1, 2, 4
+PLAY_ONCE = 2
 POINTS_MAX = 4095
 RATE_MIN, RATE_MAX = 7, 65_535
 PACKET_BYTES = 64

@@ -36,7 +36,6 @@ class BeamTimeEstimator:
         self.lattice = Lattice.from_config(config)
         self._scanner, self._servo = config.scanner, build_servo(config.scanner)
         self._tolerance_rad, self._pitch_m = min(config.tolerance_rad), config.display.pitch_m
-        self._period_s = 1.0 / config.laser.pwm_hz
         laser = config.laser
         self._drive = DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
         known = load_pixel_map(config)
