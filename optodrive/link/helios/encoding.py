@@ -25,9 +25,8 @@ from optodrive.link.helios.frames import (
     parse_points,
     point_ticks,
 )
-from optodrive.link.protocol.dac_codes import BipolarDac
+from optodrive.link.protocol.dac_codes import DacScale
 
-DAC = BipolarDac(12)
 LEVEL_MAX = 255
 TICKS_PER_US = CLOCK_HZ // 1_000_000
 TRAILING_POINTS = 2
@@ -35,13 +34,12 @@ TRAILING_POINTS = 2
 
 
 @dataclass(frozen=True)
-class PointScale:
+class PointScale(DacScale, bits=12):
     """Scale factors between SI units and codes, levels and points.
 
     points_per_s: requested rate; the actual rate of the DAC is slightly lower
     """
 
-    rad_per_code: float
     full_power_w: float
     points_per_s: int
 
@@ -55,14 +53,6 @@ class PointScale:
     def point_s(self) -> float:
         """Actual duration of a point, s."""
         return point_ticks(self.points_per_s) / CLOCK_HZ
-
-    def to_codes(self, angle_rad: FloatArray) -> IntArray:
-        """Return the codes of mirror angles, any shape. Raise LocalProtocolError beyond the DAC's range."""
-        return DAC.to_codes(angle_rad, self.rad_per_code)
-
-    def to_angles_rad(self, codes: IntArray) -> FloatArray:
-        """Return the mirror angles of codes, rad, any shape."""
-        return DAC.to_angles_rad(codes, self.rad_per_code)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +109,10 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
         np.append(np.column_stack([np.zeros_like(level), level]).ravel(), 0), np.append(run_lengths, tail)
     )
     dwell_points = np.append(last - before, tail)
-    x, y = (np.repeat(np.append(codes, codes[-1:] if len(codes) else DAC.centre), dwell_points) for codes in (x, y))
+    x, y = (
+        np.repeat(np.append(codes, codes[-1:] if len(codes) else PointScale.CENTRE_CODE), dwell_points)
+        for codes in (x, y)
+    )
     return _pack_points(x, y, levels)
 
 

@@ -1,6 +1,7 @@
 """Conversion between mirror angles and DAC codes."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -9,28 +10,26 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
-class BipolarDac:
-    """Digital-to-analogue converter whose centre code is angle 0."""
+class DacScale:
+    """Scale of a digital-to-analogue converter of the mirrors.
 
-    bits: int
+    CODE_MAX: largest code; CENTRE_CODE: that of angle 0
+    """
 
-    @property
-    def centre(self) -> int:
-        """Code of angle 0."""
-        return 1 << (self.bits - 1)
+    CODE_MAX: ClassVar[int]
+    CENTRE_CODE: ClassVar[int]
+    rad_per_code: float
 
-    @property
-    def code_max(self) -> int:
-        """Largest code."""
-        return (1 << self.bits) - 1
+    def __init_subclass__(cls, bits: int) -> None:
+        cls.CODE_MAX, cls.CENTRE_CODE = (1 << bits) - 1, 1 << (bits - 1)
 
-    def to_codes(self, angle_rad: FloatArray, rad_per_code: float) -> IntArray:
+    def to_codes(self, angle_rad: FloatArray) -> IntArray:
         """Return the codes of mirror angles, any shape. Raise LocalProtocolError beyond the DAC's range."""
-        codes = np.rint(angle_rad / rad_per_code).astype(np.int64) + self.centre
-        if codes.size and (codes.min() < 0 or codes.max() > self.code_max):
-            raise LocalProtocolError(f"codes {codes.min()} to {codes.max()} leave the DAC's range 0 to {self.code_max}")
+        codes = np.rint(angle_rad / self.rad_per_code).astype(np.int64) + self.CENTRE_CODE
+        if codes.size and (codes.min() < 0 or codes.max() > self.CODE_MAX):
+            raise LocalProtocolError(f"codes {codes.min()} to {codes.max()} leave the DAC's range 0 to {self.CODE_MAX}")
         return codes
 
-    def to_angles_rad(self, codes: IntArray, rad_per_code: float) -> FloatArray:
+    def to_angles_rad(self, codes: IntArray) -> FloatArray:
         """Return the mirror angles of codes, rad, any shape."""
-        return np.asarray((codes - self.centre) * rad_per_code, dtype=np.float64)
+        return np.asarray((codes - self.CENTRE_CODE) * self.rad_per_code, dtype=np.float64)

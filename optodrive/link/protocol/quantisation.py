@@ -8,10 +8,8 @@ import numpy as np
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import LimitedPlan
-from optodrive.link.protocol.dac_codes import BipolarDac
+from optodrive.link.protocol.dac_codes import DacScale
 
-DAC = BipolarDac(16)
-CENTRE_CODE, CODE_MAX = DAC.centre, DAC.code_max
 DUTY_MAX = 65535
 TICKS_MAX = 65535
 PADDING_TICKS = 10_000
@@ -20,20 +18,14 @@ GATE_OFF_STEP_TICKS = 60_000
 
 
 @dataclass(frozen=True)
-class WireScale:
+class WireScale(DacScale, bits=16):
     """Scale factors between SI units and wire integers."""
 
-    rad_per_code: float
     full_power_w: float
     tick_s: float
 
-    def to_codes(self, angle_rad: FloatArray) -> IntArray:
-        """Return the DAC codes of mirror angles, any shape. Raise LocalProtocolError beyond the DAC's range."""
-        return DAC.to_codes(angle_rad, self.rad_per_code)
 
-    def to_angles_rad(self, codes: IntArray) -> FloatArray:
-        """Return the mirror angles of DAC codes, rad, any shape."""
-        return DAC.to_angles_rad(codes, self.rad_per_code)
+CENTRE_CODE, CODE_MAX = WireScale.CENTRE_CODE, WireScale.CODE_MAX
 
 
 @dataclass(frozen=True, eq=False)
