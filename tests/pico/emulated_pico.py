@@ -159,11 +159,12 @@ class EmulatedPico:
         self._command("run", self.chip_us + LOOP_US)
 
     def set_input(self, name, value, now_us):
-        """Change the level of an input's pin."""
+        """Change the level of an input's pin, and let the next tick read it."""
         self.advance(now_us)
         self.inputs[name] = value
         self._sink({"t_us": round(self.chip_us), "event": "input", "input": name, "value": value})
         self._command("pin", INPUT_PINS[name], value != (name == "estop"))
+        self._command("run", self.chip_us + LOOP_US)
 
     def reset(self, now_us):
         """Pull the pin RUN low for a moment."""
