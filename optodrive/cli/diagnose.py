@@ -8,9 +8,9 @@ import typer
 
 from optodrive.cli.options import ConfigOption
 from optodrive.cli.output import announce_compilation, print_answer, show_step
-from optodrive.cli.requirements import require_scipy
 from optodrive.cli.signals import end_as_interrupted
 from optodrive.core.errors import InputError
+from optodrive.core.extras import import_extra
 
 if TYPE_CHECKING:
     from optodrive.core.provenance import Provenance
@@ -60,7 +60,7 @@ def diagnose(
     ] = None,
 ) -> None:
     """Name the errors of the model in measured data, and the gain from correcting them."""
-    require_scipy()
+    import_extra("scipy")
     from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.display_diagnosis import MAX_JOINT_PIXELS
     from optodrive.lab.recording import DisplayRuns

@@ -7,8 +7,8 @@ import typer
 
 from optodrive.cli.options import JsonOption
 from optodrive.cli.output import print_answer, show_step
-from optodrive.cli.requirements import require_scipy
 from optodrive.cli.signals import end_as_interrupted
+from optodrive.core.extras import import_extra
 
 if TYPE_CHECKING:
     from optodrive.lab.discovery import Discovery
@@ -21,7 +21,7 @@ RecordsArgument = Annotated[
 
 def discover(model: ModelArgument, records: RecordsArgument, json: JsonOption = False) -> None:
     """Find the terms that a simulation lacks, in measured records of any system."""
-    require_scipy()
+    import_extra("scipy")
     from optodrive.lab.discovery import discover as search
     from optodrive.lab.discovery.input_files import load_model, read_record
 

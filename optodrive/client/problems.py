@@ -14,6 +14,7 @@ from optodrive.core.errors import (
     OverBudgetError,
     RefusedError,
     StoppedError,
+    Unquoted,
 )
 from optodrive.daemon.api.tokens import ENVIRONMENT_VARIABLE
 from optodrive.daemon.responses.problem import Problem
@@ -54,19 +55,9 @@ def _build_typed_error(problem: Problem) -> OptodriveError:
         return InputError("token", "the one given", expected)
     if problem.status in INPUT_ERROR_STATUSES:
         if problem.where is not None and problem.expected is not None:
-            return InputError(problem.where, _PreformattedRepr(str(problem.value)), problem.expected)
+            return InputError(problem.where, Unquoted(str(problem.value)), problem.expected)
         return InputError("request", problem.status, detail)
     if problem.pixel is not None and problem.cap is not None and problem.margin_j is not None:
         fits_after_s = inf if problem.fits_after_s is None else problem.fits_after_s
         return OverBudgetError(detail, problem.pixel, problem.cap, problem.margin_j, fits_after_s)
     return ERROR_BY_CODE.get(problem.code, RefusedError)(detail)
-
-
-class _PreformattedRepr:
-    """A value whose repr the daemon has already formatted."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def __repr__(self) -> str:
-        return self._text

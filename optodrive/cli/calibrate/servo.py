@@ -8,8 +8,8 @@ import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.cli.output import list_written, print_answer
-from optodrive.cli.requirements import require_scipy
 from optodrive.core.errors import MISSING, InputError
+from optodrive.core.extras import import_extra
 
 
 def servo(
@@ -26,7 +26,7 @@ def servo(
     json: JsonOption = False,
 ) -> None:
     """Identify both mirror servos from steps or any excitation, and tell whether one linear servo suffices."""
-    require_scipy()
+    import_extra("scipy")
     from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.plausible_units import check_recording_units

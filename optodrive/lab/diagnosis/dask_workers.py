@@ -15,7 +15,8 @@ from threading import Timer
 from typing import Any, TypeVar
 from uuid import uuid4
 
-from optodrive.core.errors import MISSING, InputError, OptodriveError
+from optodrive.core.errors import InputError, OptodriveError
+from optodrive.core.extras import import_extra
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -42,11 +43,7 @@ def open_client(
     Raises InputError if the address is invalid or no scheduler answers there, OptodriveError if no local process
     starts.
     """
-    try:
-        import dask
-        import distributed
-    except ImportError:
-        raise InputError("dask", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra") from None
+    dask, distributed = import_extra("dask"), import_extra("distributed", "dask")
     # The answers report a lost worker; Dask's own messages are a page long.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)

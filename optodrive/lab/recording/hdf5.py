@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError, Unquoted
+from optodrive.core.extras import import_extra
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run
 from optodrive.lab.recording.storage import (
@@ -34,11 +35,7 @@ from optodrive.lab.recording.storage import (
 
 def import_h5py() -> Any:
     """Return the module h5py. Raise InputError if the extra that provides it is not installed."""
-    try:
-        import h5py
-    except ImportError:
-        raise InputError("h5py", MISSING, "the extra: pip install 'optodrive[analysis]'", "missing_extra") from None
-    return h5py
+    return import_extra("h5py")
 
 
 class Hdf5Tree:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optodrive.core.errors import MISSING, InputError
+from optodrive.core.extras import import_extra
 from optodrive.lab.calibration.camera.folder import PictureFolder
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
@@ -20,11 +21,7 @@ MEDIAN_BLOCK_ROWS = 200
 
 def import_opencv() -> Any:
     """Import OpenCV. Raise InputError (missing_extra) if it is not installed."""
-    try:
-        import cv2
-    except ImportError:
-        raise InputError("OpenCV", MISSING, "the extra: pip install 'optodrive[camera]'", "missing_extra") from None
-    return cv2
+    return import_extra("cv2", "OpenCV", "camera")
 
 
 def read_image(path: Path) -> Image:
