@@ -171,10 +171,12 @@ class PlanRecord:
 
         pulses: whether the report lists them one by one; clocks: give the onset of a plan that has not begun
         """
-        execution = self.execution
+        # The status first: another thread gives a plan its last one when all else is final.
+        status, execution = self.status, self.execution
         return PlanReport.from_object(
             self,
             plan=self.plan_id,
+            status=status,
             starts_in_s=self.start_s + self.delay_s - board_now_s,
             planned=self.pulse_count,
             executed=self.executed_count,

@@ -11,6 +11,7 @@ from optodrive.daemon.engine import planner
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
+from optodrive.planning.listed_pulses import ListedPulses
 from planner_rig import PlannerRig, build_frame, build_train
 
 
@@ -35,6 +36,22 @@ def test_plans_are_executed_in_order_with_the_points_that_were_proven(rig):
     assert first.executed_count == second.executed_count == 16
     assert len(rig.list_emitted()) == 32
     assert second.execution.simulated_max_m == pytest.approx(90e-6, rel=0.01)
+
+
+def test_no_report_states_an_end_without_the_execution(rig, monkeypatch):
+    """The plan ends in another thread while its report is built."""
+    record, to_columns = submit(rig, build_frame(60.0)), ListedPulses.to_columns
+    rig.until(lambda: record.executed_count >= 1)
+
+    def end_meanwhile(pulses):
+        finish(rig, record)
+        return to_columns(pulses)
+
+    monkeypatch.setattr(ListedPulses, "to_columns", end_meanwhile)
+    report = record.build_report(0.0)
+    assert record.has_ended
+    assert report.status == "running"
+    assert record.build_report(0.0).executed_pulses is not None
 
 
 def test_a_streamed_plan_replaces_the_unsent_rest_without_a_pause(rig):
