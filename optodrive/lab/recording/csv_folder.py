@@ -8,7 +8,7 @@ from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from optodrive.lab.recording.storage import (
     VERSION,
     Attributes,
     MemoryBudget,
+    RecordingTree,
     convert_errors,
     normalize_attributes,
 )
@@ -35,24 +36,17 @@ TOML_NAME = "recording.toml"
 TOML_BYTES_MAX = 64 * TEXT_BYTES_MAX
 
 
-class CsvTree:
-    """Recording in a folder of CSV files. It implements `RecordingTree`."""
+class CsvTree(RecordingTree):
+    """Recording in a folder of CSV files."""
 
     def __init__(self, path: Path) -> None:
         """Read `recording.toml`."""
-        self._path = path
+        self.path = path
         self._budget = MemoryBudget()
         self._toml = _read_toml(path / TOML_NAME)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *details: object) -> None:
         """Do nothing. No file stays open."""
-
-    def format_place(self, *names: str) -> str:
-        """Return the place of a run, signal or field for messages."""
-        return f"{self._path}: /{'/'.join(('runs', *names))}"
 
     def read_root_attributes(self) -> Attributes:
         """Return the attributes of the recording."""
@@ -60,8 +54,8 @@ class CsvTree:
 
     def list_runs(self) -> list[str]:
         """Return the run names: tables of `recording.toml`, and folders with pulses that lack a table."""
-        with convert_errors(str(self._path), "a readable folder"):
-            folders = [entry.name for entry in self._path.iterdir() if (entry / f"{PULSES}.csv").is_file()]
+        with convert_errors(str(self.path), "a readable folder"):
+            folders = [entry.name for entry in self.path.iterdir() if (entry / f"{PULSES}.csv").is_file()]
             folder_names = sorted(name for name in folders if not name.startswith("."))
         return list(dict.fromkeys([*self._get_run_tables(), *folder_names]))
 
@@ -100,17 +94,17 @@ class CsvTree:
     def _get_run_tables(self) -> dict[str, dict[str, Any]]:
         runs = self._toml.get("runs")
         if not isinstance(runs, dict) or not all(isinstance(run, dict) for run in runs.values()):
-            raise InputError(f"{self._path / TOML_NAME}: runs", runs, "one table per run: [runs.NAME]")
+            raise InputError(f"{self.path / TOML_NAME}: runs", runs, "one table per run: [runs.NAME]")
         return runs
 
     def _list_files(self, run: str) -> list[str]:
-        folder = self._path / run
+        folder = self.path / run
         with convert_errors(self.format_place(run), "a readable folder"):
             files = sorted(folder.glob("*.csv")) if folder.is_dir() else []
             return [file.stem for file in files if not file.name.startswith(".")]
 
     def _find_file(self, run: str, name: str) -> Path:
-        path = self._path / run / f"{name}.csv"
+        path = self.path / run / f"{name}.csv"
         with convert_errors(self.format_place(run, name), "a readable file"):
             if not path.is_file():
                 raise InputError(self.format_place(run, name), None, f"the file {run}/{name}.csv")

@@ -3,7 +3,7 @@
 from contextlib import suppress
 from math import prod
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from optodrive.lab.recording.storage import (
     VERSION,
     Attributes,
     MemoryBudget,
+    RecordingTree,
     convert_errors,
     format_name,
     normalize_attribute,
@@ -38,32 +39,25 @@ def import_h5py() -> Any:
     return import_extra("h5py")
 
 
-class Hdf5Tree:
-    """Recording in an HDF5 file that is open for reading. It implements `RecordingTree`."""
+class Hdf5Tree(RecordingTree):
+    """Recording in an HDF5 file that is open for reading."""
 
     def __init__(self, path: Path) -> None:
         """Open a file that `probe_in_sandbox` has accepted."""
         self._h5 = import_h5py()
-        self._path = path
+        self.path = path
         self._budget = MemoryBudget()
         self._cached_run: tuple[str, Any] | None = None
         with convert_errors(str(path), "a readable HDF5 file"):
             self._file = self._h5.File(path, "r")
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *details: object) -> None:
         with suppress(Exception):  # a damaged file may fail again when it is closed
             self._file.close()
 
-    def format_place(self, *names: str) -> str:
-        """Return the place of a run, signal or field for messages."""
-        return f"{self._path}: /{'/'.join(('runs', *names))}"
-
     def read_root_attributes(self) -> Attributes:
         """Return the attributes of the recording."""
-        return self._read_attributes(str(self._path), self._file)
+        return self._read_attributes(str(self.path), self._file)
 
     def list_runs(self) -> list[str]:
         """Return the run names."""
@@ -86,14 +80,14 @@ class Hdf5Tree:
         """Return the IDs of a session's plans. Return none for another recording."""
         if "plans" not in self._file:
             return []
-        place = f"{self._path}: /plans"
+        place = f"{self.path}: /plans"
         return [
             name for name in self._list_groups(place, self._open_group(place, self._file, "plans")) if name != "config"
         ]
 
     def read_plan(self, plan: str) -> tuple[Attributes, dict[str, str], dict[str, FloatArray]]:
         """Return a plan's attributes, texts (`PLAN_TEXTS`) and tables (`PLAN_TABLES`), those that it has."""
-        place = f"{self._path}: /plans/{plan}"
+        place = f"{self.path}: /plans/{plan}"
         group = self._open_group(place, self._file, f"plans/{plan}")
         texts: dict[str, str] = {}
         tables: dict[str, FloatArray] = {}

@@ -55,12 +55,16 @@ NAME_BYTES_MAX = 200
 class RecordingTree(Protocol):
     """An open recording in either form. Arrays are read on request."""
 
-    def __enter__(self) -> Self: ...
+    path: Path
+
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(self, *details: object) -> None: ...
 
     def format_place(self, *names: str) -> str:
         """Return the place of a run, signal or field for messages, preceded by the recording's path."""
+        return f"{self.path}: /{'/'.join(('runs', *names))}"
 
     def read_root_attributes(self) -> Attributes:
         """Return the attributes of the recording."""
