@@ -43,11 +43,11 @@ def test_no_report_states_an_end_without_the_execution(rig, monkeypatch):
     record, to_columns = submit(rig, build_frame(60.0)), ListedPulses.to_columns
     rig.until(lambda: record.executed_count >= 1)
 
-    def end_meanwhile(pulses):
+    def end_now(pulses):
         finish(rig, record)
         return to_columns(pulses)
 
-    monkeypatch.setattr(ListedPulses, "to_columns", end_meanwhile)
+    monkeypatch.setattr(ListedPulses, "to_columns", end_now)
     report = record.build_report(0.0)
     assert record.has_ended
     assert report.status == "running"
