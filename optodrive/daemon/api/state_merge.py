@@ -13,8 +13,8 @@ from optodrive.daemon.responses.state import (
     PlannerState,
     PulseTotals,
     QueueReport,
+    StageReport,
     StateReport,
-    build_stage_reports,
 )
 from optodrive.device.config import Config
 from optodrive.device.config_sections import BoardSection
@@ -63,13 +63,14 @@ def merge_state(
     ends_in_s = status["pause"]["ends_in_s"] if status is not None and status["connected"] else None
     control = status["control"] if status is not None and status["connected"] else None
     planner = planner or NO_PLANNER
+    stages = _list_unknown_stages(config) if status is None else status["stages"]
     return StateReport.from_object(
         planner,
         display=config.name,
         pixels=pixels,
         link=link,
         board=BoardReport(**board),
-        stages=build_stage_reports(_list_unknown_stages(config) if status is None else status["stages"]),
+        stages=[StageReport.model_validate(stage) for stage in stages],
         control=None if control is None else ControlReport.model_validate(control, extra="ignore"),
         queue=_merge_queue(planner.queue, ends_in_s),
     )

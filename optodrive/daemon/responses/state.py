@@ -1,7 +1,6 @@
 """The response of GET /v1/state, and of arm, disarm and stop."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 from optodrive.core.json_model import JsonModel
 from optodrive.daemon.responses.plan_status import PlanStatus
@@ -162,8 +161,3 @@ class StateReport(JsonModel):
     totals: PulseTotals
     planner: PlannerReport
     limits: LimitsReport
-
-
-def build_stage_reports(stages: Sequence[Mapping[str, Any]]) -> list[StageReport]:
-    """Build the reports of several stages from the status of the link process."""
-    return [StageReport(**{**stage, "board": BoardReport(**stage["board"])}) for stage in stages]
