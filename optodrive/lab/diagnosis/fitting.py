@@ -14,7 +14,7 @@ from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, 
 from optodrive.physics.hypothesis import FreeParameter
 
 BASE_LOG_STEP = 1e-3
-MOVED_TOGETHER = (("R",), ("C",), ("tau_g",), ("kappa", "phi"))
+MOVED_AS_ONE = (("R",), ("C",), ("tau_g",), ("kappa", "phi"))
 """Base parameters whose derivatives one prediction shows: those of one entry act on different signals."""
 _, DISPLACEMENT, FORCE = PIXEL_KINDS
 ACTS_ON = dict.fromkeys(BASE_PARAMETERS, PIXEL_KINDS) | {"kappa": (DISPLACEMENT,), "phi": (FORCE,)}
@@ -109,7 +109,7 @@ def compute_jacobian(
 ) -> FloatArray:
     """Compute derivatives [m, k] with respect to base and free parameters by finite differences."""
     columns = np.zeros((len(prediction), len(BASE_PARAMETERS) + len(free)))
-    for names in MOVED_TOGETHER:
+    for names in MOVED_AS_ONE:
         blocks = {name: [each for each in problem.data.blocks if each.kind in ACTS_ON[name]] for name in names}
         if not any(blocks.values()):
             continue
