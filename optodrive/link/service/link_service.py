@@ -191,14 +191,14 @@ class LinkService:
             self._handover.pause()
 
     def _require_armed(self, purpose: str) -> None:
-        board = self._boards.board
-        if board.state not in ARMED_STATES:
-            raise NotReadyError(f"the board is {board.state}; only an armed board can be {purpose}")
+        state = self._boards.state
+        if state not in ARMED_STATES:
+            raise NotReadyError(f"the board is {state}; only an armed board can be {purpose}")
 
     def _require_no_control(self) -> None:
         """Raise NotReadyError while a caller is arming the board or has armed it: one arming at a time."""
         if self._control is not None:
-            state = self._boards.board.state
+            state = self._boards.state
             doing = "has armed the board" if state in ARMED_STATES else "is arming the board"
             raise NotReadyError(f"{self._control.describe_caller()} {doing}; only a DISARMED board can be armed")
 
@@ -263,7 +263,7 @@ class LinkService:
         else:
             self._boards.step_connecting()
         stalled = self._clients.find_stalled()
-        control = self._control if self._boards.board.state in LEASED_STATES else None
+        control = self._control if self._boards.state in LEASED_STATES else None
         commands = self._handover.commands
         status = self._status.build_if_due(self.epoch, control, self.pauses, commands, stalled)
         if status is not None:  # before the results: who knows of ARMED from one may push to the planner at once
@@ -305,17 +305,18 @@ class LinkService:
 
         It does not end what has ended; but a report that it has may be false.
         """
-        board, seen, lost = self._boards.board, self._seen_faults, self._boards.lost
+        seen, lost = self._seen_faults, self._boards.lost
         self._seen_faults = self._boards.list_faults()
         is_new_fault = any(
             fault and fault not in seen[stage : stage + 1] and (lost is None or stage != lost.stage)
             for stage, fault in enumerate(self._seen_faults)
         )
         if is_new_fault or (self._control is not None and not self._boards.has_arming):
-            self.go_dark(self._boards.describe_split() or f"the board went to {board.state} ({self._find_reason()})")
+            end = f"the board went to {self._boards.state} ({self._find_reason()})"
+            self.go_dark(self._boards.describe_split() or end)
 
     def _find_reason(self) -> str:
-        fault = self._boards.board.fault
+        fault = self._boards.fault
         if not fault:
             return self._boards.last_event_reason
         cause = self._boards.likely_cause if fault == "LINK" else None
@@ -323,7 +324,7 @@ class LinkService:
 
     @property
     def _is_armed(self) -> bool:
-        return self._control is not None and self._boards.board.state in ARMED_STATES
+        return self._control is not None and self._boards.state in ARMED_STATES
 
     def _end_unattended(self) -> None:
         """Go dark when a plan that was allowed to finish without the web process has ended, and none has come back."""

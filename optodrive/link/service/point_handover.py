@@ -162,8 +162,8 @@ class PointHandover:
             raise NotReadyError(f"the plan is of epoch {epoch}, now is {self._epoch.number}: {self._epoch.reason}")
         if not self._permits(message):
             raise NotReadyError("the light is paused, or was since the plan was made")
-        if not self._boards.connected or self._boards.board.state not in ARMED_STATES:
-            raise NotReadyError(f"the board is {self._boards.board.state}; arm it first")
+        if not self._boards.connected or self._boards.state not in ARMED_STATES:
+            raise NotReadyError(f"the board is {self._boards.state}; arm it first")
         if crc != zlib.crc32(message.payload):
             raise NotReadyError(DAMAGED_POINTS)
 

@@ -39,13 +39,13 @@ class StatusPublisher:
         control: who armed the board; commands: number of the planner's commands carried out since it connected
         stalled: role of the process that withholds the lease, so that the board cannot be armed; '' if none does
         """
-        boards, board, link_error = self._boards, self._boards.board, self._boards.link_error
+        boards, link_error = self._boards, self._boards.link_error
         outcome = boards.is_ready, boards.last_event_reason, boards.likely_cause
         causes = None if control is None else control.arming, commands, stalled, *outcome
         pause = pauses.number, pauses.is_paused
         links = boards.connected, None if link_error is None else str(link_error)
         states = tuple(session.board.state for session in boards.sessions)
-        key = (epoch.number, pause, links, states, boards.lost, board.state, board.fault, *causes)
+        key = (epoch.number, pause, links, states, boards.lost, boards.state, boards.fault, *causes)
         now_s = self._clock.now_s()
         if key == self._published and now_s < self._due_s:
             return None
@@ -58,7 +58,7 @@ class StatusPublisher:
             "link_error": None if link_error is None else str(link_error),
             "link_error_code": None if link_error is None else link_error.code,
             "port": boards.port,
-            "board": board.to_dict(),
+            "board": boards.board.to_dict(),
             "stats": boards.collect_link_stats(),
             "faults": dict(boards.faults),
             "lease": {

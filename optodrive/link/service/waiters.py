@@ -65,19 +65,18 @@ def _is_fulfilled(waiter: Waiter, boards: BoardGroup) -> bool:
     has_confirmed = boards.is_acknowledged or (waiter.command == "stop" and boards.abort_confirmed)
     if waiter.command in ("stop", "disarm") and not boards.has_lost_ended:
         return False
-    return boards.board.state in AWAITED_STATES[waiter.command] and has_confirmed
+    return boards.state in AWAITED_STATES[waiter.command] and has_confirmed
 
 
 def _find_error(
     waiter: Waiter, boards: BoardGroup, refusal: str | None, link_error: str | None, now_s: float
 ) -> OptodriveError | None:
-    board = boards.board
     if not boards.connected:
         return LinkError(link_error or "no link to the board")
     if refusal is not None:
         return NotReadyError(f"the board refuses to {waiter.command}: {refusal}")
-    if board.state == BoardState.FAULT and waiter.command == "arm":
-        return BoardFaultError(f"the board is in FAULT {board.fault}: {get_fault_hint(board.fault)}")
+    if boards.state == BoardState.FAULT and waiter.command == "arm":
+        return BoardFaultError(f"the board is in FAULT {boards.fault}: {get_fault_hint(boards.fault)}")
     if now_s > waiter.deadline_s:
-        return NotReadyError(f"the board did not {waiter.command} within {TIMEOUT_S:g} s: it is {board.state}")
+        return NotReadyError(f"the board did not {waiter.command} within {TIMEOUT_S:g} s: it is {boards.state}")
     return None

@@ -74,8 +74,18 @@ class GroupState:
         return ", ".join(session.port for session in self.sessions)
 
     @property
+    def state(self) -> str:
+        """State of the board that is nearest to light."""
+        return min((session.board.state for session in self._present), key=STATE_ORDER.index)
+
+    @property
+    def fault(self) -> str:
+        """Fault of the first board that has one, '' if none has."""
+        return next((session.board.fault for session in self._present if session.board.fault), "")
+
+    @property
     def board(self) -> BoardView:
-        """Latest reported state of all boards: the sums of their counts, and the state of the one nearest to light."""
+        """Latest reports of all boards: the sums of their counts, `state` and `fault`."""
         boards = [session.board for session in self._present]
         if not self.has_several:
             return boards[0]
@@ -83,7 +93,7 @@ class GroupState:
         values = vars(faulty) | {name: sum(getattr(board, name) for board in boards) for name in SUMS}
         values["free_points"] = min(board.free_points for board in boards)
         values["temperature_c"] = max((b.temperature_c for b in boards if b.temperature_c is not None), default=None)
-        values["state"] = min((board.state for board in boards), key=STATE_ORDER.index)
+        values["state"] = self.state
         return BoardView(**values)
 
     @property
@@ -181,7 +191,7 @@ class GroupState:
 
     def describe_split(self) -> str:
         """Return which board has left the armed states while another is in them, '' if none has."""
-        if not self.has_several or self.board.state not in ARMED_STATES:
+        if not self.has_several or self.state not in ARMED_STATES:
             return ""
         for name, session in zip(self.names, self.sessions, strict=True):
             if session in self._present and session.board.state not in LEASED_STATES:

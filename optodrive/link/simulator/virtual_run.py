@@ -35,7 +35,7 @@ def execute(
     boards = _build_boards(display.config)
     _connect(boards)
     boards.arm()
-    while boards.board.state != BoardState.ARMED:
+    while boards.state != BoardState.ARMED:
         _step(boards)
     scales = build_scales(display.config)
     points = StagePoints.from_plan(prepared.plan, scales)
