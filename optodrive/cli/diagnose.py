@@ -6,19 +6,31 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from optodrive.cli.diagnose_live import (
+    DEFAULT_BUDGET_S,
+    DEFAULT_OUT,
+    RECORDING,
+    LiveRequest,
+    describe_campaign,
+    describe_end,
+    measure_live,
+)
 from optodrive.cli.options import ConfigOption
 from optodrive.cli.output import announce_compilation, print_answer, show_step
 from optodrive.cli.signals import end_as_interrupted
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
 from optodrive.core.extras import import_extra
 
 if TYPE_CHECKING:
     from optodrive.core.provenance import Provenance
+    from optodrive.core.types.discrepancy import Discrepancy
     from optodrive.core.types.measurements import Measurement
     from optodrive.device.config import Config
     from optodrive.lab.recording import DisplayRuns
 
-RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING", help="HDF5 files or CSV folders.")]
+RecordingsArgument = Annotated[
+    list[Path] | None, typer.Argument(metavar="RECORDING", help="HDF5 files or CSV folders; none with --live.")
+]
 STDOUT = "-"
 DEFAULT_BRIDGE_WIDTH_M = 0.4e-3
 """Assumed where the recording states no width; R and C in model.toml then hold for displays of this width only."""
@@ -36,7 +48,7 @@ class _DiagnosisOutput:
 
 def diagnose(
     context: typer.Context,
-    recordings: RecordingsArgument,
+    recordings: RecordingsArgument = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Write report.html, diagnosis.json, model.toml.")
     ] = None,
@@ -58,9 +70,24 @@ def diagnose(
             "--dask", metavar="ADDRESS", help="Dask scheduler for a recording of many pixels: tcp://host:8786."
         ),
     ] = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Measure on the board and its sensor; each diagnosis chooses the next experiment."),
+    ] = False,
+    budget_s: Annotated[
+        float, typer.Option("--budget-s", metavar="SECONDS", help="Of --live: time in the laboratory.")
+    ] = DEFAULT_BUDGET_S,
+    yes: Annotated[bool, typer.Option("--yes", help="Of --live: arm and emit without asking.")] = False,
 ) -> None:
     """Name the errors of the model in measured data, and the gain from correcting them."""
     import_extra("scipy")
+    if live:
+        _refuse_with_live(recordings, workers, dask)
+        _check_json(json)
+        _diagnose_live(context, LiveRequest(out or DEFAULT_OUT, budget_s, yes, seed, config), json)
+        return
+    if not recordings:
+        raise InputError("RECORDING", MISSING, "a recording, or --live to measure one")
     from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.display_diagnosis import MAX_JOINT_PIXELS
     from optodrive.lab.recording import DisplayRuns
@@ -78,6 +105,31 @@ def diagnose(
         else:
             output = _diagnose_jointly(recordings, out, title, seed, config, settings, provenance)
         _write_output(output, out, json)
+
+
+def _refuse_with_live(recordings: list[Path] | None, workers: int | None, dask: str | None) -> None:
+    """Raise InputError for an argument that --live does not take."""
+    for name, value in (("RECORDING", recordings and str(recordings[0])), ("--workers", workers), ("--dask", dask)):
+        if value is not None:
+            raise InputError(name, value, "nothing with --live, which measures one pixel itself")
+
+
+def _diagnose_live(context: typer.Context, request: LiveRequest, json: str | None) -> None:
+    """Measure and diagnose, and write recording and diagnosis into the folder."""
+    from optodrive.device.config_file import load_config
+
+    request.check()
+    result = measure_live(request, quiet=json == STDOUT)
+    recording = request.out / RECORDING
+    settings = load_config(request.config)
+    provenance = _capture_provenance(context, [str(recording)], settings)
+    width_m = settings.display.bridge_width_m
+    output = _build_output(
+        result.diagnosis, str(recording), [str(recording)], provenance, request.out, request.config, width_m
+    )
+    output.document["campaign"] = describe_campaign(result)
+    output.narrative[:0] = [describe_end(result), ""]
+    _write_output(output, request.out, json)
 
 
 def _capture_provenance(context: typer.Context, recordings: list[str], config: "Config | None") -> "Provenance":
@@ -102,22 +154,35 @@ def _diagnose_jointly(
 ) -> _DiagnosisOutput:
     """Diagnose one pixel, or a few pixels with common parameters."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
-    from optodrive.lab.diagnosis.model_file import build_model_toml
-    from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
     from optodrive.lab.diagnosis.next_steps import OUT
     from optodrive.lab.diagnosis.priors import build_prior
-    from optodrive.lab.diagnosis.report import build_report
 
     measurement, paths = _read_recordings(recordings), [str(path) for path in recordings]
     prior, epsilon, width_m = build_prior(measurement, config)
     announce_compilation()
     with show_step("reading") as on_progress:
         diagnosis = study(measurement, seed, prior, epsilon, on_progress)
+    return _build_output(diagnosis, title, paths, provenance, out or OUT, config_name, width_m)
+
+
+def _build_output(
+    diagnosis: "Discrepancy",
+    title: str,
+    paths: list[str],
+    provenance: "Provenance",
+    out: Path | str,
+    config_name: str | None,
+    width_m: float | None,
+) -> _DiagnosisOutput:
+    from optodrive.lab.diagnosis.model_file import build_model_toml
+    from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+    from optodrive.lab.diagnosis.report import build_report
+
     model = build_model_toml(diagnosis, title, width_m or DEFAULT_BRIDGE_WIDTH_M) if diagnosis.base else None
     return _DiagnosisOutput(
         build_answer(diagnosis) | {"provenance": provenance.to_dict()},
         build_narrative(diagnosis),
-        build_report(diagnosis, title, provenance, paths, str(out or OUT), config_name),
+        build_report(diagnosis, title, provenance, paths, str(out), config_name),
         model,
     )
 
@@ -174,9 +239,15 @@ def _check_output_paths(json: str | None, out: Path | None) -> None:
     """Reject outputs that cannot be written, or that would overwrite anything."""
     from optodrive.core.files import check_output
 
+    _check_json(json)
+    check_output("--out", out, folder=True)
+
+
+def _check_json(json: str | None) -> None:
+    from optodrive.core.files import check_output
+
     if json is not None and json != STDOUT:
         check_output("--json", Path(json), ".json")
-    check_output("--out", out, folder=True)
 
 
 def _read_recordings(paths: list[Path]) -> "Measurement":

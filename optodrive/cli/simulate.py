@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from optodrive.core.types.measurements import PixelTrace
     from optodrive.core.types.plans import ExecutedPulses
-    from optodrive.device.config import Config
-    from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.physics.thermal_state import ThermalState
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.report import FeasibilityReport
@@ -83,6 +81,7 @@ def simulate(
     from optodrive.core.files import check_output
     from optodrive.lab.recording.storage import HDF5_SUFFIXES
     from optodrive.link.simulator.traces import compute_pixel_trace, compute_traces
+    from optodrive.link.simulator.true_display import build_true_display, select_true_terms
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.link.simulator.virtual_run import execute
     from optodrive.planning.display_model import DisplayModel
@@ -99,11 +98,11 @@ def simulate(
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
     sampled_pixels = None if pixel_seed is None else GroundTruthPixels.sample(pixel_seed, display.config)
     is_nominal = truth is None and sampled_pixels is None
-    true_terms, ignored_terms = _select_true_terms(load_run_config(config, truth or model), truth)
+    true_terms, ignored_terms = select_true_terms(load_run_config(config, truth or model), truth)
     true_display = (
         display.build_cold_heat()
         if is_nominal
-        else _build_true_display(load_run_config(config, truth or model), sampled_pixels, true_terms)
+        else build_true_display(load_run_config(config, truth or model), sampled_pixels, true_terms)
     )
     selected = _parse_pixels(pixels, len(display.layout))
     sequence = load_sequence(frames, display.config)
@@ -144,41 +143,6 @@ def _format_report(report: dict[str, Any], truth: Path | None) -> Iterator[str]:
             f"pixel {item['pixel']:<10} {item['measured_max_um']:.1f} µm measured, {item['predicted_max_um']:.1f} µm "
             f"predicted, absorber up to {item['absorber_max_c']:.1f} °C"
         )
-
-
-def _select_true_terms(config: "Config", truth: Path | None) -> tuple[list[str], list[str]]:
-    """Return the terms of the ground truth, and those of its parameter set that are left out.
-
-    The truth has the planner terms and every term that its file states. Raises InputError for a term that the file
-    states and that only the limiter accounts for.
-    """
-    from optodrive.physics.parameters import list_own_terms, load_parameters
-    from optodrive.physics.terms import discover_terms
-
-    parameters = load_parameters(config.pixel_model.parameters)
-    own = () if truth is None or truth.suffix != ".toml" else list_own_terms(truth)
-    for key in own:
-        if not discover_terms()[key].in_pixel:
-            expected = "terms that pixels are simulated with; only the limiter accounts for this one"
-            raise InputError(f"--truth {truth}: terms.{key}", key, expected)
-    selected = list(dict.fromkeys((*parameters.planner_terms, *own)))
-    return selected, [key for key in parameters.terms if key not in selected]
-
-
-def _build_true_display(
-    config: "Config", sampled_pixels: "GroundTruthPixels | None", true_terms: list[str]
-) -> "ThermalState":
-    """Build the ground truth of the display: the configured model with sampled or equal pixels, without a pixel map."""
-    from optodrive.device.pixel_map import remove_pixel_map
-    from optodrive.physics.parameters import build_display_pixels, load_parameters
-    from optodrive.physics.thermal_state import build_cold_state
-
-    parameters = load_parameters(config.pixel_model.parameters)
-    parameters = parameters.model_copy(update={"planner_terms": tuple(true_terms)})
-    nominal_pixels = build_display_pixels(remove_pixel_map(config), parameters)
-    return build_cold_state(
-        config, parameters, nominal_pixels if sampled_pixels is None else sampled_pixels.apply_to(nominal_pixels)
-    )
 
 
 def _parse_pixels(pixels: str | None, count: int) -> list[int] | None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import h5py
 import numpy as np
@@ -275,18 +277,24 @@ def write_run(parent, run: Run, truth: Physics, instruments: Instruments, rng: R
     group.create_dataset("pulses", data=np.asarray(run.experiment.pulses, np.float64))
     if run.experiment.commands is not None:
         group.create_dataset("commands", data=np.asarray(run.experiment.commands, np.float64))
+    for name, t, value in measure_signals(run, truth, instruments, rng):
+        signal = group.create_group(name)
+        signal.attrs["pixel"] = run.experiment.pixel
+        if name in instruments.stated:
+            signal.attrs["sigma"] = instruments.stated[name]
+        signal.create_dataset("t_s", data=t)
+        signal.create_dataset("value", data=value)
+
+
+def measure_signals(run: Run, truth: Physics, instruments: Instruments, rng: Rng) -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, times and noisy values of each signal, NaN where a sample is missing."""
     for name, ideal in simulate_ideal_signals(truth, run, jittered=True).items():
         t = run.experiment.times[name]
         dt = float(t[-1] - t[0]) / (len(t) - 1)
         offset = instruments.run_variation.baseline[name] * rng.standard_normal()
         value = ideal + offset + instruments.colours[name].sample(rng, len(t), dt)
         value[_draw_missing(rng, len(t), instruments.missing)] = np.nan
-        signal = group.create_group(name)
-        signal.attrs["pixel"] = run.experiment.pixel
-        if name in instruments.stated:
-            signal.attrs["sigma"] = instruments.stated[name]
-        signal.create_dataset("t_s", data=np.asarray(t, np.float64))
-        signal.create_dataset("value", data=np.asarray(value, np.float64))
+        yield name, np.asarray(t, np.float64), np.asarray(value, np.float64)
 
 
 def write_recording(

@@ -36,6 +36,7 @@ ELSEWHERE = {
     "optodrive config migrate": "tests/unit/device/test_config_migration.py",
     "optodrive first-light --stage": "tests/unit/device/test_stage_config.py",
     "optodrive calibrate board": "a synopsis; tests/system/test_calibrate_loop.py",
+    "optodrive diagnose --live": "a synopsis; tests/system/test_diagnose_live.py",
     "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
     "optodrive calibrate pixels": "tests/accuracy/test_calibrate_pixels.py records its sweep, which takes minutes",
     "optodrive calibrate servo recording.h5 --stage": "tests/accuracy/test_calibrate_servo.py",

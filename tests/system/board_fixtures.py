@@ -36,8 +36,8 @@ def start(tmp_path):
     """Return a function that starts an `optodrive` command on a board."""
     commands = []
 
-    def start_command(board, *arguments):
-        commands.append(Command(tmp_path, board, *arguments))
+    def start_command(board, *arguments, **options):
+        commands.append(Command(tmp_path, board, *arguments, **options))
         return commands[-1]
 
     yield start_command

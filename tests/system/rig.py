@@ -127,11 +127,12 @@ def config_text(port=None, name="display-437", sensor=None, lease_s=PATIENT_LEAS
 
 
 class Command:
-    """Process of an `optodrive` command with the ports of a board and its sensor."""
+    """Process of an `optodrive` command with the ports of a board and its sensor. field: calibrated field, if any."""
 
-    def __init__(self, folder, board, *arguments, lease_s=PATIENT_LEASE_S):
+    def __init__(self, folder, board, *arguments, lease_s=PATIENT_LEASE_S, field=None):
         config = folder / "bench.toml"
-        config.write_text(config_text(board.port, sensor=board.sensor, lease_s=lease_s))
+        text = config_text(board.port, sensor=board.sensor, lease_s=lease_s)
+        config.write_text(text if field is None else text.replace("[scanner]", f'[scanner]\nfield = "{field}"'))
         self.process = start_process(
             [OPTODRIVE, *map(str, arguments), "--config", config],
             stdin=subprocess.PIPE,

@@ -20,12 +20,12 @@ class SpotReader:
     """Reads the sensor and keeps the board's lease while it waits."""
 
     def __init__(self, board: ExclusiveBoard, sensor: SpotSensorClient, clock: Clock) -> None:
-        self._board, self._sensor, self._clock = board, sensor, clock
+        self._board, self.sensor, self._clock = board, sensor, clock
 
     @property
     def port(self) -> str:
         """The sensor's port."""
-        return self._sensor.port
+        return self.sensor.port
 
     def read_spot(self, x_code: int, y_code: int, power_w: float, readings: int) -> SpotReading | None:
         """Measure a spot as the mean of several readings without outliers. Return None if no spot is detected.
@@ -54,24 +54,22 @@ class SpotReader:
 
     def read_mirrors_rad(self) -> tuple[float, float] | None:
         """Return the position outputs of the mirrors, rad. Return None without position outputs."""
-        return self._sensor.parse_mirrors_rad(self._query("mirrors"))
+        return self.sensor.parse_mirrors_rad(self.query("mirrors"))
 
     def open(self) -> None:
         """Open the sensor's port. Raise InputError if it does not exist, LinkError if no sensor answers."""
-        self._sensor.open()
+        self.sensor.open()
         self._query_spot()
 
     def close(self) -> None:
         """Close the sensor's port."""
-        self._sensor.close()
+        self.sensor.close()
 
-    def _query_spot(self) -> SpotReading | None:
-        return self._sensor.parse_spot(self._query("spot"))
-
-    def _query(self, request: str) -> str:
-        self._sensor.send_request(request)
+    def query(self, request: str) -> str:
+        """Send a request line and return the answer. Raise LinkError without one."""
+        self.sensor.send_request(request)
         until_s = self._clock.now_s() + ANSWER_TIMEOUT_S
-        while (line := self._sensor.poll_answer()) is None:
+        while (line := self.sensor.poll_answer()) is None:
             if self._clock.now_s() > until_s:
                 raise LinkError(
                     f"sensor at {self.port}: no answer within {ANSWER_TIMEOUT_S:g} s: "
@@ -79,6 +77,9 @@ class SpotReader:
                 )
             self._board.step()
         return line
+
+    def _query_spot(self) -> SpotReading | None:
+        return self.sensor.parse_spot(self.query("spot"))
 
 
 def robust_mean(readings: list[SpotReading]) -> SpotReading:

@@ -5,9 +5,13 @@ from typing import NamedTuple
 
 from optodrive.core.errors import LinkError
 from optodrive.core.units import um_to_m
+from optodrive.lab.recording.storage import MIRROR_SIGNALS, SIGNALS
 from optodrive.link.transport.base import Transport
 
-LINE_MAX = 64
+PIXEL_SIGNALS = tuple(name for name in SIGNALS if name not in MIRROR_SIGNALS)
+LINE_MAX = 1024
+SHOWN_MAX = 64
+"""Characters of an invalid answer that a message shows."""
 
 
 class SpotReading(NamedTuple):
@@ -76,6 +80,28 @@ class SpotSensorClient:
         numbers = self._parse_numbers(line, "mirrors", 2)
         return None if numbers is None else (numbers[0], numbers[1])
 
+    def parse_signals(self, line: str) -> tuple[str, ...]:
+        """Parse the answer to `signals` as names of signals of a pixel.
+
+        A sensor of spots records none.
+        """
+        word, *names = line.split() or [""]
+        if word == "error" or (word == "signals" and names == ["none"]):
+            return ()
+        if word != "signals" or not set(names) <= set(PIXEL_SIGNALS):
+            raise self._build_answer_error(line, f"'signals' and some of {', '.join(PIXEL_SIGNALS)}")
+        return tuple(names)
+
+    def parse_granted(self, line: str, count: int) -> None:
+        """Check the answer to `record`, which repeats the number of samples."""
+        if line.split() != ["record", str(count)]:
+            raise self._build_answer_error(line, f"'record {count}'")
+
+    def parse_samples(self, line: str) -> list[float] | None:
+        """Parse the answer to `samples`. Return None while the recording is not complete."""
+        count = len(line.split()) - 1
+        return self._parse_numbers(line, "samples", max(1, count))
+
     def _parse_numbers(self, line: str, request: str, count: int) -> list[float] | None:
         word, *rest = line.split() or [""]
         if word == request and rest == ["none"]:
@@ -90,5 +116,5 @@ class SpotSensorClient:
 
     def _build_answer_error(self, received: str, expected: str) -> LinkError:
         return LinkError(
-            f"sensor at {self.port}: received {received[:LINE_MAX]!r}, expected {expected}; is it a spot sensor?"
+            f"sensor at {self.port}: received {received[:SHOWN_MAX]!r}, expected {expected}; is it a spot sensor?"
         )

@@ -45,13 +45,13 @@ from optodrive.lab.diagnosis.model_selection import (
     has_replicate_excess,
     select_causes,
 )
-from optodrive.lab.diagnosis.next_experiment import propose_experiment
+from optodrive.lab.diagnosis.next_experiment import propose_for_verdict
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
 from optodrive.lab.diagnosis.numeric_limits import check_numeric_limits
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
-from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
+from optodrive.lab.diagnosis.refitting import refit_strongest
 from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, ignore_progress
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
 from optodrive.physics.hypothesis import Hypothesis
@@ -104,11 +104,12 @@ def diagnose(
     prior: BaseParameterPrior = BROAD_PRIOR,
     epsilon: float = DEFAULT_EPSILON,
     on_progress: ProgressCallback = ignore_progress,
+    hold_out: bool = True,
 ) -> Discrepancy:
     """Diagnose a recording.
 
-    Raises InputError if it has no data to compare with the model, a quantity that is probably in a wrong unit, or a
-    copy in place of a repeat.
+    hold_out: whether runs are held out to measure the gain, where there are enough of them. Raises InputError if it has
+    no data to compare with the model, a quantity that is probably in a wrong unit, or a copy in place of a repeat.
     """
     began_s = perf_counter()
     check_numeric_limits(measurement)
@@ -125,6 +126,7 @@ def diagnose(
             _diagnose_subsystem(
                 *(part, candidates, seed, prior, epsilon, timing_s, _find_clock_offset_s(subsystems)),
                 SearchLog(on_progress),
+                hold_out,
             )
         )
     verdict, causes = _combine_verdicts(subsystems)
@@ -193,8 +195,9 @@ def _diagnose_subsystem(
     min_timing_sigma_s: float,
     clock_offset_s: float,
     log: SearchLog,
+    hold_out: bool,
 ) -> _SubsystemFit:
-    fitted, held_out_runs = split_runs(data)
+    fitted, held_out_runs = split_runs(data) if hold_out else (list(range(len(data.runs))), [])
     fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
     log.on_progress("noise and nominal model")
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
@@ -231,7 +234,7 @@ def _diagnose_subsystem(
             problem, base, held_out, verdict = all_data, all_base, data.select([]), wider
             if wider.chosen is not None:
                 final = wider.chosen.fit
-    experiment = _propose_experiment(problem, verdict, log.on_progress)
+    experiment = propose_for_verdict(problem, base, verdict, log.on_progress)
     named = () if verdict.chosen is None else verdict.chosen.hypotheses
     covariance = compute_covariance(all_data, final, named, hypotheses)
     return _SubsystemFit(
@@ -319,20 +322,6 @@ def _combine_verdicts(subsystems: list[_SubsystemFit]) -> tuple[str, tuple[str, 
         if any(item.verdict == verdict for item in verdicts):
             return verdict, causes if verdict == "ambiguous" else ()
     return "cause", causes
-
-
-def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: ProgressCallback) -> NextExperiment | None:
-    """Return the experiment that separates the best candidate from its first rival, if the verdict is ambiguous."""
-    if verdict.verdict != "ambiguous" or not verdict.candidates:
-        return None
-    best = verdict.candidates[0]
-    rivals: list[RefittedCandidate] = [
-        item for item in verdict.candidates[1:] if set(item.causes) <= set(verdict.causes)
-    ]
-    if not rivals:
-        return None
-    on_progress("the next experiment")
-    return propose_experiment(problem, best.fit, rivals[0].fit, (best.label, rivals[0].label))
 
 
 def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:

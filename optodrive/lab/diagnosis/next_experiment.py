@@ -1,4 +1,7 @@
-"""Search for the experiment that separates two rivals in the least lab time, over a finite grid of experiments."""
+"""Search for the experiment that separates two rivals in the least lab time, over a finite grid of experiments.
+
+The recorded experiments are part of the grid: more repeats of one may be the quickest way.
+"""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -12,11 +15,15 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import NextExperiment
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Block, Dataset, DriveGroup, RunInfo
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.model_selection import Verdict
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
 from optodrive.lab.diagnosis.prediction import predict
+from optodrive.lab.diagnosis.search_log import ProgressCallback
 from optodrive.physics.pixel_ode import PixelExperiment
 
+CERTAIN = 0.95
+"""Probability of an explanation that no further experiment needs to confirm."""
 MIN_REPEATS, MAX_REPEATS = 3, 30
 """Minimum and maximum number of repeats of an experiment."""
 CHI2_SEPARATED = 24.0
@@ -31,6 +38,29 @@ ASSUMED_NOISE = {
 }
 """Noise of a signal that was not measured yet, by kind: a thermal camera, an interferometer, a load cell."""
 ASSUMED_NOISE_TEXT = {0: "1 K", 1: "0.5 µm", 2: "0.2 mN"}
+
+
+def propose_for_verdict(
+    problem: FitProblem, base: ModelFit, verdict: Verdict, on_progress: ProgressCallback
+) -> NextExperiment | None:
+    """Return the experiment that separates the two most probable models, None if one explanation is certain.
+
+    Of an ambiguity, these are two of its causes; else the nominal model is one of the rivals.
+    """
+    probabilities = verdict.probabilities
+    rivals = [(probabilities.causes[tuple(sorted(item.causes))], item.label, item.fit) for item in verdict.candidates]
+    if verdict.verdict == "ambiguous":
+        is_named = [set(item.causes) <= set(verdict.causes) for item in verdict.candidates]
+        rivals = rivals[:1] + [rival for rival, named in zip(rivals[1:], is_named[1:], strict=True) if named]
+    elif verdict.verdict == "cause" or max(probabilities.no_effect, probabilities.none_of_these) >= CERTAIN:
+        return None
+    else:
+        rivals = sorted([(probabilities.no_effect, "no effect", base), *rivals], key=lambda rival: -rival[0])
+    if len(rivals) < 2:
+        return None
+    on_progress("the next experiment")
+    (_, first_label, first), (_, second_label, second) = rivals[:2]
+    return propose_experiment(problem, first, second, (first_label, second_label))
 
 
 def propose_experiment(
@@ -102,6 +132,11 @@ def _generate_grid(data: Dataset, pixel: int) -> Iterator[tuple[str, FloatArray,
                 pulses,
                 4.0,
             )
+    for group, numbers in data.groups.items():
+        recorded = [block for block in data.blocks if block.run == numbers[0] and block.pixel == pixel]
+        if recorded:
+            span_s = max(float(block.t_s[-1]) for block in recorded)
+            yield f"the recorded experiment {group!r} again", data.runs[numbers[0]].pulses, span_s
 
 
 def _list_pulsed_pixels(data: Dataset) -> list[int]:

@@ -2,7 +2,8 @@
 
 python -m optodrive.link.simulator.board_process --pty LINK [--log FILE] [--limits FILE] [--script FILE] [--baud N]
     [--clock-ppm N] [--clock-wander-ppm N]
-    [--sensor LINK [--geometry SEED] [--config FILE] [--sensor-noise-um N] [--outlier-share N] [--no-readback]]
+    [--sensor LINK [--geometry SEED] [--config FILE] [--sensor-noise-um N] [--outlier-share N] [--no-readback]
+        [--truth MODEL]]
 """
 
 import argparse

@@ -9,7 +9,9 @@ from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.pseudo_terminal import check_link_path
 
 if TYPE_CHECKING:
+    from optodrive.device.config import Config
     from optodrive.link.simulator.simulated_optics import SimulatedOptics
+    from optodrive.physics.thermal_state import ThermalState
 
 DEMO_GEOMETRY = 437
 NOISE_MAX_UM = 1e4
@@ -32,6 +34,9 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="share of answers that are outliers (reflections)",
     )
+    sensor.add_argument(
+        "--truth", metavar="MODEL", help="record pixels of a display with this parameter set: a file or a shipped name"
+    )
     sensor.add_argument("--no-readback", action="store_true", help="a galvo driver without position outputs")
 
 
@@ -51,12 +56,22 @@ def build_optics(options: argparse.Namespace, settings: BoardSettings) -> "Simul
     from optodrive.device.config_file import load_config
     from optodrive.link.simulator.simulated_optics import SimulatedOptics
 
+    config = load_config(options.config).select_stage(options.stage)
     return SimulatedOptics(
         options.sensor,
-        load_config(options.config).select_stage(options.stage),
+        config,
         settings,
         options.geometry,
         um_to_m(options.sensor_noise_um),
         options.outlier_share,
         not options.no_readback,
+        None if options.truth is None else _build_cold_state(config, options.truth),
     )
+
+
+def _build_cold_state(config: "Config", truth: str) -> "ThermalState":
+    from optodrive.link.simulator.true_display import build_true_display, select_true_terms
+
+    section = config.pixel_model.model_copy(update={"parameters": truth})
+    true_config = config.model_copy(update={"pixel_model": section})
+    return build_true_display(true_config, None, select_true_terms(true_config, Path(truth))[0])

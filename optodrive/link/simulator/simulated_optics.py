@@ -10,16 +10,22 @@ import numpy as np
 from optodrive.device.config import Config
 from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.galvos import SimulatedGalvos
+from optodrive.link.simulator.pixel_recorder import SimulatedPixelRecorder
 from optodrive.link.simulator.pseudo_terminal import open_pty
 from optodrive.link.simulator.spot_sensor import SimulatedSpotSensor
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
+from optodrive.physics.thermal_state import ThermalState
 
 READ_MAX = 1024
 LINE_MAX = 64
+PIXEL_REQUESTS = ("signals", "record", "samples")
 
 
 class SimulatedOptics:
-    """Galvos and spot sensor that follow the board's log. The sensor answers on its own pty."""
+    """Galvos and spot sensor that follow the board's log. The sensor answers on its own pty.
+
+    cold_state: of a display under the beam, whose pixels the sensor then records; None for a sensor of spots only
+    """
 
     def __init__(
         self,
@@ -30,12 +36,18 @@ class SimulatedOptics:
         noise_m: float = 10e-6,
         outlier_share: float = 0.02,
         has_position_outputs: bool = True,
+        cold_state: ThermalState | None = None,
     ) -> None:
-        galvos_seed, sensor_seed = np.random.SeedSequence(seed).spawn(2)  # independent of the geometry
+        galvos_seed, sensor_seed, recorder_seed = np.random.SeedSequence(seed).spawn(3)  # independent of the geometry
         self.galvos = SimulatedGalvos(config, galvos_seed)
         truth = GroundTruthGeometry.sample(seed, config)
         self._sensor = SimulatedSpotSensor(
             config, truth, self.galvos, noise_m, outlier_share, has_position_outputs, sensor_seed
+        )
+        self._recorder = (
+            None
+            if cold_state is None
+            else SimulatedPixelRecorder(config, truth, self.galvos, cold_state, recorder_seed)
         )
         self._full_w = settings.limits.full_power_uw * 1e-6
         self._link = link
@@ -46,7 +58,10 @@ class SimulatedOptics:
         """Apply an event of the board's log."""
         if event["event"] == "pulse":
             width_s = (event["off_us"] - event["on_us"]) * 1e-6
-            self._sensor.record_pulse(event["on_us"], event["off_us"], event["duty"] / 65535 * self._full_w * width_s)
+            power_w = event["duty"] / 65535 * self._full_w
+            self._sensor.record_pulse(event["on_us"], event["off_us"], power_w * width_s)
+            if self._recorder is not None:
+                self._recorder.record_pulse(event["on_us"], event["off_us"], power_w)
 
     def answer_requests(self, now_us: int) -> None:
         """Answer the requests that have arrived."""
@@ -57,9 +72,16 @@ class SimulatedOptics:
         *lines, self._buffer = self._buffer.split(b"\n")
         self._buffer = self._buffer[-LINE_MAX:]
         for request in lines:
-            answer = self._sensor.answer(request.decode("ascii", "replace").strip(), now_us)
+            answer = self._answer(request.decode("ascii", "replace").strip(), now_us)
             with suppress(OSError):
                 os.write(self._master, answer.encode("ascii") + b"\n")
+
+    def _answer(self, request: str, now_us: int) -> str:
+        if request.split(" ")[0] not in PIXEL_REQUESTS:
+            return self._sensor.answer(request, now_us)
+        if self._recorder is None:
+            return "signals none" if request == "signals" else "error no pixel is recorded"
+        return self._recorder.answer(request, now_us)
 
     def inject_fault(self, kind: str, at_us: int) -> None:
         """Inject a fault: `stick_x`, `stick_y`, `invert_readback`, `blind_sensor` or `unplug_sensor`."""

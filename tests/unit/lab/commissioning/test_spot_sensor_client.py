@@ -3,7 +3,7 @@
 import pytest
 
 from optodrive.core.errors import LinkError
-from optodrive.lab.commissioning.spot_sensor_client import LINE_MAX, SpotSensorClient
+from optodrive.lab.commissioning.spot_sensor_client import SHOWN_MAX, SpotSensorClient
 
 
 class Wire:
@@ -49,9 +49,31 @@ def test_what_is_no_answer_is_named(line):
 
 
 def test_a_flood_without_a_line_ends():
-    sensor = SpotSensorClient(Wire(b"", *[b"x" * 50] * 3))
+    sensor = SpotSensorClient(Wire(b"", *[b"x" * 800] * 3))
     sensor.send_request("spot")
     assert sensor.poll_answer() is None
     with pytest.raises(LinkError, match="expected a line") as caught:
         sensor.poll_answer()
-    assert len(str(caught.value)) < 2 * LINE_MAX + 100
+    assert len(str(caught.value)) < 2 * SHOWN_MAX + 100
+
+
+def test_signals_of_a_pixel_and_their_samples():
+    sensor = SpotSensorClient(Wire())
+    assert sensor.parse_signals("signals displacement_m force_N") == ("displacement_m", "force_N")
+    assert sensor.parse_signals("signals none") == ()
+    assert sensor.parse_signals("error unknown request") == ()  # a sensor of spots, older than this request
+    assert sensor.parse_samples("samples none") is None
+    assert sensor.parse_samples("samples 1e-06 -2") == [1e-6, -2.0]
+    sensor.parse_granted("record 400", 400)
+
+
+@pytest.mark.parametrize("line", ["", "signals height", "signals mirror_x_rad", "spot none"])
+def test_signals_that_no_pixel_has_are_named(line):
+    with pytest.raises(LinkError, match=r"expected 'signals' and some of absorber_temperature_K, displacement_m"):
+        SpotSensorClient(Wire()).parse_signals(line)
+
+
+@pytest.mark.parametrize("line", ["samples", "samples 1 nan", "spot 1 2", "error out of range"])
+def test_samples_that_are_no_numbers_are_named(line):
+    with pytest.raises(LinkError, match=r"expected 'samples' and \d+ numbers"):
+        SpotSensorClient(Wire()).parse_samples(line)

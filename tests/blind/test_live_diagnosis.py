@@ -1,0 +1,78 @@
+"""Campaigns that choose their own experiments on hidden displays, in virtual time, against the generator's fixed ones.
+
+Both are charged by the generator's clock. Every run plays two hidden displays; the slow test 32, whose table it prints.
+"""
+
+from dataclasses import dataclass
+
+import pytest
+
+from blind_bench import PIXELS, BlindBench, build_display
+from blind_lab import Case, draw_case
+from blind_session import MAX_ABSORBER_K
+from optodrive.core.types.discrepancy import Discrepancy
+from optodrive.lab.diagnosis.diagnose import diagnose
+from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.live_diagnosis.campaign import CampaignRecording, CampaignResult, run_campaign
+from optodrive.lab.recording import read_recording
+
+SEED = 9_700_300
+"""A development seed."""
+NOT_MEASURED = ("beam_misalignment", "mirror_lag", "sensor_scale")
+"""Causes that need further pixels, the mirrors, or a reference temperature, which a campaign on one pixel has not."""
+NAMES_NOTHING = ("none", "instrument")
+
+
+def study_runs(measurement, config, hold_out=False):
+    prior, epsilon, _ = build_prior(measurement, config)
+    return diagnose(measurement, 0, prior, epsilon, hold_out=hold_out)
+
+
+def ignore(_):
+    """Do nothing."""
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A hidden display, its bench after a campaign, and the result."""
+
+    case: Case
+    bench: BlindBench
+    recording: CampaignRecording
+    result: CampaignResult
+
+
+def play(case, folder, budget_s=3600.0):
+    """Play a campaign on a hidden display."""
+    display = build_display(case)
+    bench = BlindBench(case, display)
+    recording = CampaignRecording(folder / "live.h5", display.config.name)
+    result = run_campaign(bench, display, PIXELS, recording, study_runs, budget_s, ignore, ignore)
+    return Campaign(case, bench, recording, result)
+
+
+def is_right(case: Case, found: Discrepancy) -> bool:
+    """Return whether a verdict is what the generator hides: alone or in an ambiguity of two."""
+    if case.block == "none":
+        return found.verdict in NAMES_NOTHING
+    if case.block == "unknown":
+        return found.verdict in ("unexplained", "instrument")
+    if found.verdict == "cause":
+        return set(found.causes) == set(case.causes)
+    return found.verdict == "ambiguous" and len(found.causes) <= 2 and set(case.causes) <= set(found.causes)
+
+
+def is_misnamed(case: Case, found: Discrepancy) -> bool:
+    """Return whether a verdict names a cause that is not there."""
+    return found.verdict == "cause" and not set(found.causes) <= set(case.causes)
+
+
+@pytest.mark.parametrize("cause", ["gas_leak", "bridge_conductivity"])
+def test_a_hidden_cause_is_named_in_a_third_of_the_time(cause, tmp_path):
+    played = play(draw_case("single", SEED, tmp_path, cause=cause), tmp_path)
+    assert played.result.diagnosis.verdict == "cause"
+    assert played.result.diagnosis.causes == (cause,)
+    assert played.result.ended == "certain"
+    assert played.bench.now_s() <= played.case.runs[-1].session_s / 3.0
+    assert played.bench.max_rise_k < MAX_ABSORBER_K
+    assert len(read_recording(played.recording.path).runs) == len(played.bench.played)
