@@ -167,15 +167,17 @@ def test_streamed_plans_report_their_end(web):
     first = web.report(web.submit(build_frame(pixels=range(300), duration_s=10.0), streamed=True))
     wait_for(lambda: web.engine.get_plan(first.plan).executed >= 5, "a part of the frame")
     second = web.report(web.submit(build_frame(pixels=range(5), duration_s=10.0), streamed=True))
-    wait_for(lambda: len(web.of_kind("ended")) == 2, "both ends")
+    wait_for(lambda: second.plan in [message.fields["plan"] for message in web.of_kind("ended")], "both ends")
     ended = {m.fields["plan"]: PlanReport.model_validate_json(m.payload) for m in web.of_kind("ended")}
-    assert {plan: report.status for plan, report in ended.items()} == {first.plan: "superseded", second.plan: "done"}
     assert all(report.pulses is None for report in ended.values())
+    assert ended.pop(second.plan).status == "done"
+    assert first.plan in ended  # on a stalled computer its rest was a frame of its own, which ends like it
+    assert {report.status for report in ended.values()} == {"superseded"}
     running = web.report(web.submit(build_frame(pixels=range(300), duration_s=10.0), streamed=True))
     wait_for(lambda: web.engine.get_plan(running.plan).executed >= 5, "a part of the frame")
     web.send("end_stream", epoch=web.engine.web.status["epoch"], caller="token")
     wait_for(lambda: web.engine.get_plan(running.plan).has_ended, "the end of the stream")
-    assert web.engine.get_plan(running.plan).dropped > 0
+    assert web.engine.get_plan(running.plan).executed < 300
 
 
 def test_a_running_plan_is_cancelled(web):
