@@ -13,11 +13,14 @@ from virtual_board import EmulatedBoard, PicoBoard, VirtualKind  # noqa: E402
 
 sys.path.append(str(Path(__file__).parents[1] / "pico"))
 
-from emulated_pico import EmulatedPico, PicoImage  # noqa: E402
+from emulated_pico import EmulatedPico, EmulatedUsbPico, PicoImage  # noqa: E402
 
 from c_core import InterruptedCBoard, SeededCBoard, build_library  # noqa: E402
 from firmware_ports import build_emulated_chip  # noqa: E402
 from optodrive.link.simulator.board_core import BoardCore  # noqa: E402
+
+PICOS = {"pico": EmulatedPico, "pico-usb": EmulatedUsbPico}
+"""The Pico by the port of its host."""
 
 
 @pytest.fixture(scope="session")
@@ -29,10 +32,10 @@ def virtual(tmp_path_factory):
     def build(name, mutant=0):
         if name == "python":
             return VirtualKind(name, BoardCore)
-        if name == "pico":
-            built = folder / f"pico-{mutant}"
+        if name in PICOS:
+            built = folder / f"{name}-{mutant}"
             built.mkdir()
-            return VirtualKind(name, partial(EmulatedPico, PicoImage(built, mutant)), make_board=PicoBoard)
+            return VirtualKind(name, partial(PICOS[name], PicoImage(built, mutant)), make_board=PicoBoard)
         if name == "qemu":
             return VirtualKind(name, build_emulated_chip(folder, mutant), make_board=EmulatedBoard)
         if name == "interrupted":

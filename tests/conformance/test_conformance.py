@@ -17,9 +17,10 @@ def test_a_core_with_ticks_wherever_they_may_interrupt_conforms(case, virtual):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["pico", "pico-usb"])
 @pytest.mark.parametrize("case", list_cases("pico"), ids=name_case)
-def test_emulated_pico_conforms(case, virtual):
-    judge(virtual("pico"), case)
+def test_emulated_pico_conforms(case, name, virtual):
+    judge(virtual(name), case)
 
 
 @pytest.mark.parametrize("case", list_cases("qemu"), ids=name_case)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 from bench import BRIGHT, CENTRE, Bench, act, here, set_input
-from emulated_pico import PWM_STEPS, EmulatedPico, PicoImage
+from emulated_pico import PWM_STEPS, EmulatedPico, EmulatedUsbPico, PicoImage
 from virtual_board import PicoBoard, VirtualKind
 
 TICK_US = 100
@@ -19,6 +19,7 @@ WATCHDOG_US = 40_000
 DAC_SETUP = [(0x28, 1), (0x38, 1), (0x02, 3), (0x30, 3)]
 """Reset, reference on, gain 1, pin LDAC ignored."""
 QUEUE_POINTS, RATE_HZ = 2048, 2000
+FLOOD_FRAMES = 20
 
 
 @pytest.fixture(scope="session")
@@ -26,9 +27,9 @@ def image(tmp_path_factory):
     return PicoImage(tmp_path_factory.mktemp("pico"))
 
 
-@pytest.fixture
-def bench(image, tmp_path):
-    bench = Bench(VirtualKind("pico", partial(EmulatedPico, image), make_board=PicoBoard), tmp_path)
+@pytest.fixture(params=[EmulatedPico])
+def bench(image, tmp_path, request):
+    bench = Bench(VirtualKind("pico", partial(request.param, image), make_board=PicoBoard), tmp_path)
     yield bench
     bench.finish(lambda board: None)
 
@@ -105,8 +106,15 @@ def test_a_link_lost_or_broken_turns_the_gate_off_in_a_tick(bench):
     assert core.pins[-1][0] - now_us <= 400, "the time of a byte, of the receiver's time-out and of a turn of the loop"
 
 
+def flood(host):
+    """Send as many requests as a packet of USB and the window of the UART hold, whose answers nobody waits for."""
+    host.board.core.receive(b"".join(host.frame("CLOCK", host_t=k) for k in range(FLOOD_FRAMES)), host.clock.now_us())
+
+
 @pytest.mark.slow
-def test_ticks_keep_their_time_at_a_full_queue_and_2000_pulses_a_second(bench):
+@pytest.mark.parametrize("bench", [EmulatedPico, EmulatedUsbPico], ids=["uart", "usb"], indirect=True)
+@pytest.mark.parametrize("floods", [False, True], ids=["", "flooded"])
+def test_ticks_keep_their_time_at_a_full_queue_and_2000_pulses_a_second(bench, floods):
     host = bench.ready(settle_us=0, settle_ns_per_code=0, queue_points=QUEUE_POINTS, spot_leak_uw=4_000_000_000)
     core = host.board.core
     points = [
@@ -119,6 +127,8 @@ def test_ticks_keep_their_time_at_a_full_queue_and_2000_pulses_a_second(bench):
     more, since_s = len(first) * 24, host.clock.now_s()
     while host.clock.now_s() < since_s + 1.0:
         host.lease()
+        if floods:
+            flood(host)
         host.receive()
         while more + 24 <= len(host.board.of("pulse")) + QUEUE_POINTS and more + 24 <= len(points):
             host.raw(host.data(*points[more : more + 24]))

@@ -6,7 +6,7 @@ import { createInterface } from "node:readline";
 import { Chip } from "./chip.mjs";
 
 const setup = JSON.parse(readFileSync(process.argv[2], "utf8"));
-const { RP2040 } = await import(setup.emulator);
+const emulator = await import(setup.emulator);
 setup.flash = Uint8Array.from(Buffer.from(setup.image, "hex"));
 
 let seed = setup.seed || 1;
@@ -17,6 +17,7 @@ const random = () => {
   return seed >>> 0;
 };
 
+const computer = { connected: false, awake: true, open: false, reads: true }; // at the USB port
 let records = [], pins = new Map(), chip;
 const emit = (...record) => records.push(record);
 const flush = (record) => {
@@ -33,7 +34,7 @@ function start(cause) {
     if (chip.logged) emit("gate", base / 1000, false, 0, -2, 0, 0, 0);
     emit("reset", base / 1000, cause);
   }
-  chip = new Chip(RP2040, setup, base, cause, memory, random, emit, () => start("watchdog"));
+  chip = new Chip(emulator, setup, base, cause, memory, computer, random, emit, () => start("watchdog"));
   for (const [pin, high] of pins) chip.setPin(pin, high);
 }
 
@@ -47,6 +48,7 @@ const commands = {
     pins.set(number, high);
     chip.setPin(number, high);
   },
+  usb(action, ...values) { chip.usb[action](...values); },
   reset() { start("run"); },
   ticks() {
     emit("ticks", chip.tickMax, chip.gapMax);

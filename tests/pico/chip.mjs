@@ -1,6 +1,7 @@
 // One power cycle of an RP2040 with the firmware's image, its circuit and a witness of its pins.
 
 import { Uart } from "./uart.mjs";
+import { UsbHost } from "./usb.mjs";
 
 const RAM = 0x20000000, RAM_BYTES = 264 * 1024, FLASH = 0x10000000;
 const PIN = { hostClosed: 2, estop: 8, key: 9, interlock: 10, relay: 12, readback: 13, gate: 14, sync: 17, tick: 22 };
@@ -18,7 +19,8 @@ const stub = (read) => ({ readUint32: read, writeUint32() {}, writeUint32Atomic(
 
 export class Chip {
   // cause: "power", "run" (the pin RUN) or "watchdog"; base: nanoseconds since the first power-up; emit: takes records
-  constructor(RP2040, setup, base, cause, memory, random, emit, onWatchdog) {
+  // computer: at the USB port
+  constructor({ RP2040, USBCDC }, setup, base, cause, memory, computer, random, emit, onWatchdog) {
     Object.assign(this, { setup, base, emit, sram: null });
     const rp2040 = (this.rp2040 = new RP2040());
     rp2040.logger = { debug() {}, info() {}, warn() {}, error: (name, text) => { throw new Error(`${name}: ${text}`); } };
@@ -29,6 +31,7 @@ export class Chip {
     this.clock = rp2040.clock;
     this.uart = new Uart(rp2040, UART_IRQ, (byte) => emit("byte", this.micros, byte));
     rp2040.peripherals[0x40034] = this.uart;
+    this.usb = new UsbHost(rp2040, USBCDC, computer, (name, ...record) => emit(name, this.micros, ...record));
     rp2040.peripherals[0x40060] = stub((offset) => (offset === 0x1c ? random() : 0));
     rp2040.peripherals[0x40064] = stub(() => (cause === "run" ? HAD_RUN : HAD_POR));
     const watchdog = rp2040.peripherals[0x40058];
@@ -161,7 +164,7 @@ export class Chip {
   // --- time ---
 
   run(untilNanos) {
-    const { core, clock } = this, idle = this.at.chip_read;
+    const { core, clock } = this, idle = this.at.host_serve;
     this.ended = false;
     while (clock.nanos < untilNanos && !this.ended) {
       const pc = core.PC;

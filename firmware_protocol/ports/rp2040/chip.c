@@ -1,12 +1,9 @@
 #include "chip.h"
 
 #include "registers.h"
-#include "settings.h"
 
 #define CRYSTAL_MHZ 12u
 #define WATCHDOG_US 40000u
-#define RX_RING 1024u /* powers of two */
-#define TX_RING 4096u
 #define NOISE_BITS 512u
 
 /* --- clocks --- */
@@ -16,7 +13,20 @@ static void wait_until_set(uint32_t address, uint32_t bits) {
     }
 }
 
-/* Reference and timer from the crystal; all other clocks from the PLL, 12 MHz × 125 / 6 / 2. */
+/* Starts a PLL at 12 MHz × factor / divider / 2. */
+static void start_pll(uint32_t pll, uint32_t reset, uint32_t factor, uint32_t divider) {
+    SET(RESETS) = reset;
+    CLEAR(RESETS) = reset;
+    wait_until_set(RESETS_DONE, reset);
+    REGISTER(PLL_CS(pll)) = 1;
+    REGISTER(PLL_FBDIV(pll)) = factor;
+    CLEAR(PLL_PWR(pll)) = BIT(0) | BIT(5);
+    wait_until_set(PLL_CS(pll), BIT(31));
+    REGISTER(PLL_PRIM(pll)) = divider << 16 | 2u << 12;
+    CLEAR(PLL_PWR(pll)) = BIT(3);
+}
+
+/* Reference and timer from the crystal, USB from its own PLL at 48 MHz, all other clocks from the PLL at CLOCK_HZ. */
 static void start_clocks(void) {
     REGISTER(XOSC_STARTUP) = 47; /* × 256 cycles: 1 ms */
     REGISTER(XOSC_CTRL) = 0xfabu << 12 | 0xaa0u;
@@ -25,19 +35,13 @@ static void start_clocks(void) {
     wait_until_set(CLK_REF_SELECTED, BIT(2));
     CLEAR(CLK_SYS_CTRL) = 1; /* leave the PLL, which may still run */
     wait_until_set(CLK_SYS_SELECTED, BIT(0));
-    SET(RESETS) = RESET_PLL_SYS;
-    CLEAR(RESETS) = RESET_PLL_SYS;
-    wait_until_set(RESETS_DONE, RESET_PLL_SYS);
-    REGISTER(PLL_CS) = 1;
-    REGISTER(PLL_FBDIV) = CLOCK_HZ / 1000000u * 12u / CRYSTAL_MHZ;
-    CLEAR(PLL_PWR) = BIT(0) | BIT(5);
-    wait_until_set(PLL_CS, BIT(31));
-    REGISTER(PLL_PRIM) = 6u << 16 | 2u << 12;
-    CLEAR(PLL_PWR) = BIT(3);
+    start_pll(PLL_SYS, RESET_PLL_SYS, CLOCK_HZ / 1000000u * 12u / CRYSTAL_MHZ, 6);
+    start_pll(PLL_USB, RESET_PLL_USB, 40, 5);
     REGISTER(CLK_SYS_CTRL) = 0; /* PLL as source, selected by the next line */
     SET(CLK_SYS_CTRL) = 1;
     wait_until_set(CLK_SYS_SELECTED, BIT(1));
     REGISTER(CLK_PERI_CTRL) = CLK_ENABLE;
+    REGISTER(CLK_USB_CTRL) = CLK_ENABLE;
     REGISTER(CLK_ADC_CTRL) = CLK_ENABLE | 3u << 5; /* the crystal, fast enough for a temperature */
     REGISTER(WATCHDOG_TICK) = CRYSTAL_MHZ | BIT(9); /* 1 µs tick of timer and watchdog */
 }
@@ -81,114 +85,16 @@ void timer_isr(void) {
     alarm_callback();
 }
 
-static void fence(void) { __asm volatile("dsb\n\tisb" ::: "memory"); }
+void chip_fence(void) { __asm volatile("dsb\n\tisb" ::: "memory"); }
 
 void chip_hold_alarm(void) {
     REGISTER(NVIC_DISABLE) = TIMER_IRQ;
-    fence();
+    chip_fence();
 }
 
 void chip_release_alarm(void) {
-    fence();
+    chip_fence();
     REGISTER(NVIC_ENABLE) = TIMER_IRQ;
-}
-
-/* --- bytes: both interrupts have the same priority, so neither preempts the other --- */
-
-static struct {
-    uint8_t bytes[RX_RING];
-    volatile uint32_t in, out;
-    volatile bool break_received;
-} received;
-
-static struct {
-    uint8_t bytes[TX_RING];
-    uint32_t in, out;
-    bool mid_frame;
-} outgoing;
-
-static void fill_transmitter(void) {
-    while (outgoing.out != outgoing.in && !(REGISTER(UART_FR) & BIT(5))) {
-        uint8_t byte = outgoing.bytes[outgoing.out++ % TX_RING];
-        outgoing.mid_frame = byte != 0;
-        REGISTER(UART_DR) = byte;
-    }
-}
-
-void uart_isr(void) {
-    REGISTER(UART_ICR) = 0x7ffu;
-    while (!(REGISTER(UART_FR) & BIT(4))) {
-        uint32_t byte = REGISTER(UART_DR);
-        if (byte & BIT(10)) {
-            received.break_received = true;
-        } else if (received.in - received.out < RX_RING) {
-            received.bytes[received.in % RX_RING] = (uint8_t)byte;
-            received.in++;
-        }
-    }
-    fill_transmitter();
-}
-
-static void start_uart(void) {
-    uint32_t divisor = CLOCK_HZ * 4u / HOST_BAUD; /* 64ths of 16 bit times */
-    REGISTER(UART_IBRD) = divisor >> 6;
-    REGISTER(UART_FBRD) = divisor & 63u;
-    REGISTER(UART_LCR_H) = 3u << 5 | BIT(4);
-    REGISTER(UART_CR) = BIT(0) | BIT(8) | BIT(9);
-    REGISTER(UART_IFLS) = 1u << 3 | 1u; /* at a quarter, both directions */
-    REGISTER(UART_IMSC) = BIT(4) | BIT(5) | BIT(6) | BIT(9);
-    REGISTER(NVIC_ENABLE) = UART_IRQ;
-}
-
-size_t chip_read(uint8_t *bytes, size_t size) {
-    size_t n = 0;
-    bool ended = false;
-    while (n < size && received.out != received.in && !ended) {
-        bytes[n] = received.bytes[received.out % RX_RING];
-        received.out = received.out + 1;
-        ended = bytes[n++] == 0;
-    }
-    return n;
-}
-
-bool chip_pop_break(void) {
-    bool break_received = received.break_received;
-    received.break_received = false;
-    return break_received;
-}
-
-static void hold_uart(void) {
-    REGISTER(NVIC_DISABLE) = UART_IRQ;
-    fence();
-}
-
-static void release_uart(void) {
-    fence();
-    REGISTER(NVIC_ENABLE) = UART_IRQ;
-}
-
-void chip_send(const uint8_t *frame, size_t n) {
-    hold_uart();
-    if (TX_RING - (outgoing.in - outgoing.out) >= n) {
-        for (size_t k = 0; k < n; k++) {
-            outgoing.bytes[outgoing.in++ % TX_RING] = frame[k];
-        }
-    }
-    fill_transmitter();
-    release_uart();
-}
-
-void chip_discard_output(void) {
-    hold_uart();
-    uint32_t end = outgoing.out;
-    if (outgoing.mid_frame) {
-        while (outgoing.bytes[end % TX_RING] != 0) {
-            end++;
-        }
-        end++;
-    }
-    outgoing.in = end;
-    release_uart();
 }
 
 /* --- sleep: the processor's own timer ends it, so that the loop notices ticks that do not come --- */
@@ -240,7 +146,7 @@ int16_t chip_temperature_dc(void) {
 
 void chip_start(void (*on_alarm)(void)) {
     static const uint32_t USED_BLOCKS = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 |
-                                        RESET_TIMER | RESET_UART0;
+                                        RESET_TIMER | RESET_UART0 | RESET_USB;
     CLEAR(WATCHDOG_CTRL) = BIT(30); /* it may still run */
     alarm_callback = on_alarm;
     start_clocks();
@@ -248,7 +154,6 @@ void chip_start(void (*on_alarm)(void)) {
     CLEAR(RESETS) = USED_BLOCKS;
     wait_until_set(RESETS_DONE, USED_BLOCKS);
     REGISTER(TIMER_INTE) = 1;
-    start_uart();
     start_systick();
     REGISTER(ADC_CS) = 1u | BIT(1);
     REGISTER(ADC_CS) = 1u | BIT(1) | BIT(3) | 4u << 12; /* temperature, free-running */

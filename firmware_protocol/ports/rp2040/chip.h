@@ -1,10 +1,9 @@
-/* Functions of the chip: clocks, time, alarm, UART, watchdog, entropy. */
+/* Functions of the chip: clocks, time, alarm, watchdog, entropy. */
 
 #ifndef CHIP_H
 #define CHIP_H
 
 #include <stdbool.h>
-#include <stddef.h>
 #include <stdint.h>
 
 #include "board.h"
@@ -12,7 +11,7 @@
 #define CLOCK_HZ 125000000u
 #define CHIP_SLEEP_US 250u
 
-/* Initialises clocks, peripherals and the UART, but not the outputs. on_alarm: called from the alarm's interrupt. */
+/* Initialises clocks and peripherals, but neither the outputs nor the host's ports. on_alarm: called from the alarm's interrupt. */
 void chip_start(void (*on_alarm)(void));
 /* Returns the cause of the last reset. */
 enum reset_cause chip_reset_cause(void);
@@ -26,15 +25,8 @@ void chip_set_alarm(uint64_t at_us);
 /* No alarm interrupts between hold and release; one that is due in between follows the release. */
 void chip_hold_alarm(void);
 void chip_release_alarm(void);
-
-/* Reads up to size received bytes, none beyond the end of a frame: the tick waits while the core answers one. */
-size_t chip_read(uint8_t *bytes, size_t size);
-/* Returns whether a BREAK was received since the last call. */
-bool chip_pop_break(void);
-/* Queues a whole frame or nothing, without blocking; called from the alarm or with the alarm held. */
-void chip_send(const uint8_t *frame, size_t n);
-/* Discards queued frames; a partly sent frame is completed. */
-void chip_discard_output(void);
+/* Completes the accesses before it, so that an interrupt disabled there does not come any more. */
+void chip_fence(void);
 
 /* Sleeps until an interrupt, at most for CHIP_SLEEP_US even if the alarm has failed. */
 void chip_sleep(void);

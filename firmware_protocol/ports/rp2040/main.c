@@ -3,6 +3,7 @@
 
 #include "board.h"
 #include "chip.h"
+#include "host_port.h"
 #include "outputs.h"
 #include "pins.h"
 #include "settings.h"
@@ -49,11 +50,11 @@ static int16_t read_temperature_dc(void *context) {
 }
 static void send(void *context, const uint8_t *frame, size_t n) {
     (void)context;
-    chip_send(frame, n);
+    host_send(frame, n);
 }
 static void discard_output(void *context) {
     (void)context;
-    chip_discard_output();
+    host_discard_output();
 }
 static void feed_watchdog(void *context) {
     (void)context;
@@ -101,24 +102,15 @@ static void on_alarm(void) {
 
 /* --- the loop --- */
 
-/* Reports the close of the port once; bytes from a closed port are ignored. */
-static bool host_disconnected(void) {
-    static bool was_closed = true;
-    bool closed = outputs_get(PIN_HOST_CLOSED), left = closed && !was_closed;
-    was_closed = closed;
-    return chip_pop_break() || left;
-}
-
 /* Returns whether there were any bytes. The core holds the alarm where it must. */
 static bool run_loop_once(void) {
     uint8_t bytes[LOOP_BYTES_MAX];
-    size_t n = chip_read(bytes, sizeof bytes);
-    bool left = host_disconnected();
     chip_collect_entropy();
-    if (left) {
+    if (host_serve()) {
         board_on_link_lost(&board, chip_now_us());
     }
-    board_receive(&board, bytes, outputs_get(PIN_HOST_CLOSED) ? 0 : n, chip_now_us());
+    size_t n = host_read(bytes, sizeof bytes);
+    board_receive(&board, bytes, n, chip_now_us());
     chip_hold_alarm();
     set_alarm();
     chip_release_alarm();
@@ -129,6 +121,7 @@ int main(void) {
     enum reset_cause cause = chip_reset_cause();
     chip_start(on_alarm);
     outputs_start();
+    host_start(SETTINGS.uid);
     last_tick_us = chip_now_us();
     board_init(&board, &HAL, &SETTINGS, cause, last_tick_us);
     chip_start_watchdog();

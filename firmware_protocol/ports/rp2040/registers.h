@@ -27,10 +27,12 @@
 #define RESET_IO_BANK0 BIT(5)
 #define RESET_PADS_BANK0 BIT(8)
 #define RESET_PLL_SYS BIT(12)
+#define RESET_PLL_USB BIT(13)
 #define RESET_PWM BIT(14)
 #define RESET_SPI0 BIT(16)
 #define RESET_TIMER BIT(21)
 #define RESET_UART0 BIT(22)
+#define RESET_USB BIT(24)
 
 #define CLOCKS 0x40008000u
 #define CLK_REF_CTRL (CLOCKS + 0x30u)
@@ -38,6 +40,7 @@
 #define CLK_SYS_CTRL (CLOCKS + 0x3cu)
 #define CLK_SYS_SELECTED (CLOCKS + 0x44u)
 #define CLK_PERI_CTRL (CLOCKS + 0x48u)
+#define CLK_USB_CTRL (CLOCKS + 0x54u)
 #define CLK_ADC_CTRL (CLOCKS + 0x60u)
 #define CLK_ENABLE BIT(11)
 
@@ -45,10 +48,11 @@
 #define XOSC_STATUS 0x40024004u
 #define XOSC_STARTUP 0x4002400cu
 #define PLL_SYS 0x40028000u
-#define PLL_CS (PLL_SYS + 0x0u)
-#define PLL_PWR (PLL_SYS + 0x4u)
-#define PLL_FBDIV (PLL_SYS + 0x8u)
-#define PLL_PRIM (PLL_SYS + 0xcu)
+#define PLL_USB 0x4002c000u
+#define PLL_CS(pll) ((pll) + 0x0u)
+#define PLL_PWR(pll) ((pll) + 0x4u)
+#define PLL_FBDIV(pll) ((pll) + 0x8u)
+#define PLL_PRIM(pll) ((pll) + 0xcu)
 
 /* --- watchdog, reset cause --- */
 #define PSM_WDSEL 0x40010008u
@@ -93,6 +97,29 @@
 #define SPI_DR (SPI + 0x08u)
 #define SPI_SR (SPI + 0x0cu)
 #define SPI_CPSR (SPI + 0x10u)
+
+/* --- USB: memory of both sides, controller --- */
+#define USB_DPRAM 0x50100000u
+#define USB_ENDPOINT_CONTROL(endpoint, out) (USB_DPRAM + 0x8u * (endpoint) + 0x4u * (out)) /* not of endpoint 0 */
+#define USB_ENDPOINT_ENABLE (BIT(31) | BIT(29)) /* each buffer shows in USB_BUFFER_STATUS */
+#define USB_BUFFER_CONTROL(endpoint, out) (USB_DPRAM + 0x80u + 0x8u * (endpoint) + 0x4u * (out))
+#define USB_BUFFER_LENGTH 0x3ffu
+#define USB_BUFFER_AVAILABLE BIT(10)
+#define USB_BUFFER_STALL BIT(11)
+#define USB_BUFFER_DATA1 BIT(13)
+#define USB_BUFFER_FULL BIT(15)
+#define USB 0x50110000u
+#define USB_ADDRESS (USB + 0x00u)
+#define USB_MAIN_CTRL (USB + 0x40u)
+#define USB_FRAME (USB + 0x48u)
+#define USB_SIE_CTRL (USB + 0x4cu)
+#define USB_SIE_STATUS (USB + 0x50u)
+#define USB_SIE_BUS_RESET BIT(19)
+#define USB_SIE_SETUP BIT(17)
+#define USB_BUFFER_STATUS (USB + 0x58u)
+#define USB_STALL_ARM (USB + 0x68u)
+#define USB_MUXING (USB + 0x74u)
+#define USB_POWER (USB + 0x78u)
 
 /* --- PWM, timer, temperature, entropy --- */
 #define PWM_CSR(slice) (0x40050000u + 0x14u * (slice))
