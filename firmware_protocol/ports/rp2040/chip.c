@@ -26,6 +26,19 @@ static void start_pll(uint32_t pll, uint32_t reset, uint32_t factor, uint32_t di
     CLEAR(PLL_PWR(pll)) = BIT(3);
 }
 
+/* Timer and watchdog count µs. */
+static void start_ticks(void) {
+#ifdef RP2350
+    static const uint32_t GENERATORS[] = {TICKS_OF_TIMER, TICKS_OF_WATCHDOG};
+    for (uint32_t k = 0; k < 2; k++) {
+        REGISTER(GENERATORS[k] + 4u) = CRYSTAL_MHZ;
+        REGISTER(GENERATORS[k]) = 1;
+    }
+#else
+    REGISTER(WATCHDOG_TICK) = CRYSTAL_MHZ | BIT(9);
+#endif
+}
+
 /* Reference and timer from the crystal, USB from its own PLL at 48 MHz, all other clocks from the PLL at CLOCK_HZ. */
 static void start_clocks(void) {
     REGISTER(XOSC_STARTUP) = 47; /* × 256 cycles: 1 ms */
@@ -43,14 +56,18 @@ static void start_clocks(void) {
     REGISTER(CLK_PERI_CTRL) = CLK_ENABLE;
     REGISTER(CLK_USB_CTRL) = CLK_ENABLE;
     REGISTER(CLK_ADC_CTRL) = CLK_ENABLE | 3u << 5; /* the crystal, fast enough for a temperature */
-    REGISTER(WATCHDOG_TICK) = CRYSTAL_MHZ | BIT(9); /* 1 µs tick of timer and watchdog */
+    start_ticks();
 }
 
 enum reset_cause chip_reset_cause(void) {
     if (REGISTER(WATCHDOG_REASON) & 1u) {
         return RESET_WATCHDOG;
     }
-    return REGISTER(CHIP_RESET) & BIT(16) ? RESET_RESET : RESET_POWER_UP; /* the chip does not report a brown-out */
+    uint32_t causes = REGISTER(CHIP_RESET);
+    if (causes & CHIP_RESET_BROWN_OUT) {
+        return RESET_BROWN_OUT;
+    }
+    return causes & CHIP_RESET_RUN ? RESET_RESET : RESET_POWER_UP;
 }
 
 /* --- time --- */
@@ -88,13 +105,13 @@ void timer_isr(void) {
 void chip_fence(void) { __asm volatile("dsb\n\tisb" ::: "memory"); }
 
 void chip_hold_alarm(void) {
-    REGISTER(NVIC_DISABLE) = TIMER_IRQ;
+    REGISTER(NVIC_DISABLE(TIMER_IRQ)) = NVIC_BIT(TIMER_IRQ);
     chip_fence();
 }
 
 void chip_release_alarm(void) {
     chip_fence();
-    REGISTER(NVIC_ENABLE) = TIMER_IRQ;
+    REGISTER(NVIC_ENABLE(TIMER_IRQ)) = NVIC_BIT(TIMER_IRQ);
 }
 
 /* --- sleep: the processor's own timer ends it, so that the loop notices ticks that do not come --- */
@@ -112,13 +129,12 @@ void chip_sleep(void) { __asm volatile("wfi" ::: "memory"); }
 /* --- watchdog --- */
 
 void chip_start_watchdog(void) {
-    REGISTER(PSM_WDSEL) = 0x1fffcu; /* resets everything but the oscillators, so all pins become inputs */
+    REGISTER(PSM_WDSEL) = PSM_ALL_BUT_OSCILLATORS; /* so all pins become inputs */
     chip_feed_watchdog();
     REGISTER(WATCHDOG_CTRL) = BIT(30);
 }
 
-/* The chip counts down twice per microsecond (erratum E1). */
-void chip_feed_watchdog(void) { REGISTER(WATCHDOG_LOAD) = 2u * WATCHDOG_US; }
+void chip_feed_watchdog(void) { REGISTER(WATCHDOG_LOAD) = WATCHDOG_PER_US * WATCHDOG_US; }
 
 /* --- entropy, temperature --- */
 

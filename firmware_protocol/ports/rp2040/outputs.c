@@ -14,10 +14,16 @@ void outputs_set(uint32_t pin, bool high) { REGISTER(high ? SIO_OUT_SET : SIO_OU
 
 bool outputs_get(uint32_t pin) { return REGISTER(SIO_IN) >> pin & 1u; }
 
+/* Connects a pin that floats since the reset, in this order. */
+static void connect(uint32_t pin, uint32_t function) {
+    REGISTER(IO_CTRL(pin)) = function;
+    REGISTER(PAD(pin)) = PAD_AFTER_RESET;
+}
+
 static void configure_output(uint32_t pin, bool high) {
     outputs_set(pin, high);
     REGISTER(SIO_OE_SET) = BIT(pin);
-    REGISTER(IO_CTRL(pin)) = IO_SIO;
+    connect(pin, IO_SIO);
 }
 
 static void configure_input(uint32_t pin, uint32_t pull) {
@@ -60,8 +66,8 @@ void outputs_move_mirrors(uint16_t x, uint16_t y) {
 
 static void start_dac(void) {
     configure_output(PIN_DAC_SYNC, true);
-    REGISTER(IO_CTRL(PIN_DAC_CLOCK)) = IO_SPI;
-    REGISTER(IO_CTRL(PIN_DAC_DATA)) = IO_SPI;
+    connect(PIN_DAC_CLOCK, IO_SPI);
+    connect(PIN_DAC_DATA, IO_SPI);
     REGISTER(SPI_CPSR) = 2;
     REGISTER(SPI_CR0) = 2u << 8 | BIT(7) | 7u; /* 125 MHz / 2 / 3, mode 1, 8 bits */
     REGISTER(SPI_CR1) = BIT(1);
@@ -74,7 +80,7 @@ static void start_dac(void) {
 /* --- startup --- */
 
 void outputs_start(void) {
-    REGISTER(IO_CTRL(PIN_GATE)) = GATE_FORCED_LOW;
+    connect(PIN_GATE, GATE_FORCED_LOW);
     REGISTER(PWM_TOP(GATE_SLICE)) = GATE_PERIOD - 1u;
     configure_output(PIN_RELAY, false);
     configure_output(PIN_INDICATOR, false);
@@ -86,6 +92,6 @@ void outputs_start(void) {
     configure_input(PIN_HOST_CLOSED, PAD_PULL_UP); /* a broken wire reads as a closed port */
     configure_input(PIN_HOST_RX, PAD_PULL_UP);
     REGISTER(IO_CTRL(PIN_HOST_RX)) = IO_UART;
-    REGISTER(IO_CTRL(PIN_HOST_TX)) = IO_UART;
+    connect(PIN_HOST_TX, IO_UART);
     start_dac();
 }

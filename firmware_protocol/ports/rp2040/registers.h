@@ -1,4 +1,4 @@
-/* Registers of the RP2040 (data sheet: Raspberry Pi, "RP2040 Datasheet"), used by this port. */
+/* Registers of the RP2040 and the RP2350 (Raspberry Pi's data sheets), used by this port. */
 
 #ifndef REGISTERS_H
 #define REGISTERS_H
@@ -11,77 +11,50 @@
 #define CLEAR(address) REGISTER((address) + 0x3000u)
 #define BIT(n) (1u << (n))
 
-/* --- flash: boot2 only --- */
-#define SSI 0x18000000u
-#define SSI_CTRLR0 (SSI + 0x00u)
-#define SSI_CTRLR1 (SSI + 0x04u)
-#define SSI_SSIENR (SSI + 0x08u)
-#define SSI_SER (SSI + 0x10u)
-#define SSI_BAUDR (SSI + 0x14u)
-#define SSI_SPI_CTRLR0 (SSI + 0xf4u)
+#ifdef RP2350
+#include "rp2350.h"
+#else
+#include "rp2040.h"
+#endif
 
 /* --- clocks and resets --- */
-#define RESETS 0x4000c000u
 #define RESETS_DONE (RESETS + 0x8u)
-#define RESET_ADC BIT(0)
-#define RESET_IO_BANK0 BIT(5)
-#define RESET_PADS_BANK0 BIT(8)
-#define RESET_PLL_SYS BIT(12)
-#define RESET_PLL_USB BIT(13)
-#define RESET_PWM BIT(14)
-#define RESET_SPI0 BIT(16)
-#define RESET_TIMER BIT(21)
-#define RESET_UART0 BIT(22)
-#define RESET_USB BIT(24)
-
-#define CLOCKS 0x40008000u
 #define CLK_REF_CTRL (CLOCKS + 0x30u)
 #define CLK_REF_SELECTED (CLOCKS + 0x38u)
 #define CLK_SYS_CTRL (CLOCKS + 0x3cu)
 #define CLK_SYS_SELECTED (CLOCKS + 0x44u)
 #define CLK_PERI_CTRL (CLOCKS + 0x48u)
-#define CLK_USB_CTRL (CLOCKS + 0x54u)
-#define CLK_ADC_CTRL (CLOCKS + 0x60u)
 #define CLK_ENABLE BIT(11)
 
-#define XOSC_CTRL 0x40024000u
-#define XOSC_STATUS 0x40024004u
-#define XOSC_STARTUP 0x4002400cu
-#define PLL_SYS 0x40028000u
-#define PLL_USB 0x4002c000u
+#define XOSC_CTRL XOSC
+#define XOSC_STATUS (XOSC + 0x4u)
+#define XOSC_STARTUP (XOSC + 0xcu)
 #define PLL_CS(pll) ((pll) + 0x0u)
 #define PLL_PWR(pll) ((pll) + 0x4u)
 #define PLL_FBDIV(pll) ((pll) + 0x8u)
 #define PLL_PRIM(pll) ((pll) + 0xcu)
 
-/* --- watchdog, reset cause --- */
-#define PSM_WDSEL 0x40010008u
-#define WATCHDOG_CTRL 0x40058000u
-#define WATCHDOG_LOAD 0x40058004u
-#define WATCHDOG_REASON 0x40058008u
-#define WATCHDOG_TICK 0x4005802cu
-#define CHIP_RESET 0x40064008u
+/* --- watchdog --- */
+#define WATCHDOG_CTRL WATCHDOG
+#define WATCHDOG_LOAD (WATCHDOG + 0x4u)
+#define WATCHDOG_REASON (WATCHDOG + 0x8u)
 
 /* --- pins --- */
-#define IO_CTRL(pin) (0x40014004u + 8u * (pin))
+#define IO_CTRL(pin) (IO_BANK0 + 0x4u + 8u * (pin))
 #define IO_SPI 1u
 #define IO_UART 2u
 #define IO_PWM 4u
 #define IO_SIO 5u
 #define IO_OUT_LOW (2u << 8) /* independent of the peripheral */
-#define PAD(pin) (0x4001c004u + 4u * (pin))
+#define PAD(pin) (PADS_BANK0 + 0x4u + 4u * (pin))
 #define PAD_SCHMITT BIT(1)
 #define PAD_PULL_DOWN BIT(2)
 #define PAD_PULL_UP BIT(3)
 #define PAD_4_MA (1u << 4)
 #define PAD_INPUT BIT(6)
-#define SIO_IN 0xd0000004u
-#define SIO_OUT_SET 0xd0000014u
-#define SIO_OUT_CLEAR 0xd0000018u
-#define SIO_OE_SET 0xd0000024u
+#define PAD_AFTER_RESET (PAD_SCHMITT | PAD_PULL_DOWN | PAD_4_MA | PAD_INPUT) /* the RP2350 also isolates it */
 
 /* --- UART 0 (Arm PL011), SPI 0 (Arm PL022) --- */
-#define UART 0x40034000u
 #define UART_DR (UART + 0x00u)
 #define UART_FR (UART + 0x18u)
 #define UART_IBRD (UART + 0x24u)
@@ -91,7 +64,6 @@
 #define UART_IFLS (UART + 0x34u)
 #define UART_IMSC (UART + 0x38u)
 #define UART_ICR (UART + 0x44u)
-#define SPI 0x4003c000u
 #define SPI_CR0 (SPI + 0x00u)
 #define SPI_CR1 (SPI + 0x04u)
 #define SPI_DR (SPI + 0x08u)
@@ -122,29 +94,27 @@
 #define USB_POWER (USB + 0x78u)
 
 /* --- PWM, timer, temperature, entropy --- */
-#define PWM_CSR(slice) (0x40050000u + 0x14u * (slice))
-#define PWM_CTR(slice) (0x40050008u + 0x14u * (slice))
-#define PWM_CC(slice) (0x4005000cu + 0x14u * (slice))
-#define PWM_TOP(slice) (0x40050010u + 0x14u * (slice))
-#define TIMER 0x40054000u
+#define PWM_CSR(slice) (PWM + 0x14u * (slice))
+#define PWM_CTR(slice) (PWM + 0x8u + 0x14u * (slice))
+#define PWM_CC(slice) (PWM + 0xcu + 0x14u * (slice))
+#define PWM_TOP(slice) (PWM + 0x10u + 0x14u * (slice))
 #define TIMER_ALARM0 (TIMER + 0x10u)
 #define TIMER_RAW_HIGH (TIMER + 0x24u)
 #define TIMER_RAW_LOW (TIMER + 0x28u)
-#define TIMER_INTR (TIMER + 0x34u)
-#define TIMER_INTE (TIMER + 0x38u)
-#define TIMER_INTF (TIMER + 0x3cu)
-#define ADC_CS 0x4004c000u
-#define ADC_RESULT 0x4004c004u
-#define ROSC_RANDOM_BIT 0x4006001cu
+#define TIMER_INTR TIMER_INTERRUPTS
+#define TIMER_INTE (TIMER_INTERRUPTS + 0x4u)
+#define TIMER_INTF (TIMER_INTERRUPTS + 0x8u)
+#define ADC_CS ADC
+#define ADC_RESULT (ADC + 0x4u)
 
 /* --- the processor --- */
 #define SYSTICK_CTRL 0xe000e010u
 #define SYSTICK_RELOAD 0xe000e014u
 #define SYSTICK_VALUE 0xe000e018u
 #define VTOR 0xe000ed08u
-#define NVIC_ENABLE 0xe000e100u
-#define NVIC_DISABLE 0xe000e180u
-#define TIMER_IRQ BIT(0)
-#define UART_IRQ BIT(20)
+#define NVIC_ENABLE(irq) (0xe000e100u + (irq) / 32u * 4u)
+#define NVIC_DISABLE(irq) (0xe000e180u + (irq) / 32u * 4u)
+#define NVIC_BIT(irq) BIT((irq) % 32u)
+#define TIMER_IRQ 0u
 
 #endif

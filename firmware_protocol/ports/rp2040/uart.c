@@ -47,7 +47,7 @@ void uart_start(void) {
     REGISTER(UART_CR) = BIT(0) | BIT(8) | BIT(9);
     REGISTER(UART_IFLS) = 1u << 3 | 1u; /* at a quarter, both directions */
     REGISTER(UART_IMSC) = BIT(4) | BIT(5) | BIT(6) | BIT(9);
-    REGISTER(NVIC_ENABLE) = UART_IRQ;
+    REGISTER(NVIC_ENABLE(UART_IRQ)) = NVIC_BIT(UART_IRQ);
 }
 
 bool uart_is_open(void) { return !outputs_get(PIN_HOST_CLOSED); }
@@ -72,13 +72,13 @@ bool uart_pop_break(void) {
 }
 
 static void hold(void) {
-    REGISTER(NVIC_DISABLE) = UART_IRQ;
+    REGISTER(NVIC_DISABLE(UART_IRQ)) = NVIC_BIT(UART_IRQ);
     chip_fence();
 }
 
 static void release(void) {
     chip_fence();
-    REGISTER(NVIC_ENABLE) = UART_IRQ;
+    REGISTER(NVIC_ENABLE(UART_IRQ)) = NVIC_BIT(UART_IRQ);
 }
 
 void uart_select(bool selected) {

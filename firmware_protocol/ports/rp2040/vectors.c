@@ -1,14 +1,19 @@
+#include "registers.h"
 #include "start.h"
+
+#define FIRST_IRQ 15u
 
 extern char stack_top[];
 void systick_isr(void), timer_isr(void), uart_isr(void);
 
 __attribute__((section(".vectors"), used)) static const struct {
     void *stack;
-    handler handlers[15 + 26];
+    handler handlers[FIRST_IRQ + IRQS];
 } vectors = {
     stack_top,
     {reset, halt, halt, 0, 0, 0, 0, 0, 0, 0, halt, 0, 0, halt, systick_isr,
-     timer_isr, halt, halt, halt, halt, halt, halt, halt, halt, halt, halt, halt, halt,
-     halt, halt, halt, halt, halt, halt, halt, uart_isr, halt, halt, halt, halt, halt},
+     [FIRST_IRQ + TIMER_IRQ] = timer_isr,
+     [FIRST_IRQ + TIMER_IRQ + 1u ... FIRST_IRQ + UART_IRQ - 1u] = halt,
+     [FIRST_IRQ + UART_IRQ] = uart_isr,
+     [FIRST_IRQ + UART_IRQ + 1u ... FIRST_IRQ + IRQS - 1u] = halt},
 };
