@@ -2,6 +2,7 @@
 
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,24 +12,35 @@ from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.cli.output import print_json
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from optodrive.cli.doctor_finding import Finding
     from optodrive.core.clock import Clock
     from optodrive.device.config import Config
 
+BAUD = 1_000_000
 MARKS = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
 
 
 def doctor(
     config: ConfigOption = None,
     stage: StageOption = None,
+    board: Annotated[
+        str | None,
+        typer.Option("--board", metavar="PORT", help="Examine the board on a serial port, without a configuration."),
+    ] = None,
+    baud: Annotated[
+        int, typer.Option("--baud", metavar="N", help="Rate of that port; a board's own USB ignores it.")
+    ] = BAUD,
     watch: Annotated[bool, typer.Option("--watch", help="Repeat the checks until Ctrl-C and show changes.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Check computer, port and board without arming. The exit status is 1 where there is a problem."""
+    examination = partial(examine, config, stage=stage) if board is None else partial(examine_port, board, baud)
     if watch:
-        _report_changes(config, stage, json)
+        _report_changes(examination, json)
         return
-    findings = examine(config, stage=stage)
+    findings = examination()
     problems = sum(finding.status == "problem" for finding in findings)
     warnings = sum(finding.status == "warning" for finding in findings)
     if json:
@@ -48,14 +60,14 @@ def _print_findings(findings: "list[Finding]") -> None:
             print(f"{'':9}{'':14} {finding.remedy}")
 
 
-def _report_changes(config: str | None, stage: str | None, json: bool) -> None:
+def _report_changes(examination: "Callable[[], list[Finding]]", json: bool) -> None:
     """Print all findings and then, with the time of day, those that change. With `json`, print one line per change."""
     from json import dumps
 
     from optodrive.cli.doctor_watch import watch
     from optodrive.core.clock import MonotonicClock
 
-    for number, changed in enumerate(watch(lambda: examine(config, stage=stage), MonotonicClock())):
+    for number, changed in enumerate(watch(examination, MonotonicClock())):
         if json:
             print(dumps({"unix_s": time.time(), "findings": [finding._asdict() for finding in changed]}), flush=True)
             continue
@@ -96,6 +108,18 @@ def examine(config: str | None, root: Path = Path("/"), stage: str | None = None
             found = [item._replace(check=f"{one.stages[0].name} {item.check}") for item in found]
         findings += found
     return findings
+
+
+def examine_port(port: str, baud: int = BAUD, root: Path = Path("/")) -> list["Finding"]:
+    """Return the findings on a serial port and the board on it, without a configuration."""
+    from optodrive.cli.doctor_bare_board import check_bare_board
+    from optodrive.cli.doctor_port import check_port
+    from optodrive.core.clock import MonotonicClock
+    from optodrive.device.config_sections import BoardSection
+    from optodrive.link.transport.serial_port import SerialPort
+
+    findings, free = check_port(BoardSection(transport="serial", port=port), root)
+    return [*findings, *(check_bare_board(SerialPort(port, baud, "--board"), MonotonicClock()) if free else [])]
 
 
 def _examine_board(config: "Config", clock: "Clock", root: Path) -> list["Finding"]:

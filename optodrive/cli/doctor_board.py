@@ -11,6 +11,7 @@ from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.registry import find_transport_factory
 
 ROUND_TRIP_WARNING_S = 0.01
+UNANSWERED = "check power, port and baud rate"
 SAFE_INPUTS = {"interlock": True, "key": True, "estop": False}
 UNSAFE_REASONS = {
     "interlock": "the enclosure is open",
@@ -25,9 +26,10 @@ def check_board(config: Config, clock: Clock) -> list[Finding]:
     session = BoardSession(transport, clock, build_board_requirements(config))
     try:
         session.connect()
-        return [*_check_identity(session, config), _check_inputs(session), _check_round_trip(session)]
+        trip_s = session.collect_link_stats()["round_trip_ms"] * 1e-3
+        return [*_check_identity(session, config), check_inputs(session.board.inputs), check_trip(trip_s)]
     except LinkError as error:
-        return [report_problem("board", str(error), "check power, port and board.baud")]
+        return [report_problem("board", str(error), UNANSWERED)]
     except InputError as error:
         return [report_problem("board", f"{error.where} is {error.value}", f"expected: {error.expected}")]
     finally:
@@ -52,18 +54,19 @@ def _check_identity(session: BoardSession, config: Config) -> list[Finding]:
     return [report_ok("board", observation), limits]
 
 
-def _check_inputs(session: BoardSession) -> Finding:
-    input_states = {name: bool(session.board.inputs >> bit & 1) for bit, name in enumerate(INPUTS)}
+def check_inputs(inputs: int) -> Finding:
+    """Return the finding on the bits of the inputs."""
+    input_states = {name: bool(inputs >> bit & 1) for bit, name in enumerate(INPUTS)}
     unsafe = [UNSAFE_REASONS[name] for name in INPUTS if input_states[name] != SAFE_INPUTS[name]]
     if unsafe:
         return report_warning("inputs", "; ".join(unsafe), "the board refuses to arm until this is corrected")
     return report_ok("inputs", "enclosure closed, key on, emergency stop released")
 
 
-def _check_round_trip(session: BoardSession) -> Finding:
-    trip_ms = session.collect_link_stats()["round_trip_ms"]
-    observation = f"round trip {trip_ms:.2f} ms"
-    if trip_ms > ROUND_TRIP_WARNING_S * 1e3:
+def check_trip(trip_s: float) -> Finding:
+    """Return the finding on the shortest round trip."""
+    observation = f"round trip {trip_s * 1e3:.2f} ms"
+    if trip_s > ROUND_TRIP_WARNING_S:
         return report_warning(
             "link", observation, "slow: see latency above, and connect the board directly rather than through a hub"
         )

@@ -1,7 +1,8 @@
-"""The paper's experiments through the real planner, queue and link service to the core on an emulated Cortex-M3."""
+"""The paper's experiments through the real planner, queue and link service to boards on emulated chips."""
 
 import numpy as np
 import pytest
+from emulated_pico import EmulatedUsbPico, PicoImage
 
 from displays import DISPLAYS
 from optodrive.link.board_setup import build_board_requirements
@@ -13,6 +14,7 @@ from planner_rig import PlannerRig
 
 DISPLAY = DISPLAYS["display-437"]
 PWM_S = 2e-4
+BOOT_US = 50_000
 EXPERIMENTS = [
     *(pytest.param(name, given, count, marks=pytest.mark.slow) for name, given, count in (
         ("experiment-1", {"direction": "right"}, 24),
@@ -39,9 +41,8 @@ class ChipRig(PlannerRig):
         return BoardGroup([self.session], self.clock, [self.open_port])
 
 
-@pytest.mark.parametrize(("name", "given", "count"), EXPERIMENTS)
-def test_an_experiment_is_executed_as_planned(monkeypatch, chips, name, given, count):
-    rig = ChipRig(monkeypatch, chips(0)).ready().arm()
+def check_executed(rig, name, given, count):
+    """Play an experiment of `count` pulses on an armed board. Check what it emitted against the plan."""
     rig.run(0.01)
     planned = rig.submit(build_pattern(name, given, DISPLAY.config), rig.remote.epoch).result()
     record = rig.store.find(planned.plan)
@@ -59,3 +60,23 @@ def test_an_experiment_is_executed_as_planned(monkeypatch, chips, name, given, c
     assert codes.tolist() == np.column_stack([scale.to_codes(plan.x_rad), scale.to_codes(plan.y_rad)]).tolist()
     assert not [event for event in rig.log if event["event"] == "fault"]
     rig.chip.close()
+
+
+@pytest.mark.parametrize(("name", "given", "count"), EXPERIMENTS)
+def test_an_experiment_is_executed_as_planned(monkeypatch, chips, name, given, count):
+    check_executed(ChipRig(monkeypatch, chips(0)).ready().arm(), name, given, count)
+
+
+@pytest.mark.slow
+def test_experiment_1_is_executed_by_a_pico_on_its_usb_port(monkeypatch, tmp_path):
+    """The image has its own settings, with which the key must be turned before each arming."""
+    image = PicoImage(tmp_path)
+
+    def make_pico(settings, sink, seed):
+        pico = EmulatedUsbPico(image, settings, sink, seed)
+        pico.set_input("key", False, 0)
+        pico.set_input("key", True, BOOT_US)
+        pico.open_port(BOOT_US)
+        return pico
+
+    check_executed(ChipRig(monkeypatch, make_pico).ready().arm(), "experiment-1", {"direction": "right"}, 24)

@@ -14,11 +14,16 @@ from emulated_pico import HOST_CLOSED, LOOP_US, PORT, SEND_BREAK, EmulatedPico, 
 from virtual_board import PicoBoard, VirtualKind
 from wire_format import HOST, MessageReader, body_of, frame
 
+from optodrive.cli.doctor_bare_board import check_bare_board
+from optodrive.core.clock import ManualClock
+from optodrive.link.simulator.memory_link import MemoryLink
+
 BUS_LOST_US = 4000
 """The board notices within this time that no frame begins any more."""
 TURN_US = 500
 """The main loop notices within this time what the computer does."""
 BUS_RESET_US = 10_000
+BOOT_US = 50_000
 GAP_MAX_US = 600
 SET_CONFIGURATION_0 = bytes.fromhex("0009000000000000")
 LOSSES = {
@@ -173,6 +178,19 @@ def test_a_host_that_does_not_read_delays_nothing_and_loses_whole_frames(bench):
     host.received.clear()
     host.send("GET_EXECUTED", first_index=599)
     host.wait(lambda: host.of("EXECUTED"), "the last report")
+
+
+def test_doctor_finds_the_shipped_image_in_order(image):
+    log, clock = [], ManualClock()
+    pico = EmulatedUsbPico(image, None, log.append)
+    pico.open_port(BOOT_US)
+    clock.sleep(BOOT_US * 1e-6)
+    findings = {finding.check: finding for finding in check_bare_board(MemoryLink(pico, clock), clock)}
+    assert {finding.status for finding in findings.values()} == {"ok"}
+    assert findings["capacities"].observation == "2048 points, 2048 pulses a second, 1536 cells of 1300 codes"
+    assert {entry["state"] for entry in log if entry["event"] == "state"} == {"DISARMED"}
+    assert pico.pins == []
+    pico.close()
 
 
 # --- two ports ------------------------------------------------------------------------------------------------------

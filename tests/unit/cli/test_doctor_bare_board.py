@@ -1,0 +1,114 @@
+"""`optodrive doctor --board`: a board without a configuration, in virtual time, and never armed."""
+
+import json
+
+import pytest
+
+from forked_process import SIMULATED, start_process
+from optodrive.cli.doctor_bare_board import check_bare_board
+from optodrive.cli.main import run
+from optodrive.core.clock import ManualClock
+from optodrive.link.protocol.states import BoardState
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.board_machine import BoardMachine
+from optodrive.link.simulator.memory_link import MemoryLink
+
+CHECKS = ["board", "capacities", "limits", "inputs", "clock", "link", "lease, stop"]
+
+
+class DriftingLink(MemoryLink):
+    """A link to a board whose clock runs at another rate."""
+
+    rate = 1.0
+
+    def _now_us(self):
+        return round(super()._now_us() * self.rate)
+
+
+class DeadLink(MemoryLink):
+    """A link on which nothing answers."""
+
+    def write(self, data):
+        pass
+
+
+def examine(link=MemoryLink, rate=1.0, inputs=(), **settings):
+    """Examine a simulated board. Return its findings by check, and its log."""
+    log, clock = [], ManualClock(5.0)
+    board = BoardCore(BoardSettings(**settings), log.append, seed=1)
+    for name, value in inputs:
+        board.set_input(name, value, 1000)
+    line = link(board, clock)
+    line.rate = rate
+    findings = check_bare_board(line, clock)
+    return {finding.check: finding for finding in findings}, log
+
+
+def states(log):
+    return {entry["state"] for entry in log if entry["event"] == "state"}
+
+
+def test_a_sound_board_is_described_and_stays_disarmed():
+    findings, log = examine(uid="0123456789abcdef01234567", cells=77, window_pulses=99, queue_points=300)
+    assert list(findings) == CHECKS
+    assert {finding.status for finding in findings.values()} == {"ok"}
+    assert "uid 0123456789abcdef01234567" in findings["board"].observation
+    assert findings["capacities"].observation.startswith("300 points, 99 pulses a second, 77 cells of ")
+    assert states(log) == {"DISARMED"}
+    assert not [entry for entry in log if entry["event"] in ("gate", "fault", "rx_error")]
+
+
+@pytest.mark.parametrize(
+    ("rate", "status", "ppm"), [(1 + 1e-4, "ok", 100), (1 - 3e-3, "problem", -3000), (1.01, "problem", 10_000)]
+)
+def test_the_rate_of_its_clock(rate, status, ppm):
+    finding = examine(DriftingLink, rate)[0]["clock"]
+    stated, uncertainty = (int(word) for word in finding.observation.split(" ppm")[0].split(" ± "))
+    assert finding.status == status
+    assert abs(stated - ppm) <= uncertainty < 100
+
+
+def test_inputs_and_a_fault_are_named():
+    findings, _ = examine(inputs=[("interlock", False), ("estop", True)])
+    assert findings["inputs"].observation == "the enclosure is open; the emergency stop is pressed"
+    assert findings["board"].status == "warning"
+    assert "FAULT INTERLOCK" in findings["board"].observation
+
+
+def test_a_board_that_a_lease_arms_is_a_problem(monkeypatch):
+    def arm(machine, duration_ms):
+        machine.state = BoardState.ARMED
+
+    monkeypatch.setattr(BoardMachine, "renew_lease", arm)
+    finding = examine()[0]["lease, stop"]
+    assert finding.status == "problem"
+    assert "FAULT LINK after LEASE" in finding.observation, "it had no lease at its arming"
+
+
+def test_a_silent_port_is_one_problem():
+    findings, _ = examine(DeadLink)
+    assert list(findings) == ["board"]
+    assert findings["board"].observation == "no answer to HELLO within 3 s"
+
+
+def test_the_command_examines_a_port(tmp_path, capsys):
+    port = tmp_path / "tty"
+    board = start_process([*SIMULATED, "--pty", port, "--log", tmp_path / "log"])
+    try:
+        while not port.exists():
+            assert board.poll() is None
+        assert run(["doctor", "--board", str(port), "--json"]) == 0
+    finally:
+        board.terminate()
+        board.wait()
+    found = {finding["check"]: finding["status"] for finding in json.loads(capsys.readouterr().out)["findings"]}
+    assert {check: status for check, status in found.items() if check in CHECKS and check not in ("link", "clock")} == {
+        check: "ok" for check in CHECKS if check not in ("link", "clock")
+    }
+    assert states([json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]) == {"DISARMED"}
+
+
+def test_a_port_that_is_not_there_is_one_problem(tmp_path, capsys):
+    assert run(["doctor", "--board", str(tmp_path / "tty")]) == 1
+    assert "tty does not exist" in capsys.readouterr().out
