@@ -129,6 +129,8 @@ def _check_clock(conversation: _Conversation, tick_hz: int) -> list[Finding]:
         if reply.host_t == len(exchanges):
             exchanges.append((reply_s - request_s, 0.5 * (request_s + reply_s), reply.tick / tick_hz))
         clock.sleep(CLOCK_INTERVAL_S)
+    if len(exchanges) < 2:
+        raise LinkError("the board does not return the stamps of CLOCK")
     quarter = max(1, len(exchanges) // 4)
     (first_s, first_host_s, first_board_s), (last_s, last_host_s, last_board_s) = (
         min(exchanges[:quarter]),
