@@ -17,6 +17,8 @@ PACKAGES = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "qemu-system-arm": "qemu-system-arm",
     "node": "nodejs npm",
+    "clang": "clang",
+    "cppcheck": "cppcheck",
 }
 NEEDS = {"host": ("gcc", "make"), "mps2-an385": ("arm-none-eabi-gcc", "qemu-system-arm", "make")}
 

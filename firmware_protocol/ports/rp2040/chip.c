@@ -67,7 +67,7 @@ enum reset_cause chip_reset_cause(void) {
     if (causes & CHIP_RESET_BROWN_OUT) {
         return RESET_BROWN_OUT;
     }
-    return causes & CHIP_RESET_RUN ? RESET_RESET : RESET_POWER_UP;
+    return (causes & CHIP_RESET_RUN) ? RESET_RESET : RESET_POWER_UP;
 }
 
 /* --- time --- */

@@ -56,7 +56,7 @@ static uint8_t line_coding[LINE_CODING_BYTES] = {0x00, 0xc2, 0x01, 0x00, 0, 0, 8
 /* Gives a buffer to the controller, whose slower clock must see the length before the bit that makes it available. */
 static void arm(uint32_t endpoint, enum way way, uint32_t length) {
     uint32_t address = USB_BUFFER_CONTROL(endpoint, way), bit = BUFFER_BIT(endpoint, way);
-    uint32_t word = length | (way == IN ? USB_BUFFER_FULL : 0) | (usb.data1 & bit ? USB_BUFFER_DATA1 : 0);
+    uint32_t word = length | (way == IN ? USB_BUFFER_FULL : 0) | ((usb.data1 & bit) ? USB_BUFFER_DATA1 : 0);
     usb.data1 ^= bit;
     REGISTER(address) = word;
     for (uint32_t k = 0; k < 4; k++) {
@@ -88,13 +88,11 @@ struct setup {
 };
 
 static void send_reply(void) {
-    size_t n = usb.reply_length < USB_PACKET ? usb.reply_length : USB_PACKET;
-    for (size_t k = 0; k < n; k++) {
-        DPRAM(CONTROL_BUFFER + k) = usb.reply[k];
+    uint32_t n = 0;
+    for (; n < USB_PACKET && usb.reply_length > 0; n++, usb.reply_length--) {
+        DPRAM(CONTROL_BUFFER + n) = *usb.reply++;
     }
-    usb.reply += n;
-    usb.reply_length -= n;
-    arm(CONTROL, IN, (uint32_t)n);
+    arm(CONTROL, IN, n);
 }
 
 /* No reply fills its last packet, except one that the computer asked for in this length, so none needs an empty packet. */
@@ -161,7 +159,7 @@ static bool handle_standard(const struct setup *setup) {
         return acknowledge();
     case CLEAR_FEATURE:
         if ((setup->index & 0x7fu) == USB_DATA && usb.configuration) {
-            restart(setup->index & 0x80u ? IN : OUT);
+            restart((setup->index & 0x80u) ? IN : OUT);
         }
         return acknowledge();
     case SET_INTERFACE:
