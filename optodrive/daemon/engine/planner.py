@@ -160,9 +160,7 @@ class Planner:
         except (NotReadyError, LinkError):  # it was stopped or paused, and a stream shows the present
             self._plan_queue.stream.forget_unfinished()
         except Exception as error:  # of any kind: what cannot be proven is not played
-            reason = f"the rest of a streamed frame could not be planned: {error}"
-            with suppress(LinkError):
-                self._run_in_loop(lambda: self._plan_queue.end_all(PlanStatus.FAILED, reason))
+            self._fail_all(f"the rest of a streamed frame could not be planned: {error}")
         finally:
             use_usual_priority()
             self._progress_at_s = self._clock.now_s()
@@ -200,9 +198,7 @@ class Planner:
             while not self._restart_once(on_progress):
                 pass
         except Exception as error:  # of any kind: what cannot be proven is not played
-            reason = f"what was left after an interruption could not be planned again: {error}"
-            with suppress(LinkError):
-                self._run_in_loop(lambda: self._plan_queue.end_all(PlanStatus.FAILED, reason))
+            self._fail_all(f"what was left after an interruption could not be planned again: {error}")
         finally:
             on_progress()
 
@@ -220,6 +216,11 @@ class Planner:
             return self._dimmer.display is display and self._plan_queue.pause.commit_restart(restart)
 
         return self._run_in_loop(commit)
+
+    def _fail_all(self, reason: str) -> None:
+        """End all plans, unless the loop has ended with them."""
+        with suppress(LinkError):
+            self._run_in_loop(lambda: self._plan_queue.end_all(PlanStatus.FAILED, reason))
 
     def _process(self, request: PlanningRequest) -> PlanReport:
         """Plan one request, a streamed one before all programs of usual priority."""

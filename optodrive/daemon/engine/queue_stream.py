@@ -33,8 +33,6 @@ from optodrive.planning.display_model import DisplayModel
 STREAM_START_LEAD_S = 0.02
 SHARED_STREAM_LEAD_S = 0.04
 """Least lead of a stream if the link process has no real-time scheduling."""
-
-
 GROWTH_MARGIN_S = 0.01
 """Time reserved for the loop and the hand-over of a plan's rest, besides its planning."""
 
