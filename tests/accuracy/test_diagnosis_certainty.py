@@ -178,8 +178,8 @@ def test_an_interval_that_contains_zero_is_in_the_first_sentence(late):
 
 def test_an_interval_that_contains_the_least_plausible_size_is_in_the_first_sentence(leak):
     assert leak.doubts == {}
-    assert build_narrative(spread(leak, 0.02, 3.0))[0].endswith(
-        "but the 95 % interval of gas_leak.rate, 0.02 1/s to 3 1/s, contains the smallest plausible size."
+    assert build_narrative(spread(leak, 1e-3, 3.0))[0].endswith(
+        "but the 95 % interval of gas_leak.rate, 0.001 1/s to 3 1/s, contains the smallest plausible size."
     )
 
 

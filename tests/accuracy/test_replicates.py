@@ -10,7 +10,6 @@ from optodrive.core.types.discrepancy import CandidateCause, NextExperiment
 from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.lab.diagnosis import model_selection
 from optodrive.lab.diagnosis.dataset import build_dataset
-from optodrive.lab.diagnosis.detection import NOISE_KNOWN_DEGREES
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.evidence import compute_bin_evidence, temper
@@ -18,6 +17,7 @@ from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.next_experiment import propose_experiment
+from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES, MAX_DEGREES, NoiseCertainty, count_noise_degrees
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus
@@ -85,7 +85,7 @@ def test_odds_are_worth_less_the_fewer_contrasts_the_noise_comes_from():
     for odds in (10.0, 100.0, 1000.0):
         surprising = [temper(0.5 * ratio, 10) > np.log(odds) for ratio in ratios]
         assert np.mean(surprising) < 1.0 / odds
-    assert temper(12.5, 10) < 0.6 * temper(12.5, NOISE_KNOWN_DEGREES)
+    assert temper(12.5, 10) < 0.6 * temper(12.5, KNOWN_DEGREES)
     assert temper(0.01, 10) == pytest.approx(0.011, rel=0.01)
 
 
@@ -185,3 +185,17 @@ def test_an_experiment_is_asked_for_only_where_it_would_tell_and_as_often_as_it_
     assert proposal.separation >= 12.0
     assert 3 <= proposal.repeats <= 30
     assert f"{proposal.repeats} times" in proposal.description
+
+
+def test_noise_is_known_as_well_as_its_part_by_which_two_fits_differ():
+    problem, base = fit_nominal(build_dataset(lab(21, {}, repeats=2)))
+    jitter = compute_jitter_sensitivity(problem.data, base.point, problem.epsilon, base.prediction)
+    certainty = NoiseCertainty(problem, base)
+    jitter_degrees = count_noise_degrees(problem.data)
+    as_power = replace(base, prediction=base.prediction + 0.3 * jitter.power)
+    assert certainty.count_degrees(as_power) == pytest.approx(jitter_degrees, rel=0.3)
+    alternating = np.zeros(len(problem.data.value))
+    for block in problem.data.blocks:
+        alternating[block.part] = problem.noise.coloured[block.kind].white * (-1.0) ** np.arange(len(block.t_s))
+    assert certainty.count_degrees(replace(base, prediction=base.prediction + alternating)) == MAX_DEGREES
+    assert certainty.count_degrees(base) == jitter_degrees

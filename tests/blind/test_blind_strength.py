@@ -106,17 +106,17 @@ def test_the_ideal_observer_agrees_with_simulated_tests():
 
 
 def test_every_kind_meets_every_strength_and_other_tables_are_refused(tmp_path):
-    tasks = [calibration.build_task("report", k) for k in range(100)]
+    tasks = [calibration.build_task("report", k) for k in range(105)]
     assert {(task.kind, task.strength) for task in tasks} == {
         (kind, strength * (10.0 if kind == "instrument" else 1.0))
         for kind in calibration.KINDS
         for strength in calibration.STRENGTHS
     }
-    assert len({task.seed for task in tasks}) == 100
+    assert len({task.seed for task in tasks}) == 105
     path = tmp_path / "table.csv"
     assert calibration.read_table(path) == []
-    calibration.write_table(path, "report", [build_row(5_000_007), build_row(5_000_003)])
-    assert [row["seed"] for row in calibration.read_table(path)] == ["5000003", "5000007"]
+    calibration.write_table(path, "report", [build_row(6_000_007), build_row(6_000_003)])
+    assert [row["seed"] for row in calibration.read_table(path)] == ["6000003", "6000007"]
     with pytest.raises(SystemExit, match="expected dev seeds"):
         next(calibration.measure("dev", 0.0, None, 0, 1, path))
     assert "2 recordings" in "".join(calibration.measure("report", 0.0, None, 0, 1, path))

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.diagnosis import candidate_judgement
 from optodrive.lab.diagnosis.candidate_judgement import NOISE_CHI2, judge_candidates
-from optodrive.lab.diagnosis.detection import NOISE_KNOWN_DEGREES, Detection, Score
+from optodrive.lab.diagnosis.detection import Detection, Score
 from optodrive.lab.diagnosis.evidence import Explanation, compute_probabilities, compute_score_evidence
 from optodrive.lab.diagnosis.model_selection import Verdict
+from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -19,14 +20,17 @@ KEYS = sorted(discover_terms())
 evidences = st.lists(st.floats(-50.0, 1e6), min_size=2, max_size=len(KEYS))
 ROUNDING = 1e-6
 """Of a difference of χ² of 1e5: a rival at the very limit may be on either side of it."""
-degrees = st.sampled_from([8, 20, NOISE_KNOWN_DEGREES])
+degrees = st.sampled_from([8, 20, KNOWN_DEGREES])
 
 
 def explain(values, none_of_these, noise_degrees):
     """Return the probabilities of causes with these log evidences, beside no effect and something else."""
-    some = [Explanation((key,), -4.0, value) for key, value in zip(KEYS, values, strict=False)]
-    others = [Explanation((), -0.7, 0.0), Explanation((), -2.3, none_of_these, own_share=0.0)]
-    return compute_probabilities([*some, *others], noise_degrees)
+    some = [Explanation((key,), -4.0, value, noise_degrees) for key, value in zip(KEYS, values, strict=False)]
+    others = [
+        Explanation((), -0.7, 0.0, noise_degrees),
+        Explanation((), -2.3, none_of_these, noise_degrees, own_share=0.0),
+    ]
+    return compute_probabilities([*some, *others])
 
 
 @given(evidences, st.floats(-50.0, 1e6), degrees)
@@ -89,7 +93,7 @@ def test_no_rival_within_the_noise_of_the_winner_is_ruled_out(candidates, noise_
 
 @pytest.mark.parametrize("is_refitted", [True, False])
 def test_a_rival_far_behind_is_ruled_out(is_refitted):
-    judgements, _ = judge([100.0, 200.0], [0.0, 0.0], [True, is_refitted], NOISE_KNOWN_DEGREES)
+    judgements, _ = judge([100.0, 200.0], [0.0, 0.0], [True, is_refitted], KNOWN_DEGREES)
     assert judgements[KEYS[1]] == "ruled out"
 
 

@@ -1,7 +1,7 @@
 """Detection of model errors: a score per hypothesis and an omnibus test over bins, both under the noise model.
 
 Each start of a hypothesis is a column beside the base fit, at a finite size; its likelihood ratio follows from one
-matrix of all columns. The noise model is an estimate from a finite number of contrasts (`count_noise_degrees`).
+matrix of all columns.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,6 @@ import numpy as np
 
 from optodrive.core.errors import DivergedError, OptodriveError
 from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
 from optodrive.lab.diagnosis.evidence import compute_form_evidence
 from optodrive.lab.diagnosis.fitting import (
     FitProblem,
@@ -27,8 +26,6 @@ from optodrive.physics.hypothesis import Hypothesis
 
 ROUNDING_FRACTION = 1e-12
 """An effect with a smaller share orthogonal to the fitted parameters is known only by rounding errors, and unseen."""
-NOISE_PRIOR_DEGREES, NOISE_KNOWN_DEGREES = 6, 10_000
-"""Degrees of freedom of the prior knowledge of noise; degrees of freedom where the noise model counts as known."""
 
 
 @dataclass(frozen=True)
@@ -142,15 +139,6 @@ def score_effects(
     if np.isnan(numbers).any() or not np.isfinite(numbers[:3]).all():  # no comparison with a number would be true
         raise OptodriveError("the test of the residuals gave no number; nothing is concluded from it")
     return Detection(tuple(scores), omnibus, residual_chi2, form_evidence)
-
-
-def count_noise_degrees(data: Dataset) -> int:
-    """Return the degrees of freedom of the noise model.
-
-    Mirror noise, raised above its estimate, counts as known.
-    """
-    mirrors = all(kind in MIRROR_KINDS for kind in data.kinds)
-    return NOISE_KNOWN_DEGREES if mirrors or not data.contrast_count else NOISE_PRIOR_DEGREES + data.contrast_count
 
 
 def _select_starts(item: Hypothesis) -> tuple[dict[str, float], ...]:

@@ -10,8 +10,8 @@ from optodrive.core.quantity import format_range
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import Estimate
 from optodrive.lab.diagnosis.dataset import Dataset
-from optodrive.lab.diagnosis.detection import count_noise_degrees
 from optodrive.lab.diagnosis.fitting import ModelFit
+from optodrive.lab.diagnosis.noise_certainty import count_noise_degrees
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 

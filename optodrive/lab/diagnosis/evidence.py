@@ -56,13 +56,14 @@ UNIFORM_VARIANCE = 1.0 / 12.0
 class Explanation:
     """A model of the recording.
 
-    causes: none for no effect or for something else; own_share: probability that these causes, rather than something
-    else, are what it describes
+    causes: none for no effect or for something else; degrees: degrees of freedom of the noise by which it differs from
+    the best explanation; own_share: probability that these causes, rather than something else, are what it describes
     """
 
     causes: tuple[str, ...]
     log_prior: float
     log_evidence: float
+    degrees: float
     own_share: float = 1.0
 
 
@@ -139,16 +140,16 @@ def compute_own_share(rest: float, middle: float) -> float:
     return float(1.0 / (1.0 + (rest / middle) ** REST_POWER))
 
 
-def temper(difference: float, degrees: int) -> float:
+def temper(difference: float, degrees: float) -> float:
     """Return the logarithm of the odds for a difference of log evidence, with the noise known to some degrees."""
     return 0.5 * (degrees + 1) * log1p(2.0 * difference / degrees)
 
 
-def compute_probabilities(explanations: Iterable[Explanation], degrees: int) -> Probabilities:
+def compute_probabilities(explanations: Iterable[Explanation]) -> Probabilities:
     """Return the probabilities of all explanations, which sum to 1."""
     items = list(explanations)
     best = max(item.log_evidence for item in items)
-    logs = np.array([item.log_prior - temper(best - item.log_evidence, degrees) for item in items])
+    logs = np.array([item.log_prior - temper(best - item.log_evidence, item.degrees) for item in items])
     weights = np.exp(logs - np.logaddexp.reduce(logs))
     no_effect = none_of_these = 0.0
     causes: dict[tuple[str, ...], float] = {}

@@ -27,7 +27,7 @@ from math import log, log1p
 import numpy as np
 
 from optodrive.core.types.discrepancy import Probabilities
-from optodrive.lab.diagnosis.detection import Detection, count_noise_degrees, detect, score_effects, simulate_effects
+from optodrive.lab.diagnosis.detection import Detection, detect, score_effects, simulate_effects
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.evidence import (
     BINS_REST,
@@ -46,6 +46,7 @@ from optodrive.lab.diagnosis.evidence import (
     compute_score_evidence,
 )
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
+from optodrive.lab.diagnosis.noise_certainty import NoiseCertainty, count_noise_degrees
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
 from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.physics.hypothesis import Hypothesis
@@ -156,8 +157,9 @@ def select_from_single_causes(
         for item in select_near(base, pairs)[:EXAMINED_PAIRS]:
             _examine(problem, base, hypotheses, item, examined, log)
     explanations = _list_explanations(problem, base, hypotheses, nominal_detection, [*singles, *pairs], examined)
-    probabilities = compute_probabilities(explanations, count_noise_degrees(problem.data))
-    return _build_verdict(problem, base, nominal_detection, [*singles, *pairs], examined, probabilities)
+    refits = [*singles, *pairs]
+    probabilities = compute_probabilities(explanations)
+    return _build_verdict(problem, base, nominal_detection, refits, examined, probabilities)
 
 
 def select_near(base: ModelFit, ranked: list[RefittedCandidate]) -> list[RefittedCandidate]:
@@ -210,11 +212,13 @@ def _list_explanations(
     examined: _Examined,
 ) -> list[Explanation]:
     """Return every explanation of the recording with its prior and its evidence."""
+    degrees_of = _count_degrees(problem, base, refits)
+    degrees = degrees_of.pop(None)
     nothing = compute_log_evidence(problem, base, base.chi2)
     something = nothing + nominal_detection.omnibus.log_evidence
     out = [
-        Explanation((), log(PRIOR_NO_EFFECT), nothing),
-        Explanation((), log(PRIOR_NONE_OF_THESE), something, own_share=0.0),
+        Explanation((), log(PRIOR_NO_EFFECT), nothing, degrees),
+        Explanation((), log(PRIOR_NONE_OF_THESE), something, degrees, own_share=0.0),
     ]
     keys = {item.key for item in hypotheses}
     forms_of = {key: sum(item.key == key for item in hypotheses) for key in keys}
@@ -225,11 +229,19 @@ def _list_explanations(
         key, label = score.hypothesis.key, score.hypothesis.label
         if label not in refitted:
             prior = log(PRIOR_ONE_CAUSE / catalogue / forms_of[key] / count_trials(score.hypothesis))
-            out.append(Explanation((key,), prior, nothing + compute_score_evidence(score.ratio)))
-    for item in refits:
+            out.append(Explanation((key,), prior, nothing + compute_score_evidence(score.ratio), degrees))
+
+    def log_prior(item: RefittedCandidate) -> float:
         prior = PRIOR_ONE_CAUSE / catalogue if len(item.causes) == 1 else PRIOR_TWO_CAUSES / pair_count
-        prior = log(prior / np.prod([forms_of[part.key] * count_trials(part) for part in item.hypotheses]))
-        out.append(Explanation(item.causes, prior, item.log_evidence))
+        return log(prior / np.prod([forms_of[part.key] * count_trials(part) for part in item.hypotheses]))
+
+    for item in refits:
+        prior = log_prior(item)
+        out.append(Explanation(item.causes, prior, item.log_evidence, degrees_of[item]))
+        single, share = _find_sufficient_single(item, refits, examined)
+        if single is not None:
+            mended = log_prior(single) + log(OTHER_ODDS * share / catalogue)
+            out.append(Explanation(single.causes, mended, item.log_evidence, degrees_of[item]))
         rest = examined.get(item)
         if rest is None:
             continue
@@ -243,12 +255,22 @@ def _list_explanations(
             (prior, rest.log_evidence + bins, own_bins),
             (prior + log(OTHER_ODDS), forms + both, own_forms * own_bins),
         )
-        single, share = _find_sufficient_single(item, refits, examined)
         for other_prior, evidence, own in variants:
-            out.append(Explanation(item.causes, other_prior + log1p(-share), evidence, own))
+            out.append(Explanation(item.causes, other_prior + log1p(-share), evidence, degrees, own))
             if single is not None:
-                out.append(Explanation(single.causes, other_prior + log(share), evidence, own))
+                out.append(Explanation(single.causes, other_prior + log(share), evidence, degrees, own))
     return out
+
+
+def _count_degrees(
+    problem: FitProblem, base: ModelFit, refits: list[RefittedCandidate]
+) -> dict[RefittedCandidate | None, float]:
+    """Return the degrees of freedom of the noise between the best refit and each, and the nominal fit (None)."""
+    if not refits:
+        return {None: count_noise_degrees(problem.data)}
+    best = max(refits, key=lambda item: item.log_evidence)
+    certainty = NoiseCertainty(problem, best.fit)
+    return {None: certainty.count_degrees(base)} | {item: certainty.count_degrees(item.fit) for item in refits}
 
 
 def count_trials(hypothesis: Hypothesis) -> int:
@@ -261,7 +283,8 @@ def _find_sufficient_single(
 ) -> tuple[RefittedCandidate | None, float]:
     """Return the cause of a pair that may explain all in another form, and the probability that it does.
 
-    A pair that leaves a rest is not literally true; its second cause may only mend the form of the first one.
+    Its second cause may only mend the form of the first one, as any cause of the catalogue may do by chance; a pair
+    that leaves a rest is not literally true at all.
     """
     singles = [
         (other, compute_own_share(1.0 - examined[other].explained_with_forms, PAIR_REST))

@@ -23,7 +23,7 @@ class GasLeak(Term):
 
     key = "gas_leak"
     label = "gas leaks out of the warm cell"
-    parameters = (TermParameter("rate", "1/s", 1.0, 0.02, 20.0, "0.1 to 10 1/s", starts=(0.3, 2.0, 8.0)),)
+    parameters = (TermParameter("rate", "1/s", 1.0, 1e-3, 20.0, "0.1 to 10 1/s", starts=(0.3, 2.0, 8.0)),)
     followers = ("leaked_k",)
     kernels = Kernels(rates=rates, membrane_drive=gas_drive, force_drive=gas_drive)
     cannot_add_heat = True

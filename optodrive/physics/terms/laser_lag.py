@@ -45,7 +45,7 @@ class LaserLag(Term):
     label = "the laser follows its command with a time constant, at both edges"
     parameters = (
         TermParameter(
-            "time", "s", 5e-4, 2e-5, 4e-3, "drivers with a filter, 0.02 to 3 ms", starts=(5e-5, 2e-4, 6e-4, 2e-3)
+            "time", "s", 5e-4, 5e-6, 4e-3, "drivers with a filter, 0.02 to 3 ms", starts=(5e-5, 2e-4, 6e-4, 2e-3)
         ),
     )
     followers = ("emitted_w",)

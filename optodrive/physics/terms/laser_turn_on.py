@@ -24,7 +24,7 @@ class LaserTurnOn(Term):
             "time",
             "s",
             5e-4,
-            1e-5,
+            1e-6,
             4e-3,
             "thermal and driver transients of blue diodes, 0.02 to 3 ms",
             starts=(1e-4, 4e-4, 1.5e-3),

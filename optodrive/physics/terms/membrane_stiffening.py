@@ -18,7 +18,7 @@ class MembraneStiffening(Term):
     key = "membrane_stiffening"
     label = "the membrane stiffens as it rises"
     parameters = (
-        TermParameter("curvature", "1/K", 2e-3, 1e-5, 5e-2, "from a plate to a stretched membrane within the stroke"),
+        TermParameter("curvature", "1/K", 2e-3, 1e-6, 5e-2, "from a plate to a stretched membrane within the stroke"),
         TermParameter(
             "order", "1", 1.5, 0.7, 4.0, "2 for a cubic balance at small displacement", (1.0, 2.0), is_shape=True
         ),

@@ -26,7 +26,7 @@ class Radiation(Term):
             "emitting_area",
             "m^2",
             4e-6,
-            1e-7,
+            1e-8,
             2e-5,
             "both faces of a 2 mm x 1.5 mm absorber and its bridges, emissivity 0.5 to 0.9",
         ),

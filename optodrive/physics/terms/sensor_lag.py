@@ -19,7 +19,7 @@ class SensorLag(Term):
     label = "the thermometer lags"
     parameters = (
         TermParameter(
-            "time", "s", 5e-4, 2e-5, 5e-3, "0.05 to 3 ms, camera exposure or detector", starts=(1e-4, 5e-4, 2e-3)
+            "time", "s", 5e-4, 1e-6, 5e-3, "0.05 to 3 ms, camera exposure or detector", starts=(1e-4, 5e-4, 2e-3)
         ),
         TermParameter(
             "delay_share",
