@@ -54,6 +54,10 @@ const commands = {
     emit("ticks", chip.tickMax, chip.gapMax);
     chip.tickMax = chip.gapMax = 0;
   },
+  trace(on) {
+    setup.tracing = on;
+    if (on) chip.traceLevels(-1);
+  },
   inject(name) { chip.inject(name); },
   break() { chip.uart.feed([1 << 10]); },
 };

@@ -4,7 +4,8 @@ import { Uart } from "./uart.mjs";
 import { UsbHost } from "./usb.mjs";
 
 const RAM = 0x20000000, RAM_BYTES = 264 * 1024, FLASH = 0x10000000;
-const PIN = { hostClosed: 2, estop: 8, key: 9, interlock: 10, relay: 12, readback: 13, gate: 14, sync: 17, tick: 22 };
+const PIN = { hostClosed: 2, estop: 8, key: 9, interlock: 10, indicator: 11, relay: 12, readback: 13, gate: 14, sync: 17, tick: 22 };
+const TRACED = [PIN.indicator, PIN.relay, PIN.sync, PIN.tick];
 const CYCLE_NANOS = 8; // 125 MHz
 const SPI_BYTE_NANOS = 384; // 8 bits at 20.8 MHz
 const OUT_SET = 0x14, OUT_CLEAR = 0x18;
@@ -43,6 +44,7 @@ export class Chip {
     this.bend(rp2040);
     this.gateOpen = this.logged = this.stuck = this.loopStopped = this.tickStopped = false;
     this.level = {};
+    this.outputs = 0;
     this.pending = null; // change of state under way
     this.badFrames = this.tickMax = this.gapMax = 0;
     this.word = null; // bytes since SYNC fell
@@ -103,12 +105,21 @@ export class Chip {
   }
 
   onPins(bits, high) {
+    const before = this.outputs;
+    this.outputs = high ? before | bits : before & ~bits;
+    if (this.setup.tracing) this.traceLevels(before ^ this.outputs);
     if (bits & (1 << PIN.sync)) {
       if (high && this.word) this.onDacWord();
       this.word = high ? null : [];
     }
     if (bits & (1 << PIN.tick)) this.onTick(high);
     if (bits & (1 << PIN.relay) && this.pending) this.onStateChanged();
+  }
+
+  traceLevels(changed) {
+    for (const pin of TRACED) {
+      if (changed & (1 << pin)) this.emit("level", this.micros, pin, (this.outputs & (1 << pin)) !== 0);
+    }
   }
 
   // Longest tick, and longest time from one tick's begin to the next one's.
