@@ -1,4 +1,4 @@
-"""Generate core/messages.h and the page's board_states.js from messages.toml: run this after the table has changed."""
+"""Generate core/messages.h, model/transitions.pml and the page's board_states.js from messages.toml, after a change."""
 
 import tomllib
 from pathlib import Path
@@ -47,6 +47,16 @@ def build_page_module(table: Table) -> str:
     inputs = ", ".join(f'"{word}"' for word in table["enumerations"]["input_bit"])
     lines += ["", "// The inputs by bit, bit 0 first.", f"export const INPUTS = Object.freeze([{inputs}]);"]
     return "\n".join(lines) + "\n"
+
+
+def build_model_table(table: Table) -> str:
+    """Return the transitions between the states of the SPIN model, which has no BOOT, as a condition."""
+    pairs = {(state, entry["to"]): None for entry in table["transition"] for state in entry["from"] if state != "BOOT"}
+    rows = " || \\\n".join(f"    (from == {state} && to == {to})" for state, to in pairs)
+    return (
+        "/* Generated from messages.toml by generate.py: do not edit. */\n"
+        f"#define IS_TRANSITION(from, to) ( \\\n{rows})\n"
+    )
 
 
 def format_numbers(table: Table) -> str:
@@ -157,4 +167,5 @@ def format_layouts(table: Table) -> str:
 if __name__ == "__main__":
     messages = tomllib.loads((HERE / "messages.toml").read_text(encoding="utf-8"))
     (HERE / "core" / "messages.h").write_text(build_header(messages), encoding="utf-8")
+    (HERE / "model" / "transitions.pml").write_text(build_model_table(messages), encoding="utf-8")
     (PAGE / "board_states.js").write_text(build_page_module(messages), encoding="utf-8")

@@ -13,7 +13,9 @@
      the gate is never on without a queued point (B2)
      the gate is never on for longer than a lease after the host's last message
 
-   MUTANT=n, 1 to 6, removes one rule; the search must find a violation.
+     the board changes its state only as the table of messages.toml permits (transitions.pml, generated from it)
+
+   MUTANT=n, 1 to 6, removes one rule; 7 and 8 make a change that the table does not have. The search must find a violation.
 
    spin -a board.pml && gcc -O3 -DSAFETY -o pan pan.c && ./pan -m2000000 -w24      4 million states, some seconds */
 
@@ -37,7 +39,7 @@
 #define ON_DUPLICATE(kind, argument) skip
 #endif
 #if MUTANT == 6
-#define ON_EMPTY_QUEUE state = HOLD
+#define ON_EMPTY_QUEUE become(HOLD)
 #define ON_POINT_END skip
 #else
 #define ON_EMPTY_QUEUE close_gate(HOLD)
@@ -53,6 +55,19 @@
 #else
 #define LEASE_ENDS (lease == 0 && leased)
 #endif
+
+#if MUTANT == 7
+#define ON_START become(HOLD)
+#else
+#define ON_START become(RUNNING)
+#endif
+#if MUTANT == 8
+#define IS_CONFIRMABLE (state == ARMING || state == DISARMED)
+#else
+#define IS_CONFIRMABLE (state == ARMING)
+#endif
+
+#include "transitions.pml"
 
 #define POINTS 2      /* of a job */
 #define SEQS 4        /* sequence numbers, fewer than all messages, so that they wrap */
@@ -85,7 +100,8 @@ byte recorded_nonce;      /* nonce that a recorder of the line could replay */
 
 #define leased (state == ARMING || state == ARMED || state == RUNNING || state == HOLD)
 
-inline close_gate(next) { gate = false; state = next }
+inline become(next) { assert(state == next || IS_TRANSITION(state, next)); state = next }
+inline close_gate(next) { gate = false; become(next) }
 inline drop() { queued = 0; ends = false }
 
 inline send(what, value) {
@@ -106,20 +122,20 @@ inline check() {
 inline carry_out(kind, argument) {
     if
     :: kind == ARM_REQ && state == DISARMED ->
-        state = ARMING; lease = LEASE; nonce_good = true; nonce = NEW_NONCE;
+        become(ARMING); lease = LEASE; nonce_good = true; nonce = NEW_NONCE;
         send(CHALLENGE, nonce)
-    :: kind == CONFIRM && state == ARMING && nonce_good && argument == nonce ->
-        state = ARMED; nonce_good = false
+    :: kind == CONFIRM && IS_CONFIRMABLE && nonce_good && argument == nonce ->
+        become(ARMED); nonce_good = false
     :: kind == CONFIRM && state == ARMING && !(nonce_good && argument == nonce) ->
         close_gate(DISARMED); nonce_good = false; drop()
     :: kind == DATA && (state == ARMED || state == RUNNING || state == HOLD) && IS_NEXT_INDEX(argument) ->
         assert(argument == first + queued);
         queued = queued + 1;
         if
-        :: state == HOLD -> state = RUNNING
+        :: state == HOLD -> become(RUNNING)
         :: else
         fi
-    :: kind == START && state == ARMED -> state = RUNNING
+    :: kind == START && state == ARMED -> ON_START
     :: kind == END && (state == RUNNING || state == HOLD) && argument == first + queued ->
         ends = true;
         if

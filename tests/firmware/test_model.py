@@ -40,6 +40,12 @@ def test_a_removed_rule_is_detected(tmp_path, mutant):
     assert "assertion violated" in reported
 
 
+@pytest.mark.parametrize("mutant", [7, 8])
+def test_a_change_of_state_that_the_table_does_not_have_is_detected(tmp_path, mutant):
+    _, _, reported = explored(tmp_path, mutant)
+    assert "assertion violated ((state==" in reported
+
+
 def test_no_interleaving_emits_what_was_accepted_in_an_older_epoch_or_built_before_a_pause(tmp_path):
     errors, states, reported = explored(tmp_path, 0, "epochs.pml")
     assert errors == 0, reported

@@ -11,6 +11,7 @@ GENERATE = runpy.run_path(str(CONTRACT / "generate.py"))
 TABLE = tomllib.loads((CONTRACT / "messages.toml").read_text())
 GENERATED = {
     "build_header": CONTRACT / "core" / "messages.h",
+    "build_model_table": CONTRACT / "model" / "transitions.pml",
     "build_page_module": GENERATE["PAGE"] / "board_states.js",
 }
 
