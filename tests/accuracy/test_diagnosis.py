@@ -368,7 +368,7 @@ def test_whole_groups_are_held_out_never_the_only_one_of_its_kind():
 
 def test_bins_do_not_mix_groups_or_signals():
     data = build_dataset(lab(16, {}))
-    labels = assign_bins(data)
+    labels = assign_bins(data).label
     owner = {}
     for block in data.blocks:
         for label in np.unique(labels[block.part]):

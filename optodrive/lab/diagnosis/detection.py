@@ -135,7 +135,7 @@ def score_effects(
     omnibus = compute_omnibus(problem, np.column_stack([fitted_columns, residual]), sensitivity)
     scores = compute_scores(simulated.starts, projected, scale, independent)
     residual_chi2 = float(projected[-1, -1])
-    numbers = [omnibus.chi2, omnibus.log_evidence, residual_chi2, *(score.ratio for score in scores)]
+    numbers = [omnibus.chi2, omnibus.evidence.log_evidence, residual_chi2, *(score.ratio for score in scores)]
     if np.isnan(numbers).any() or not np.isfinite(numbers[:3]).all():  # no comparison with a number would be true
         raise OptodriveError("the test of the residuals gave no number; nothing is concluded from it")
     return Detection(tuple(scores), omnibus, residual_chi2, form_evidence)

@@ -109,8 +109,31 @@ def compute_form_evidence(gram: FloatArray, right: FloatArray) -> float:
     return average_log(gains)
 
 
-def compute_bin_evidence(gram: FloatArray, right: FloatArray, noise_chi2: float, noise_degrees: int) -> float:
-    """Return the gain in log evidence by independent means of bins, normal with `BIN_VARIANCES`.
+@dataclass(frozen=True, eq=False)
+class BinEvidence:
+    """Evidence for free means of bins, for each prior variance of these.
+
+    gains: [v] in log evidence; rests: [v] χ² that they are expected to take then
+    """
+
+    gains: FloatArray
+    rests: FloatArray
+
+    @property
+    def log_evidence(self) -> float:
+        """Gain in log evidence, averaged over the variances."""
+        return average_log(self.gains.tolist())
+
+    def compute_own_share(self, reduction: float, middle: float) -> float:
+        """Return the probability that the rest in the bins belongs to a cause that reduced χ² by this amount."""
+        weights = np.exp(self.gains - np.logaddexp.reduce(self.gains))
+        shares = self.rests / np.maximum(max(reduction, 0.0) + self.rests, 1e-9)
+        own = [compute_own_share(share, middle) for share in shares.tolist()]
+        return float(weights @ own)
+
+
+def compute_bin_evidence(gram: FloatArray, right: FloatArray, noise_chi2: float, noise_degrees: int) -> BinEvidence:
+    """Return the evidence for independent means of bins, normal with `BIN_VARIANCES`.
 
     gram: [k, k] correlations of the bins; right: [k] with the residual; noise_chi2, noise_degrees: of the same bins of
     the differences between repeats, which estimate the scale of the noise
@@ -122,12 +145,14 @@ def compute_bin_evidence(gram: FloatArray, right: FloatArray, noise_chi2: float,
     noise = max(degrees, noise_chi2) if noise_degrees else 1e9
     degrees = degrees if noise_degrees else 10**9
     half = 0.5 * (degrees + len(values))
-    gains = []
+    gains, rests = [], []
     for variance in BIN_VARIANCES:
         inflation = 1.0 + variance * values
         likelihood = half * (log1p(float(squares.sum()) / noise) - log1p(float((squares / inflation).sum()) / noise))
         gains.append(likelihood - 0.5 * float(np.log(inflation).sum()))
-    return average_log(gains)
+        shrinkage = 1.0 - 1.0 / inflation
+        rests.append(float((shrinkage**2 * squares + shrinkage).sum()))
+    return BinEvidence(np.array(gains), np.array(rests))
 
 
 def average_log(logs: Sequence[float]) -> float:

@@ -58,6 +58,8 @@ MIN_NAMED = 0.97
 """Smallest probability of what is named: of one set of causes, or of all sets of an ambiguity."""
 MIN_ALONE = 0.2
 """Smallest probability of the named causes without another one, which would else be missing in the answer."""
+MIN_LISTED = 0.01
+"""Smallest probability of a further set of causes in an ambiguity."""
 MAX_AMBIGUOUS = 4
 """Largest number of sets of causes in an ambiguity; a longer list is no answer."""
 NEAR_CHI2 = 30.0
@@ -215,7 +217,7 @@ def _list_explanations(
     degrees_of = _count_degrees(problem, base, refits)
     degrees = degrees_of.pop(None)
     nothing = compute_log_evidence(problem, base, base.chi2)
-    something = nothing + nominal_detection.omnibus.log_evidence
+    something = nothing + nominal_detection.omnibus.evidence.log_evidence
     out = [
         Explanation((), log(PRIOR_NO_EFFECT), nothing, degrees),
         Explanation((), log(PRIOR_NONE_OF_THESE), something, degrees, own_share=0.0),
@@ -248,12 +250,16 @@ def _list_explanations(
         prior += log(OTHER_ODDS)
         forms = rest.log_evidence + rest.with_forms.form_evidence
         own_forms = compute_own_share(1.0 - rest.explained, FORM_REST)
-        own_bins = compute_own_share(1.0 - rest.explained_with_forms, BINS_REST)
-        bins, both = rest.detection.omnibus.log_evidence, rest.with_forms.omnibus.log_evidence
+        bins, both = rest.detection.omnibus.evidence, rest.with_forms.omnibus.evidence
+        reduction = base.chi2 - item.chi2
         variants = (
             (prior, forms, own_forms),
-            (prior, rest.log_evidence + bins, own_bins),
-            (prior + log(OTHER_ODDS), forms + both, own_forms * own_bins),
+            (prior, rest.log_evidence + bins.log_evidence, bins.compute_own_share(reduction, BINS_REST)),
+            (
+                prior + log(OTHER_ODDS),
+                forms + both.log_evidence,
+                own_forms * both.compute_own_share(reduction, BINS_REST),
+            ),
         )
         for other_prior, evidence, own in variants:
             out.append(Explanation(item.causes, other_prior + log1p(-share), evidence, degrees, own))
@@ -312,16 +318,19 @@ def _build_verdict(
         return Verdict("none", (), probabilities, None, candidates, nominal_detection, base.chi2)
     if not candidates or probabilities.none_of_these > probabilities.causes[ranked[0]]:
         return Verdict("unexplained", (), probabilities, None, candidates, nominal_detection, base.chi2)
-    keys = {key for keys in ranked for key in keys}
-    named = tuple(sorted(key for key in keys if probabilities.sum_of(key) >= MIN_NAMED))
+    named = tuple(
+        sorted(key for key in {key for keys in ranked for key in keys} if probabilities.sum_of(key) >= MIN_NAMED)
+    )
     if named in by_causes and probabilities.causes[named] >= MIN_ALONE and problem.noise.from_replicates:
         candidates = (by_causes[named], *(item for item in candidates if item is not by_causes[named]))
         chosen = [named]
     else:
         named, chosen, total = (), list[tuple[str, ...]](), 0.0
-        while len(chosen) < min(MAX_AMBIGUOUS, len(ranked)) and total < MIN_NAMED:
-            total += probabilities.causes[ranked[len(chosen)]]
-            chosen.append(ranked[len(chosen)])
+        for keys in ranked[:MAX_AMBIGUOUS]:
+            if total >= MIN_NAMED or (chosen and probabilities.causes[keys] < MIN_LISTED):
+                break
+            total += probabilities.causes[keys]
+            chosen.append(keys)
     best = candidates[0]
     rest = examined.get(best)
     explained = 0.0 if rest is None else rest.explained

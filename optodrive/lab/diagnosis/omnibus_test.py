@@ -1,6 +1,8 @@
 """Omnibus test of whitened residuals against zero in bins of group, signal and time after a gate edge.
 
-The same bins of the differences between repeats hold noise only and set the scale.
+The same bins of the differences between repeats hold noise only and set the scale. Hundreds of means hide an effect
+that all groups share; so the groups' bins are joined, too, each weighed by the group's span: what heats twice as much
+shows an effect about twice as large.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import Dataset
-from optodrive.lab.diagnosis.evidence import compute_bin_evidence
+from optodrive.lab.diagnosis.evidence import BinEvidence, compute_bin_evidence
 from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity
 from optodrive.lab.diagnosis.noise_model import whiten
 from optodrive.lab.diagnosis.normal_equations import project_out
@@ -22,32 +24,55 @@ EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)
 RUN_BINS = 4
 """Number of bins over a whole run, for slow effects."""
 RIDGE = 1e-4
-_known_bins: "WeakKeyDictionary[Dataset, IntArray]" = WeakKeyDictionary()
+_known_bins: "WeakKeyDictionary[Dataset, Bins]" = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
 class OmnibusStatistic:
     """χ² in bins with its degrees of freedom, and the same of differences between repeats, which hold noise only.
 
-    log_evidence: gain in log evidence by independent means of the bins
+    evidence: for independent means of the bins, and of the joined bins
     """
 
     chi2: float
     degrees: int
     noise_chi2: float
     noise_degrees: int
-    log_evidence: float
+    evidence: BinEvidence
+
+
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """Bins of a dataset.
+
+    label: [m] of each sample, −1 for none; joined: [bins, k] weight of each bin in the bins that join all groups
+    """
+
+    label: IntArray
+    joined: FloatArray
+
+
+class _Noise:
+    """χ² and degrees of freedom of bins within the groups: of all runs, less those of their sums."""
+
+    def __init__(self) -> None:
+        self.chi2, self.degrees = 0.0, 0
+
+    def add(self, gram: FloatArray, right: FloatArray, sign: int) -> None:
+        """Add the bins of a run, or subtract those of a group."""
+        chi2, degrees = _compute_quadratic_form(gram, right)
+        self.chi2, self.degrees = self.chi2 + sign * chi2, self.degrees + sign * degrees
 
 
 def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: JitterSensitivity) -> OmnibusStatistic:
     """Compute the statistic of the last of the columns [m, k], with the others projected out."""
     data, noise, kinds = problem.data, problem.noise, problem.data.kinds
-    labels, width = _find_bins(data), columns.shape[1]
-    count = int(labels.max()) + 1
+    bins, width = _find_bins(data), columns.shape[1]
+    labels, count = bins.label, len(bins.joined)
     total = np.zeros((width + count, width + count))
     if width > len(BASE_PARAMETERS):
         total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] = 1.0 / np.square(problem.prior.sigma)
-    noise_chi2, noise_degrees = 0.0, 0
+    own_noise, joined_noise = _Noise(), _Noise()
     groups: dict[str, tuple[FloatArray, FloatArray]] = {}
     by_run: dict[int, list[int]] = {}
     for number, block in enumerate(data.blocks):
@@ -85,20 +110,32 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
         indices = np.concatenate([np.arange(width), width + run_bins])
         total[np.ix_(indices, indices)] += reduced
         bin_gram, bin_right = reduced[width:, width:], reduced[width:, width - 1]
-        chi2, degrees = _compute_quadratic_form(bin_gram, bin_right)
-        noise_chi2, noise_degrees = noise_chi2 + chi2, noise_degrees + degrees
+        joined = _select_joined(bins, run_bins)
+        own_noise.add(bin_gram, bin_right, 1)
+        joined_noise.add(joined.T @ bin_gram @ joined, joined.T @ bin_right, 1)
         gram_sum, one_sum = groups.setdefault(data.runs[run].group, (np.zeros((count, count)), np.zeros(count)))
         gram_sum[np.ix_(run_bins, run_bins)] += bin_gram
         one_sum[run_bins] += bin_right
     for gram_sum, one_sum in groups.values():
-        chi2, degrees = _compute_quadratic_form(gram_sum, one_sum)
-        noise_chi2, noise_degrees = noise_chi2 - chi2, noise_degrees - degrees
+        joined = _select_joined(bins, np.flatnonzero(np.diag(gram_sum)))
+        own_noise.add(gram_sum, one_sum, -1)
+        used = np.flatnonzero(np.diag(gram_sum))
+        joined_noise.add(joined.T @ gram_sum[np.ix_(used, used)] @ joined, joined.T @ one_sum[used], -1)
     removed, last = list(range(width - 1)), width - 1
     projected = project_out(total, removed, [*range(width, width + count), last])
     correlation, scaled = _scale_informative(projected[:-1, :-1], projected[:-1, -1])
     chi2 = float(scaled @ cho_solve(cho_factor(correlation), scaled))
-    evidence = compute_bin_evidence(correlation, scaled, noise_chi2, noise_degrees)
-    return OmnibusStatistic(chi2, len(scaled), noise_chi2, noise_degrees, evidence)
+    parts = [compute_bin_evidence(correlation, scaled, own_noise.chi2, own_noise.degrees)]
+    gram, right = bins.joined.T @ projected[:-1, :-1] @ bins.joined, bins.joined.T @ projected[:-1, -1]
+    parts.append(compute_bin_evidence(*_scale_informative(gram, right), joined_noise.chi2, joined_noise.degrees))
+    evidence = BinEvidence(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("gains", "rests")))
+    return OmnibusStatistic(chi2, len(scaled), own_noise.chi2, own_noise.degrees, evidence)
+
+
+def _select_joined(bins: Bins, used: IntArray) -> FloatArray:
+    """Return the weights of some bins in the joined bins that they are in, [used, k]."""
+    weights = bins.joined[used]
+    return np.asarray(weights[:, weights.any(axis=0)])
 
 
 def _compute_quadratic_form(gram: FloatArray, right: FloatArray) -> tuple[float, int]:
@@ -134,19 +171,24 @@ def _list_bins(labels: IntArray) -> IntArray:
     return np.asarray(np.unique(labels[labels >= 0]))
 
 
-def _find_bins(data: Dataset) -> IntArray:
+def _find_bins(data: Dataset) -> Bins:
     """Return the bins of `assign_bins`, computed once for a dataset: every detection asks for them."""
     if data not in _known_bins:
         _known_bins[data] = assign_bins(data)
     return _known_bins[data]
 
 
-def assign_bins(data: Dataset) -> IntArray:
-    """Return the bin of each sample [m], or −1 for none.
+def assign_bins(data: Dataset) -> Bins:
+    """Return the bins: group × signal × pixel × (edge, logarithm of the time after it, time in the run).
 
-    Bins: group × signal × pixel × (edge, logarithm of the time after it, time in the run)
+    Joined ones: signal × pixel × (direction of the edge, train or not, logarithm of the time after it, time in the run)
     """
     names: dict[tuple[object, ...], int] = {}
+    joined_names: dict[tuple[object, ...], int] = {}
+    joined: list[tuple[int, float]] = []
+    max_span = {
+        kind: max(float(np.ptp(data.value[b.part])) for b in data.blocks if b.kind == kind) for kind in data.kinds
+    }
     label = np.full(len(data.value), -1, dtype=np.int64)
     for block in data.blocks:
         run = data.runs[block.run]
@@ -164,11 +206,18 @@ def assign_bins(data: Dataset) -> IntArray:
         order = np.where(
             row < 0, -1, np.where(rising[np.maximum(row, 0)], 0, 1) + 2 * (0 if is_train else 1) * (row // 2)
         )
+        weight = float(np.ptp(data.value[block.part])) / max(max_span[block.kind], 1e-300)
         keys = zip(order.tolist(), edge_bin.tolist(), run_bin.tolist(), strict=True)
         for at, key in enumerate(keys, start=block.part.start):
             bin_key = (run.group, block.kind, block.pixel, *key)
             label[at] = names.setdefault(bin_key, len(names))
-    return label
+            if label[at] == len(joined):
+                joined_key = (block.kind, block.pixel, is_train, min(key[0], key[0] % 2), *key[1:])
+                joined.append((joined_names.setdefault(joined_key, len(joined_names)), weight))
+    weights = np.zeros((len(joined), len(joined_names)))
+    for number, (column, weight) in enumerate(joined):
+        weights[number, column] = weight
+    return Bins(label, weights)
 
 
 def _find_edges(pulses: FloatArray, commands: FloatArray | None) -> tuple[FloatArray, np.ndarray]:
