@@ -3,12 +3,22 @@
 The emulated chip plays in every run what the processes on ptys play; scripts/test --slow plays all.
 """
 
+import link_scenarios
 import pytest
+import trust_scenarios
 from all_scenarios import MODULES, SCENARIOS
 from bench import BRIGHT, Bench, set_input
 from process_board import has_subject
 from scenario import GUARDS, audit_output, judge
-from test_conformance_pty import list_cases, name_case
+from test_conformance_pty import in_every_run, list_cases, name_case
+
+OF_A_PORT = (link_scenarios.__name__, trust_scenarios.__name__)
+"""Modules whose scenarios a port can change; the other guards see only what it has carried."""
+
+
+def list_of_a_port():
+    """Return the scenarios that a port can change."""
+    return [case for case in SCENARIOS if in_every_run(case) or case.module in OF_A_PORT]
 
 
 @pytest.mark.parametrize("case", list_cases("interrupted"), ids=name_case)
@@ -17,10 +27,15 @@ def test_a_core_with_ticks_wherever_they_may_interrupt_conforms(case, virtual):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pico", "pico-usb"])
 @pytest.mark.parametrize("case", list_cases("pico"), ids=name_case)
-def test_emulated_pico_conforms(case, name, virtual):
-    judge(virtual(name), case)
+def test_emulated_pico_conforms(case, virtual):
+    judge(virtual("pico"), case)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", list_of_a_port(), ids=name_case)
+def test_emulated_pico_conforms_on_its_usb_port(case, virtual):
+    judge(virtual("pico-usb"), case)
 
 
 @pytest.mark.parametrize("case", list_cases("qemu"), ids=name_case)

@@ -1,12 +1,13 @@
 """The Pico's own USB port in the emulator: a second port of the same image, in the emulator's time.
 
-The conformance suite plays its scenarios over it with --slow. The computer at the port is rp2040js's, on a bus that
-`usb.mjs` completes.
+The conformance suite plays what a port can change over it with --slow. The computer at the port is rp2040js's, on a
+bus that `usb.mjs` completes.
 """
 
 import shutil
 import struct
 from functools import partial
+from random import Random
 
 import pytest
 from bench import BRIGHT, Bench, here
@@ -24,6 +25,7 @@ TURN_US = 500
 """The main loop notices within this time what the computer does."""
 BUS_RESET_US = 10_000
 BOOT_US = 50_000
+NONSENSE = 400
 GAP_MAX_US = 600
 SET_CONFIGURATION_0 = bytes.fromhex("0009000000000000")
 LOSSES = {
@@ -83,6 +85,7 @@ def lose(bench, loss):
     return off_us - now_us
 
 
+@pytest.mark.slow
 def test_a_job_over_usb_is_emitted_as_sent(bench):
     host = bench.ready(**BRIGHT)
     points = [here(500, dark_us=300, x=30_000 + 100 * k) for k in range(60)]
@@ -193,6 +196,43 @@ def test_doctor_finds_the_shipped_image_in_order(image):
     pico.close()
 
 
+def test_a_replugged_board_is_greeted_and_not_armed(bench):
+    host = bench.ready(**BRIGHT)
+    core = host.board.core
+    core.usb("unplug")
+    host.wait_for_change("link lost", lease=False)
+    core.usb("plug")
+    core.open_port(host.clock.now_us())
+    assert host.hello().reset_cause == 0
+    assert host.status().state == "DISARMED"
+
+
+def test_a_computer_that_asks_for_nonsense_delays_no_tick(image):
+    random = Random(11)
+    core = EmulatedUsbPico(image, None, lambda event: None)
+    core.open_port(0)
+    core.advance(BOOT_US)
+    core.measure_ticks()
+    for _ in range(NONSENSE):
+        setup = bytearray(random.randbytes(8))
+        if random.random() < 0.7:  # mostly of a kind that the device knows
+            setup[0] &= 0xA1
+            setup[1] = random.choice((0, 1, 5, 6, 8, 9, 10, 11, 0x20, 0x21, 0x22, 0x23))
+            setup[2:6] = (random.randrange(3), random.randrange(8), random.choice((0, 1, 2, 0x82)), 0)
+        core.usb("nonsense", setup.hex(), random.randbytes(random.randrange(64)).hex())
+        core.usb("bytes", random.randbytes(random.randrange(200)).hex())
+        core.advance(round(core.chip_us) + random.randrange(TURN_US))
+    assert core.measure_ticks()[1] <= GAP_MAX_US
+    core.usb("unplug")
+    core.usb("plug")
+    core.open_port(round(core.chip_us) + 2 * BUS_RESET_US)
+    core.receive(b"\0" + HELLO, round(core.chip_us))
+    core.advance(round(core.chip_us) + OPEN_US)
+    assert "HELLO_REPLY" in names(core.bytes_to_send())
+    assert core.pins == []
+    core.close()
+
+
 # --- two ports ------------------------------------------------------------------------------------------------------
 
 
@@ -239,7 +279,7 @@ class UartBesideUsb(EmulatedPico):
         self.second += bytes.fromhex(data)
 
 
-@pytest.mark.parametrize("core", [UsbBesideUart, UartBesideUsb])
+@pytest.mark.parametrize("core", [UsbBesideUart, pytest.param(UartBesideUsb, marks=pytest.mark.slow)])
 def test_the_port_that_opened_first_holds_the_board_until_it_closes(image, tmp_path, core):
     bench = make_bench(image, tmp_path, core)
     host = bench.ready(**BRIGHT)

@@ -35,6 +35,7 @@ export class UsbHost {
 
   // A computer that has not met the device yet.
   meet() {
+    this.counts = true;
     const { usb } = this, cdc = (this.cdc = new this.USBCDC(usb));
     const setLines = cdc.cdcSetControlLineState.bind(cdc), onControl = usb.onEndpointWrite;
     cdc.cdcSetControlLineState = () => setLines(this.state.open ? DTR_RTS : 0);
@@ -54,10 +55,12 @@ export class UsbHost {
 
   plug() {
     this.state.connected = this.state.awake = true;
+    this.toSend = [];
+    this.request = [];
     this.meet();
     this.usb.resetDevice();
   }
-  unplug() { this.state.connected = false; }
+  unplug() { this.state.connected = this.state.open = false; }
   suspend() { this.state.awake = false; }
   resume() {
     this.state.awake = true;
@@ -90,6 +93,12 @@ export class UsbHost {
     this.usb.sendSetupPacket(Buffer.from(setup, "hex"));
   }
 
+  // A request that no computer sends: what follows need not count right until the next plug().
+  nonsense(setup, data) {
+    this.counts = false;
+    this.control(setup, data);
+  }
+
   // --- the bus ---
 
   get isAlive() { return this.state.connected && this.state.awake; }
@@ -114,7 +123,8 @@ export class UsbHost {
     if (endpoint === DATA) this.armed[isOut ? "out" : "in"] = false;
     if (!(value & AVAILABLE)) return;
     if (before !== (value & ~AVAILABLE)) throw new Error("USB: a buffer became available together with its length");
-    if (Boolean(value & DATA1) !== Boolean(this.expected.get(offset))) throw new Error(`USB: number of a packet at ${offset}`);
+    const counted = Boolean(value & DATA1) === Boolean(this.expected.get(offset));
+    if (this.counts && !counted) throw new Error(`USB: number of a packet at ${offset}`);
     if (endpoint === DATA && !isOut) this.armed.in = true;
     else {
       if (endpoint === CONTROL) this.count(offset);
