@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from optodrive.core.types.discrepancy import Discrepancy
     from optodrive.core.types.measurements import Measurement
     from optodrive.device.config import Config
+    from optodrive.lab.pixel_discovery import PixelDiscovery
     from optodrive.lab.recording import DisplayRuns
 
 RecordingsArgument = Annotated[
@@ -78,6 +79,9 @@ def diagnose(
         float, typer.Option("--budget-s", metavar="SECONDS", help="Of --live: time in the laboratory.")
     ] = DEFAULT_BUDGET_S,
     yes: Annotated[bool, typer.Option("--yes", help="Of --live: arm and emit without asking.")] = False,
+    discover: Annotated[
+        bool, typer.Option("--discover", help="Seek a term that no catalogue holds, even where a cause is named.")
+    ] = False,
 ) -> None:
     """Name the errors of the model in measured data, and the gain from correcting them."""
     import_extra("scipy")
@@ -103,7 +107,7 @@ def diagnose(
         if len(runs.pixels) > MAX_JOINT_PIXELS:
             output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers, provenance)
         else:
-            output = _diagnose_jointly(recordings, out, title, seed, config, settings, provenance)
+            output = _diagnose_jointly(recordings, out, title, seed, config, settings, provenance, discover)
         _write_output(output, out, json)
 
 
@@ -151,8 +155,9 @@ def _diagnose_jointly(
     config_name: str | None,
     config: "Config | None",
     provenance: "Provenance",
+    discovers: bool,
 ) -> _DiagnosisOutput:
-    """Diagnose one pixel, or a few pixels with common parameters."""
+    """Diagnose one pixel, or a few pixels with common parameters, and seek a term where no known cause explains all."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
     from optodrive.lab.diagnosis.next_steps import OUT
     from optodrive.lab.diagnosis.priors import build_prior
@@ -162,7 +167,12 @@ def _diagnose_jointly(
     announce_compilation()
     with show_step("reading") as on_progress:
         diagnosis = study(measurement, seed, prior, epsilon, on_progress)
-    return _build_output(diagnosis, title, paths, provenance, out or OUT, config_name, width_m)
+        discovery = None
+        if discovers or diagnosis.verdict == "unexplained":
+            from optodrive.lab.pixel_discovery import discover_in_pixel
+
+            discovery = discover_in_pixel(measurement, prior, epsilon, on_progress)
+    return _build_output(diagnosis, title, paths, provenance, out or OUT, config_name, width_m, discovery)
 
 
 def _build_output(
@@ -173,16 +183,22 @@ def _build_output(
     out: Path | str,
     config_name: str | None,
     width_m: float | None,
+    discovery: "PixelDiscovery | None" = None,
 ) -> _DiagnosisOutput:
     from optodrive.lab.diagnosis.model_file import build_model_toml
     from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
     from optodrive.lab.diagnosis.report import build_report
+    from optodrive.lab.pixel_discovery import narrative
 
     model = build_model_toml(diagnosis, title, width_m or DEFAULT_BRIDGE_WIDTH_M) if diagnosis.base else None
+    document, lines, sections = None, list[str](), list[str]()
+    if discovery is not None:
+        document, sections = narrative.build_document(discovery), narrative.build_sections(discovery)
+        lines = ["", *narrative.build_lines(discovery)]
     return _DiagnosisOutput(
-        build_answer(diagnosis) | {"provenance": provenance.to_dict()},
-        build_narrative(diagnosis),
-        build_report(diagnosis, title, provenance, paths, str(out), config_name),
+        build_answer(diagnosis) | {"discovery": document, "provenance": provenance.to_dict()},
+        build_narrative(diagnosis) + lines,
+        build_report(diagnosis, title, provenance, paths, str(out), config_name, sections),
         model,
     )
 

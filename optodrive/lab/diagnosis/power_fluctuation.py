@@ -38,7 +38,7 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
             pairs.setdefault(item.pair, []).append(item)
     excess = variance = 0.0
     for members in pairs.values():
-        slices = _slice_pulses(experiments[members[0].block].pulses)
+        slices = slice_pulses(experiments[members[0].block].pulses)
         count = 1 + len(slices)
         size = 2 + len(PIXEL_KINDS)
         gram = np.zeros((count + size, count + size))
@@ -56,7 +56,7 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
     return excess / float(np.sqrt(variance)) if variance > 0.0 else 0.0
 
 
-def _slice_pulses(pulses: FloatArray) -> FloatArray:
+def slice_pulses(pulses: FloatArray) -> FloatArray:
     """Return pulses [k, 4] cut into equal slices, MAX_SLICES at most."""
     rows = []
     for start_s, width_s, power_w, pixel in pulses.tolist():

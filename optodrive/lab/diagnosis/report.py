@@ -27,16 +27,19 @@ def build_report(
     recordings: Sequence[str] = ("recording.h5",),
     out: str = OUT,
     config: str | None = None,
+    sections: Sequence[str] = (),
 ) -> str:
     """Return the report as HTML.
 
-    recordings, out, config: what was diagnosed, the report's folder and the configuration, as the command named them
+    recordings, out, config: what was diagnosed, the report's folder and the configuration, as the command named them;
+    sections: HTML that follows the probabilities
     """
     has_extension = bool(discrepancy.terms)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     parts = [
         *_build_next_steps(list_next_steps(discrepancy, recordings, out, config)),
         *_build_probabilities(discrepancy.probabilities),
+        *sections,
         "<h2>Measured against model</h2>",
         f"<p>{MEASURED}, {models}. The nominal model has the R, C, τ<sub>g</sub>, κ and φ that fit these data best, "
         "not those of a parameter set. Of each signal the run in which it is worst, and the median one; below, "

@@ -30,8 +30,17 @@ class Data:
         return [np.isin(labels, blocks) for labels in self.block]
 
 
-def split(records: Sequence[Record]) -> Data:
-    """Return the records in some 32 blocks of equal length, of which every fourth is held out."""
+def split(records: Sequence[Record], held_out: Sequence[int] = ()) -> Data:
+    """Return the records in some 32 blocks of equal length, of which every fourth is held out.
+
+    held_out: numbers of records that are held out as a whole; every record then is one block
+    """
+    if held_out:
+        labels = [np.full(len(record.t_s), number) for number, record in enumerate(records)]
+        fitted = tuple(number for number in range(len(records)) if number not in held_out)
+        if not fitted:
+            raise InputError("held_out", f"all {len(records)} records", "some records to be fitted")
+        return Data(tuple(records), tuple(labels), fitted, tuple(held_out))
     total = sum(len(r.t_s) for r in records)
     if total < HELD_OUT_EVERY * 2 * MIN_BLOCK:
         raise InputError("train", f"{total} samples", f"{HELD_OUT_EVERY * 2 * MIN_BLOCK} or more")
@@ -48,7 +57,7 @@ def split(records: Sequence[Record]) -> Data:
 def thin(data: Data) -> Data:
     """Return the data of the search: everything, or of long records the beginning of each block as a record."""
     total = sum(len(r.t_s) for r in data.records)
-    if total <= SEARCH_SAMPLES:
+    if total <= SEARCH_SAMPLES or any(record.whiten for record in data.records):
         return data
     pieces, labels = [], []
     for record, block in zip(data.records, data.block, strict=True):

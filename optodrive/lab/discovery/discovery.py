@@ -29,8 +29,8 @@ from optodrive.lab.discovery.fitting import (
 )
 from optodrive.lab.discovery.formula_text import build_terms, describe_term
 from optodrive.lab.discovery.model import Curve, Discovery, Finding, OdeModel, Record
+from optodrive.lab.discovery.proposals import Proposal, choose_simplest
 from optodrive.lab.discovery.screening import (
-    Candidate,
     Filtered,
     Place,
     Screened,
@@ -51,35 +51,33 @@ START_UNCERTAINTY = 0.3
 RATE_MEMORY = 10.0
 """Samples over which a model error persists that the filters assume."""
 MAX_TERMS = 4
-PLACES, FORMULAS = 3, 5
-"""Places whose formulas are fitted, and how many of each."""
-TOLERANCE, SHARE_TOLERANCE = 0.06, 0.05
-"""Squared error above the best formula's that a number saved is worth: relative to it, and to the best's reduction."""
+PLACES, PLACES_FROM_REST, FORMULAS = 3, 7, 5
+"""Places whose formulas are fitted, with a filter and without one, and how many of each.
+
+A large effect leads free runs away from where it acts, and the first-order comparison of places with them.
+"""
+REFINEMENTS = 2
+"""How often formulas are ranked again along the free runs with the best one."""
 MIN_ERROR = 1e-3
 """Error of a model, relative to the output, that the integration and the inputs' interpolation may cause."""
 MIN_REDUCTION, MIN_FURTHER_REDUCTION = 0.005, 0.03
 """Reduction of the held-out RMSE of the first term, and of further ones, below which none is reported."""
-MIN_FURTHER_GAIN = 0.01
-"""Share of the first model's avoidable error that a further term removes at least."""
+MIN_FURTHER_GAIN, MIN_FURTHER_GAIN_WHITE = 0.01, 0.1
+"""Share of the first model's avoidable error that a further term removes at least, where noise is estimated and known.
+
+Where it is known a little more than the first formula's form is seen, which is no term of its own.
+"""
 MAX_P = 1e-3
+MIN_SQUARES = 12.0
+"""Squares in units of noise that a curve removes in cross-validation, below which no formula is fitted."""
 Progress = Callable[[str, float], None]
-
-
-@dataclass(frozen=True, eq=False)
-class _Proposal:
-    """A formula with all numbers fitted, and its squared prediction error."""
-
-    screened: Screened
-    candidate: Candidate
-    point: Point
-    loss: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
     """An accepted proposal, the share of the avoidable held-out error that it removes, and its probability."""
 
-    proposal: _Proposal
+    proposal: Proposal
     gain: float
     probability: float
 
@@ -89,18 +87,20 @@ def discover(
     train: Sequence[Record],
     seed: int = 0,
     progress: Progress = lambda stage, fraction: None,
+    held_out: Sequence[int] = (),
 ) -> Discovery:
     """Return the terms that a simulation lacks, and the model extended by them.
 
-    progress: receives the name of each stage and the share of the work that is done. seed: kept for methods that draw;
-    this one does not. Raises InputError for records that do not fit the model.
+    held_out: numbers of records that are held out as a whole, parts of all records by default; progress: receives the
+    name of each stage and the share of the work that is done. seed: kept for methods that draw; this one does not.
+    Raises InputError for records that do not fit the model.
     """
     del seed
     if not train:
         raise InputError("train", "no record", "at least one record")
     for record in train:
         record.check(model)
-    return _Search(model, split(train), progress).run()
+    return _Search(model, split(train, held_out), progress).run()
 
 
 class _Search:
@@ -109,9 +109,11 @@ class _Search:
     def __init__(self, model: OdeModel, data: Data, progress: Progress) -> None:
         self.model, self.data, self.few, self.progress = model, data, thin(data), progress
         progress("compiling", 0.0)
-        self.simulation = Simulation(model)
-        self.sizes = output_sizes(data.records)
-        self.noise = np.maximum(estimate_noise(data.records), 1e-4 * self.sizes)
+        self.simulation = Simulation(model, hold=0 if model.from_rest else 1)
+        self.is_white = all(record.whiten is not None for record in data.records)
+        self.sizes = np.ones(len(model.outputs)) if self.is_white else output_sizes(data.records)
+        self.noise = np.maximum(estimate_noise(data.records), 1e-4 * self.sizes * (not self.is_white))
+        self.min_further_gain = MIN_FURTHER_GAIN_WHITE if self.is_white else MIN_FURTHER_GAIN
         self.state_sizes = np.ones(len(model.states))
         self.rate_sizes = np.ones(len(model.states))
 
@@ -124,13 +126,15 @@ class _Search:
             self.progress(f"term {number + 1}", 0.2 + 0.16 * number)
             if float(np.max(rmse / self.sizes)) < MIN_ERROR:
                 break
+            if found and self._share_left(base_rmse, rmse) < self.min_further_gain:
+                break
             proposal, probability = self._extend(point, MIN_FURTHER_REDUCTION if found else MIN_REDUCTION)
             if proposal is None:
                 break
             shorter_rmse = self._held_out_rmse(proposal.point)
-            avoidable = np.maximum(base_rmse - np.minimum(self.noise, shorter_rmse), 1e-300)
-            gain = float(np.max((rmse - shorter_rmse) / avoidable))
-            if found and gain < MIN_FURTHER_GAIN:
+            floor = np.minimum(1.0 if self.is_white else self.noise, shorter_rmse)
+            gain = float(np.max((rmse - shorter_rmse) / np.maximum(base_rmse - floor, 1e-300)))
+            if found and gain < self.min_further_gain:
                 break
             point, rmse = proposal.point, shorter_rmse
             found.append(_Step(proposal, gain, probability))
@@ -165,6 +169,8 @@ class _Search:
         start = Point(simulation.start, Terms.none())
         simulation.h_max = choose_step(simulation, self.few.records, start)
         self._measure_sizes(start)
+        if self.model.from_rest:
+            return self._fit_free(start, self.data.fitted)
         best: tuple[float, int, Point] | None = None
         for hold in (0, 1, 2) if self.model.inputs else (0,):
             simulation.hold, point, loss = hold, start, np.inf
@@ -185,7 +191,7 @@ class _Search:
 
     def _measure_sizes(self, point: Point) -> None:
         """Note rms of states and of their rates along the filtered records."""
-        filtered = self._filter(point, TIGHTNESS[0])
+        filtered = self._filter(point, 0.0 if self.model.from_rest else TIGHTNESS[0])
         states = [each.line.states for each in filtered]
         rates = [np.diff(x, axis=0) / np.diff(e.record.t_s)[:, None] for x, e in zip(states, filtered, strict=True)]
         for name, values in (("state_sizes", states), ("rate_sizes", rates)):
@@ -201,21 +207,25 @@ class _Search:
         for record, block in zip(self.few.records, self.few.block, strict=True):
             dt_s = float(np.median(np.diff(record.t_s)))
             noise_rate = (tightness * self.rate_sizes) ** 2 * RATE_MEMORY * dt_s
-            line, start = simulation.linearise(
-                record, point, self.state_sizes, noise_rate, self.noise**2, START_UNCERTAINTY * self.state_sizes
-            )
+            start_sigma = (0.0 if self.model.from_rest else START_UNCERTAINTY) * self.state_sizes
+            line, start = simulation.linearise(record, point, self.state_sizes, noise_rate, self.noise**2, start_sigma)
             measured = np.isfinite(record.outputs) & np.isfinite(line.predicted) & (line.variance > 0.0)
-            weights = np.where(measured, 1.0 / np.sqrt(np.where(measured, line.variance, 1.0)), 0.0)
+            if self.is_white and tightness == 0.0:
+                weights = measured.astype(np.float64)
+            else:
+                record = replace(record, whiten=None)  # the filter's errors are white by themselves
+                weights = np.where(measured, 1.0 / np.sqrt(np.where(measured, line.variance, 1.0)), 0.0)
             columns = line.propagate(line.forcing, line.direct, start)
-            filtered.append(Filtered(record, line, columns, block, weights))
+            variables = simulation.list_variables(record, point, line.states)
+            filtered.append(Filtered(record, line, columns, block, weights, *variables))
         return filtered
 
     def _fit_filtered(self, point: Point, filtered: Sequence[Filtered], evaluations: int = 15) -> tuple[Point, float]:
         """Return the point that minimises the prediction errors in fitted blocks, with the filters' gains kept."""
         masks = self.few.masks(self.few.fitted)
         weights = [each.weights * mask[:, None] for each, mask in zip(filtered, masks, strict=True)]
-        gains = [each.line.gains for each in filtered]
-        return fit(self.simulation, self.few.records, point, weights, gains, evaluations)
+        gains, records = [each.line.gains for each in filtered], [each.record for each in filtered]
+        return fit(self.simulation, records, point, weights, gains, evaluations)
 
     def _fit_free(self, point: Point, blocks: Sequence[int], evaluations: int = 15) -> Point:
         """Return the point that minimises the error of free runs in these blocks."""
@@ -224,26 +234,38 @@ class _Search:
         return fit(self.simulation, self.data.records, point, weights, evaluations=evaluations)[0]
 
     def _held_out_rmse(self, point: Point) -> FloatArray:
-        return free_run_rmse(self.simulation, self.data.records, point, self.data.masks(self.data.held_out))
+        """Return the RMSE of free runs in held-out blocks, of each output [o], or of all in units of noise [1]."""
+        rmse = free_run_rmse(self.simulation, self.data.records, point, self.data.masks(self.data.held_out))
+        return np.sqrt(np.mean(rmse**2, keepdims=True)) if self.is_white else rmse
+
+    def _share_left(self, base_rmse: FloatArray, rmse: FloatArray) -> float:
+        """Return the share of the first model's avoidable error that is left, or 1 where noise is estimated."""
+        return float((rmse[0] - 1.0) / max(base_rmse[0] - 1.0, 1e-9)) if self.is_white else 1.0
 
     # One further term
 
-    def _extend(self, point: Point, min_reduction: float) -> tuple[_Proposal | None, float]:
+    def _extend(self, point: Point, min_reduction: float) -> tuple[Proposal | None, float]:
         """Return the best further term, None if there is no evidence for one, and its probability."""
         base, filtered, ranked = self._screen(point)
         if not ranked or ranked[0].loss >= 1.0:
             return None, 0.0
+        if self.is_white and (1.0 - ranked[0].loss) * ranked[0].total < MIN_SQUARES:
+            return None, 0.0
         base, base_loss = self._fit_filtered(base, filtered, 5)
         proposals = []
-        for screened in ranked[:PLACES]:
+        places, evaluations = (PLACES_FROM_REST, 3) if self.model.from_rest else (PLACES, 5)
+        for screened in ranked[:places]:
             for candidate in rank_formulas(screened, FORMULAS):
                 terms = point.terms.extend(build_terms(candidate, screened.nodes))
-                longer, loss = self._fit_filtered(base.with_terms(terms), filtered, 5)
-                proposals.append(_Proposal(screened, candidate, longer, loss))
+                longer, loss = self._fit_filtered(base.with_terms(terms), filtered, evaluations)
+                proposals.append(Proposal(screened, candidate, longer, loss))
         proposals.sort(key=lambda p: p.loss)
         if not proposals:
             return None, 0.0
-        chosen = _choose_simplest(proposals, base_loss)
+        if self.model.from_rest:
+            for _ in range(REFINEMENTS):
+                proposals += self._refine(point, min(proposals, key=lambda p: p.loss))
+        chosen = choose_simplest(proposals, base_loss)
         p_value = find_p_value(self.simulation, self.few, filtered, base, chosen.point)
         if p_value > MAX_P:
             return None, 0.0
@@ -257,25 +279,43 @@ class _Search:
             return None, 0.0
         return chosen, compute_probability(p_value)
 
+    def _refine(self, point: Point, best: Proposal) -> list[Proposal]:
+        """Return formulas at the place of the best one, ranked along its own free runs, nearer to the data."""
+        frozen = best.point.terms.freeze()
+        filtered = self._filter(best.point.with_terms(frozen), 0.0)
+        rest = screen(filtered, best.candidate.at, self.few.fitted, len(self.model.states))
+        if rest is None:
+            return []
+        proposals = []
+        for candidate in rank_formulas(rest.add_curve(best.evaluate(rest.nodes)), FORMULAS):
+            terms = point.terms.extend(build_terms(candidate, rest.nodes))
+            longer, loss = self._fit_filtered(best.point.with_terms(terms), filtered, 20)
+            proposals.append(Proposal(best.screened, candidate, longer, loss))
+        return proposals
+
     def _screen(self, point: Point) -> tuple[Point, list[Filtered], list[Screened]]:
         """Return the places in order of evidence, with the filter that shows it most clearly, and its parameters."""
         best: tuple[Point, list[Filtered], list[Screened]] = (point, [], [])
-        for tightness in (*TIGHTNESS, 0.0):
+        for tightness in (0.0,) if self.model.from_rest else (*TIGHTNESS, 0.0):
             refitted, _ = self._fit_filtered(point, self._filter(point, tightness), 5)
-            filtered = self._filter(refitted, tightness)
-            if not all(np.isfinite(each.line.predicted).all() for each in filtered):
-                continue
-            found = [
-                screened
-                for place in list_places(self.simulation, filtered, refitted)
-                # A term in an output also changes how strongly a filter follows the data: only free runs judge it.
-                if (place.place < len(self.model.states) or tightness == 0.0)
-                and (screened := screen(filtered, place, self.few.fitted, len(self.model.states))) is not None
-            ]
-            found.sort(key=lambda each: each.loss)
+            filtered, found = self._screen_filtered(refitted, tightness)
             if found and (not best[2] or 1.0 - found[0].loss > LOOSER * (1.0 - best[2][0].loss)):
                 best = (refitted, filtered, found)
         return best
+
+    def _screen_filtered(self, point: Point, tightness: float) -> tuple[list[Filtered], list[Screened]]:
+        """Return the filtered records, and the places in order of evidence, none where the model diverges."""
+        filtered = self._filter(point, tightness)
+        if not all(np.isfinite(each.line.predicted).all() for each in filtered):
+            return filtered, []
+        found = [
+            screened
+            for place in list_places(self.simulation, filtered, point)
+            # A term in an output also changes how strongly a filter follows the data: only free runs judge it.
+            if (place.place < len(self.model.states) or tightness == 0.0)
+            and (screened := screen(filtered, place, self.few.fitted, len(self.model.states))) is not None
+        ]
+        return filtered, sorted(found, key=lambda each: each.loss)
 
     def _report(self, final: Point, steps: Sequence[_Step]) -> tuple[Finding, ...]:
         """Return one finding per place and variable, with the numbers of the final fit.
@@ -286,7 +326,7 @@ class _Search:
         for row, step in enumerate(steps):
             groups.setdefault(step.proposal.candidate.at, []).append(row)
         names, findings = self.model.variable_names, []
-        filtered = self._filter(final, TIGHTNESS[1])
+        filtered = self._filter(final, 0.0 if self.model.from_rest else TIGHTNESS[1])
         for at, rows in groups.items():
             screened = screen(filtered, at, self.few.fitted, len(self.model.states))
             curve = (steps[rows[0]].proposal.screened if screened is None else screened).curve
@@ -310,15 +350,3 @@ class _Search:
                 )
             )
         return tuple(findings)
-
-
-def _choose_simplest(proposals: Sequence[_Proposal], base_loss: float) -> _Proposal:
-    """Return the proposal with the fewest numbers that does as well as the best."""
-    best = min(proposals, key=lambda p: p.loss)
-    chosen = best
-    for proposal in sorted(proposals, key=lambda p: p.loss):
-        saved = best.candidate.numbers - proposal.candidate.numbers
-        allowed = saved * min(TOLERANCE * best.loss, SHARE_TOLERANCE * max(base_loss - best.loss, 0.0))
-        if proposal.candidate.numbers < chosen.candidate.numbers and proposal.loss - best.loss <= allowed:
-            chosen = proposal
-    return chosen

@@ -6,7 +6,7 @@ from math import e, erfc, log, sqrt
 import numpy as np
 
 from optodrive.lab.discovery.blocks import Data
-from optodrive.lab.discovery.fitting import Point, Simulation
+from optodrive.lab.discovery.fitting import Point, Simulation, weigh
 from optodrive.lab.discovery.screening import Filtered
 
 PARTS = 8
@@ -28,8 +28,8 @@ def find_p_value(
         after = simulation.run(each.record, longer, each.line.gains)[0]
         if not np.isfinite(after[mask]).all():
             return 1.0
-        error0 = np.nan_to_num(each.record.outputs - before) * each.weights
-        error1 = np.nan_to_num(each.record.outputs - after) * each.weights
+        error0 = weigh(each.record, np.nan_to_num(each.record.outputs - before), each.weights)
+        error1 = weigh(each.record, np.nan_to_num(each.record.outputs - after), each.weights)
         change = (error0 - error1) * mask[:, None]
         score += float(np.sum(change * error0))
         reduction += float(np.sum(mask[:, None] * (error0**2 - error1**2)))

@@ -16,6 +16,8 @@ DIVERGED = 1e3
 """Residual in standard deviations of an output that stands for a diverged one."""
 CONVERGED = 1e-3
 """Change of a free run, relative to the outputs, at which the integration step is short enough."""
+LONGEST_FROM_REST = 8.0
+"""First step tried between samples that are dense where light changes, in their median distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,10 @@ class Terms:
     def extend(self, other: "Terms") -> "Terms":
         """Return both."""
         return Terms(*(np.concatenate([getattr(self, f), getattr(other, f)]) for f in Terms.__dataclass_fields__))
+
+    def freeze(self) -> "Terms":
+        """Return the same terms, none of whose numbers is fitted."""
+        return replace(self, free=np.zeros_like(self.free))
 
     def __len__(self) -> int:
         return len(self.table)
@@ -67,8 +73,8 @@ class Simulation:
         self.high = np.array([item.high for item in items])
         self.start = np.array([item.start for item in items])
         self.logarithmic = np.array([item.is_logarithmic for item in items])
-        sizes = (len(model.states), len(model.inputs), len(model.outputs))
-        self.kernels: Kernels = build_kernels(model.rhs, model.output, *sizes, self.names)
+        sizes = (len(model.states), len(model.inputs), len(model.outputs), max(len(model.quantities), 1))
+        self.kernels: Kernels = build_kernels(model.rhs, model.output, model.quantity, *sizes, self.names)
         self._work = allocate_work(*sizes)
         self._type = [(name, np.float64) for name in self.names]
 
@@ -158,6 +164,19 @@ class Simulation:
         )
         return out, np.array(starts).T.reshape(len(x0), len(columns))
 
+    def list_variables(self, record: Record, point: Point, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return all variables [m, v] at the samples, and as they are on arrival there, with the inputs held before."""
+        arriving = record.inputs
+        if self.hold == 0:
+            arriving = np.concatenate([record.inputs[:1], record.inputs[:-1]])
+        tables = []
+        for inputs in (record.inputs, arriving):
+            derived = np.zeros((len(states), max(len(self.model.quantities), 1)))
+            packed = self.pack(point.parameters[None, :])
+            self.kernels.describe(record.t_s, states, np.ascontiguousarray(inputs), packed, derived)
+            tables.append(np.column_stack([states, inputs, record.t_s, derived[:, : len(self.model.quantities)]]))
+        return tables[0], tables[1]
+
     def find_parametrised(self, record: Record, states: FloatArray, point: Point) -> list[int]:
         """Return the states whose equation a parameter changes directly, at some of the states [m, n] of a record."""
         found = set[int]()
@@ -222,7 +241,7 @@ def fit(
         parts = []
         for k, record in enumerate(records):
             predicted, _ = simulation.run(record, trial, None if gains is None else gains[k])
-            error = ((record.outputs - predicted) * weights[k])[used[k]]
+            error = weigh(record, record.outputs - predicted, weights[k])[used[k]]
             parts.append(np.nan_to_num(np.clip(error, -DIVERGED, DIVERGED), nan=DIVERGED))
         on_progress()
         return np.concatenate(parts)
@@ -237,6 +256,8 @@ def fit(
         residuals,
         start,
         bounds=(low / unit, high / unit),
+        # Free runs near the data have one minimum, which "dogbox" reaches in a few steps; filters have valleys.
+        method="dogbox" if simulation.model.from_rest else "trf",
         x_scale="jac",
         diff_step=STEP,
         ftol=1e-6,
@@ -247,11 +268,23 @@ def fit(
     return simulation.from_vector(best.x * unit, point), float(2.0 * best.cost)
 
 
+def weigh(record: Record, errors: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the errors [m, o] of a record, or their columns [m, o, k], times the weights [m, o], whitened before."""
+    if record.whiten is not None:
+        measured = np.isfinite(record.outputs).reshape(*record.outputs.shape, *(1,) * (errors.ndim - 2))
+        columns = np.where(measured, errors, 0.0)
+        errors = record.whiten(columns.reshape(*record.outputs.shape, -1)).reshape(columns.shape)
+    return errors * (weights if errors.ndim == 2 else weights[:, :, None])
+
+
 def estimate_noise(records: Sequence[Record]) -> FloatArray:
     """Return an upper estimate of the measurement noise of each output [o], from fourth differences.
 
-    They vanish for a signal that is a cubic over five samples; the estimate is robust against steps.
+    They vanish for a signal that is a cubic over five samples; the estimate is robust against steps. That of records
+    which state their noise follows from what whitening makes of alternating errors of one.
     """
+    if all(record.whiten is not None for record in records):
+        return _find_stated_noise(records)
     columns = range(records[0].outputs.shape[1])
     estimates = []
     for column in columns:
@@ -259,6 +292,21 @@ def estimate_noise(records: Sequence[Record]) -> FloatArray:
         joined = np.concatenate([d[np.isfinite(d)] for d in differences]) if differences else np.zeros(0)
         estimates.append(1.4826 * float(np.median(np.abs(joined))) if len(joined) else 0.0)
     return np.array(estimates)
+
+
+def _find_stated_noise(records: Sequence[Record]) -> FloatArray:
+    """Return the noise of a sample of each output [o], as the records state it, or 1 without samples."""
+    squares, counts = np.zeros(records[0].outputs.shape[1]), np.zeros(records[0].outputs.shape[1])
+    for record in records:
+        measured = np.isfinite(record.outputs)
+        signs = np.where(np.arange(len(record.t_s)) % 2, 1.0, -1.0)
+        for column in np.flatnonzero(measured.any(axis=0)):
+            errors = np.zeros(record.outputs.shape)
+            errors[:, column] = signs
+            squares[column] += float(np.sum(weigh(record, errors, measured.astype(np.float64)) ** 2))
+            counts[column] += measured[:, column].sum()
+    noise: FloatArray = 1.0 / np.sqrt(np.where(counts > 0.0, squares / np.maximum(counts, 1.0), 1.0))
+    return noise
 
 
 def output_sizes(records: Sequence[Record]) -> FloatArray:
@@ -276,7 +324,7 @@ def free_run_rmse(
     for record, mask in zip(records, masks, strict=True):
         predicted, _ = simulation.run(record, point)
         use = np.isfinite(record.outputs) & mask[:, None]
-        error = np.where(use, record.outputs - predicted, 0.0)
+        error = np.where(use, weigh(record, record.outputs - predicted, np.ones_like(predicted)), 0.0)
         total += np.sum(np.where(np.isnan(error), np.inf, error) ** 2, axis=0)
         count += use.sum(axis=0)
     result: FloatArray = np.sqrt(total / np.maximum(count, 1.0))
@@ -284,16 +332,17 @@ def free_run_rmse(
 
 
 def choose_step(simulation: Simulation, records: Sequence[Record], point: Point) -> float:
-    """Return the longest step, a sample divided by a power of two, that halving does not change the free run by."""
+    """Return the longest step, a sample's by a power of two, that halving does not change the free run by."""
     record = records[0]
-    h = float(np.median(np.diff(record.t_s)))
+    h = float(np.median(np.diff(record.t_s))) * (LONGEST_FROM_REST if simulation.model.from_rest else 1.0)
     probe = Record(record.t_s[:4000], record.inputs[:4000], record.outputs[:4000])
     size = output_sizes(records)
+    tolerance = CONVERGED * (0.1 if simulation.model.from_rest else 1.0)
     before = Simulation(simulation.model, h, simulation.hold).run(probe, point)[0]
     for _ in range(7):
         after = Simulation(simulation.model, h / 2.0, simulation.hold).run(probe, point)[0]
         difference = np.abs(after - before) / size
-        if np.isfinite(difference).all() and np.percentile(difference, 99) < CONVERGED:
+        if np.isfinite(difference).all() and np.percentile(difference, 99) < tolerance:
             return h
         h, before = h / 2.0, after
     return h

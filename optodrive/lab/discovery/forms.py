@@ -8,7 +8,22 @@ import numpy as np
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 
-POWER, ABSOLUTE, SIGNED_POWER, SATURATION, EXPONENTIAL, DEAD_ZONE, ABOVE, BELOW, STEP, SINE, COSINE, BUMP = range(12)
+(
+    POWER,
+    ABSOLUTE,
+    SIGNED_POWER,
+    SATURATION,
+    EXPONENTIAL,
+    DEAD_ZONE,
+    ABOVE,
+    BELOW,
+    STEP,
+    SINE,
+    COSINE,
+    BUMP,
+    CLIP,
+    DECAY,
+) = range(14)
 MAX_EXPONENT = 50.0
 
 
@@ -42,6 +57,10 @@ def evaluate_form(form: int, z: float, first: float, second: float) -> float:
         return float(sin(first * z))
     if form == COSINE:
         return float(cos(first * z) - 1.0)
+    if form == CLIP:
+        return min(z, first)
+    if form == DECAY:
+        return float(exp(-z / first))
     return float(exp(-(((z - first) / second) ** 2)))
 
 
@@ -90,6 +109,11 @@ def list_forms(z: FloatArray) -> list[Form]:
         ]
     else:
         forms.append(Form(SIGNED_POWER, starts(np.array([0.5])), 0, "square root", "sqrt({z})"))
+    if z[0] >= 0.0:
+        forms += [
+            Form(CLIP, starts(inner), 1, "saturation", "min({z}, {a})"),
+            Form(DECAY, starts(np.concatenate([inner[inner < 0.5 * span], widths])), 1, "decay", "exp(-{z} / {a})"),
+        ]
     forms += [
         Form(EXPONENTIAL, starts(np.concatenate([widths, -widths])), 1, "exponential", "(exp({z} / {a}) - 1)"),
         Form(ABOVE, starts(inner), 1, "end stop", "max({z} - {a}, 0)"),
@@ -99,7 +123,7 @@ def list_forms(z: FloatArray) -> list[Form]:
         Form(COSINE, starts(np.array([1.0, *(np.arange(1, 9) * pi / span)])), 1, "sine", "(cos({a} {z}) - 1)"),
         Form(
             BUMP,
-            np.array([(centre, width * span) for centre in inner for width in (0.06, 0.15, 0.3)]),
+            np.array([(centre, width * span) for centre in inner for width in (0.03, 0.08, 0.2)]),
             2,
             "bump",
             "exp(-(({z} - {a}) / {b})^2)",

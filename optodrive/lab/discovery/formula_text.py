@@ -4,10 +4,10 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.fitting import Terms
-from optodrive.lab.discovery.forms import BUMP, COSINE, EXPONENTIAL, POWER, SATURATION, SINE, Form
+from optodrive.lab.discovery.forms import BUMP, COSINE, DECAY, EXPONENTIAL, POWER, SATURATION, SINE, Form
 from optodrive.lab.discovery.screening import Candidate
 
-SMOOTHING = {SATURATION: 2e-3, EXPONENTIAL: 1e-2, BUMP: 1e-2}
+SMOOTHING = {SATURATION: 2e-3, EXPONENTIAL: 1e-2, BUMP: 1e-2, DECAY: 1e-4}
 """Smallest inner number that is a scale, relative to the variable's largest value."""
 
 
@@ -22,6 +22,8 @@ def build_terms(candidate: Candidate, nodes: FloatArray) -> Terms:
         limits = (edge, np.inf) if first > 0.0 else (-np.inf, -edge)
     elif form.code in (SINE, COSINE):
         limits = (0.3 * first, 3.0 * first)
+    elif form.code == DECAY:
+        limits = (edge, 10.0 * size)
     else:
         limits = (float(nodes[0]) - 0.5 * span, float(nodes[-1]) + 0.5 * span)
     return Terms(

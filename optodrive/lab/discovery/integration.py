@@ -30,7 +30,8 @@ from optodrive.lab.discovery.linearisation import copy, correct, predict_covaria
 
 PLACE, FORM, VARIABLE, FACTOR = range(4)
 """Columns of a table of terms: place (states' equations, then outputs), form, variable, and a variable that multiplies
-the form, or -1. Variables: states, inputs, time. The table of values holds amplitude and the form's inner numbers."""
+the form, or -1. Variables: states, inputs, time, quantities of the model. The table of values holds amplitude and the
+form's inner numbers."""
 STEP = 1e-5
 """Relative step of derivatives."""
 MAX_STATE = 1e9
@@ -45,16 +46,20 @@ class Kernels(NamedTuple):
 
     run(samples, x0, p, terms, values, h_max, hold, gains, workspace, predicted, states);
     linearise(samples, x0, ps, terms, values_s, deltas, scales, h_max, hold, q, r, p0, workspace, out);
+    describe(times, states, inputs, p, out): the model's quantities at each of m samples;
     samples: times, inputs, their slopes and outputs of a record
     """
 
     run: Callable[..., None]
     linearise: Callable[..., None]
+    describe: Callable[..., None]
     is_compiled: bool
 
 
 @lru_cache(maxsize=64)
-def build_kernels(rhs: Any, output: Any, n: int, i: int, o: int, parameters: tuple[str, ...]) -> Kernels:
+def build_kernels(
+    rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, c: int, parameters: tuple[str, ...]
+) -> Kernels:
     """Return the functions of a model, compiled if numba can, interpreted otherwise.
 
     Functions that return a display of numbers compile to code without reference counts, which is several times as fast.
@@ -62,20 +67,20 @@ def build_kernels(rhs: Any, output: Any, n: int, i: int, o: int, parameters: tup
     p = np.ones(1, dtype=[(name, np.float64) for name in parameters])
     t, u, y = np.array([0.0, 1e-9]), np.zeros((2, i)), np.zeros((2, o))
     terms, values, gains = np.zeros((0, 4), dtype=np.int64), np.zeros((0, 3)), np.zeros((2, n, o))
-    work = allocate_work(n, i, o)
+    work = allocate_work(n, i, o, c)
     for count_references in (False, True):
-        kernels = _build(rhs, output, n, i, o, count_references)
+        kernels = _build(rhs, output, quantity, n, i, o, count_references)
         try:
             kernels.run((t, u, u, y), np.ones(n), p, terms, values, 1.0, 0, gains, work, y.copy(), np.zeros((2, n)))
         except (NumbaError, TypeError, NotImplementedError):
             continue
         return kernels
-    return _build(rhs, output, n, i, o, None)
+    return _build(rhs, output, quantity, n, i, o, None)
 
 
-def allocate_work(n: int, i: int, o: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return work arrays of a run: [9, n], [i], [o] and [2, n, n]."""
-    return np.zeros((9, n)), np.zeros(i), np.zeros(o), np.zeros((2, n, n))
+def allocate_work(n: int, i: int, o: int, c: int) -> tuple[FloatArray, ...]:
+    """Return work arrays of a run: [9, n], [i], [o], [2, n, n] and [c]."""
+    return np.zeros((9, n)), np.zeros(i), np.zeros(o), np.zeros((2, n, n)), np.zeros(c)
 
 
 def _return_tuple(function: Any) -> Any:
@@ -88,7 +93,7 @@ def _return_tuple(function: Any) -> Any:
     return FunctionType(changed, function.__globals__, function.__name__, function.__defaults__, function.__closure__)
 
 
-def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: bool | None) -> Kernels:
+def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_references: bool | None) -> Kernels:
     """Return compiled functions, with reference counts or without, or interpreted ones (None)."""
     is_compiled = counts_references is not None
 
@@ -102,6 +107,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         record = compile_(lambda ps, q: ps[q])
         rhs = compile_(rhs if counts_references else _return_tuple(rhs))
         output = compile_(output if counts_references else _return_tuple(output))
+        quantity = compile_(quantity if counts_references else _return_tuple(quantity))
     else:
         state_tuple = input_tuple = np.array
         record = lambda ps, q: ps.view(np.recarray)[q]  # noqa: E731
@@ -121,32 +127,40 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                 j += 1  # noqa: SIM113
 
     @compile_
-    def variable(which: int, t: float, x: Any, u: Any) -> float:
+    def variable(which: int, t: float, x: Any, u: Any, derived: Any) -> float:
         if which < n:
             return float(x[which])
+        if which > n + i:
+            return float(derived[which - n - i - 1])
         return float(u[which - n]) if which < n + i else t
 
     @compile_
-    def term_value(terms: Any, values: Any, row: int, t: float, x: Any, u: Any) -> float:
-        factor = 1.0 if terms[row, FACTOR] < 0 else variable(terms[row, FACTOR], t, x, u)
-        z = variable(terms[row, VARIABLE], t, x, u)
+    def term_value(terms: Any, values: Any, row: int, t: float, x: Any, u: Any, derived: Any) -> float:
+        factor = 1.0 if terms[row, FACTOR] < 0 else variable(terms[row, FACTOR], t, x, u, derived)
+        z = variable(terms[row, VARIABLE], t, x, u, derived)
         return float(factor * values[row, 0] * evaluate_form(terms[row, FORM], z, values[row, 1], values[row, 2]))
 
     @compile_
-    def rates(t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, values: Any, offset: Any, out: Any) -> None:
+    def rates(
+        t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, values: Any, offset: Any, derived: Any, out: Any
+    ) -> None:
         store(rhs(t, state_tuple(x), input_tuple(u), record(ps, q)), out)
         for j in range(n):
             out[j] += offset[j]
+        if len(terms) > 0:
+            store(quantity(t, state_tuple(x), input_tuple(u), record(ps, q)), derived)
         for row in range(len(terms)):
             if terms[row, PLACE] < n:
-                out[terms[row, PLACE]] += term_value(terms, values, row, t, x, u)
+                out[terms[row, PLACE]] += term_value(terms, values, row, t, x, u, derived)
 
     @compile_
-    def observe(t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, values: Any, out: Any) -> None:
+    def observe(t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, values: Any, derived: Any, out: Any) -> None:
         store(output(state_tuple(x), input_tuple(u), record(ps, q)), out)
+        if len(terms) > 0:
+            store(quantity(t, state_tuple(x), input_tuple(u), record(ps, q)), derived)
         for row in range(len(terms)):
             if terms[row, PLACE] >= n:
-                out[terms[row, PLACE] - n] += term_value(terms, values, row, t, x, u)
+                out[terms[row, PLACE] - n] += term_value(terms, values, row, t, x, u, derived)
 
     @compile_
     def advance(
@@ -162,6 +176,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         x: Any,
         work: Any,
         held: Any,
+        derived: Any,
     ) -> None:
         """Advance x in place from sample k - 1 to k.
 
@@ -185,7 +200,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                 weight = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
                 for j in range(n):
                     work[4, j] = x[j] + (weight * work[stage - 1, j] if stage > 0 else 0.0)
-                rates(t0 + part * (t1 - t0), work[4], held, ps, q, terms, values, offset, work[stage])
+                rates(t0 + part * (t1 - t0), work[4], held, ps, q, terms, values, offset, derived, work[stage])
             for j in range(n):
                 x[j] += h / 6.0 * (work[0, j] + 2.0 * work[1, j] + 2.0 * work[2, j] + work[3, j])
 
@@ -211,18 +226,18 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
         states: Any,
     ) -> None:
         t, u, _, y = samples
-        work, held, _, _ = workspace
+        work, held, _, _, derived = workspace
         x, offset = work[5], work[6]
         copy(x0, x)
         offset[:] = 0.0
         for k in range(len(t)):
             if k > 0:
-                advance(k, samples, h_max, hold, ps, 0, terms, values, offset, x, work, held)
+                advance(k, samples, h_max, hold, ps, 0, terms, values, offset, x, work, held, derived)
             if not is_sound(x):
                 predicted[k:] = np.nan
                 states[k:] = np.nan
                 return
-            observe(t[k], x, u[k], ps, 0, terms, values, predicted[k])
+            observe(t[k], x, u[k], ps, 0, terms, values, derived, predicted[k])
             for j in range(o):
                 if isfinite(y[k, j]):
                     for s in range(n):
@@ -248,7 +263,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
     ) -> None:
         predicted, variance, states, gains, transition, response, forcing, observation, direct = out
         t, u, _, y = samples
-        work, held, y1, half = workspace
+        work, held, y1, half, derived = workspace
         x, offset, before, moved = work[5], work[6], work[7], work[8]
         copy(x0, x)
         offset[:] = 0.0
@@ -272,7 +287,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                     elif case > 2 * n:
                         q = case - 2 * n
                         size = deltas[q - 1]
-                    advance(k, samples, h_max, hold, ps, q, terms, values[q], offset, moved, work, held)
+                    advance(k, samples, h_max, hold, ps, q, terms, values[q], offset, moved, work, held, derived)
                     for s in range(n):
                         if case == 0:
                             x[s] = moved[s]
@@ -296,7 +311,7 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
                     moved[case - 1] += size
                 elif q > 0:
                     size = deltas[q - 1]
-                observe(t[k], moved, u[k], ps, q, terms, values[q], y1)
+                observe(t[k], moved, u[k], ps, q, terms, values[q], derived, y1)
                 for j in range(o):
                     if case == 0:
                         predicted[k, j] = y1[j]
@@ -307,4 +322,9 @@ def _build(rhs: Any, output: Any, n: int, i: int, o: int, counts_references: boo
             correct(x, covariance, observation[k], noise, y[k], predicted[k], variance[k], gains[k])
             copy(x, states[k])
 
-    return Kernels(run, linearise, is_compiled)
+    @compile_
+    def describe(t: Any, x: Any, u: Any, ps: Any, out: Any) -> None:
+        for k in range(len(t)):
+            store(quantity(t[k], state_tuple(x[k]), input_tuple(u[k]), record(ps, 0)), out[k])
+
+    return Kernels(run, linearise, describe, is_compiled)

@@ -14,6 +14,11 @@ FIRST_ROWS = 100
 """Rows of measured outputs that `OdeModel.initial` receives at most."""
 
 
+def no_quantity(t: Any, state: Any, u: Any, p: Any) -> Sequence[Any]:
+    """Return one unused number: a model without quantities of its own."""
+    return [0.0]
+
+
 @dataclass(frozen=True)
 class Parameter:
     """Number to be fitted: start and limits."""
@@ -35,7 +40,10 @@ class OdeModel:
     rhs, output: return a list of numbers from time, s, the states, the inputs and the parameters, `p["name"]` or
     `p.name`; compiled if numba can, interpreted otherwise. initial: returns the states at the start of a record from
     its first measured outputs, [up to 100 samples, outputs] (of one sample, [outputs], if the function needs it so),
-    and the parameters, of which some may occur only there.
+    and the parameters, of which some may occur only there. quantities: names of what `quantity` returns from the same
+    arguments as `rhs`, further variables of a term; places: where a term may enter, what it depends on and what
+    multiplies it ("" for nothing), everywhere by default; from_rest: records begin in a known state, and inputs are
+    constant from one sample to the next, as in pulses, so that no filter is needed to keep the states near the data
     """
 
     states: tuple[str, ...]
@@ -45,14 +53,18 @@ class OdeModel:
     rhs: Callable[[Any, Any, Any, Any], Sequence[Any]]
     output: Callable[[Any, Any, Any], Sequence[Any]]
     initial: Callable[[Any, Any], Sequence[Any]]
+    quantities: tuple[str, ...] = ()
+    quantity: Callable[[Any, Any, Any, Any], Sequence[Any]] = no_quantity
+    places: tuple[tuple[str, str, str], ...] = ()
+    from_rest: bool = False
 
     def __post_init__(self) -> None:
-        for field in ("states", "inputs", "outputs"):
+        for field in ("states", "inputs", "outputs", "quantities"):
             object.__setattr__(self, field, tuple(getattr(self, field)))
-        names = [*self.states, *self.inputs]
+        names = [*self.states, *self.inputs, *self.quantities]
         repeated = next((name for name in names if names.count(name) > 1), None)
         if repeated is not None:
-            raise InputError("states and inputs", repeated, "every name once")
+            raise InputError("states, inputs and quantities", repeated, "every name once")
         if not self.states or not self.outputs or not self.parameters:
             raise InputError("model", (self.states, self.outputs), "at least one state, output and parameter")
         for name, item in self.parameters.items():
@@ -61,8 +73,8 @@ class OdeModel:
 
     @property
     def variable_names(self) -> tuple[str, ...]:
-        """Quantities that a term can depend on: states, inputs, time."""
-        return (*self.states, *self.inputs, "t")
+        """Quantities that a term can depend on: states, inputs, time, and those of the model."""
+        return (*self.states, *self.inputs, "t", *self.quantities)
 
     @property
     def place_names(self) -> tuple[str, ...]:
@@ -72,11 +84,17 @@ class OdeModel:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Measured inputs [m, i] and outputs [m, o] at increasing times t_s [m]. An output that is NaN was not measured."""
+    """Measured inputs [m, i] and outputs [m, o] at increasing times t_s [m]. An output that is NaN was not measured.
+
+    whiten: linear map of errors [m, o, k], zero where nothing was measured, to errors of independent noise of one, in
+    the same shape; what differs from record to record, such as a zero, is marginalised by it. Without it, noise is
+    estimated and taken as white.
+    """
 
     t_s: FloatArray
     inputs: FloatArray
     outputs: FloatArray
+    whiten: Callable[[FloatArray], FloatArray] | None = None
 
     def __post_init__(self) -> None:
         times = np.array(self.t_s, dtype=np.float64).reshape(-1)
@@ -164,8 +182,8 @@ class Discovery:
     """Answer of `discover`.
 
     base_rmse, extended_rmse: root mean square error over all outputs in free run, in the held-out parts, to which
-    neither model was fitted; parameters: of the extended model, fitted to everything; base_parameters: likewise without
-    terms
+    neither model was fitted, in units of noise for records that state it; parameters: of the extended model, fitted to
+    everything; base_parameters: likewise without terms
     """
 
     findings: tuple[Finding, ...]

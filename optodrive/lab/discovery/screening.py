@@ -9,18 +9,18 @@ hats' columns times its values at the nodes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.lab.discovery.fitting import Point, Simulation
+from optodrive.lab.discovery.fitting import Point, Simulation, weigh
 from optodrive.lab.discovery.forms import Form, list_forms
 from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.model import Curve, Record
 
-EVEN_NODES = 11
+EVEN_NODES = 21
 SHARES = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.3, 0.4])
 """Nodes at equal distances, and at these shares of the samples from either end: end stops act on few samples."""
 FOLDS = 4
@@ -37,7 +37,8 @@ BAND = 1.96
 class Filtered:
     """Linearisation of one record with the derivatives [m, o, q] by all fitted numbers and a label of each sample [m].
 
-    block: number of the block, which is used for fits if it is in the list of fitted blocks
+    block: number of the block, which is used for fits if it is in the list of fitted blocks; variables, arriving: as
+    of `Simulation.list_variables`
     """
 
     record: Record
@@ -45,6 +46,8 @@ class Filtered:
     columns: FloatArray
     block: IntArray
     weights: FloatArray
+    variables: FloatArray
+    arriving: FloatArray
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,12 @@ class Screened:
     weights: FloatArray
     sigma: FloatArray
 
+    def add_curve(self, values: FloatArray) -> "Screened":
+        """Return the normal equations of the whole term, where these are those beside a curve with values [c]."""
+        change = self.matrix @ values
+        total = self.total + float(2.0 * values @ self.vector + values @ change)
+        return replace(self, vector=self.vector + change, total=total)
+
     @property
     def curve(self) -> Curve:
         """The smooth curve with its band."""
@@ -100,9 +109,16 @@ class Candidate:
 def list_places(simulation: Simulation, filtered: Sequence[Filtered], point: Point) -> list[Place]:
     """Return all places with the variables and factors to be tried.
 
-    An equation that no parameter changes defines its state, as dx/dt = v does, and is left out unless all do.
+    Without places of the model's own, an equation that no parameter changes defines its state, as dx/dt = v does, and
+    is left out unless all do.
     """
     model = simulation.model
+    if model.places:
+        names = model.variable_names
+        return [
+            Place(model.place_names.index(where), names.index(on), names.index(factor) if factor else -1)
+            for where, on, factor in model.places
+        ]
     n, i, o = len(model.states), len(model.inputs), len(model.outputs)
     equations = simulation.find_parametrised(filtered[0].record, filtered[0].line.states, point) or list(range(n))
     quantities = list(range(n + i))
@@ -113,14 +129,6 @@ def list_places(simulation: Simulation, filtered: Sequence[Filtered], point: Poi
             if factor != variable:
                 places.append(Place(place, variable, factor))
     return places
-
-
-def variable_values(each: Filtered, variable: int) -> FloatArray:
-    """Return a variable [m] along a record."""
-    n, i = each.line.states.shape[1], each.record.inputs.shape[1]
-    if variable < n:
-        return each.line.states[:, variable]
-    return each.record.inputs[:, variable - n] if variable < n + i else each.record.t_s
 
 
 def choose_nodes(values: FloatArray) -> FloatArray:
@@ -148,7 +156,7 @@ def hat_functions(z: FloatArray, nodes: FloatArray) -> FloatArray:
 
 def screen(filtered: Sequence[Filtered], at: Place, blocks: Sequence[int], n: int) -> Screened | None:
     """Return the regression of a place on the fitted blocks, None if the variable does not vary."""
-    values = np.concatenate([variable_values(each, at.variable) for each in filtered])
+    values = np.concatenate([each.variables[:, at.variable] for each in filtered])
     if not np.isfinite(values).all() or np.ptp(values) <= 1e-9 * np.abs(values).max():
         return None
     nodes = choose_nodes(values)
@@ -191,16 +199,17 @@ def _build_grams(
     size = filtered[0].columns.shape[2] + len(nodes) + 1
     grams = np.zeros((len(blocks), size, size))
     for each in filtered:
-        hats = hat_functions(variable_values(each, at.variable), nodes)
-        if at.factor >= 0:
-            hats *= variable_values(each, at.factor)[:, None]
+        hats, arriving = (
+            hat_functions(values[:, at.variable], nodes) * (values[:, at.factor, None] if at.factor >= 0 else 1.0)
+            for values in (each.variables, each.arriving)
+        )
         line = each.line
         forcing = np.zeros((*line.states.shape, len(nodes)))
         if at.place < n:
-            forcing[1:] = (0.5 * line.response[1:, :, at.place])[:, :, None] * (hats[:-1] + hats[1:])[:, None, :]
+            forcing[1:] = (0.5 * line.response[1:, :, at.place])[:, :, None] * (hats[:-1] + arriving[1:])[:, None, :]
         change = line.propagate(forcing, direct[:, None] * hats[:, None, :], np.zeros((n, len(nodes))))
         error = np.nan_to_num(each.record.outputs - line.predicted)[:, :, None]
-        joined = np.concatenate([each.columns, change, error], axis=2) * each.weights[:, :, None]
+        joined = weigh(each.record, np.concatenate([each.columns, change, error], axis=2), each.weights)
         for row, block in enumerate(blocks):
             part = joined[each.block == block].reshape(-1, size)
             grams[row] += part.T @ part

@@ -1,0 +1,106 @@
+"""Discovery of the terms that the nominal pixel lacks, in a recording."""
+
+from time import perf_counter
+
+import numpy as np
+
+from optodrive.core.types.discrepancy import InstrumentDisturbance
+from optodrive.core.types.measurements import Measurement
+from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset, build_dataset
+from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, remove_disturbances
+from optodrive.lab.diagnosis.model_selection import has_replicate_excess
+from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal
+from optodrive.lab.diagnosis.search_log import ProgressCallback, ignore_progress
+from optodrive.lab.discovery import Finding, discover
+from optodrive.lab.pixel_discovery.experiment_records import build_records, choose_held_out
+from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
+from optodrive.lab.pixel_discovery.pixel_model import AFTER, LIGHT, OUTPUTS, TEMPERATURE, build_model
+from optodrive.lab.pixel_discovery.random_light import find_random_light
+
+UNITS = {"dabsorber/dt": "K/s", "dgas/dt": "K/s", "temperature": "K", "displacement": "m", "force": "N"}
+OTHER_SIGNALS = "displacement and force, by powers fitted to the temperature alone"
+MIN_EXPERIMENTS = 4
+"""Experiments below which none can be held out and the others still tell places apart."""
+
+
+def discover_in_pixel(
+    measurement: Measurement,
+    prior: BaseParameterPrior = BROAD_PRIOR,
+    epsilon: float = DEFAULT_EPSILON,
+    on_progress: ProgressCallback = ignore_progress,
+) -> PixelDiscovery:
+    """Return the terms that the nominal pixel lacks, with evidence from experiments that were held out.
+
+    measurement, prior, epsilon: as of `diagnose`
+    """
+    began_s = perf_counter()
+    on_progress("discovery: noise and nominal model")
+    parts = [part for part in build_dataset(measurement).split_subsystems() if set(part.kinds) <= set(PIXEL_KINDS)]
+    if not parts:
+        return PixelDiscovery((), (), "", 0.0, 0.0, {}, perf_counter() - began_s)
+    problem, base, disturbances = _fit_without_disturbances(parts[0], prior, epsilon)
+    if has_replicate_excess(problem):
+        # The mean over repeats, which differ, is that of no pixel.
+        found, errors = find_random_light(problem, base)
+        return PixelDiscovery(found, disturbances, OTHER_SIGNALS, *errors, {}, perf_counter() - began_s)
+    experiments = build_records(problem, base)
+    held_out = choose_held_out(experiments)
+    if len(experiments) < MIN_EXPERIMENTS or not held_out:
+        return PixelDiscovery((), disturbances, "", 0.0, 0.0, {}, perf_counter() - began_s)
+    measured = [name for name, kind in zip(OUTPUTS, PIXEL_KINDS, strict=True) if kind in problem.data.kinds]
+    answer = discover(
+        build_model(np.exp(np.array(base.point.base)).tolist(), measured),
+        [each.record for each in experiments],
+        progress=lambda stage, fraction: on_progress(f"discovery: {stage}"),
+        held_out=held_out,
+    )
+    return PixelDiscovery(
+        tuple(_describe(each) for each in answer.findings),
+        disturbances,
+        "held-out experiments: " + ", ".join(experiments[number].name for number in held_out),
+        answer.base_rmse,
+        answer.extended_rmse,
+        answer.parameters,
+        perf_counter() - began_s,
+    )
+
+
+def _fit_without_disturbances(
+    data: Dataset, prior: BaseParameterPrior, epsilon: float
+) -> tuple[FitProblem, ModelFit, tuple[InstrumentDisturbance, ...]]:
+    """Return noise and nominal fit without disturbances of the instruments, and these."""
+    problem, base = fit_nominal(data, prior, epsilon)
+    sensitivity = compute_jitter_sensitivity(data, base.point, epsilon, base.prediction)
+    disturbances, added = find_disturbances(data, data.value - base.prediction, sensitivity, problem.noise)
+    if disturbances:
+        problem, base = fit_nominal(remove_disturbances(data, added), prior, epsilon)
+    return problem, base, disturbances
+
+
+def _describe(finding: Finding) -> PixelFinding:
+    """Return a finding with the node of the pixel in which it lies."""
+    kind = "memory" if finding.depends_on[0] == "memory" else finding.kind
+    return PixelFinding(
+        _find_node(finding),
+        finding.where,
+        UNITS[finding.where],
+        finding.depends_on,
+        kind,
+        finding.formula,
+        finding.curve,
+        finding.gain,
+        finding.probability,
+    )
+
+
+def _find_node(finding: Finding) -> str:
+    """Return the node in which a term acts. One of light that acts on a signal is an instrument's."""
+    if finding.where == "dgas/dt":
+        return "gas"
+    if finding.where == "dabsorber/dt":
+        if finding.depends_on[0] == "memory":
+            return "wall"
+        return "light" if LIGHT in finding.depends_on or AFTER in finding.depends_on else "absorber"
+    is_instrument = finding.where == TEMPERATURE or finding.depends_on[0] in (LIGHT, "t")
+    return "sensor" if is_instrument else "membrane"

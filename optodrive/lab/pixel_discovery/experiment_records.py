@@ -1,0 +1,180 @@
+"""Records of a discovery from the runs of a recording: one per experiment, of the mean over its repeats.
+
+Theory of operation. What is averaged are residuals of the nominal fit, in bins of time between two gate edges, over all
+repeats; the nominal prediction at the middle of the bin is added again. A residual is smooth where a signal is not, so
+bins widen with the time since the edge, and a long gap in the dark costs few samples. Gate edges are samples of their
+own, without outputs, because light is held from one sample to the next.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.lab.diagnosis.dataset import PIXEL_KINDS
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity
+from optodrive.lab.discovery import Record
+from optodrive.lab.pixel_discovery.record_noise import BinnedSignal, build_whitening
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+
+MIN_BIN_S = 2e-4
+BIN_GROWTH = 0.08
+"""Width of a bin per time since the gate edge before it."""
+MAX_SAMPLES, FIRST_PULSES = 500, 10
+"""Samples of a record above which bins are kept only of its first pulses and of one in two, four, eight… later ones."""
+NEAR = 0.1
+"""Share of a bin within which mean times of two signals count as one."""
+HELD_OUT_EVERY = 3
+"""Every third experiment in order of energy is held out, from the second strongest on."""
+
+Repeats = list[tuple[PixelExperiment, tuple[int, int, int]]]
+"""Runs of one experiment with the numbers of their blocks by kind of signal, −1 where it was not measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentRecord:
+    """Record of one experiment with its name and its pulses [n, 4]."""
+
+    name: str
+    pulses: FloatArray
+    record: Record
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Times [m] of a record with its inputs [m, 4].
+
+    begin_s, end_s: of each bin [b]; rows: of each bin in each signal [b, 3]. A signal's samples in a bin stand at their
+    mean time, which is a row of its own where another signal's is not near.
+    """
+
+    t_s: FloatArray
+    inputs: FloatArray
+    begin_s: FloatArray
+    end_s: FloatArray
+    rows: IntArray
+
+    def find_rows(self, t_s: FloatArray, kind: int) -> IntArray:
+        """Return the row in which each sample of a kind of signal counts, −1 where it lies in no bin."""
+        found = np.maximum(np.searchsorted(self.begin_s, t_s, side="right") - 1, 0)
+        is_inside = (t_s >= self.begin_s[found]) & (t_s < self.end_s[found])
+        return np.asarray(np.where(is_inside, self.rows[found, kind], -1))
+
+
+def build_records(problem: FitProblem, base: ModelFit) -> list[ExperimentRecord]:
+    """Return the records of all experiments that light the measured pixel and no other."""
+    data = problem.data
+    experiments: dict[tuple[str, int], Repeats] = {}
+    for experiment, numbers in data.experiments:
+        run = data.blocks[max(numbers)].run
+        if len(experiment.pulses) and (experiment.pulses[:, 3] == experiment.pixel).all():
+            experiments.setdefault((data.runs[run].group, experiment.pixel), []).append((experiment, numbers))
+    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    columns = np.column_stack([data.value - base.prediction, sensitivity.power, sensitivity.timing])
+    return [
+        ExperimentRecord(name, repeats[0][0].pulses, _build_record(repeats, problem, base, columns))
+        for (name, _), repeats in experiments.items()
+    ]
+
+
+def choose_held_out(experiments: Sequence[ExperimentRecord]) -> list[int]:
+    """Return the numbers of the experiments to hold out, of trains and of single pulses separately.
+
+    The strongest is fitted: where it alone shows an effect, there would be nothing else to find it in.
+    """
+    held_out: list[int] = []
+    for is_train in (False, True):
+        own = [k for k, each in enumerate(experiments) if (len(each.pulses) > 2) == is_train]
+        own.sort(key=lambda k: -float((experiments[k].pulses[:, 1] * experiments[k].pulses[:, 2]).sum()))
+        held_out += own[1::HELD_OUT_EVERY]
+    return sorted(held_out)
+
+
+def _build_record(repeats: Repeats, problem: FitProblem, base: ModelFit, columns: FloatArray) -> Record:
+    """Return the record of an experiment.
+
+    columns: [samples of the data, 3], residual and sensitivities to power and timing
+    """
+    data, first = problem.data, repeats[0][0]
+    blocks = [[data.blocks[numbers[kind]] for _, numbers in repeats if numbers[kind] >= 0] for kind in PIXEL_KINDS]
+    samples_s = [np.sort(np.concatenate([block.t_s for block in own] or [np.zeros(0)])) for own in blocks]
+    finest_s = min(float(np.median(np.diff(block.t_s))) for own in blocks for block in own)
+    grid = _build_grid(first, problem.epsilon, samples_s, max(MIN_BIN_S, finest_s))
+    nominal = simulate_signals(
+        PixelExperiment(first.pulses, first.pixel, first.ambient_k, (grid.t_s,) * 3, full_w=first.full_w),
+        base.point.pixel(problem.epsilon),
+        ActiveTerms.from_values(base.point.terms),
+    )
+    outputs = np.full((len(grid.t_s), len(PIXEL_KINDS)), np.nan)
+    signals: list[BinnedSignal] = []
+    for kind in PIXEL_KINDS:
+        if not blocks[kind]:
+            continue
+        places = grid.find_rows(np.concatenate([block.t_s for block in blocks[kind]]), kind)
+        rows, place, counts = np.unique(places[places >= 0], return_inverse=True, return_counts=True)
+        values = np.concatenate([columns[block.part] for block in blocks[kind]])[places >= 0]
+        means = np.column_stack([np.bincount(place, column) / counts for column in values.T])
+        outputs[rows, kind] = nominal[kind][rows] + means[:, 0]
+        densest = max(blocks[kind], key=lambda block: len(block.t_s)).t_s
+        densest = densest[grid.find_rows(densest, kind) >= 0]
+        lonely = np.setdiff1d(rows, grid.find_rows(densest, kind))  # samples that the densest repeat misses
+        sampled_s = np.sort(np.concatenate([densest, grid.t_s[lonely]]))
+        sampled_rows = grid.find_rows(sampled_s, kind)
+        signals.append(BinnedSignal(kind, rows, counts, sampled_s, sampled_rows, len(blocks[kind]), means[:, 1:]))
+    return Record(grid.t_s, grid.inputs, outputs, build_whitening(signals, problem.noise))
+
+
+def _build_grid(
+    experiment: PixelExperiment, epsilon: float, samples_s: Sequence[FloatArray], first_bin_s: float
+) -> _Grid:
+    """Return the grid of an experiment, for sorted sample times of each kind of signal."""
+    kept = 1
+    while True:
+        grid = _divide(experiment, epsilon, samples_s, first_bin_s, kept)
+        if len(grid.t_s) <= MAX_SAMPLES or kept > len(experiment.pulses):
+            return grid
+        kept *= 2
+
+
+def _divide(
+    experiment: PixelExperiment, epsilon: float, samples_s: Sequence[FloatArray], first_bin_s: float, kept: int
+) -> _Grid:
+    """Return the grid with the bins of the first pulses and of one in `kept` later ones."""
+    rows, bins = list[tuple[float, ...]](), list[tuple[float, float, list[int]]]()
+    gates = [(0.0, 0.0, 0.0)]  # begin, light, light of the pulse before
+    for start_s, width_s, power_w, _ in experiment.pulses.tolist():
+        gates += [(start_s, epsilon * power_w, 0.0), (start_s + width_s, 0.0, epsilon * power_w)]
+    for number, (begin_s, light_w, after_w) in enumerate(gates):
+        is_last, pulse = number + 1 == len(gates), (number - 1) // 2
+        end_s = max(float(t_s[-1]) for t_s in samples_s if len(t_s)) + 1e-6 if is_last else gates[number + 1][0]
+        if end_s - begin_s < 1e-9:
+            continue
+        inputs = (light_w, after_w, begin_s if light_w > 0.0 else 0.0, begin_s if after_w > 0.0 else 0.0)
+        rows.append((begin_s, *inputs))
+        left_s = begin_s if pulse < FIRST_PULSES or pulse % kept == 0 or is_last else end_s
+        while left_s < end_s - 1e-9:
+            right_s = left_s + max(first_bin_s, BIN_GROWTH * (left_s - begin_s))
+            right_s = end_s if right_s + first_bin_s > end_s else right_s
+            times_s, places = _place_samples(samples_s, left_s, right_s)
+            bins.append((left_s, right_s, [place + len(rows) if place >= 0 else -1 for place in places]))
+            rows += [(time_s, *inputs) for time_s in times_s]
+            left_s = right_s
+    table, edges_s = np.array(rows), np.array([(left_s, right_s) for left_s, right_s, _ in bins])
+    places_of = np.array([places for _, _, places in bins])
+    return _Grid(table[:, 0], np.ascontiguousarray(table[:, 1:]), edges_s[:, 0], edges_s[:, 1], places_of)
+
+
+def _place_samples(samples_s: Sequence[FloatArray], left_s: float, right_s: float) -> tuple[list[float], list[int]]:
+    """Return the times of a bin's rows, and the number of each signal's, −1 without a sample."""
+    means_s = dict[int, float]()
+    for kind, t_s in enumerate(samples_s):
+        first, last = np.searchsorted(t_s, [left_s, right_s])
+        if last > first:
+            means_s[kind] = float(t_s[first:last].mean())
+    times_s, places = list[float](), [-1] * len(samples_s)
+    for kind in sorted(means_s, key=lambda kind: means_s[kind]):
+        if not times_s or means_s[kind] - times_s[-1] > NEAR * (right_s - left_s):
+            times_s.append(max(means_s[kind], left_s + 1e-9))
+        places[kind] = len(times_s) - 1
+    return times_s, places

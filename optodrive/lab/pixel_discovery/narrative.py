@@ -1,0 +1,107 @@
+"""A discovery in a pixel as text, as JSON and as a section of the report."""
+
+from html import escape
+from typing import Any
+
+from optodrive.core.quantity import format_quantity
+from optodrive.core.svg_plot import Axis, Series, draw_plot
+from optodrive.lab.discovery import Curve
+from optodrive.lab.pixel_discovery.findings import NODES, PixelDiscovery, PixelFinding
+
+PLOT_HEIGHT = 200
+VARIABLES = {
+    "absorber": ("rise of the absorber", "K"),
+    "gas": ("rise of the gas", "K"),
+    "memory": ("rise of a part that follows the absorber", "K"),
+    "heating": ("rate of the absorber", "K/s"),
+    "drive": ("half the absorber's rise less the gas's", "K"),
+    "light": ("absorbed light", "W"),
+    "after": ("absorbed light of the pulse before", "W"),
+    "since_opening": ("time since the gate opened", "s"),
+    "since_closing": ("time since the gate closed", "s"),
+    "t": ("time in the run", "s"),
+}
+"""Variables of the pixel with their unit."""
+PLACES = {
+    "dabsorber/dt": "the rate of the absorber's temperature",
+    "dgas/dt": "the rate of the gas's temperature",
+    "temperature": "the measured temperature",
+    "displacement": "the measured displacement",
+    "force": "the measured force",
+}
+
+
+def build_lines(discovery: PixelDiscovery) -> list[str]:
+    """Return the lines of text."""
+    if not discovery.judged_by:
+        return ["No missing term was sought: too few experiments light a measured pixel alone."]
+    judged = f"on {discovery.judged_by}"
+    if not discovery.findings:
+        return [
+            "No missing term was found: nothing predicts better than the nominal pixel, which is off by "
+            f"{discovery.error_before:.2f} of the noise {judged}."
+        ]
+    lines = [line for finding in discovery.findings for line in _describe(finding)]
+    error = f"{discovery.error_before:.2f} of the noise before, {discovery.error_after:.2f} after"
+    return [*lines, f"Error {judged}: {error}."]
+
+
+def _describe(finding: PixelFinding) -> list[str]:
+    gain = f"  removes {finding.gain:.0%} of the avoidable error; probability {finding.probability:.4f}"
+    if finding.curve is None:
+        return [
+            f"A term that nobody wrote down: {NODES[finding.node]} changes at random, other in every repeat.",
+            f"  {finding.formula}",
+            gain,
+        ]
+    on = " times ".join(VARIABLES[name][0] for name in finding.depends_on)
+    return [
+        f"A term that nobody wrote down: {NODES[finding.node]} lacks one that depends on {on} ({finding.kind}).",
+        f"  {PLACES[finding.where]}, {finding.unit}: {finding.formula}",
+        gain,
+    ]
+
+
+def build_document(discovery: PixelDiscovery) -> dict[str, Any]:
+    """Return the discovery as JSON values."""
+    return {
+        "findings": [
+            {
+                "node": each.node,
+                "where": each.where,
+                "unit": each.unit,
+                "depends_on": [{"name": name, "unit": VARIABLES[name][1]} for name in each.depends_on],
+                "kind": each.kind,
+                "formula": each.formula,
+                "curve": None
+                if each.curve is None
+                else {name: getattr(each.curve, name).tolist() for name in ("x", "y", "low", "high")},
+                "gain": each.gain,
+                "probability": each.probability,
+            }
+            for each in discovery.findings
+        ],
+        "error_before": discovery.error_before,
+        "error_after": discovery.error_after,
+        "judged_by": discovery.judged_by,
+        "parameters": discovery.parameters,
+        "elapsed_s": discovery.elapsed_s,
+    }
+
+
+def build_sections(discovery: PixelDiscovery) -> list[str]:
+    """Return the section of the report, with the curve of each term and its 95 % band."""
+    parts = ["<h2>Terms that nobody wrote down</h2>", *(f"<p>{escape(line)}</p>" for line in build_lines(discovery))]
+    curves = [_draw_curve(each, each.curve) for each in discovery.findings if each.curve is not None]
+    return [*parts, "<div class='grid'>", *curves, "</div>"] if curves else parts
+
+
+def _draw_curve(finding: PixelFinding, curve: Curve) -> str:
+    quantity, unit = VARIABLES[finding.depends_on[0]]
+    factor = VARIABLES[finding.depends_on[1]] if len(finding.depends_on) > 1 else None
+    y_axis = Axis(finding.where if factor is None else f"{finding.where} per {factor[1]}", finding.unit)
+    series = [Series(curve.y, "extended"), Series(curve.low, "nominal"), Series(curve.high, "nominal")]
+    plot = draw_plot(f"{finding.where} against {quantity}", curve.x, Axis(quantity, unit), y_axis, series, PLOT_HEIGHT)
+    span = f"{format_quantity(float(curve.x[0]), unit)} to {format_quantity(float(curve.x[-1]), unit)}"
+    caption = f"{finding.formula}; over the data, {span}. Dashed: 95 % band."
+    return f"<figure>{plot}<figcaption>{escape(caption)}</figcaption></figure>"

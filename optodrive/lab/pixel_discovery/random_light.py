@@ -1,0 +1,100 @@
+"""Light that changes at random within runs, other in every repeat: which no term of states and time can describe.
+
+Theory of operation. Pulses are cut into slices of about the thermal time constant. The power of every slice is fitted
+to the temperature of its run, and judged by the displacement and force that it predicts, which no fit has seen: light
+moves all signals together, an instrument only its own.
+"""
+
+from dataclasses import dataclass, replace
+from math import erfc, sqrt
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray
+from optodrive.lab.diagnosis.dataset import PIXEL_KINDS
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
+from optodrive.lab.diagnosis.power_fluctuation import slice_pulses
+from optodrive.lab.discovery.evidence import compute_probability
+from optodrive.lab.pixel_discovery.findings import PixelFinding
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+
+POWER_SIGMA = 0.5
+"""Prior σ of a slice's relative power: a missed pulse has none."""
+MIN_GAIN = 0.5
+"""Share of the displacement's and force's error that the powers remove, below which the light is not the cause."""
+MAX_P = 1e-3
+DARK = 0.3
+"""Relative power below which a slice counts as dark."""
+
+
+@dataclass(frozen=True, eq=False)
+class _RunPowers:
+    """Relative powers [k] of the slices of one run, with errors of its other signals in units of noise, [n] each."""
+
+    powers: FloatArray
+    before: FloatArray
+    after: FloatArray
+
+
+def find_random_light(problem: FitProblem, base: ModelFit) -> tuple[tuple[PixelFinding, ...], tuple[float, float]]:
+    """Return the finding, if there is one, and the errors in units of the noise before and after."""
+    runs = [
+        found
+        for experiment, numbers in problem.data.experiments
+        if len(experiment.pulses) and (experiment.pulses[:, 3] == experiment.pixel).all()
+        if (found := _fit_powers(problem, base, experiment, numbers)) is not None
+    ]
+    if not runs:
+        return (), (1.0, 1.0)
+    before, after = (np.concatenate([getattr(run, name) for run in runs]) for name in ("before", "after"))
+    rms = float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2)))
+    gain = (rms[0] - rms[1]) / max(rms[0] - min(1.0, rms[1]), 1e-9)
+    products = np.array([float(((run.before - run.after) * run.before).sum()) for run in runs])
+    errors = np.array([float(((run.before - run.after) * run.after).sum()) for run in runs])
+    p_value = 0.5 * erfc(float(products.sum()) / sqrt(2.0 * max(float((errors**2).sum()), 1e-300)))
+    if gain < MIN_GAIN or p_value > MAX_P:
+        return (), rms
+    powers = np.concatenate([run.powers for run in runs])
+    finding = PixelFinding(
+        "light", "light", "1", (), "random", _describe(powers), None, gain, compute_probability(p_value)
+    )
+    return (finding,), rms
+
+
+def _fit_powers(
+    problem: FitProblem, base: ModelFit, experiment: PixelExperiment, numbers: tuple[int, int, int]
+) -> _RunPowers | None:
+    """Return the powers of a run's slices, None where its temperature or all other signals are missing."""
+    judged = [kind for kind in PIXEL_KINDS[1:] if numbers[kind] >= 0]
+    if numbers[0] < 0 or not judged:
+        return None
+    data, pixel = problem.data, base.point.pixel(problem.epsilon)
+    slices = slice_pulses(experiment.pulses)
+    nothing = ActiveTerms.from_values({})
+    signals = [simulate_signals(replace(experiment, pulses=part[None, :]), pixel, nothing) for part in slices]
+    responses = [np.column_stack([each[kind] for each in signals]) for kind in PIXEL_KINDS]
+    residual, noise = data.value - base.prediction, problem.noise
+    measured = residual[data.blocks[numbers[0]].part]
+    columns = np.column_stack([responses[0], np.full(len(measured), noise.baseline_sigma[0])])
+    white = noise.coloured[0].white
+    precision = np.append(np.full(len(slices), 1.0 / POWER_SIGMA**2), 1.0)
+    matrix = columns.T @ columns / white**2 + np.diag(precision)
+    changes = np.linalg.solve(matrix, columns.T @ measured / white**2)[:-1]
+    whole = responses[0].sum(axis=1)
+    common = np.full(len(slices), float(whole @ measured / (whole @ whole)))
+    before, after = list[FloatArray](), list[FloatArray]()
+    for kind in judged:
+        for powers, out in ((common, before), (changes, after)):
+            error = residual[data.blocks[numbers[kind]].part] - responses[kind] @ powers
+            out.append((error - error.mean()) / noise.coloured[kind].white)
+    return _RunPowers(1.0 + changes, np.concatenate(before), np.concatenate(after))
+
+
+def _describe(powers: FloatArray) -> str:
+    """Return a description of the powers [k] of all slices."""
+    dark = int((powers < DARK).sum())
+    if dark:
+        return f"{dark} of {len(powers)} parts of pulses stay dark"
+    middle = 0.5 * (powers.min() + powers.max())
+    share = 1.0 - float(np.median(powers[powers < middle])) / float(np.median(powers[powers >= middle]))
+    return f"the power falls by {share:.1%} and returns"
