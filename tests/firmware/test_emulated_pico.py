@@ -141,3 +141,6 @@ def test_ticks_keep_their_time_at_a_full_queue_and_2000_pulses_a_second(bench, f
     for name, side in (("on", late_us[::2]), ("off", late_us[1::2])):
         print(f"pin {name}: median {np.median(side):.0f} µs, at most {side.max():.0f} µs late, {len(side)} edges")
     assert gap_us <= TICK_US + 500
+    used, available = core.measure_stack()
+    print(f"stack {used} of {available} bytes")
+    assert 0 < used < available // 2

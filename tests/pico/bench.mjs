@@ -54,6 +54,7 @@ const commands = {
     emit("ticks", chip.tickMax, chip.gapMax);
     chip.tickMax = chip.gapMax = 0;
   },
+  stack() { emit("stack", ...chip.measureStack()); },
   trace(on) {
     setup.tracing = on;
     if (on) chip.traceLevels(-1);

@@ -14,6 +14,7 @@ const FUNCTION_PWM = 4;
 const TIMER_IRQ = 0, UART_IRQ = 20;
 const HAD_POR = 1 << 8, HAD_RUN = 1 << 16;
 const FAULT_REASON = 14;
+const PAINT = 0xa5a5a5a5; // of the stack that was never used
 
 // Registers that the emulator leaves out: one value each, or a function of the offset.
 const stub = (read) => ({ readUint32: read, writeUint32() {}, writeUint32Atomic() {} });
@@ -28,6 +29,7 @@ export class Chip {
     if (memory) rp2040.sram.set(memory);
     rp2040.flash.set(setup.flash);
     this.ram = rp2040.sramView;
+    for (let at = setup.symbols.bss_end; at < RAM + RAM_BYTES; at += 4) this.ram.setUint32(at - RAM, PAINT, true);
     this.core = rp2040.core;
     this.clock = rp2040.clock;
     this.uart = new Uart(rp2040, UART_IRQ, (byte) => emit("byte", this.micros, byte));
@@ -164,6 +166,14 @@ export class Chip {
   onStateChanged() {
     this.emit("state", this.readTime(), this.read8("state"), this.pending.before, this.pending.reason);
     this.pending = null;
+  }
+
+  // Bytes of the stack that were used since power-up, and those that there are.
+  measureStack() {
+    const begin = this.at.bss_end, end = RAM + RAM_BYTES;
+    let at = begin;
+    while (at < end && this.ram.getUint32(at - RAM, true) === PAINT) at += 4;
+    return [end - at, end - begin];
   }
 
   countBadFrames() {

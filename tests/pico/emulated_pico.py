@@ -30,7 +30,16 @@ FIRMWARE = 0x0001_0000
 BLOCK = struct.Struct("<8I476sI")
 FLASH = 0x1000_0000
 OFFSETS = ("now_us", "state", "fault", "index", "x", "y", "duty", "crc_errors", "format_errors")
-SYMBOLS = ("board", "change_state", "outputs_set_gate", "host_serve", "SETTINGS", "data_begin", "data_stored")
+SYMBOLS = (
+    "board",
+    "change_state",
+    "outputs_set_gate",
+    "host_serve",
+    "SETTINGS",
+    "data_begin",
+    "data_stored",
+    "bss_end",
+)
 INPUT_PINS = {"interlock": 10, "key": 9, "estop": 8}
 HOST_CLOSED = 2
 PWM_STEPS, DUTY_FULL = 2500, 65535
@@ -111,6 +120,7 @@ class EmulatedPico:
         self.nominal_us = []
         """Times at which the core commanded the edges of `pins`."""
         self.ticks_us = (0.0, 0.0)
+        self.stack_bytes = (0, 0)
         flash = image.with_settings(settings) if settings else image.flash
         setup = {"emulator": str(EMULATOR), "image": flash.hex(), "symbols": image.symbols, "offsets": image.offsets}
         setup |= {"seed": int.from_bytes(os.urandom(4)) if seed is None else seed + 1, "lateNanos": LATE_TICK_US * 1000}
@@ -192,6 +202,11 @@ class EmulatedPico:
         self._command("ticks")
         return self.ticks_us
 
+    def measure_stack(self):
+        """Return the bytes of the stack that were used since power-up, and those that there are."""
+        self._command("stack")
+        return self.stack_bytes
+
     # --- the emulator -------------------------------------------------------------------------------------------
 
     def _command(self, *values):
@@ -230,6 +245,9 @@ class EmulatedPico:
 
     def _on_ticks(self, longest_us, apart_us):
         self.ticks_us = longest_us, apart_us
+
+    def _on_stack(self, used, available):
+        self.stack_bytes = used, available
 
     def _on_rx_error(self, at_us, count):
         self._sink({"t_us": round(at_us), "event": "rx_error", "bad_frames": count})
