@@ -9,11 +9,17 @@ const AVAILABLE = 1 << 10, STALL = 1 << 11, DATA1 = 1 << 13, FIRST = 0x80, LAST 
 const CLEAR_FEATURE = 1, SET_CONFIGURATION = 9, DTR_RTS = 3;
 const at = (endpoint, way) => FIRST + 8 * endpoint + 4 * way;
 
+// The emulator's PLL oscillates at any frequency; the chip's at 750 to 1600 MHz.
+function checkClock({ frequency, postdiv1, postdiv2 }) {
+  const oscillator = frequency * postdiv1 * postdiv2;
+  if (frequency !== 48e6 || oscillator < 750e6 || oscillator > 1600e6) throw new Error(`USB: ${frequency} of ${oscillator} Hz`);
+}
+
 export class UsbHost {
   // state: { connected, awake, open, reads } of the computer, which outlives a reset of the chip; emit: takes records
   constructor(rp2040, USBCDC, state, emit) {
     const usb = rp2040.usbCtrl, { clock } = rp2040;
-    Object.assign(this, { usb, USBCDC, state, emit, memory: rp2040.usbDPRAMView });
+    Object.assign(this, { usb, pll: rp2040.pllUsb, USBCDC, state, emit, memory: rp2040.usbDPRAMView });
     this.toSend = [];
     this.request = []; // data of a control request
     this.written = new Map(); // buffer control words
@@ -29,7 +35,6 @@ export class UsbHost {
     usb.sendSetupPacket = (setup) => this.onSetup(setup);
     usb.writeDelayMicroseconds = 0;
     this.meet();
-    usb.onUSBEnabled = () => state.connected && usb.resetDevice();
     this.frames.schedule(FRAME_NANOS);
   }
 
@@ -39,6 +44,10 @@ export class UsbHost {
     const { usb } = this, cdc = (this.cdc = new this.USBCDC(usb));
     const setLines = cdc.cdcSetControlLineState.bind(cdc), onControl = usb.onEndpointWrite;
     cdc.cdcSetControlLineState = () => setLines(this.state.open ? DTR_RTS : 0);
+    usb.onUSBEnabled = () => {
+      checkClock(this.pll);
+      if (this.state.connected) usb.resetDevice();
+    };
     usb.onEndpointWrite = (endpoint, bytes) => {
       if (endpoint === DATA) this.emit("usb", Buffer.from(bytes).toString("hex"));
       else if (cdc.initialized) this.emit("control", Buffer.from(bytes).toString("hex"));

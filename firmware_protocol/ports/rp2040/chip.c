@@ -13,8 +13,8 @@ static void wait_until_set(uint32_t address, uint32_t bits) {
     }
 }
 
-/* Starts a PLL at 12 MHz × factor / divider / 2. */
-static void start_pll(uint32_t pll, uint32_t reset, uint32_t factor, uint32_t divider) {
+/* Starts a PLL at CRYSTAL_MHZ × factor, which must be 750 to 1600 MHz, divided by both dividers. */
+static void start_pll(uint32_t pll, uint32_t reset, uint32_t factor, uint32_t divider1, uint32_t divider2) {
     SET(RESETS) = reset;
     CLEAR(RESETS) = reset;
     wait_until_set(RESETS_DONE, reset);
@@ -22,7 +22,7 @@ static void start_pll(uint32_t pll, uint32_t reset, uint32_t factor, uint32_t di
     REGISTER(PLL_FBDIV(pll)) = factor;
     CLEAR(PLL_PWR(pll)) = BIT(0) | BIT(5);
     wait_until_set(PLL_CS(pll), BIT(31));
-    REGISTER(PLL_PRIM(pll)) = divider << 16 | 2u << 12;
+    REGISTER(PLL_PRIM(pll)) = divider1 << 16 | divider2 << 12;
     CLEAR(PLL_PWR(pll)) = BIT(3);
 }
 
@@ -48,8 +48,8 @@ static void start_clocks(void) {
     wait_until_set(CLK_REF_SELECTED, BIT(2));
     CLEAR(CLK_SYS_CTRL) = 1; /* leave the PLL, which may still run */
     wait_until_set(CLK_SYS_SELECTED, BIT(0));
-    start_pll(PLL_SYS, RESET_PLL_SYS, CLOCK_HZ / 1000000u * 12u / CRYSTAL_MHZ, 6);
-    start_pll(PLL_USB, RESET_PLL_USB, 40, 5);
+    start_pll(PLL_SYS, RESET_PLL_SYS, CLOCK_HZ / 1000000u * 12u / CRYSTAL_MHZ, 6, 2);
+    start_pll(PLL_USB, RESET_PLL_USB, 1200u / CRYSTAL_MHZ, 5, 5);
     REGISTER(CLK_SYS_CTRL) = 0; /* PLL as source, selected by the next line */
     SET(CLK_SYS_CTRL) = 1;
     wait_until_set(CLK_SYS_SELECTED, BIT(1));
