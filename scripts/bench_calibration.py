@@ -1,7 +1,7 @@
 """Calibration of the diagnosis's probabilities on recordings of 3 to 30 σ, from a generator without its code.
 
 Each call adds rows for the next seeds to a table, and prints everything that the table says. Report seeds start at
-6,000,000, development seeds at 9,500,000; nothing is tuned on the former.
+6,100,000, development seeds at 9,500,000; nothing is tuned on the former.
 """
 
 import csv
@@ -23,7 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from measuring import ROOT
 
-FIRST_SEEDS = {"dev": 9_500_000, "report": 6_000_000}
+FIRST_SEEDS = {"dev": 9_500_000, "report": 6_100_000}
 TABLE = ROOT / "docs" / "reference" / "calibration.csv"
 OPTIONS = {
     "--seeds": {"choices": tuple(FIRST_SEEDS), "default": "report"},

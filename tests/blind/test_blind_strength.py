@@ -115,8 +115,8 @@ def test_every_kind_meets_every_strength_and_other_tables_are_refused(tmp_path):
     assert len({task.seed for task in tasks}) == 105
     path = tmp_path / "table.csv"
     assert calibration.read_table(path) == []
-    calibration.write_table(path, "report", [build_row(6_000_007), build_row(6_000_003)])
-    assert [row["seed"] for row in calibration.read_table(path)] == ["6000003", "6000007"]
+    calibration.write_table(path, "report", [build_row(6_100_007), build_row(6_100_003)])
+    assert [row["seed"] for row in calibration.read_table(path)] == ["6100003", "6100007"]
     with pytest.raises(SystemExit, match="expected dev seeds"):
         next(calibration.measure("dev", 0.0, None, 0, 1, path))
     assert "2 recordings" in "".join(calibration.measure("report", 0.0, None, 0, 1, path))

@@ -21,6 +21,8 @@ from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS
 
 EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)
 """Bin edges of the time after a gate edge."""
+JOINED_BINS_S = np.array([2e-3, 1e-2, 1e-1])
+"""The same of the bins that join all groups, few enough for an effect of seven σ to be seen in them."""
 RUN_BINS = 4
 """Number of bins over a whole run, for slow effects."""
 RIDGE = 1e-4
@@ -181,7 +183,7 @@ def _find_bins(data: Dataset) -> Bins:
 def assign_bins(data: Dataset) -> Bins:
     """Return the bins: group × signal × pixel × (edge, logarithm of the time after it, time in the run).
 
-    Joined ones: signal × pixel × (direction of the edge, train or not, logarithm of the time after it, time in the run)
+    Joined ones: signal × pixel × (direction of the edge, train or not, logarithm of the time after it)
     """
     names: dict[tuple[object, ...], int] = {}
     joined_names: dict[tuple[object, ...], int] = {}
@@ -207,12 +209,13 @@ def assign_bins(data: Dataset) -> Bins:
             row < 0, -1, np.where(rising[np.maximum(row, 0)], 0, 1) + 2 * (0 if is_train else 1) * (row // 2)
         )
         weight = float(np.ptp(data.value[block.part])) / max(max_span[block.kind], 1e-300)
-        keys = zip(order.tolist(), edge_bin.tolist(), run_bin.tolist(), strict=True)
-        for at, key in enumerate(keys, start=block.part.start):
+        joined_bin = np.searchsorted(JOINED_BINS_S, after_s)
+        keys = zip(order.tolist(), edge_bin.tolist(), run_bin.tolist(), joined_bin.tolist(), strict=True)
+        for at, (*key, wide) in enumerate(keys, start=block.part.start):
             bin_key = (run.group, block.kind, block.pixel, *key)
             label[at] = names.setdefault(bin_key, len(names))
             if label[at] == len(joined):
-                joined_key = (block.kind, block.pixel, is_train, min(key[0], key[0] % 2), *key[1:])
+                joined_key = (block.kind, block.pixel, is_train, min(key[0], key[0] % 2), wide)
                 joined.append((joined_names.setdefault(joined_key, len(joined_names)), weight))
     weights = np.zeros((len(joined), len(joined_names)))
     for number, (column, weight) in enumerate(joined):
