@@ -12,7 +12,8 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "tests" / name) for name in ("", "conformance", "pico")]
 
 from bench import BRIGHT, Bench, act, here, set_input  # noqa: E402 - of the tests
-from emulated_pico import EmulatedPico, EmulatedUsbPico, PicoImage  # noqa: E402
+from emulated_pico import EmulatedPico, PicoImage  # noqa: E402
+from emulated_usb_pico import EmulatedUsbPico  # noqa: E402
 from virtual_board import PicoBoard, VirtualKind  # noqa: E402
 
 OUT = ROOT / "docs" / "pictures"

@@ -13,7 +13,8 @@ from virtual_board import EmulatedBoard, PicoBoard, VirtualKind  # noqa: E402
 
 sys.path.append(str(Path(__file__).parents[1] / "pico"))
 
-from emulated_pico import EmulatedPico, EmulatedUsbPico, PicoImage  # noqa: E402
+from emulated_pico import EmulatedPico, PicoImage  # noqa: E402
+from emulated_usb_pico import EmulatedUsbPico  # noqa: E402
 
 from c_core import InterruptedCBoard, SeededCBoard, build_library  # noqa: E402
 from firmware_ports import build_emulated_chip  # noqa: E402

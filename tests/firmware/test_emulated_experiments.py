@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from emulated_pico import EmulatedUsbPico, PicoImage
+from emulated_pico import PicoImage
+from emulated_usb_pico import EmulatedUsbPico
 
 from displays import DISPLAYS
 from optodrive.link.board_setup import build_board_requirements

@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 import pytest
 from bench import BRIGHT, CENTRE, Bench, act, here, set_input
-from emulated_pico import PWM_STEPS, EmulatedPico, EmulatedUsbPico, PicoImage
+from emulated_pico import PWM_STEPS, EmulatedPico, PicoImage
+from emulated_usb_pico import EmulatedUsbPico
 from virtual_board import PicoBoard, VirtualKind
 
 TICK_US = 100

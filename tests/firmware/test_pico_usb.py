@@ -11,7 +11,8 @@ from random import Random
 
 import pytest
 from bench import BRIGHT, Bench, here
-from emulated_pico import HOST_CLOSED, LOOP_US, PORT, SEND_BREAK, EmulatedPico, EmulatedUsbPico, PicoImage
+from emulated_pico import HOST_CLOSED, LOOP_US, PORT, EmulatedPico, PicoImage
+from emulated_usb_pico import SEND_BREAK, EmulatedUsbPico
 from virtual_board import PicoBoard, VirtualKind
 from wire_format import HOST, MessageReader, body_of, frame
 

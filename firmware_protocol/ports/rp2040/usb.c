@@ -3,6 +3,7 @@
 #include "chip.h"
 #include "outgoing.h"
 #include "registers.h"
+#include "usb_buffers.h"
 #include "usb_descriptors.h"
 
 #define CONTROL 0u
@@ -10,9 +11,6 @@
 #define BUS_LOST_US 4000u          /* a computer that is there and awake begins a frame every millisecond */
 #define LINE_CODING_BYTES 7u
 
-enum way { IN, OUT }; /* as the computer sees it */
-
-#define BUFFER_BIT(endpoint, way) BIT(2u * (endpoint) + (way))
 #define DPRAM(offset) (*(volatile uint8_t *)(USB_DPRAM + (offset)))
 #define CONTROL_BUFFER 0x100u
 #define IN_BUFFER 0x180u
@@ -40,7 +38,6 @@ static struct {
     size_t reply_length;
     uint8_t address, configuration;
     bool dtr, break_received;
-    uint32_t data1; /* BUFFER_BITs whose next packet is DATA1 */
     bool sending;
     uint32_t packet_at, packet_length; /* of received bytes */
     uint32_t frame;
@@ -50,35 +47,6 @@ static struct {
 
 /* 115200 baud, 8N1: a virtual port only keeps what it is told. */
 static uint8_t line_coding[LINE_CODING_BYTES] = {0x00, 0xc2, 0x01, 0x00, 0, 0, 8};
-
-/* --- buffers --- */
-
-/* Gives a buffer to the controller, whose slower clock must see the length before the bit that makes it available. */
-static void arm(uint32_t endpoint, enum way way, uint32_t length) {
-    uint32_t address = USB_BUFFER_CONTROL(endpoint, way), bit = BUFFER_BIT(endpoint, way);
-    uint32_t word = length | (way == IN ? USB_BUFFER_FULL : 0) | ((usb.data1 & bit) ? USB_BUFFER_DATA1 : 0);
-    usb.data1 ^= bit;
-    REGISTER(address) = word;
-    for (uint32_t k = 0; k < 4; k++) {
-        __asm volatile("nop\n\tnop\n\tnop");
-    }
-    REGISTER(address) = word | USB_BUFFER_AVAILABLE;
-}
-
-static void take_back(uint32_t endpoint, enum way way) {
-    REGISTER(USB_BUFFER_CONTROL(endpoint, way)) = 0;
-    CLEAR(USB_BUFFER_STATUS) = BUFFER_BIT(endpoint, way);
-}
-
-static bool pop_done(uint32_t endpoint, enum way way) {
-    bool done = REGISTER(USB_BUFFER_STATUS) & BUFFER_BIT(endpoint, way);
-    if (done) {
-        CLEAR(USB_BUFFER_STATUS) = BUFFER_BIT(endpoint, way);
-    }
-    return done;
-}
-
-static uint32_t received_length(uint32_t endpoint) { return REGISTER(USB_BUFFER_CONTROL(endpoint, OUT)) & USB_BUFFER_LENGTH; }
 
 /* --- control requests --- */
 
@@ -92,7 +60,7 @@ static void send_reply(void) {
     for (; n < USB_PACKET && usb.reply_length > 0; n++, usb.reply_length--) {
         DPRAM(CONTROL_BUFFER + n) = *usb.reply++;
     }
-    arm(CONTROL, IN, n);
+    buffer_arm(CONTROL, IN, n);
 }
 
 /* No reply fills its last packet, except one that the computer asked for in this length, so none needs an empty packet. */
@@ -106,7 +74,7 @@ static bool reply(const struct setup *setup, const uint8_t *bytes, size_t n) {
 
 static bool acknowledge(void) {
     usb.stage = STATUS_OF_REQUEST;
-    arm(CONTROL, IN, 0);
+    buffer_arm(CONTROL, IN, 0);
     return true;
 }
 
@@ -114,22 +82,23 @@ static void configure(uint8_t configuration) {
     usb.configuration = configuration;
     usb.dtr = usb.sending = false;
     usb.packet_at = usb.packet_length = 0;
-    usb.data1 &= ~(BUFFER_BIT(USB_DATA, IN) | BUFFER_BIT(USB_DATA, OUT));
-    take_back(USB_DATA, IN);
-    take_back(USB_DATA, OUT);
+    buffer_count_from(USB_DATA, IN, 0);
+    buffer_count_from(USB_DATA, OUT, 0);
+    buffer_take_back(USB_DATA, IN);
+    buffer_take_back(USB_DATA, OUT);
     if (configuration) {
-        arm(USB_DATA, OUT, USB_PACKET);
+        buffer_arm(USB_DATA, OUT, USB_PACKET);
     }
 }
 
 /* The packets of an endpoint count from DATA0 again; the buffer that the controller has is given anew. */
 static void restart(enum way way) {
     bool armed = way == IN ? usb.sending : usb.packet_length == 0;
-    uint32_t length = way == IN ? REGISTER(USB_BUFFER_CONTROL(USB_DATA, IN)) & USB_BUFFER_LENGTH : USB_PACKET;
-    usb.data1 &= ~BUFFER_BIT(USB_DATA, way);
+    uint32_t length = way == IN ? buffer_length(USB_DATA, IN) : USB_PACKET;
+    buffer_count_from(USB_DATA, way, 0);
     if (armed) {
-        take_back(USB_DATA, way);
-        arm(USB_DATA, way, length);
+        buffer_take_back(USB_DATA, way);
+        buffer_arm(USB_DATA, way, length);
     }
 }
 
@@ -175,7 +144,7 @@ static bool handle_class(const struct setup *setup) {
         return reply(setup, line_coding, sizeof line_coding);
     case SET_LINE_CODING:
         usb.stage = DATA_OF_REQUEST;
-        arm(CONTROL, OUT, USB_PACKET);
+        buffer_arm(CONTROL, OUT, USB_PACKET);
         return true;
     case SET_CONTROL_LINE_STATE:
         usb.dtr = setup->value & 1u;
@@ -204,9 +173,10 @@ static void handle_setup(void) {
         .index = (uint16_t)(DPRAM(4) | DPRAM(5) << 8),
         .length = (uint16_t)(DPRAM(6) | DPRAM(7) << 8),
     };
-    take_back(CONTROL, IN);
-    take_back(CONTROL, OUT);
-    usb.data1 |= BUFFER_BIT(CONTROL, IN) | BUFFER_BIT(CONTROL, OUT);
+    buffer_take_back(CONTROL, IN);
+    buffer_take_back(CONTROL, OUT);
+    buffer_count_from(CONTROL, IN, 1);
+    buffer_count_from(CONTROL, OUT, 1);
     uint32_t kind = setup.type >> 5 & 3u;
     if (!(kind == 0 ? handle_standard(&setup) : kind == 1 && handle_class(&setup))) {
         refuse();
@@ -218,8 +188,8 @@ static void on_control_sent(void) {
         send_reply();
     } else if (usb.stage == REPLY) {
         usb.stage = STATUS_OF_REPLY;
-        usb.data1 |= BUFFER_BIT(CONTROL, OUT);
-        arm(CONTROL, OUT, USB_PACKET);
+        buffer_count_from(CONTROL, OUT, 1);
+        buffer_arm(CONTROL, OUT, USB_PACKET);
     } else {
         usb.stage = IDLE;
         REGISTER(USB_ADDRESS) = usb.address;
@@ -232,7 +202,7 @@ static void on_control_received(void) {
     if (!is_data) {
         return;
     }
-    for (uint32_t k = 0; k < LINE_CODING_BYTES && k < received_length(CONTROL); k++) {
+    for (uint32_t k = 0; k < LINE_CODING_BYTES && k < buffer_length(CONTROL, OUT); k++) {
         line_coding[k] = DPRAM(CONTROL_BUFFER + k);
     }
     (void)acknowledge();
@@ -265,24 +235,24 @@ void usb_serve(void) {
         reset_device();
         return;
     }
-    if (pop_done(CONTROL, IN)) {
+    if (buffer_pop_done(CONTROL, IN)) {
         on_control_sent();
     }
-    if (pop_done(CONTROL, OUT)) {
+    if (buffer_pop_done(CONTROL, OUT)) {
         on_control_received();
     }
     if (REGISTER(USB_SIE_STATUS) & USB_SIE_SETUP) {
         CLEAR(USB_SIE_STATUS) = USB_SIE_SETUP;
         handle_setup();
     }
-    if (pop_done(USB_DATA, IN)) {
+    if (buffer_pop_done(USB_DATA, IN)) {
         usb.sending = false;
     }
-    if (pop_done(USB_DATA, OUT)) {
+    if (buffer_pop_done(USB_DATA, OUT)) {
         usb.packet_at = 0;
-        usb.packet_length = received_length(USB_DATA);
+        usb.packet_length = buffer_length(USB_DATA, OUT);
         if (usb.packet_length == 0) {
-            arm(USB_DATA, OUT, USB_PACKET);
+            buffer_arm(USB_DATA, OUT, USB_PACKET);
         }
     }
 }
@@ -300,7 +270,7 @@ bool usb_pop_break(void) {
 void usb_skip(void) {
     if (usb.packet_length > 0) {
         usb.packet_length = 0;
-        arm(USB_DATA, OUT, USB_PACKET);
+        buffer_arm(USB_DATA, OUT, USB_PACKET);
     }
 }
 
@@ -330,7 +300,7 @@ void usb_transmit(void) {
     chip_release_alarm();
     if (n > 0) {
         usb.sending = true;
-        arm(USB_DATA, IN, n);
+        buffer_arm(USB_DATA, IN, n);
     }
 }
 
