@@ -293,10 +293,10 @@ def test_the_port_that_opened_first_holds_the_board_until_it_closes(image, tmp_p
     assert host.board.states()[-1][0] == "RUNNING"
     assert host.board.is_gate_on()
     assert host.status().seq_errors == 0
+    assert chip.second == b""
     host.close()
     assert host.board.states()[-1] == ("DISARMED", "link lost")
     assert not chip.pins[-1][1]
-    assert chip.second == b""
     chip.advance(round(chip.chip_us) + LOOP_US)
     chip.send_second(HELLO)
     assert names(chip.second) == ["HELLO_REPLY"]
