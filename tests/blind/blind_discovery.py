@@ -13,7 +13,15 @@ capacity in a narrow range of temperatures. one_way_gas: the gas follows a falli
 one. slack_membrane: the first part of the displacement is missing.
 """
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+
+from blind_lab import Case
+from blind_score import wilson
+from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.pixel_discovery import discover_in_pixel
+from optodrive.lab.recording import read_recording
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,7 @@ EXPECTED = {
 class Answer:
     """What was found in one recording: of the strongest finding the node and the class, and the gain of all."""
 
+    seed: int
     hidden: str
     node: str
     kind: str
@@ -61,3 +70,45 @@ class Answer:
     def has_right_kind(self) -> bool:
         """Whether node and class of formula are right."""
         return self.has_right_node and any(kind in EXPECTED[self.hidden].kinds for kind in self.kind.split(" and "))
+
+
+def measure(case: Case) -> Answer:
+    """Return what is found in a recording. An instrument's line is subtracted before, and is the answer then."""
+    measurement = read_recording(case.path)
+    prior, epsilon, _ = build_prior(measurement, None)
+    found = discover_in_pixel(measurement, prior, epsilon)
+    strongest = max(found.findings, key=lambda finding: finding.gain, default=None)
+    node, kind, gain = "", "", 0.0
+    if strongest is not None:
+        node, kind, gain = strongest.node, strongest.kind, sum(finding.gain for finding in found.findings)
+    elif any(item.form == "line" for item in found.disturbances):
+        node, kind, gain = "sensor", "sine", math.nan
+    hidden = case.causes[-1] if case.causes else ""
+    return Answer(case.seed, hidden, node, kind, gain, found.error_before, found.error_after, found.elapsed_s)
+
+
+def format_table(answers: Iterable[Answer]) -> str:
+    """Return the scores, and what was found for each mechanism, as Markdown."""
+    every = list(answers)
+    hidden, nulls = [each for each in every if each.hidden], [each for each in every if not each.hidden]
+    gains = sorted(each.gain for each in hidden if not math.isnan(each.gain))
+    lines = ["| score | hits | aim |", "|---|---|---|"]
+    for name, hits, count, aim in (
+        ("right node", sum(each.has_right_node for each in hidden), len(hidden), "≥ 80 %"),
+        ("right class of formula", sum(each.has_right_kind for each in hidden), len(hidden), "≥ 60 %"),
+        ("false discoveries in nulls", sum(bool(each.node) for each in nulls), len(nulls), "0"),
+    ):
+        low, high = wilson(hits, count)
+        share = f"{hits / max(count, 1):.0%} ({low:.0%} to {high:.0%})"
+        lines.append(f"| {name} | {hits}/{count}, {share} | {aim} |")
+    if gains:
+        lines.append(f"| held-out gain, median | {gains[len(gains) // 2]:.2f} of {len(gains)} | ≥ 0.8 |")
+    seconds = sorted(each.elapsed_s for each in every)
+    lines += [f"| time, median and largest | {seconds[len(seconds) // 2]:.0f} s, {seconds[-1]:.0f} s | ≤ 5 min |", ""]
+    lines += ["| hidden | found: node, class, held-out gain |", "|---|---|"]
+    for name in EXPECTED:
+        own = [each for each in hidden if each.hidden == name]
+        found = "; ".join(f"{each.node} {each.kind} {each.gain:.2f}" if each.node else "nothing" for each in own)
+        if own:
+            lines.append(f"| {name} | {found} |")
+    return "\n".join(lines) + "\n"

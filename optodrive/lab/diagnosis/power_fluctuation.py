@@ -56,11 +56,11 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
     return excess / float(np.sqrt(variance)) if variance > 0.0 else 0.0
 
 
-def slice_pulses(pulses: FloatArray) -> FloatArray:
+def slice_pulses(pulses: FloatArray, slice_s: float = SLICE_S) -> FloatArray:
     """Return pulses [k, 4] cut into equal slices, MAX_SLICES at most."""
     rows = []
     for start_s, width_s, power_w, pixel in pulses.tolist():
-        count = max(1, round(width_s / SLICE_S))
+        count = max(1, round(width_s / slice_s))
         rows += [[start_s + k * width_s / count, width_s / count, power_w, pixel] for k in range(count)]
     slices = np.array(rows, dtype=np.float64).reshape(-1, 4)
     return slices[:: max(1, ceil(len(slices) / MAX_SLICES))]

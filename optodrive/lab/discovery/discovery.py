@@ -9,7 +9,7 @@ without it, by more than the noise can explain. 5. Steps 2 to 4 are repeated wit
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,12 +27,11 @@ from optodrive.lab.discovery.fitting import (
     free_run_rmse,
     output_sizes,
 )
-from optodrive.lab.discovery.formula_text import build_terms, describe_term
-from optodrive.lab.discovery.model import Curve, Discovery, Finding, OdeModel, Record
-from optodrive.lab.discovery.proposals import Proposal, choose_simplest
+from optodrive.lab.discovery.formula_text import build_terms
+from optodrive.lab.discovery.model import Discovery, OdeModel, Record
+from optodrive.lab.discovery.proposals import Proposal, Step, choose_simplest, describe_steps
 from optodrive.lab.discovery.screening import (
     Filtered,
-    Place,
     Screened,
     list_places,
     rank_formulas,
@@ -56,6 +55,8 @@ PLACES, PLACES_FROM_REST, FORMULAS = 3, 7, 5
 
 A large effect leads free runs away from where it acts, and the first-order comparison of places with them.
 """
+ATTEMPTS = 3
+"""Places whose best formula is judged by held-out free runs, one after another, until one predicts them."""
 REFINEMENTS = 2
 """How often formulas are ranked again along the free runs with the best one."""
 MIN_ERROR = 1e-3
@@ -67,19 +68,13 @@ MIN_FURTHER_GAIN, MIN_FURTHER_GAIN_WHITE = 0.01, 0.1
 
 Where it is known a little more than the first formula's form is seen, which is no term of its own.
 """
+MIN_GAIN_WHITE = 0.5
+"""Share of the avoidable error that the first term removes at least, where noise is known: one that leaves more than it
+removes is not what is missing."""
 MAX_P = 1e-3
 MIN_SQUARES = 12.0
 """Squares in units of noise that a curve removes in cross-validation, below which no formula is fitted."""
 Progress = Callable[[str, float], None]
-
-
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """An accepted proposal, the share of the avoidable held-out error that it removes, and its probability."""
-
-    proposal: Proposal
-    gain: float
-    probability: float
 
 
 def discover(
@@ -121,14 +116,17 @@ class _Search:
         """Return the answer."""
         base = self._fit_base()
         base_rmse = rmse = self._held_out_rmse(base)
-        point, found = base, list[_Step]()
+        point, found = base, list[Step]()
         for number in range(MAX_TERMS):
             self.progress(f"term {number + 1}", 0.2 + 0.16 * number)
             if float(np.max(rmse / self.sizes)) < MIN_ERROR:
                 break
             if found and self._share_left(base_rmse, rmse) < self.min_further_gain:
                 break
-            proposal, probability = self._extend(point, MIN_FURTHER_REDUCTION if found else MIN_REDUCTION)
+            min_reduction = MIN_FURTHER_REDUCTION if found else MIN_REDUCTION
+            if self.is_white and not found:
+                min_reduction = max(min_reduction, MIN_GAIN_WHITE * (1.0 - 1.0 / max(float(rmse[0]), 1.0)))
+            proposal, probability = self._extend(point, min_reduction)
             if proposal is None:
                 break
             shorter_rmse = self._held_out_rmse(proposal.point)
@@ -137,12 +135,13 @@ class _Search:
             if found and gain < self.min_further_gain:
                 break
             point, rmse = proposal.point, shorter_rmse
-            found.append(_Step(proposal, gain, probability))
+            found.append(Step(proposal, gain, probability))
         self.progress("final fit", 0.85)
         everything = [*self.data.fitted, *self.data.held_out]
         final_base = self._fit_free(base, everything)
         final = self._fit_free(point, everything) if found else final_base
-        findings = self._report(final, found)
+        filtered = self._filter(final, 0.0 if self.model.from_rest else TIGHTNESS[1])
+        findings = describe_steps(self.model, final, found, filtered, self.few.fitted)
         self.progress("done", 1.0)
         simulation = self.simulation
 
@@ -259,25 +258,34 @@ class _Search:
                 terms = point.terms.extend(build_terms(candidate, screened.nodes))
                 longer, loss = self._fit_filtered(base.with_terms(terms), filtered, evaluations)
                 proposals.append(Proposal(screened, candidate, longer, loss))
-        proposals.sort(key=lambda p: p.loss)
-        if not proposals:
-            return None, 0.0
-        if self.model.from_rest:
-            for _ in range(REFINEMENTS):
-                proposals += self._refine(point, min(proposals, key=lambda p: p.loss))
-        chosen = choose_simplest(proposals, base_loss)
+        for _ in range(ATTEMPTS if self.model.from_rest else 1):
+            if not proposals:
+                break
+            if self.model.from_rest:
+                for _ in range(REFINEMENTS):
+                    proposals += self._refine(point, min(proposals, key=lambda p: p.loss))
+            chosen = choose_simplest(proposals, base_loss)
+            chosen, p_value = self._judge(point, base, filtered, chosen, min_reduction)
+            if p_value <= MAX_P:
+                return chosen, compute_probability(p_value)
+            proposals = [each for each in proposals if each.candidate.at != chosen.candidate.at]
+        return None, 0.0
+
+    def _judge(
+        self, point: Point, base: Point, filtered: Sequence[Filtered], chosen: Proposal, min_reduction: float
+    ) -> tuple[Proposal, float]:
+        """Return the proposal as fitted in free run, and its p value, 1 if held-out free runs gain too little."""
         p_value = find_p_value(self.simulation, self.few, filtered, base, chosen.point)
         if p_value > MAX_P:
-            return None, 0.0
+            return chosen, 1.0
         # Numbers that fit one step ahead need not fit free runs best; those of a chaotic system fit only the former.
         masks, records = self.data.masks(self.data.fitted), self.data.records
         trials = [chosen.point, self._fit_free(chosen.point, self.data.fitted, 8)]
         losses = [np.sum((free_run_rmse(self.simulation, records, p, masks) / self.sizes) ** 2) for p in trials]
-        chosen = replace(chosen, point=trials[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))])
-        before, after = self._held_out_rmse(point) / self.sizes, self._held_out_rmse(chosen.point) / self.sizes
-        if not np.sum(after**2) < np.sum(before**2) * (1.0 - min_reduction) ** 2:
-            return None, 0.0
-        return chosen, compute_probability(p_value)
+        fitted = replace(chosen, point=trials[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))])
+        before, after = self._held_out_rmse(point) / self.sizes, self._held_out_rmse(fitted.point) / self.sizes
+        is_better = np.sum(after**2) < np.sum(before**2) * (1.0 - min_reduction) ** 2
+        return fitted, p_value if is_better else 1.0
 
     def _refine(self, point: Point, best: Proposal) -> list[Proposal]:
         """Return formulas at the place of the best one, ranked along its own free runs, nearer to the data."""
@@ -316,37 +324,3 @@ class _Search:
             and (screened := screen(filtered, place, self.few.fitted, len(self.model.states))) is not None
         ]
         return filtered, sorted(found, key=lambda each: each.loss)
-
-    def _report(self, final: Point, steps: Sequence[_Step]) -> tuple[Finding, ...]:
-        """Return one finding per place and variable, with the numbers of the final fit.
-
-        The curve is the formula plus what the data still ask for there; its band is that of a curve without a formula.
-        """
-        groups: dict[Place, list[int]] = {}
-        for row, step in enumerate(steps):
-            groups.setdefault(step.proposal.candidate.at, []).append(row)
-        names, findings = self.model.variable_names, []
-        filtered = self._filter(final, 0.0 if self.model.from_rest else TIGHTNESS[1])
-        for at, rows in groups.items():
-            screened = screen(filtered, at, self.few.fitted, len(self.model.states))
-            curve = (steps[rows[0]].proposal.screened if screened is None else screened).curve
-            involved = (names[at.variable], *((names[at.factor],) if at.factor >= 0 else ()))
-            numbers = [final.terms.values[row] for row in rows]
-            forms = [steps[row].proposal.candidate.form for row in rows]
-            parts = [n[0] * form.evaluate(curve.x, n[1], n[2]) for form, n in zip(forms, numbers, strict=True)]
-            values = np.sum(parts, axis=0)
-            by_size = np.argsort([-np.ptp(part) for part in parts], kind="stable")
-            forms, numbers = [forms[k] for k in by_size], [numbers[k] for k in by_size]
-            texts = [describe_term(form, n, *involved) for form, n in zip(forms, numbers, strict=True)]
-            findings.append(
-                Finding(
-                    self.model.place_names[at.place],
-                    involved,
-                    Curve(curve.x, values + curve.y, values + curve.low, values + curve.high),
-                    " + ".join(texts).replace("+ -", "- "),
-                    " and ".join(dict.fromkeys(form.kind for form in forms)),
-                    min(1.0, sum(steps[row].gain for row in rows)),
-                    max(steps[row].probability for row in rows),
-                )
-            )
-        return tuple(findings)

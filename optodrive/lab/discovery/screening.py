@@ -199,6 +199,9 @@ def _build_grams(
     size = filtered[0].columns.shape[2] + len(nodes) + 1
     grams = np.zeros((len(blocks), size, size))
     for each in filtered:
+        own = [row for row, block in enumerate(blocks) if (each.block == block).any()]
+        if not own:
+            continue
         hats, arriving = (
             hat_functions(values[:, at.variable], nodes) * (values[:, at.factor, None] if at.factor >= 0 else 1.0)
             for values in (each.variables, each.arriving)
@@ -210,8 +213,8 @@ def _build_grams(
         change = line.propagate(forcing, direct[:, None] * hats[:, None, :], np.zeros((n, len(nodes))))
         error = np.nan_to_num(each.record.outputs - line.predicted)[:, :, None]
         joined = weigh(each.record, np.concatenate([each.columns, change, error], axis=2), each.weights)
-        for row, block in enumerate(blocks):
-            part = joined[each.block == block].reshape(-1, size)
+        for row in own:
+            part = joined[each.block == blocks[row]].reshape(-1, size)
             grams[row] += part.T @ part
     return grams
 

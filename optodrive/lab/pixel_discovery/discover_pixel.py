@@ -6,7 +6,7 @@ import numpy as np
 
 from optodrive.core.types.discrepancy import InstrumentDisturbance
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset, build_dataset
+from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, build_dataset
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, remove_disturbances
 from optodrive.lab.diagnosis.model_selection import has_replicate_excess
@@ -39,11 +39,15 @@ def discover_in_pixel(
     parts = [part for part in build_dataset(measurement).split_subsystems() if set(part.kinds) <= set(PIXEL_KINDS)]
     if not parts:
         return PixelDiscovery((), (), "", 0.0, 0.0, {}, perf_counter() - began_s)
-    problem, base, disturbances = _fit_without_disturbances(parts[0], prior, epsilon)
+    problem, base = fit_nominal(parts[0], prior, epsilon)
     if has_replicate_excess(problem):
-        # The mean over repeats, which differ, is that of no pixel.
+        # The mean over repeats, which differ, is that of no pixel. Missed pulses would pass for hops of an instrument.
         found, errors = find_random_light(problem, base)
-        return PixelDiscovery(found, disturbances, OTHER_SIGNALS, *errors, {}, perf_counter() - began_s)
+        if found:
+            return PixelDiscovery(found, (), OTHER_SIGNALS, *errors, {}, perf_counter() - began_s)
+    problem, base, disturbances = _subtract_disturbances(problem, base)
+    if has_replicate_excess(problem):
+        return PixelDiscovery((), disturbances, "", 0.0, 0.0, {}, perf_counter() - began_s)
     experiments = build_records(problem, base)
     held_out = choose_held_out(experiments)
     if len(experiments) < MIN_EXPERIMENTS or not held_out:
@@ -66,15 +70,15 @@ def discover_in_pixel(
     )
 
 
-def _fit_without_disturbances(
-    data: Dataset, prior: BaseParameterPrior, epsilon: float
+def _subtract_disturbances(
+    problem: FitProblem, base: ModelFit
 ) -> tuple[FitProblem, ModelFit, tuple[InstrumentDisturbance, ...]]:
     """Return noise and nominal fit without disturbances of the instruments, and these."""
-    problem, base = fit_nominal(data, prior, epsilon)
+    data, epsilon = problem.data, problem.epsilon
     sensitivity = compute_jitter_sensitivity(data, base.point, epsilon, base.prediction)
     disturbances, added = find_disturbances(data, data.value - base.prediction, sensitivity, problem.noise)
     if disturbances:
-        problem, base = fit_nominal(remove_disturbances(data, added), prior, epsilon)
+        problem, base = fit_nominal(remove_disturbances(data, added), problem.prior, epsilon)
     return problem, base, disturbances
 
 

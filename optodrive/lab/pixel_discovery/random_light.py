@@ -1,8 +1,8 @@
 """Light that changes at random within runs, other in every repeat: which no term of states and time can describe.
 
 Theory of operation. Pulses are cut into slices of about the thermal time constant. The power of every slice is fitted
-to the temperature of its run, and judged by the displacement and force that it predicts, which no fit has seen: light
-moves all signals together, an instrument only its own.
+to the temperature of its run, and judged by the displacement and force that it predicts, of which a fit has seen one
+factor each: light moves all signals together, an instrument only its own.
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +18,7 @@ from optodrive.lab.discovery.evidence import compute_probability
 from optodrive.lab.pixel_discovery.findings import PixelFinding
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
+SLICE_S = 6e-3
 POWER_SIGMA = 0.5
 """Prior σ of a slice's relative power: a missed pulse has none."""
 MIN_GAIN = 0.5
@@ -29,11 +30,13 @@ DARK = 0.3
 
 @dataclass(frozen=True, eq=False)
 class _RunPowers:
-    """Relative powers [k] of the slices of one run, with errors of its other signals in units of noise, [n] each."""
+    """Relative powers [k] of the slices of one run, and its other signals in units of noise.
+
+    signals: by kind, [n, 3]: measured, and predicted from one power and from those of all slices; without zeros
+    """
 
     powers: FloatArray
-    before: FloatArray
-    after: FloatArray
+    signals: dict[int, FloatArray]
 
 
 def find_random_light(problem: FitProblem, base: ModelFit) -> tuple[tuple[PixelFinding, ...], tuple[float, float]]:
@@ -46,12 +49,13 @@ def find_random_light(problem: FitProblem, base: ModelFit) -> tuple[tuple[PixelF
     ]
     if not runs:
         return (), (1.0, 1.0)
-    before, after = (np.concatenate([getattr(run, name) for run in runs]) for name in ("before", "after"))
+    errors = _compute_errors(runs)
+    before, after = np.concatenate([each[:, 0] for each in errors]), np.concatenate([each[:, 1] for each in errors])
     rms = float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2)))
     gain = (rms[0] - rms[1]) / max(rms[0] - min(1.0, rms[1]), 1e-9)
-    products = np.array([float(((run.before - run.after) * run.before).sum()) for run in runs])
-    errors = np.array([float(((run.before - run.after) * run.after).sum()) for run in runs])
-    p_value = 0.5 * erfc(float(products.sum()) / sqrt(2.0 * max(float((errors**2).sum()), 1e-300)))
+    score = sum(float(((each[:, 0] - each[:, 1]) * each[:, 0]).sum()) for each in errors)
+    squares = sum(float(((each[:, 0] - each[:, 1]) * each[:, 1]).sum()) ** 2 for each in errors)
+    p_value = 0.5 * erfc(score / sqrt(2.0 * max(squares, 1e-300)))
     if gain < MIN_GAIN or p_value > MAX_P:
         return (), rms
     powers = np.concatenate([run.powers for run in runs])
@@ -69,10 +73,10 @@ def _fit_powers(
     if numbers[0] < 0 or not judged:
         return None
     data, pixel = problem.data, base.point.pixel(problem.epsilon)
-    slices = slice_pulses(experiment.pulses)
+    slices = slice_pulses(experiment.pulses, SLICE_S)
     nothing = ActiveTerms.from_values({})
-    signals = [simulate_signals(replace(experiment, pulses=part[None, :]), pixel, nothing) for part in slices]
-    responses = [np.column_stack([each[kind] for each in signals]) for kind in PIXEL_KINDS]
+    parts = [simulate_signals(replace(experiment, pulses=part[None, :]), pixel, nothing) for part in slices]
+    responses = [np.column_stack([each[kind] for each in parts]) for kind in PIXEL_KINDS]
     residual, noise = data.value - base.prediction, problem.noise
     measured = residual[data.blocks[numbers[0]].part]
     columns = np.column_stack([responses[0], np.full(len(measured), noise.baseline_sigma[0])])
@@ -82,12 +86,28 @@ def _fit_powers(
     changes = np.linalg.solve(matrix, columns.T @ measured / white**2)[:-1]
     whole = responses[0].sum(axis=1)
     common = np.full(len(slices), float(whole @ measured / (whole @ whole)))
-    before, after = list[FloatArray](), list[FloatArray]()
+    signals = dict[int, FloatArray]()
     for kind in judged:
-        for powers, out in ((common, before), (changes, after)):
-            error = residual[data.blocks[numbers[kind]].part] - responses[kind] @ powers
-            out.append((error - error.mean()) / noise.coloured[kind].white)
-    return _RunPowers(1.0 + changes, np.concatenate(before), np.concatenate(after))
+        part = data.blocks[numbers[kind]].part
+        columns = np.column_stack(
+            [data.value[part], responses[kind] @ (1.0 + common), responses[kind] @ (1.0 + changes)]
+        )
+        signals[kind] = (columns - columns.mean(axis=0)) / noise.coloured[kind].white
+    return _RunPowers(1.0 + changes, signals)
+
+
+def _compute_errors(runs: list[_RunPowers]) -> list[FloatArray]:
+    """Return the errors [n, 2] of each run's other signals, each predicted with one factor common to all runs."""
+    errors = [list[FloatArray]() for _ in runs]
+    for kind in PIXEL_KINDS[1:]:
+        own = [(run.signals[kind], out) for run, out in zip(runs, errors, strict=True) if kind in run.signals]
+        if not own:
+            continue
+        joined = np.concatenate([signal for signal, _ in own])
+        factors = (joined[:, 1:] * joined[:, :1]).sum(axis=0) / (joined[:, 1:] ** 2).sum(axis=0)
+        for signal, out in own:
+            out.append(signal[:, :1] - factors * signal[:, 1:])
+    return [np.concatenate(out) for out in errors]
 
 
 def _describe(powers: FloatArray) -> str:
