@@ -281,12 +281,20 @@ void board_on_link_lost(struct board *b, uint64_t now_us) {
 
 /* --- power-up --- */
 
+/* A port that states more than its tables hold would have the guards write beyond them. */
+static uint16_t bound_by(uint16_t stated, uint32_t held) {
+    return stated < held ? stated : (uint16_t)held;
+}
+
 void board_init(struct board *b, const struct board_hal *hal, const struct board_config *config,
                 enum reset_cause cause, uint64_t now_us) {
     hal->set_gate(hal->context, false, 0); /* before anything else */
     memset(b, 0, sizeof *b);
     b->hal = *hal;
     b->config = *config;
+    b->config.queue_points = bound_by(config->queue_points, BOARD_QUEUE_POINTS);
+    b->config.cells = bound_by(config->cells, BOARD_CELLS);
+    b->config.window_pulses = bound_by(config->window_pulses, BOARD_PULSES);
     b->limits = config->limits;
     b->now_us = b->epoch_us = b->settled_us = b->last_tick_us = now_us;
     b->reset_cause = (uint8_t)cause;

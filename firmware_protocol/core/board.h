@@ -75,8 +75,8 @@ struct board_config {
     uint8_t uid[12];
     uint32_t firmware;
     uint16_t cell_codes;   /* at least 1 */
-    uint16_t queue_points; /* DATA_ITEMS_MAX to BOARD_QUEUE_POINTS */
-    uint16_t cells, window_pulses; /* 1 to BOARD_CELLS, 1 to BOARD_PULSES */
+    uint16_t queue_points; /* at least DATA_ITEMS_MAX; BOARD_QUEUE_POINTS where it states more */
+    uint16_t cells, window_pulses; /* at least 1; BOARD_CELLS and BOARD_PULSES where they state more */
     bool key_edge;
 };
 

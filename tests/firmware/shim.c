@@ -99,8 +99,8 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
     s->config.firmware = 0x00010000u;
     s->config.cell_codes = (uint16_t)cell_codes;
     s->config.queue_points = (uint16_t)queue_points;
-    s->config.cells = (uint16_t)(cells < BOARD_CELLS ? cells : BOARD_CELLS);
-    s->config.window_pulses = (uint16_t)(window_pulses < BOARD_PULSES ? window_pulses : BOARD_PULSES);
+    s->config.cells = (uint16_t)cells;
+    s->config.window_pulses = (uint16_t)window_pulses;
     s->config.key_edge = key_edge;
     return s;
 }

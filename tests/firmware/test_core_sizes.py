@@ -21,7 +21,7 @@ SIZES = ("BOARD_CELLS=4", "BOARD_PULSES=8", "BOARD_QUEUE_POINTS=24", "BOARD_RECO
 def ready(libraries, tmp_path):
     """Return a function of limits for a host that has armed the core with small tables."""
     bench = Bench(VirtualKind("c", partial(SeededCBoard, libraries(0, *SIZES))), tmp_path)
-    return partial(bench.ready, queue_points=24, **PATIENT)
+    return partial(bench.ready, **PATIENT)
 
 
 def row(count, dark_us=0):
