@@ -34,10 +34,7 @@ PLACES = {
 def build_lines(discovery: PixelDiscovery) -> list[str]:
     """Return the lines of text."""
     if not discovery.judged_by:
-        return [
-            "No missing term was sought: repeats of one experiment differ by more than noise, or too few experiments "
-            "light a measured pixel alone."
-        ]
+        return ["No missing term was sought: too few experiments light a measured pixel alone."]
     judged = f"on {discovery.judged_by}"
     if not discovery.findings:
         return [
