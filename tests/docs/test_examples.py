@@ -48,6 +48,7 @@ ELSEWHERE = {
     "optodrive plan frames.json --pixel-map": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive simulate sweep/": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive discover": "tests/accuracy/test_discovery.py",
+    "optodrive diagnose recording.h5 --discover": "tests/accuracy/test_pixel_discovery.py",
     "optodrive diagnose film.h5 --out cluster/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
 }
 """Beginnings of examples that are not run here, and where they are."""
@@ -81,7 +82,11 @@ DRAWINGS = {
     "docs/explanation/architecture.md": ("FrameSequence →", "core < device"),
     "docs/how-to/reach-it-from-the-network.md": ("lab.example {", "server {"),
     "docs/how-to/wire-a-board.md": ("PC ── USB",),
-    "docs/how-to/discover-a-term.md": ("from optodrive.lab.discovery import ", "dspeed/dt lacks "),
+    "docs/how-to/discover-a-term.md": (
+        "from optodrive.lab.discovery import ",
+        "dspeed/dt lacks ",
+        "A term that nobody wrote down",
+    ),
     "docs/reference/recordings.md": ("/        ", "recording.toml   "),
 }
 """Beginnings of indented blocks that are drawings, layouts of files or configurations of other programs."""
