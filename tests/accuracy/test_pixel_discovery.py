@@ -9,7 +9,6 @@ import pytest
 from labs import lab
 from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.pixel_discovery import discover_in_pixel
 from optodrive.lab.recording import write_recording
 
 SLACK_M = 4e-5
@@ -28,11 +27,14 @@ def lab_with_slack(seed):
     return Measurement(tuple(runs))
 
 
-def test_nothing_is_found_where_nothing_is_hidden():
-    found = discover_in_pixel(lab(31, {}))
-    assert found.findings == ()
-    assert found.judged_by == "held-out experiments: middle"
-    assert found.error_before == found.error_after == pytest.approx(1.0, abs=0.2)
+def test_nothing_is_found_where_nothing_is_hidden(tmp_path, capsys):
+    path = tmp_path / "nothing.h5"
+    write_recording(path, lab(31, {}))
+    assert run(["diagnose", str(path), "--discover", "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)["discovery"]
+    assert found["findings"] == []
+    assert found["judged_by"] == "held-out experiments: middle"
+    assert found["error_before"] == found["error_after"] == pytest.approx(1.0, abs=0.2)
 
 
 def test_an_unexplained_recording_is_searched_for_the_term_that_nobody_wrote_down(tmp_path, capsys):
