@@ -122,6 +122,7 @@ class Term:
     gas time constant; cannot_add_heat, whether it never makes anything hotter, see also `bound_heat_gain`.
     Diagnosis: signature, where the effect shows in recorded data, empty if it is no possible cause of a discrepancy;
     subsystems, the kinds of recording that can show it; varies_between_runs, whether repeats of one drive differ by it;
+    is_exact, whether the effect has no other form than the term's, but for its share in each signal;
     is_linear and fit_every_start as in `Hypothesis`; detection_limit, replaces the computed smallest visible effect.
     """
 
@@ -141,6 +142,7 @@ class Term:
     signature: str = ""
     subsystems: tuple[str, ...] = ("pixels",)
     varies_between_runs: bool = False
+    is_exact: bool = False
     is_linear: bool = False
     fit_every_start: bool = False
     detection_limit: str = ""

@@ -4,7 +4,7 @@ A real droop need not follow the power, ageing need not be uniform, a rise need 
 depend on temperature, a gas need not follow the warmth of a wall. The residuals of a fitted cause are therefore first
 compared with the cause's own effect, modulated by power, temperature, dose and session time, with another share of it
 in each signal, with its term at other time constants and with its other hypotheses; only then is a second cause
-considered.
+considered. A late clock is late: only its share in each signal is free.
 """
 
 from collections.abc import Sequence
@@ -19,6 +19,7 @@ from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobi
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 from optodrive.physics.hypothesis import Hypothesis
+from optodrive.physics.terms import discover_terms
 
 MIN_POWER_FRACTION = 0.02
 """Lower limit of the relative power in the modulation by its inverse."""
@@ -49,13 +50,15 @@ def compute_discrepancy_basis(
     for item in hypotheses:
         others = {key: values for key, values in terms.items() if key != item.key}
         effect = fitted.prediction - predict(data, ParameterPoint(fitted.point.base, others), problem.epsilon)
+        columns += _separate_signals(data, effect)
+        if discover_terms()[item.key].is_exact:
+            continue
         columns += [
             effect * power,
             effect / np.maximum(power, MIN_POWER_FRACTION),
             effect * dose,
             effect * session,
             effect * heat,
-            *_separate_signals(data, effect),
         ]
         alternatives: list[ParameterPoint] = []
         for other in all_hypotheses:

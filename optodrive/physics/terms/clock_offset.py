@@ -18,6 +18,7 @@ class ClockOffset(Term):
         TermParameter("mirrors", "s", 1e-4, -5e-3, 5e-3, "as above", neutral=0.0),
     )
     cannot_add_heat = True
+    is_exact = True
     subsystems = ("pixels", "mirrors")
     signature = "every edge, in proportion to the slope"
 
