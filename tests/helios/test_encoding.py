@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from helios.bench import build_display, build_frame, build_train, build_verified
@@ -47,8 +47,17 @@ def sequences(draw):
     return FrameSequence(tuple(frames), trains)
 
 
+def build_cut_at_its_end():
+    """Return a train with a pulse whose last lit point is the last one of a frame, which is blank."""
+    target = np.zeros(16)
+    target[0] = 1.0288831538445006e-05
+    train = PulseTrain(0, 0.6590443679293911, 0.3, 0.0218, 1e-3, 1.0)
+    return FrameSequence((TactileFrame("f0", 0.0, 0.4, target),), (train,))
+
+
 @settings(max_examples=60)
 @given(sequences(), st.sampled_from([20_000, 33_333, 40_000, 50_000]))
+@example(build_cut_at_its_end(), 33_333)
 def test_emission_lies_within_the_plan_and_the_energy_loss_is_bounded(sequence, rate):
     display = build_display(points_per_s=rate)
     plan, verified = build_verified(display, sequence)
@@ -59,13 +68,15 @@ def test_emission_lies_within_the_plan_and_the_energy_loss_is_bounded(sequence, 
     assert (pulses.power_w <= plan.power_w[row] * (1 + 1e-9)).all()
     assert (np.abs(pulses.x_rad - plan.x_rad[row]) <= 0.5001 * scale.rad_per_code).all()
     assert (np.abs(pulses.y_rad - plan.y_rad[row]) <= 0.5001 * scale.rad_per_code).all()
+    blank_s = (np.cumsum([len(parse_points(frame.data)[0]) for frame in verified.frames]) - 1) * scale.point_s
     touching = np.append(plan.start_s[1:] - plan_end_s[:-1] < scale.point_s, False)
     for index in np.flatnonzero(plan.power_w >= scale.full_power_w / 255):
         parts = row == index
         assert pulses.start_s[parts].min() < plan.start_s[index] + scale.point_s
         assert end_s[parts].max() > plan_end_s[index] - (2 + parts.sum() + touching[index]) * scale.point_s
         on_s = pulses.width_s[parts].sum()
-        assert on_s > plan.width_s[index] - (1 + parts.sum() + touching[index]) * scale.point_s - 1e-9
+        cuts = ((blank_s > plan.start_s[index] - 1e-9) & (blank_s + scale.point_s < plan_end_s[index] + 1e-9)).sum()
+        assert on_s > plan.width_s[index] - (2 + cuts + touching[index]) * scale.point_s - 1e-9
         assert pulses.power_w[parts].min() > plan.power_w[index] - scale.full_power_w / 255
     for frame in verified.frames:
         points, points_per_s = parse_points(frame.data)
