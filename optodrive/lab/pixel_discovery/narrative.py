@@ -5,6 +5,7 @@ from typing import Any
 
 from optodrive.core.quantity import format_quantity
 from optodrive.core.svg_plot import Axis, Series, draw_plot
+from optodrive.lab.diagnosis.narrative import format_probability
 from optodrive.lab.discovery import Curve
 from optodrive.lab.pixel_discovery.findings import NODES, PixelDiscovery, PixelFinding
 
@@ -39,15 +40,18 @@ def build_lines(discovery: PixelDiscovery) -> list[str]:
     if not discovery.findings:
         return [
             "No missing term was found: nothing predicts better than the nominal pixel, which is off by "
-            f"{discovery.error_before:.2f} of the noise {judged}."
+            f"{discovery.error_before:.2f} times the noise {judged}."
         ]
     lines = [line for finding in discovery.findings for line in _describe(finding)]
-    error = f"{discovery.error_before:.2f} of the noise before, {discovery.error_after:.2f} after"
-    return [*lines, f"Error {judged}: {error}."]
+    before, after = discovery.error_before, discovery.error_after
+    return [
+        *lines,
+        f"The error is {before:.2f} times the noise without it, {after:.2f} times with it; judged {judged}.",
+    ]
 
 
 def _describe(finding: PixelFinding) -> list[str]:
-    gain = f"  removes {finding.gain:.0%} of the avoidable error; probability {finding.probability:.4f}"
+    gain = f"  removes {finding.gain:.0%} of the avoidable error; probability {format_probability(finding.probability)}"
     if finding.curve is None:
         return [
             f"A term that nobody wrote down: {NODES[finding.node]} changes at random, other in every repeat.",
