@@ -41,15 +41,13 @@ def doctor(
         _report_changes(examination, json)
         return
     findings = examination()
-    problems = sum(finding.status == "problem" for finding in findings)
-    warnings = sum(finding.status == "warning" for finding in findings)
+    counts = {f"{status}s": sum(each.status == status for each in findings) for status in ("problem", "warning")}
     if json:
-        counts = {"problems": problems, "warnings": warnings}
-        print_json({"ok": not problems, **counts, "findings": [finding._asdict() for finding in findings]})
+        print_json({"ok": not counts["problems"], **counts, "findings": [finding._asdict() for finding in findings]})
     else:
         _print_findings(findings)
-        print(f"{problems} problems, {warnings} warnings")
-    if problems:
+        print(", ".join(f"{count} {name[:-1] if count == 1 else name}" for name, count in counts.items()))
+    if counts["problems"]:
         raise typer.Exit(1)
 
 

@@ -229,7 +229,7 @@ def test_the_command_exits_0_without_a_problem_and_1_with_one(tmp_path, capsys, 
     assert run(["doctor", "--config", str(path)]) == 1
     out = capsys.readouterr().out
     assert f"PROBLEM  port           {tmp_path}/tty does not exist" in out
-    assert "1 problems" in out
+    assert "1 problem, " in out
     path.write_text("format = 3")
     assert run(["doctor", "--config", str(path)]) == 1
     assert "PROBLEM  configuration" in capsys.readouterr().out
