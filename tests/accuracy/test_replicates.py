@@ -20,8 +20,9 @@ from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES, MAX_DEGREES, NoiseCertainty, count_noise_degrees
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
-from optodrive.lab.diagnosis.omnibus_test import compute_omnibus
-from optodrive.lab.diagnosis.prediction import ParameterPoint
+from optodrive.lab.diagnosis.omnibus_test import assign_bins, compute_omnibus
+from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.physics.hypothesis import RecordingScope
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.terms import discover_terms
 
@@ -113,6 +114,49 @@ def test_bins_of_pure_noise_have_their_degrees_and_repeats_set_the_scale():
     # Noise 1.5 times that of the model is no effect; a residual common to all repeats is one.
     assert compute_omnibus(problem, 1.5 * residual[:, None], shared).evidence.log_evidence < 2.0
     assert compute_omnibus(problem, (residual + 1.5 * oscillation)[:, None], shared).evidence.log_evidence > 8.0
+
+
+def test_an_effect_that_all_groups_share_is_seen_in_their_joined_bins():
+    problem, base = fit_nominal(build_dataset(lab(21, {}, repeats=2)))
+    data, rng = problem.data, np.random.default_rng(4)
+    jitter = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    plain = {
+        kind: ColouredNoise(own.white, (1e-9 * own.white,) * 2, (1e-2, 1.0))
+        for kind, own in problem.noise.coloured.items()
+    }
+    problem = replace(problem, noise=replace(problem.noise, coloured=plain))
+    joined = assign_bins(data).joined
+    assert (np.count_nonzero(joined, axis=1) == 1).all()
+    assert joined.max() == pytest.approx(1.0)
+    noise, shared, alternating = (np.zeros(len(data.value)) for _ in range(3))
+    for block in data.blocks:
+        noise[block.part] = plain[block.kind].white * rng.standard_normal(len(block.t_s))
+        if block.kind == 1:
+            span = float(np.ptp(data.value[block.part]))
+            shared[block.part] = span * (np.arange(len(block.t_s)) > 0.5 * len(block.t_s))
+            alternating[block.part] = shared[block.part] * (-1.0) ** list(data.groups).index(data.runs[block.run].group)
+    size = 0.5 * plain[1].white / shared.max()
+
+    def compute_gains(effect):
+        gains = compute_omnibus(problem, (noise + size * effect)[:, None], jitter).evidence.gains
+        return [part.max() for part in np.split(gains, 2)]
+
+    own, joint = compute_gains(shared)
+    assert joint > own + 2.0
+    assert compute_gains(alternating)[1] < 1.0
+
+
+def test_a_late_clock_has_no_other_form_than_its_share_in_each_signal():
+    scope = RecordingScope(CLOCKS[:3], (0,), frozenset({0}), False, 3)
+    every = {key: discover_terms()[key].build_hypotheses(scope) for key in ("clock_offset", "laser_lag")}
+    data = build_dataset(lab(21, {}, repeats=2))
+    problem, base = fit_nominal(data)
+    for key, is_free in (("clock_offset", False), ("laser_lag", True)):
+        item = every[key][0]
+        point = ParameterPoint(base.point.base, {key: dict(item.starts[0])})
+        fitted = replace(base, point=point, prediction=predict(data, point, problem.epsilon))
+        columns = compute_discrepancy_basis(problem, fitted, (item,), every[key])
+        assert (columns.shape[1] > len(data.kinds) - 1) == is_free
 
 
 def test_power_that_hops_within_pulses_is_not_named(hopping):

@@ -124,11 +124,11 @@ class BinEvidence:
         """Gain in log evidence, averaged over the variances."""
         return average_log(self.gains.tolist())
 
-    def compute_own_share(self, reduction: float, middle: float) -> float:
+    def compute_own_share(self, reduction: float) -> float:
         """Return the probability that the rest in the bins belongs to a cause that reduced χ² by this amount."""
         weights = np.exp(self.gains - np.logaddexp.reduce(self.gains))
         shares = self.rests / np.maximum(max(reduction, 0.0) + self.rests, 1e-9)
-        own = [compute_own_share(share, middle) for share in shares.tolist()]
+        own = [compute_own_share(share, BINS_REST) for share in shares.tolist()]
         return float(weights @ own)
 
 

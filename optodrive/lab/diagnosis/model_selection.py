@@ -21,8 +21,10 @@ Invariants. Nothing here changes the data or the noise model. The same recording
 that cannot be computed is recorded in the log with its reason.
 """
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log, log1p
+from math import log, log1p, prod
 
 import numpy as np
 
@@ -30,7 +32,6 @@ from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.diagnosis.detection import Detection, detect, score_effects, simulate_effects
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.evidence import (
-    BINS_REST,
     FORM_REST,
     MAX_FORM_PROBABILITY,
     OTHER_ODDS,
@@ -222,50 +223,55 @@ def _list_explanations(
         Explanation((), log(PRIOR_NO_EFFECT), nothing, degrees),
         Explanation((), log(PRIOR_NONE_OF_THESE), something, degrees, own_share=0.0),
     ]
-    keys = {item.key for item in hypotheses}
-    forms_of = {key: sum(item.key == key for item in hypotheses) for key in keys}
-    catalogue = len(discover_terms())  # also of a subsystem that few of them act in
-    pair_count = catalogue * (catalogue - 1) // 2
+    priors = _Priors(hypotheses)
     refitted = {item.label for item in refits}
     for score in nominal_detection.scores:
-        key, label = score.hypothesis.key, score.hypothesis.label
-        if label not in refitted:
-            prior = log(PRIOR_ONE_CAUSE / catalogue / forms_of[key] / count_trials(score.hypothesis))
-            out.append(Explanation((key,), prior, nothing + compute_score_evidence(score.ratio), degrees))
-
-    def log_prior(item: RefittedCandidate) -> float:
-        prior = PRIOR_ONE_CAUSE / catalogue if len(item.causes) == 1 else PRIOR_TWO_CAUSES / pair_count
-        return log(prior / np.prod([forms_of[part.key] * count_trials(part) for part in item.hypotheses]))
-
+        if score.hypothesis.label not in refitted:
+            evidence = nothing + compute_score_evidence(score.ratio)
+            out.append(Explanation((score.hypothesis.key,), priors.compute((score.hypothesis,)), evidence, degrees))
     for item in refits:
-        prior = log_prior(item)
+        prior = priors.compute(item.hypotheses)
         out.append(Explanation(item.causes, prior, item.log_evidence, degrees_of[item]))
         single, share = _find_sufficient_single(item, refits, examined)
         if single is not None:
-            mended = log_prior(single) + log(OTHER_ODDS * share / catalogue)
+            mended = priors.compute(single.hypotheses) + log(OTHER_ODDS * share / priors.catalogue)
             out.append(Explanation(single.causes, mended, item.log_evidence, degrees_of[item]))
-        rest = examined.get(item)
-        if rest is None:
+        if item not in examined:
             continue
-        prior += log(OTHER_ODDS)
-        forms = rest.log_evidence + rest.with_forms.form_evidence
-        own_forms = compute_own_share(1.0 - rest.explained, FORM_REST)
-        bins, both = rest.detection.omnibus.evidence, rest.with_forms.omnibus.evidence
-        reduction = base.chi2 - item.chi2
-        variants = (
-            (prior, forms, own_forms),
-            (prior, rest.log_evidence + bins.log_evidence, bins.compute_own_share(reduction, BINS_REST)),
-            (
-                prior + log(OTHER_ODDS),
-                forms + both.log_evidence,
-                own_forms * both.compute_own_share(reduction, BINS_REST),
-            ),
-        )
-        for other_prior, evidence, own in variants:
-            out.append(Explanation(item.causes, other_prior + log1p(-share), evidence, degrees, own))
+        for more_odds, evidence, own in _list_variants(examined[item], base.chi2 - item.chi2):
+            out.append(Explanation(item.causes, prior + more_odds + log1p(-share), evidence, degrees, own))
             if single is not None:
-                out.append(Explanation(single.causes, other_prior + log(share), evidence, degrees, own))
+                out.append(Explanation(single.causes, prior + more_odds + log(share), evidence, degrees, own))
     return out
+
+
+class _Priors:
+    """Prior probabilities of causes: shared among the catalogue, and those of one cause among its hypotheses."""
+
+    def __init__(self, hypotheses: list[Hypothesis]) -> None:
+        self.catalogue = len(discover_terms())  # also of a subsystem that few of them act in
+        self._forms = Counter(item.key for item in hypotheses)
+
+    def compute(self, hypotheses: Sequence[Hypothesis]) -> float:
+        """Return the logarithm of the prior of one hypothesis, or of two together."""
+        pairs = self.catalogue * (self.catalogue - 1) // 2
+        prior = PRIOR_ONE_CAUSE / self.catalogue if len(hypotheses) == 1 else PRIOR_TWO_CAUSES / pairs
+        return log(prior / prod(self._forms[item.key] * count_trials(item) for item in hypotheses))
+
+
+def _list_variants(rest: _Examination, reduction: float) -> list[tuple[float, float, float]]:
+    """Return log odds, log evidence and own share of a refit with other forms, with free bins, and with both.
+
+    reduction: of χ² by the refit
+    """
+    odds, forms = log(OTHER_ODDS), rest.log_evidence + rest.with_forms.form_evidence
+    own = compute_own_share(1.0 - rest.explained, FORM_REST)
+    bins, both = rest.detection.omnibus.evidence, rest.with_forms.omnibus.evidence
+    return [
+        (odds, forms, own),
+        (odds, rest.log_evidence + bins.log_evidence, bins.compute_own_share(reduction)),
+        (2.0 * odds, forms + both.log_evidence, own * both.compute_own_share(reduction)),
+    ]
 
 
 def _count_degrees(

@@ -119,9 +119,9 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
         gram_sum[np.ix_(run_bins, run_bins)] += bin_gram
         one_sum[run_bins] += bin_right
     for gram_sum, one_sum in groups.values():
-        joined = _select_joined(bins, np.flatnonzero(np.diag(gram_sum)))
-        own_noise.add(gram_sum, one_sum, -1)
         used = np.flatnonzero(np.diag(gram_sum))
+        joined = _select_joined(bins, used)
+        own_noise.add(gram_sum, one_sum, -1)
         joined_noise.add(joined.T @ gram_sum[np.ix_(used, used)] @ joined, joined.T @ one_sum[used], -1)
     removed, last = list(range(width - 1)), width - 1
     projected = project_out(total, removed, [*range(width, width + count), last])
@@ -211,11 +211,11 @@ def assign_bins(data: Dataset) -> Bins:
         weight = float(np.ptp(data.value[block.part])) / max(max_span[block.kind], 1e-300)
         joined_bin = np.searchsorted(JOINED_BINS_S, after_s)
         keys = zip(order.tolist(), edge_bin.tolist(), run_bin.tolist(), joined_bin.tolist(), strict=True)
-        for at, (*key, wide) in enumerate(keys, start=block.part.start):
+        for at, (*key, joined_edge) in enumerate(keys, start=block.part.start):
             bin_key = (run.group, block.kind, block.pixel, *key)
             label[at] = names.setdefault(bin_key, len(names))
             if label[at] == len(joined):
-                joined_key = (block.kind, block.pixel, is_train, min(key[0], key[0] % 2), wide)
+                joined_key = (block.kind, block.pixel, is_train, min(key[0], key[0] % 2), joined_edge)
                 joined.append((joined_names.setdefault(joined_key, len(joined_names)), weight))
     weights = np.zeros((len(joined), len(joined_names)))
     for number, (column, weight) in enumerate(joined):
