@@ -86,7 +86,7 @@ def diagnose(
     """Name the errors of the model in measured data, and the gain from correcting them."""
     import_extra("scipy")
     if live:
-        _refuse_with_live(recordings, workers, dask)
+        _refuse_with_live(recordings, workers, dask, discover)
         _check_json(json)
         _diagnose_live(context, LiveRequest(out or DEFAULT_OUT, budget_s, yes, seed, config), json)
         return
@@ -105,15 +105,19 @@ def diagnose(
     title, provenance = ", ".join(names), _capture_provenance(context, names, settings)
     with end_as_interrupted():
         if len(runs.pixels) > MAX_JOINT_PIXELS:
+            if discover:
+                expected = f"a recording of at most {MAX_JOINT_PIXELS} pixels; this one has {len(runs.pixels)}"
+                raise InputError("--discover", True, expected)
             output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers, provenance)
         else:
             output = _diagnose_jointly(recordings, out, title, seed, config, settings, provenance, discover)
         _write_output(output, out, json)
 
 
-def _refuse_with_live(recordings: list[Path] | None, workers: int | None, dask: str | None) -> None:
+def _refuse_with_live(recordings: list[Path] | None, workers: int | None, dask: str | None, discover: bool) -> None:
     """Raise InputError for an argument that --live does not take."""
-    for name, value in (("RECORDING", recordings and str(recordings[0])), ("--workers", workers), ("--dask", dask)):
+    given = {"RECORDING": recordings and str(recordings[0]), "--workers": workers, "--dask": dask}
+    for name, value in (given | {"--discover": discover or None}).items():
         if value is not None:
             raise InputError(name, value, "nothing with --live, which measures one pixel itself")
 

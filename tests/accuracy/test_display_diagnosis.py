@@ -193,6 +193,15 @@ def test_a_cluster_has_its_own_workers(recording, capsys):
     assert "--workers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("more", [["--live"], []], ids=["live", "whole display"])
+def test_a_discovery_where_there_is_none_is_refused(recording, tmp_path, more, capsys):
+    given = more or [str(recording), "--out", str(tmp_path / "answer")]
+    assert run(["diagnose", "--discover", *given]) == 2
+    (error,) = capsys.readouterr().err.strip().splitlines()
+    assert "--discover" in error
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_pixel_reads_its_own_runs_and_signals(recording):
     runs = DisplayRuns.open([recording])
     assert [item.pixel for item in runs.pixels] == [*HIDDEN, BAD]
