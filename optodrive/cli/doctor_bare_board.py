@@ -3,7 +3,7 @@
 import secrets
 from typing import TypeVar
 
-from optodrive.cli.doctor_board import UNANSWERED, check_inputs, check_trip
+from optodrive.cli.doctor_board import check_inputs, check_trip, describe_failure
 from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
@@ -31,10 +31,8 @@ def check_bare_board(transport: Transport, clock: Clock) -> list[Finding]:
     try:
         transport.open()
         return _examine(conversation)
-    except LinkError as error:
-        return [report_problem("board", str(error), UNANSWERED)]
-    except InputError as error:
-        return [report_problem("board", f"{error.where} is {error.value}", f"expected: {error.expected}")]
+    except (LinkError, InputError) as error:
+        return [describe_failure(error)]
     finally:
         transport.release()
 

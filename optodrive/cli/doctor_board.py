@@ -28,12 +28,17 @@ def check_board(config: Config, clock: Clock) -> list[Finding]:
         session.connect()
         trip_s = session.collect_link_stats()["round_trip_ms"] * 1e-3
         return [*_check_identity(session, config), check_inputs(session.board.inputs), check_trip(trip_s)]
-    except LinkError as error:
-        return [report_problem("board", str(error), UNANSWERED)]
-    except InputError as error:
-        return [report_problem("board", f"{error.where} is {error.value}", f"expected: {error.expected}")]
+    except (LinkError, InputError) as error:
+        return [describe_failure(error)]
     finally:
         session.close()
+
+
+def describe_failure(error: LinkError | InputError) -> Finding:
+    """Return the finding on a board that does not answer, or that answers something else than expected."""
+    if isinstance(error, LinkError):
+        return report_problem("board", str(error), UNANSWERED)
+    return report_problem("board", f"{error.where} is {error.value}", f"expected: {error.expected}")
 
 
 def _check_identity(session: BoardSession, config: Config) -> list[Finding]:
