@@ -33,6 +33,8 @@ RecordingsArgument = Annotated[
     list[Path] | None, typer.Argument(metavar="RECORDING", help="HDF5 files or CSV folders; none with --live.")
 ]
 STDOUT = "-"
+NAMELESS = ("none", "instrument", "unexplained")
+"""Verdicts without a cause, whose model takes what a discovery found."""
 DEFAULT_BRIDGE_WIDTH_M = 0.4e-3
 """Assumed where the recording states no width; R and C in model.toml then hold for displays of this width only."""
 
@@ -193,12 +195,21 @@ def _build_output(
     from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
     from optodrive.lab.diagnosis.report import build_report
     from optodrive.lab.pixel_discovery import narrative
+    from optodrive.lab.pixel_discovery.planned_terms import build_planned_terms
+    from optodrive.physics.discovered_term import DiscoveredTerm
 
-    model = build_model_toml(diagnosis, title, width_m or DEFAULT_BRIDGE_WIDTH_M) if diagnosis.base else None
     document, lines, sections = None, list[str](), list[str]()
+    base, terms, discovered = diagnosis.base, diagnosis.terms, list[DiscoveredTerm]()
     if discovery is not None:
-        document, sections = narrative.build_document(discovery), narrative.build_sections(discovery)
-        lines = ["", *narrative.build_lines(discovery)]
+        document, lines = narrative.build_document(discovery), narrative.build_lines(discovery)
+        if discovery.findings and diagnosis.verdict in NAMELESS:
+            planned = build_planned_terms(discovery)
+            base, terms, discovered = base | planned.base, {}, [*planned.terms]
+            lines += narrative.build_planning_lines(planned, str(Path(out) / "model.toml"))
+        sections = narrative.build_sections(discovery, lines)
+        lines = ["", *lines]
+    width_m = width_m or DEFAULT_BRIDGE_WIDTH_M
+    model = build_model_toml(base, terms, diagnosis.verdict, title, width_m, discovered=discovered) if base else None
     return _DiagnosisOutput(
         build_answer(diagnosis) | {"discovery": document, "provenance": provenance.to_dict()},
         build_narrative(diagnosis) + lines,
@@ -228,7 +239,14 @@ def _diagnose_per_pixel(
     model = (
         None
         if median_parameters is None
-        else build_model_toml(median_parameters, title, width_m or DEFAULT_BRIDGE_WIDTH_M, description)
+        else build_model_toml(
+            median_parameters.base,
+            median_parameters.terms,
+            median_parameters.verdict,
+            title,
+            width_m or DEFAULT_BRIDGE_WIDTH_M,
+            description,
+        )
     )
     return _DiagnosisOutput(
         build_display_answer(diagnosis) | {"provenance": provenance.to_dict()},

@@ -36,7 +36,7 @@ from optodrive.physics.snapshot import SnapshotCache, compute_snapshot
 from optodrive.physics.stability import check_time_constants
 from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, SESSION_TIME, TermValues
 from optodrive.physics.term_kernels import STATE_COUNT
-from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms import all_terms
 
 BATCH = 128
 """Pulses or pixels between two calls of on_progress: a tenth of a second on a slow machine."""
@@ -61,7 +61,7 @@ class ExtendedThermalState:
         self.pixels = pixels
         self._values, self._active = values, ActiveTerms.from_values(values)
         check_time_constants(values)
-        is_coupled = any(discover_terms()[key].couples_neighbours for key in values)
+        is_coupled = any(all_terms()[key].couples_neighbours for key in values)
         indices = neighbours.indices if is_coupled else np.zeros((len(pixels), 0), dtype=np.int64)
         self._neighbours = np.ascontiguousarray(indices)
         self._context = np.zeros(CONTEXT_SIZE)
@@ -133,7 +133,7 @@ class ExtendedThermalState:
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
         """Return the largest displacement that one pulse can reach on each cold pixel, m, [p]."""
-        affected = {discover_terms()[key].affected_pixel(values) for key, values in self._values.items()}
+        affected = {all_terms()[key].affected_pixel(values) for key, values in self._values.items()}
         kinds = [(pixel, index if index in affected else None) for index, pixel in enumerate(self.pixels.elements)]
         width_s = drive.max_periods * drive.period_s
         by_kind: dict[tuple[Pixel, int | None], float] = {}
@@ -173,9 +173,9 @@ class ExtendedThermalState:
         if self._events.states.any():
             raise ValueError("a display with terms is traced from the cold state only")
         # Membrane terms do not act back on the gas: without them, the displacement is proportional to the gas's rise.
-        gas_terms = {key: values for key, values in self._values.items() if not discover_terms()[key].moves_membrane}
+        gas_terms = {key: values for key, values in self._values.items() if not all_terms()[key].moves_membrane}
         ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
-        delays = [discover_terms()[key].signal_delays(values) for key, values in self._values.items()]
+        delays = [all_terms()[key].signal_delays(values) for key, values in self._values.items()]
         late_s = tuple(sum(getattr(item, name) for item in delays) for name in ("temperature", "displacement", "force"))
         columns = []
         for index in pixels:

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.plausibility import PlausibleRange, guess_unit
+from optodrive.core.quantity import format_quantity
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
@@ -17,8 +18,10 @@ from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import locate_shipped
 from optodrive.device.config_sections import BridgeWidth
 from optodrive.device.pixel_map import load_pixel_map
+from optodrive.physics.discovered_term import KEY as DISCOVERED
+from optodrive.physics.discovered_term import MAX_SLOTS, SHORTEST_S, DiscoveredTerm, list_values
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.terms import check_requirements, discover_terms, find_term
+from optodrive.physics.terms import all_terms, check_requirements, find_term
 
 FORMAT = "optodrive-parameters"
 VERSION = 1
@@ -87,8 +90,9 @@ class Bridge(_SiUnits):
 class ParameterSet(_SiUnits):
     """A named set of pixel parameters. `claims` states the stimuli and quantities for which it is valid.
 
-    terms: parameters of the terms that extend the nominal pixel, by the keys of `optodrive.physics.terms`. The limiter
-    accounts for all of them; planner_terms: those that the planner simulates heights with.
+    terms: parameters of the terms that extend the nominal pixel, by the keys of `optodrive.physics.terms`; discovered:
+    functions that no term of the catalogue states. The limiter accounts for all of them; planner_terms: those that the
+    planner simulates heights with, "discovered" for the functions.
     """
 
     format: Literal["optodrive-parameters"]
@@ -103,10 +107,18 @@ class ParameterSet(_SiUnits):
     C_mean: Annotated[NonNegativeParameter, _within(5e-6, 2e-3, "J/K")]
     bridge: tuple[Bridge, ...]
     terms: dict[str, dict[str, Parameter]] = Field(default_factory=dict)
+    discovered: Annotated[tuple[DiscoveredTerm, ...], Field(max_length=MAX_SLOTS)] = ()
     planner_terms: tuple[str, ...] = ()
+
+    @property
+    def term_keys(self) -> tuple[str, ...]:
+        """Keys of all terms, with that of what was discovered."""
+        return (*self.terms, *((DISCOVERED,) if self.discovered else ()))
 
     def term_values(self, key: str) -> dict[str, float]:
         """Return a term's parameters by name, SI."""
+        if key == DISCOVERED:
+            return list_values(self.discovered)
         return {name: item.value for name, item in self.terms[key].items()}
 
     def build_pixel(self, bridge_width_m: float) -> Pixel:
@@ -168,20 +180,27 @@ def load_parameters(name: str | Path) -> ParameterSet:
     terms = {key: _complete_term(f"{path}: terms.{key}", key, values) for key, values in parameters.terms.items()}
     parameters = parameters.model_copy(update={"terms": terms})
     check_requirements(f"{path}: terms", parameters.terms)
+    for number, term in enumerate(parameters.discovered):
+        rate_per_s = term.find_rate_per_s(parameters.C_mean.value)
+        if rate_per_s * SHORTEST_S > 1.0:
+            found, expected = format_quantity(1.0 / rate_per_s, "s", 2), f"{format_quantity(SHORTEST_S, 's')} or more"
+            raise InputError(f"{path}: discovered.{number}.values", f"a time constant of {found}", expected)
     for key in parameters.planner_terms:
-        if key not in parameters.terms:
+        if key not in parameters.term_keys:
             raise InputError(
-                f"{path}: planner_terms", key, f"a term of this set, {suggest_nearest(key, [*parameters.terms])}"
+                f"{path}: planner_terms", key, f"a term of this set, {suggest_nearest(key, [*parameters.term_keys])}"
             )
-        if not discover_terms()[key].in_pixel:
+        if not all_terms()[key].in_pixel:
             raise InputError(f"{path}: planner_terms", key, "a term that heights can be planned with")
     return parameters
 
 
 def list_own_terms(path: Path) -> tuple[str, ...]:
     """Return the keys of the terms that a parameter file states itself, rather than its base."""
-    terms = read_toml(path).get("terms", {})
-    return tuple(terms) if isinstance(terms, dict) else ()
+    table = read_toml(path)
+    terms = table.get("terms", {})
+    own = tuple(terms) if isinstance(terms, dict) else ()
+    return (*own, DISCOVERED) if table.get("discovered") else own
 
 
 def _complete_term(where: str, key: str, values: dict[str, Parameter]) -> dict[str, Parameter]:

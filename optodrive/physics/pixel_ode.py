@@ -38,7 +38,7 @@ from optodrive.physics.term import (
     TermValues,
 )
 from optodrive.physics.term_kernels import CHAINS, FOLLOWER_ROW, MAX_PARAMETERS, STATE_COUNT, TERM_ROW, TERMS
-from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms import all_terms
 
 FIRST_STEP, FIRST_STEP_FAST_S = 0.15, 1e-5
 """First step after a gate edge, in time constants of gas or absorber, the faster one; or in s for a faster term."""
@@ -114,14 +114,14 @@ class ActiveTerms(NamedTuple):
         on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), MAX_PARAMETERS))
         rows, laser_rows, panel_rows = [ABSORBER, GAS, NEIGHBOUR], list[int](), list[int]()
         for key, term_values in values.items():
-            row, term = TERM_ROW[key], discover_terms()[key]
+            row, term = TERM_ROW[key], all_terms()[key]
             on[row] = 1
-            v[row, : len(term_values)] = [term_values[item.name] for item in term.parameters]
+            v[row, : term.row_length] = term.pack(term_values)
             followers = range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(term.followers))
             rows += [*term.states, *followers]
             laser_rows += followers if term.has_laser_state else ()
             panel_rows += followers if term.has_panel_state else ()
-        is_fast = any(discover_terms()[key].is_fast for key in values)
+        is_fast = any(all_terms()[key].is_fast for key in values)
         shared = (np.array(laser_rows, dtype=np.int64), np.array(panel_rows, dtype=np.int64))
         return cls(on, v, np.array(rows), *shared, is_fast)
 

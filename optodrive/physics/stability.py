@@ -24,7 +24,7 @@ from optodrive.physics.term import (
     TermValues,
 )
 from optodrive.physics.term_kernels import FOLLOWER_ROW, STATE_COUNT, TERM_ROW
-from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms import all_terms
 
 STABLE_STEP = 2.78
 """Longest stable step of the classical Runge–Kutta method, in time constants."""
@@ -45,8 +45,8 @@ def check_time_constants(values: Mapping[str, TermValues]) -> None:
     They are the inverse eigenvalues of the Jacobian of the term's own states, on a hot pixel in the light.
     """
     for key, term_values in values.items():
-        if discover_terms()[key].states or discover_terms()[key].followers:
-            requirements = {name: values.get(name, {}) for name in discover_terms()[key].requires}
+        if all_terms()[key].states or all_terms()[key].followers:
+            requirements = {name: values.get(name, {}) for name in all_terms()[key].requires}
             every = {key: term_values, **requirements}
             _check_term(key, tuple((name, tuple(sorted(item.items()))) for name, item in every.items()))
 
@@ -54,7 +54,7 @@ def check_time_constants(values: Mapping[str, TermValues]) -> None:
 @lru_cache(maxsize=1024)
 def _check_term(key: str, frozen: tuple[tuple[str, tuple[tuple[str, float], ...]], ...]) -> None:
     active = ActiveTerms.from_values({name: dict(items) for name, items in frozen})
-    term, first = discover_terms()[key], FOLLOWER_ROW[TERM_ROW[key]]
+    term, first = all_terms()[key], FOLLOWER_ROW[TERM_ROW[key]]
     rows = [*term.states, *range(first, first + len(term.followers))]
     context, state = np.zeros(CONTEXT_SIZE), np.zeros(STATE_COUNT)
     context[POWER_W] = context[FULL_W] = 2.45

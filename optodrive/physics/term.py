@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from itertools import product
 from typing import NamedTuple
 
+import numpy as np
+
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.servo import Servo
@@ -79,13 +81,19 @@ class OperatingEnvelope(NamedTuple):
     """Largest values that a display can reach.
 
     absorber_k: rise of one absorber; summed_absorbers_k: sum of all absorbers' rises under all beams; full_w: power of
-    the strongest laser; all_power_w: that of all lasers together.
+    the strongest laser; all_power_w: that of all lasers together; r_k_per_w: resistance of a hot bridge; c_j_per_k: the
+    smallest heat capacity of an absorber; tau_g_s: time constant of the gas; gas_share: share of the gas's rise that a
+    touch surface takes.
     """
 
     absorber_k: float
     summed_absorbers_k: float
     full_w: float
     all_power_w: float
+    r_k_per_w: float
+    c_j_per_k: float
+    tau_g_s: float
+    gas_share: float
 
 
 class HeatGainBound(NamedTuple):
@@ -146,6 +154,15 @@ class Term:
     is_linear: bool = False
     fit_every_start: bool = False
     detection_limit: str = ""
+
+    @property
+    def row_length(self) -> int:
+        """Length of the row by which kernels receive the term's numbers."""
+        return len(self.parameters)
+
+    def pack(self, values: TermValues) -> FloatArray:
+        """Return the numbers of the term as kernels receive them, [row_length]."""
+        return np.array([values[item.name] for item in self.parameters])
 
     @property
     def moves_membrane(self) -> bool:

@@ -16,7 +16,7 @@ from optodrive.core.files import atomic_write
 from optodrive.core.kernels import code_folder
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.physics.term import FIRST_FOLLOWER, Kernels, Term
-from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms import all_terms
 
 HookChain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, float], float]
 RateChain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, FloatArray], None]
@@ -44,9 +44,9 @@ class HookChains(NamedTuple):
     sensor_lag: HookChain
 
 
-TERMS: tuple[Term, ...] = tuple(discover_terms()[key] for key in sorted(discover_terms()))
+TERMS: tuple[Term, ...] = tuple(all_terms()[key] for key in sorted(all_terms()))
 """Every term, in the order of the rows of `on` and `v`."""
-MAX_PARAMETERS = max(len(term.parameters) for term in TERMS)
+MAX_PARAMETERS = max(term.row_length for term in TERMS)
 TERM_ROW = {term.key: row for row, term in enumerate(TERMS)}
 STATE_COUNT = FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS)
 FOLLOWER_ROW = tuple(FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))

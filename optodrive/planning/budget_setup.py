@@ -13,7 +13,7 @@ from optodrive.device.neighbours import Neighbours
 from optodrive.device.panel import complete_panel
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
-from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms import all_terms
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
 from optodrive.planning.limiter.nominal_model import (
@@ -126,11 +126,21 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
 
     Raises InputError for a term without such a bound.
     """
-    terms = {key: parameters.term_values(key) for key in parameters.terms}
+    terms = {key: parameters.term_values(key) for key in parameters.term_keys}
     powers_w = [stage.laser.max_power_w for stage in config.list_stage_configs()]
-    envelope = OperatingEnvelope(config.limits.absorber_max_c - config.ambient_c, 0.0, max(powers_w), sum(powers_w))
+    r_k_per_w = float(pixels.r_k_per_w.max())
+    envelope = OperatingEnvelope(
+        config.limits.absorber_max_c - config.ambient_c,
+        0.0,
+        max(powers_w),
+        sum(powers_w),
+        r_k_per_w * (1 + config.limits.uncertainty.bridge_resistance) * _compute_bridge_factor(config, terms),
+        float(pixels.c_j_per_k.min()) * (1 - config.limits.uncertainty.absorber_capacity),
+        float(pixels.tau_g_s.max()) * (1 + config.limits.uncertainty.gas_lag),
+        terms.get("touch_surface", {}).get("gas_share", 0.0) * (1 + config.limits.uncertainty.touch_share),
+    )
     heat_gain = _combine_heat_gains(terms, envelope)
-    c_j_per_k, r_k_per_w = float(pixels.c_j_per_k.max()) * heat_gain.capacity_factor, float(pixels.r_k_per_w.max())
+    c_j_per_k = float(pixels.c_j_per_k.max()) * heat_gain.capacity_factor
     display_rise_k = (
         heat_gain.power_factor
         * float(pixels.epsilon.max())
@@ -156,7 +166,7 @@ def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnve
     for key in terms:
         if key in BOUNDED_TERMS:
             continue
-        term_gain = discover_terms()[key].bound_heat_gain(terms[key], envelope)
+        term_gain = all_terms()[key].bound_heat_gain(terms[key], envelope)
         if term_gain is None:
             raise InputError(
                 f"terms.{key}", key, "a term that the limiter can bound: this one can warm capped nodes without limit"
@@ -174,15 +184,20 @@ def _compute_uncertainty_factor(config: Config, terms: Mapping[str, TermValues],
     the largest R C; dividing it by the smallest C gives the rise.
     """
     uncertainty = config.limits.uncertainty
-    temperature_ratio = (config.limits.absorber_max_c + ZERO_CELSIUS_K) / (config.ambient_c + ZERO_CELSIUS_K)
-    exponent = terms.get("bridge_conductivity", {}).get("exponent", 0.0) + uncertainty.exponent
     capacity_ratio = (1 + uncertainty.absorber_capacity) / (1 - uncertainty.absorber_capacity) * capacity
     return float(
         (1 + uncertainty.absorbed_power)
         * (1 + uncertainty.bridge_resistance)
         * capacity_ratio
-        * temperature_ratio**exponent
+        * _compute_bridge_factor(config, terms)
     )
+
+
+def _compute_bridge_factor(config: Config, terms: Mapping[str, TermValues]) -> float:
+    """Return the factor by which the resistance of a hot bridge can exceed that of a cold one."""
+    temperature_ratio = (config.limits.absorber_max_c + ZERO_CELSIUS_K) / (config.ambient_c + ZERO_CELSIUS_K)
+    exponent = terms.get("bridge_conductivity", {}).get("exponent", 0.0) + config.limits.uncertainty.exponent
+    return float(max(1.0, temperature_ratio**exponent))
 
 
 def build_nominal_model(
@@ -198,7 +213,7 @@ def build_nominal_model(
     ambient_k: ambient temperature, K; heat_gain: bound on the terms outside the model; panel: None for one that stays
     at ambient temperature
     """
-    terms = {key: parameters.term_values(key) for key in parameters.terms}
+    terms = {key: parameters.term_values(key) for key in parameters.term_keys}
     wall, lateral, touch = (terms.get(key) for key in ("wall_heating", "lateral_conduction", "touch_surface"))
     walls = None
     if wall is not None:

@@ -280,7 +280,7 @@ def test_the_answer_is_json_of_the_format(droop):
 
 def test_the_model_file_loads_as_it_is(droop, tmp_path):
     path = tmp_path / "model.toml"
-    path.write_text(build_model_toml(droop, 'odd "name"\n.h5', 0.4e-3))
+    path.write_text(build_model_toml(droop.base, droop.terms, droop.verdict, 'odd "name"\n.h5', 0.4e-3))
     loaded = load_parameters(path)
     assert loaded.terms["laser_droop"]["share"].value == droop.terms["laser_droop"]["share"]
     pixel = loaded.build_pixel(0.4e-3)

@@ -89,7 +89,7 @@ def late(leak):
 def measure_planned_errors(found, folder):
     """Plan a ladder of heights with the diagnosed model. Return (true − target) / target of each push."""
     path = folder / "model.toml"
-    path.write_text(build_model_toml(found, "orifice", WIDTH_M))
+    path.write_text(build_model_toml(found.base, found.terms, found.verdict, "orifice", WIDTH_M))
     config = load_config("display-16")
     section = config.pixel_model.model_copy(update={"parameters": str(path)})
     display = config.display.model_copy(update={"bridge_width_m": WIDTH_M})
@@ -223,7 +223,9 @@ def list_commands(found, *recordings):
 def test_the_report_says_what_to_run_next_and_the_commands_run(leak, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "answer").mkdir()
-    (tmp_path / "answer" / "model.toml").write_text(build_model_toml(leak, "orifice", WIDTH_M))
+    (tmp_path / "answer" / "model.toml").write_text(
+        build_model_toml(leak.base, leak.terms, leak.verdict, "orifice", WIDTH_M)
+    )
     frames = {"frames": [{"show_at_s": 0.0, "duration_s": 0.3, "target_um": {"3": 100}}]}
     (tmp_path / "frames.json").write_text(json.dumps(frames))
     commands = list_commands(leak)

@@ -4,20 +4,21 @@ The package plans and the ground truth's own integrator judges. The nominal mode
 display without its effect.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from blind_display import simulate_signals
 from blind_lab import Case
-from optodrive.core.types.discrepancy import Discrepancy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.pixel_discovery import discover_in_pixel
+from optodrive.lab.pixel_discovery.planned_terms import build_planned_terms
 from optodrive.lab.recording import read_recording
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
@@ -32,7 +33,7 @@ STEP_S = 5e-5
 
 @dataclass(frozen=True)
 class LoopResult:
-    """RMS of (true − target) / target over all pulses, and the diagnosis.
+    """RMS of (true − target) / target over all pulses, and the diagnosis, or where a discovery found which function.
 
     trimmed: pulses trimmed by a cap
     """
@@ -55,9 +56,32 @@ def close_loop(case: Case, folder: Path) -> LoopResult:
     measurement = read_recording(case.path)
     prior, epsilon, width_m = build_prior(measurement, None)
     found = diagnose(measurement, prior=prior, epsilon=epsilon)
-    nominal = replace(found, base=case.base, terms={}, verdict="none", causes=())
-    plain = _load_display(nominal, folder / "nominal.toml", width_m or WIDTH_M)
-    extended = _load_display(found, folder / "model.toml", width_m or WIDTH_M)
+    model = build_model_toml(found.base, found.terms, found.verdict, "blind", width_m or WIDTH_M)
+    return _compare_plans(case, folder, found.verdict, found.causes, model, width_m or WIDTH_M)
+
+
+def close_discovery_loop(case: Case, folder: Path) -> LoopResult | None:
+    """Do the same with what a discovery finds. Return None if heights cannot be planned with it."""
+    measurement = read_recording(case.path)
+    prior, epsilon, width_m = build_prior(measurement, None)
+    planned = build_planned_terms(discover_in_pixel(measurement, prior, epsilon))
+    if not planned.terms:
+        return None
+    width_m = width_m or WIDTH_M
+    model = build_model_toml(planned.base, {}, "unexplained", "blind", width_m, discovered=planned.terms)
+    places = tuple(f"{term.where} by {term.depends_on}" for term in planned.terms)
+    return _compare_plans(case, folder, "unexplained", places, model, width_m)
+
+
+def _compare_plans(
+    case: Case, folder: Path, verdict: str, causes: tuple[str, ...], model: str, width_m: float
+) -> LoopResult:
+    """Return the errors of heights planned with the true nominal model, and with what was found.
+
+    model: text of its parameter file
+    """
+    plain = _load_display(build_model_toml(case.base, {}, "none", "blind", width_m), folder / "nominal.toml", width_m)
+    extended = _load_display(model, folder / "model.toml", width_m)
     frames = _build_sequence(plain, extended)
     errors, trimmed = [], []
     for display in (plain, extended):
@@ -65,11 +89,11 @@ def close_loop(case: Case, folder: Path) -> LoopResult:
         trimmed.append(int(np.count_nonzero(prepared.plan.reason != "")))
         errors.append(compute_height_errors(case, display, prepared))
     rms = [float(np.sqrt(np.mean(np.square(item)))) for item in errors]
-    return LoopResult(found.verdict, found.causes, rms[0], rms[1], len(errors[0]), max(trimmed))
+    return LoopResult(verdict, causes, rms[0], rms[1], len(errors[0]), max(trimmed))
 
 
-def _load_display(found: Discrepancy, path: Path, width_m: float) -> DisplayModel:
-    path.write_text(build_model_toml(found, "blind", width_m))
+def _load_display(model: str, path: Path, width_m: float) -> DisplayModel:
+    path.write_text(model)
     config = load_config("display-16")
     display = config.display.model_copy(update={"bridge_width_m": width_m})
     section = config.pixel_model.model_copy(update={"parameters": str(path)})

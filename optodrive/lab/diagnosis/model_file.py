@@ -1,22 +1,32 @@
 """Extended model as a parameter file that planner and daemon load unchanged."""
 
-from optodrive.core.types.discrepancy import Discrepancy
+from collections.abc import Mapping, Sequence
+
+from optodrive.physics.discovered_term import KEY, DiscoveredTerm
+from optodrive.physics.term import TermValues
 from optodrive.physics.terms import discover_terms
 
 BASE_PARAMETER_SET = "surroundings"
 VALUE_UNITS = {"tau_g": "s", "kappa": "m/K", "phi": "N/K"}
 
 
-def build_model_toml(discrepancy: Discrepancy, recording: str, width_m: float, estimator: str = "") -> str:
+def build_model_toml(
+    base: Mapping[str, float],
+    terms: Mapping[str, TermValues],
+    verdict: str,
+    recording: str,
+    width_m: float,
+    estimator: str = "",
+    discovered: Sequence[DiscoveredTerm] = (),
+) -> str:
     """Return TOML of format optodrive-parameters, version 1.
 
-    width_m: bridge width of the recorded pixel; estimator: how values were combined, where they are not of a single fit
+    base, terms, verdict: as of `Discrepancy`; width_m: bridge width of the recorded pixel; estimator: how values were
+    combined, where they are not of a single fit; discovered: functions that heights are planned with too
     """
-    base, source = discrepancy.base, f'source = "fitted on {_sanitize(recording)}"'
-    claim = "; ".join(
-        part for part in (f"Fitted on {_sanitize(recording)}", estimator, f"verdict: {discrepancy.verdict}") if part
-    )
-    planned = ", ".join(f'"{key}"' for key in discrepancy.terms)
+    source = f'source = "fitted on {_sanitize(recording)}"'
+    claim = "; ".join(part for part in (f"Fitted on {_sanitize(recording)}", estimator, f"verdict: {verdict}") if part)
+    planned = ", ".join(f'"{key}"' for key in (*terms, *((KEY,) if discovered else ())))
     lines = [
         'format = "optodrive-parameters"',
         "version = 1",
@@ -33,7 +43,7 @@ def build_model_toml(discrepancy: Discrepancy, recording: str, width_m: float, e
     lines += ["[[bridge]]", f"width_m = {width_m!r}"]
     for name, unit in (("R", "K/W"), ("C", "J/K")):
         lines += [f"[bridge.{name}]", f"value = {base[name]!r}", f'unit = "{unit}"', source]
-    for key, values in discrepancy.terms.items():
+    for key, values in terms.items():
         for item in discover_terms()[key].parameters:
             lines += [
                 "",
@@ -42,6 +52,13 @@ def build_model_toml(discrepancy: Discrepancy, recording: str, width_m: float, e
                 f'unit = "{item.unit}"',
                 source,
             ]
+    for term in discovered:
+        lines += ["", "[[discovered]]", source]
+        lines += [f'{name} = "{getattr(term, name)}"' for name in ("where", "depends_on", "unit", "formula")]
+        lines += [f"{name} = {getattr(term, name)!r}" for name in ("low", "high")]
+        if term.memory_time_s is not None:
+            lines.append(f"memory_time_s = {term.memory_time_s!r}")
+        lines.append(f"values = [{', '.join(f'{value:.9g}' for value in term.values)}]")
     return "\n".join(lines) + "\n"
 
 

@@ -13,7 +13,7 @@ from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, simulate_signals
 from optodrive.physics.stability import check_time_constants
 from optodrive.physics.term import SignalDelays, TermValues
-from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms import all_terms
 
 BASE_PARAMETERS = ("R", "C", "tau_g", "kappa", "phi")
 """Fitted nominal parameters, all by their logarithms."""
@@ -42,7 +42,7 @@ def predict(
     """
     out = np.zeros(len(data.value))
     pixel = point.pixel(epsilon * power_factor)
-    terms = [(discover_terms()[key], values) for key, values in point.terms.items()]
+    terms = [(all_terms()[key], values) for key, values in point.terms.items()]
     signal_delays = [term.signal_delays(values) for term, values in terms]
     signal_count = len(SignalDelays._fields)
     delays_s = [delay_s + sum(delays[signal] for delays in signal_delays) for signal in range(signal_count)]

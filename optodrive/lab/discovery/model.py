@@ -150,12 +150,16 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Term as a function of the quantity that it depends on, without a formula, with its 95 % band, each [n]."""
+    """Term as a function of the quantity that it depends on, without a formula, with its 95 % band, each [n].
+
+    evaluate: values at values [n] of the quantity, of the formula if there is one
+    """
 
     x: FloatArray
     y: FloatArray
     low: FloatArray
     high: FloatArray
+    evaluate: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.fitting import Point
+from optodrive.lab.discovery.forms import Form
 from optodrive.lab.discovery.formula_text import describe_term
 from optodrive.lab.discovery.model import Curve, Finding, OdeModel
 from optodrive.lab.discovery.screening import Candidate, Filtered, Place, Screened, screen
@@ -73,6 +75,7 @@ def describe_steps(
         forms = [steps[row].proposal.candidate.form for row in rows]
         parts = [n[0] * form.evaluate(curve.x, n[1], n[2]) for form, n in zip(forms, numbers, strict=True)]
         values = np.sum(parts, axis=0)
+        evaluate = partial(_evaluate_all, tuple(zip(forms, numbers, strict=True)))
         by_size = np.argsort([-np.ptp(part) for part in parts], kind="stable")
         forms, numbers = [forms[k] for k in by_size], [numbers[k] for k in by_size]
         texts = [describe_term(form, n, *involved) for form, n in zip(forms, numbers, strict=True)]
@@ -80,7 +83,7 @@ def describe_steps(
             Finding(
                 model.place_names[at.place],
                 involved,
-                Curve(curve.x, values + curve.y, values + curve.low, values + curve.high),
+                Curve(curve.x, values + curve.y, values + curve.low, values + curve.high, evaluate),
                 " + ".join(texts).replace("+ -", "- "),
                 " and ".join(dict.fromkeys(form.kind for form in forms)),
                 min(1.0, sum(steps[row].gain for row in rows)),
@@ -88,3 +91,10 @@ def describe_steps(
             )
         )
     return tuple(findings)
+
+
+def _evaluate_all(parts: Sequence[tuple[Form, FloatArray]], z: FloatArray) -> FloatArray:
+    """Return the sum [n] of formulas with their numbers at z [n]."""
+    return np.asarray(
+        np.sum([numbers[0] * form.evaluate(z, numbers[1], numbers[2]) for form, numbers in parts], axis=0)
+    )

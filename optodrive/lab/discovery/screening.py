@@ -83,11 +83,14 @@ class Screened:
         total = self.total + float(2.0 * values @ self.vector + values @ change)
         return replace(self, vector=self.vector + change, total=total)
 
+    def _interpolate(self, z: FloatArray) -> FloatArray:
+        return np.asarray(np.interp(z, self.nodes, self.weights))
+
     @property
     def curve(self) -> Curve:
         """The smooth curve with its band."""
         half = BAND * self.sigma
-        return Curve(self.nodes, self.weights, self.weights - half, self.weights + half)
+        return Curve(self.nodes, self.weights, self.weights - half, self.weights + half, self._interpolate)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,19 +38,19 @@ def discover_in_pixel(
     on_progress("discovery: noise and nominal model")
     parts = [part for part in build_dataset(measurement).split_subsystems() if set(part.kinds) <= set(PIXEL_KINDS)]
     if not parts:
-        return PixelDiscovery((), (), "", 0.0, 0.0, {}, perf_counter() - began_s)
+        return PixelDiscovery((), (), "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
     problem, base = fit_nominal(parts[0], prior, epsilon)
     if has_replicate_excess(problem):
         # Before disturbances are subtracted: missed pulses would pass for hops of an instrument.
         found, errors = find_random_light(problem, base)
         if found:
-            return PixelDiscovery(found, (), OTHER_SIGNALS, *errors, {}, perf_counter() - began_s)
+            return PixelDiscovery(found, (), OTHER_SIGNALS, *errors, {}, epsilon, perf_counter() - began_s)
     # A large effect shifts the sensitivities to jitters, and repeats then differ too; held-out experiments judge it.
     problem, base, disturbances = _subtract_disturbances(problem, base)
     experiments = build_records(problem, base)
     held_out = choose_held_out(experiments)
     if len(experiments) < MIN_EXPERIMENTS or not held_out:
-        return PixelDiscovery((), disturbances, "", 0.0, 0.0, {}, perf_counter() - began_s)
+        return PixelDiscovery((), disturbances, "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
     measured = [name for name, kind in zip(OUTPUTS, PIXEL_KINDS, strict=True) if kind in problem.data.kinds]
     answer = discover(
         build_model(np.exp(np.array(base.point.base)).tolist(), measured),
@@ -65,6 +65,7 @@ def discover_in_pixel(
         answer.base_rmse,
         answer.extended_rmse,
         answer.parameters,
+        epsilon,
         perf_counter() - began_s,
     )
 

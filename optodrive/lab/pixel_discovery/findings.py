@@ -40,7 +40,7 @@ class PixelDiscovery:
 
     disturbances: of the instruments, subtracted before all else; judged_by: what no fit has seen, empty if nothing was
     sought; error_before, error_after: root mean square errors of the nominal and the extended pixel there, in units of
-    the noise; parameters: of the extended pixel, SI
+    the noise; parameters: of the extended pixel, SI; epsilon: absorptance that they hold for
     """
 
     findings: tuple[PixelFinding, ...]
@@ -49,4 +49,5 @@ class PixelDiscovery:
     error_before: float
     error_after: float
     parameters: dict[str, float]
+    epsilon: float
     elapsed_s: float

@@ -1,5 +1,6 @@
 """A discovery in a pixel as text, as JSON and as a section of the report."""
 
+from collections.abc import Sequence
 from html import escape
 from typing import Any
 
@@ -8,6 +9,7 @@ from optodrive.core.svg_plot import Axis, Series, draw_plot
 from optodrive.lab.diagnosis.narrative import format_probability
 from optodrive.lab.discovery import Curve
 from optodrive.lab.pixel_discovery.findings import NODES, PixelDiscovery, PixelFinding
+from optodrive.lab.pixel_discovery.planned_terms import PlannedTerms
 
 PLOT_HEIGHT = 200
 VARIABLES = {
@@ -48,6 +50,19 @@ def build_lines(discovery: PixelDiscovery) -> list[str]:
         *lines,
         f"The error is {before:.2f} times the noise without it, {after:.2f} times with it; judged {judged}.",
     ]
+
+
+def build_planning_lines(planned: PlannedTerms, model: str) -> list[str]:
+    """Return what a plan makes of the findings.
+
+    model: path of the parameter file
+    """
+    lines = [f"Heights cannot be planned with it: {reason}." for reason in planned.refused]
+    if planned.terms:
+        lines.append(f"Heights are planned with it: optodrive plan frames.json --model {model}")
+    elif not planned.refused:
+        lines.append(f"It changes a reading and no height; {model} is the pixel without it.")
+    return lines
 
 
 def _describe(finding: PixelFinding) -> list[str]:
@@ -93,9 +108,9 @@ def build_document(discovery: PixelDiscovery) -> dict[str, Any]:
     }
 
 
-def build_sections(discovery: PixelDiscovery) -> list[str]:
-    """Return the section of the report, with the curve of each term and its 95 % band."""
-    parts = ["<h2>Terms that nobody wrote down</h2>", *(f"<p>{escape(line)}</p>" for line in build_lines(discovery))]
+def build_sections(discovery: PixelDiscovery, lines: Sequence[str]) -> list[str]:
+    """Return the section of the report: lines of text, and the curve of each term with its 95 % band."""
+    parts = ["<h2>Terms that nobody wrote down</h2>", *(f"<p>{escape(line)}</p>" for line in lines)]
     curves = [_draw_curve(each, each.curve) for each in discovery.findings if each.curve is not None]
     return [*parts, "<div class='grid'>", *curves, "</div>"] if curves else parts
 

@@ -7,7 +7,7 @@ from optodrive.device.config import Config
 from optodrive.device.pixel_map import remove_pixel_map
 from optodrive.link.simulator.true_pixels import GroundTruthPixels
 from optodrive.physics.parameters import build_display_pixels, list_own_terms, load_parameters
-from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms import all_terms
 from optodrive.physics.thermal_state import ThermalState, build_cold_state
 
 
@@ -20,11 +20,11 @@ def select_true_terms(config: Config, truth: Path | None) -> tuple[list[str], li
     parameters = load_parameters(config.pixel_model.parameters)
     own = () if truth is None or truth.suffix != ".toml" else list_own_terms(truth)
     for key in own:
-        if not discover_terms()[key].in_pixel:
+        if not all_terms()[key].in_pixel:
             expected = "terms that pixels are simulated with; only the limiter accounts for this one"
             raise InputError(f"--truth {truth}: terms.{key}", key, expected)
     selected = list(dict.fromkeys((*parameters.planner_terms, *own)))
-    return selected, [key for key in parameters.terms if key not in selected]
+    return selected, [key for key in parameters.term_keys if key not in selected]
 
 
 def build_true_display(config: Config, sampled_pixels: GroundTruthPixels | None, true_terms: list[str]) -> ThermalState:

@@ -6,6 +6,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from optodrive.core.errors import MISSING, InputError, suggest_nearest
+from optodrive.physics import discovered_term
 from optodrive.physics.term import Term
 
 
@@ -15,6 +16,12 @@ def discover_terms() -> dict[str, Term]:
     modules = (import_module(f"{__name__}.{item.name}") for item in iter_modules(__path__))
     terms: list[Term] = [module.TERM for module in modules]
     return {term.key: term for term in terms}
+
+
+@cache
+def all_terms() -> dict[str, Term]:
+    """Return every term by its key, and that of what a discovery found, which no catalogue holds."""
+    return {**discover_terms(), discovered_term.KEY: discovered_term.Discovered()}
 
 
 def find_term(where: str, key: str, given: Collection[str]) -> Term:

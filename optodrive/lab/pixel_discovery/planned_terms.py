@@ -1,0 +1,79 @@
+"""What a discovery found, as functions that heights are planned with, or the reason why not."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optodrive.lab.discovery import Curve
+from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
+from optodrive.lab.pixel_discovery.pixel_model import AFTER, LIGHT
+from optodrive.physics.discovered_term import KNOTS, UNITS, DiscoveredTerm
+
+RATE_OF_ABSORBER, RATE_OF_GAS = "dabsorber/dt", "dgas/dt"
+BASE = ("R", "C", "tau_g", "kappa", "phi")
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedTerms:
+    """The extended pixel for planning.
+
+    base: parameters of the pixel, SI; terms: functions to be added; refused: why a finding cannot be planned with, by
+    finding; heights are then not better than those of the nominal pixel
+    """
+
+    base: dict[str, float]
+    terms: tuple[DiscoveredTerm, ...]
+    refused: tuple[str, ...]
+
+
+def build_planned_terms(discovery: PixelDiscovery) -> PlannedTerms:
+    """Return the terms of all findings that act in the pixel.
+
+    What an instrument adds to its reading changes no height and is left out.
+    """
+    base = {name: discovery.parameters[name] for name in BASE if name in discovery.parameters}
+    terms, refused = list[DiscoveredTerm](), list[str]()
+    for finding in discovery.findings:
+        if finding.node == "sensor":
+            continue
+        if finding.curve is None:
+            refused.append("the light changes at random, otherwise in every run")
+        elif AFTER in finding.depends_on:
+            refused.append("light after the gate has closed has no bound in the limiter")
+        else:
+            terms.append(_build_term(finding, finding.curve, discovery.parameters, discovery.epsilon))
+    return PlannedTerms(base, tuple(terms), tuple(refused))
+
+
+def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float], epsilon: float) -> DiscoveredTerm:
+    """Return the function of one finding.
+
+    Rates of the absorber become heat flows by its capacity, absorbed light becomes incident light.
+    """
+    variable, *factor = finding.depends_on
+    low, high = float(curve.x[0]), float(curve.x[-1])
+    values, where, depends_on = curve.evaluate(np.linspace(low, high, KNOTS)), finding.where, variable
+    if finding.where == RATE_OF_GAS:
+        where = "gas"
+    elif finding.where == RATE_OF_ABSORBER:
+        where, capacity = "absorber", parameters["C"]
+        if factor == ["heating"]:
+            where, capacity = "heat_capacity", 1.0
+        elif factor == [LIGHT]:
+            where, depends_on = "light", variable
+        elif variable == LIGHT:
+            where, depends_on, low, high, capacity = "light", "power", low / epsilon, high / epsilon, capacity / epsilon
+        values = values * capacity
+    return DiscoveredTerm.model_validate(
+        {
+            "where": where,
+            "depends_on": depends_on,
+            "unit": "W" if depends_on == "power" else UNITS[where],
+            "formula": f"{finding.where}: {finding.formula}",
+            "low": low,
+            "high": high,
+            "values": values.tolist(),
+            "memory_time_s": parameters["tau_m"] if depends_on == "memory" else None,
+            "source": "a discovery",
+        }
+    )
