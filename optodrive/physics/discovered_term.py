@@ -1,4 +1,4 @@
-"""The term of what a discovery found: tabulated functions of one quantity each, in up to four places of the pixel.
+"""Term of the discovered functions: tabulated, of one quantity each, in up to four places of the pixel.
 
 Theory of operation. A discovery ends in a formula. The pixel gets its values at equal distances over the range that the
 data covered, and takes them linearly between these and constant beyond: so no formula is evaluated where nothing was
@@ -207,7 +207,7 @@ def force(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> floa
 
 
 class Discovered(Term):
-    """What a discovery found in a recording, tabulated: the `[[discovered]]` tables of a parameter set."""
+    """Functions that a discovery found in a recording, the `[[discovered]]` tables of a parameter set."""
 
     key = KEY
     label = "a term that was discovered"
@@ -224,7 +224,7 @@ class Discovered(Term):
     )
 
     def pack(self, values: TermValues) -> FloatArray:
-        """Return the row; a column without a number is zero."""
+        """Return the row, zero in every column without a number."""
         row = np.zeros(self.row_length)
         for column, value in values.items():
             row[int(column)] = value

@@ -112,7 +112,7 @@ class ParameterSet(_SiUnits):
 
     @property
     def term_keys(self) -> tuple[str, ...]:
-        """Keys of all terms, with that of what was discovered."""
+        """Keys of all terms, with that of discovered functions."""
         return (*self.terms, *((DISCOVERED,) if self.discovered else ()))
 
     def term_values(self, key: str) -> dict[str, float]:

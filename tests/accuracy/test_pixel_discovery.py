@@ -6,12 +6,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from labs import lab
+from labs import AMBIENT_K, PIXEL, lab
 from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.device.config_file import load_config
+from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.recording import write_recording
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 
-SLACK_M = 4e-5
+SLACK_M, WIDTH_M = 4e-5, 0.4e-3
+TRUE_BASE = {
+    "R": PIXEL.r_k_per_w,
+    "C": PIXEL.c_j_per_k,
+    "tau_g": PIXEL.tau_g_s,
+    "kappa": PIXEL.kappa_m_per_k,
+    "phi": PIXEL.phi_n_per_k,
+}
 pytestmark = pytest.mark.timeout(600)
 
 
@@ -59,3 +72,30 @@ def test_an_unexplained_recording_is_searched_for_the_term_that_nobody_wrote_dow
     assert "the membrane lacks one that depends on rise of the gas (saturation)" in text
     assert "displacement against rise of the gas" in report
     assert answer["discovery"]["error_after"] < 0.5 * answer["discovery"]["error_before"]
+    assert f"Heights are planned with it: optodrive plan frames.json --model {out / 'model.toml'}" in text
+    nominal = build_model_toml(TRUE_BASE, {}, "none", "truth", WIDTH_M)
+    (tmp_path / "nominal.toml").write_text(nominal)
+    before, after = plan_on_slack_membrane(tmp_path / "nominal.toml"), plan_on_slack_membrane(out / "model.toml")
+    assert before > 0.1
+    assert after < 0.2 * before
+
+
+def plan_on_slack_membrane(model):
+    """Plan heights with a model, and return the rms of their relative errors on the slack membrane."""
+    config = load_config("display-16")
+    section = config.pixel_model.model_copy(update={"parameters": str(model)})
+    width = config.display.model_copy(update={"bridge_width_m": WIDTH_M})
+    display = DisplayModel.from_config(config.model_copy(update={"display": width, "pixel_model": section}))
+    heights_m = np.linspace(6e-5, 2e-4, len(display.layout))
+    frames = FrameSequence((TactileFrame("ladder", 0.0, 0.5, heights_m),), ())
+    plan = plan_sequence(display, frames, *display.build_cold_state()).plan
+    assert not plan.reason.any()
+    errors = []
+    for row in range(len(plan)):
+        t_s = np.arange(0.0, plan.width_s[row] + 0.05, 1e-4)
+        pulse = np.array([[0.0, plan.width_s[row], plan.power_w[row], 0.0]])
+        scene = PixelExperiment(pulse, 0, AMBIENT_K, (t_s[:0], t_s, t_s[:0]))
+        displacement_m = simulate_signals(scene, PIXEL, ActiveTerms.from_values({}))[1]
+        height_m = float((displacement_m - np.minimum(displacement_m, SLACK_M)).max())
+        errors.append(height_m / plan.target_m[row] - 1.0)
+    return float(np.sqrt(np.mean(np.square(errors))))

@@ -53,7 +53,7 @@ def build_lines(discovery: PixelDiscovery) -> list[str]:
 
 
 def build_planning_lines(planned: PlannedTerms, model: str) -> list[str]:
-    """Return what a plan makes of the findings.
+    """Return lines that state whether heights are planned with the findings.
 
     model: path of the parameter file
     """

@@ -1,4 +1,4 @@
-"""What a discovery found, as functions that heights are planned with, or the reason why not."""
+"""Functions that heights are planned with, from the findings of a discovery."""
 
 from dataclasses import dataclass
 

@@ -20,7 +20,7 @@ def discover_terms() -> dict[str, Term]:
 
 @cache
 def all_terms() -> dict[str, Term]:
-    """Return every term by its key, and that of what a discovery found, which no catalogue holds."""
+    """Return every term by its key, with the term of discovered functions, which is in no catalogue."""
     return {**discover_terms(), discovered_term.KEY: discovered_term.Discovered()}
 
 
