@@ -1,5 +1,6 @@
 """All scenarios, registered by their modules."""
 
+import edge_scenarios
 import guard_scenarios
 import job_scenarios
 import link_scenarios
@@ -11,4 +12,4 @@ from scenario import SCENARIOS
 __all__ = ["GUARD_MODULES", "MODULES", "SCENARIOS"]
 
 GUARD_MODULES = [module.__name__ for module in (guard_scenarios, trust_scenarios, order_scenarios, self_scenarios)]
-MODULES = [*GUARD_MODULES, job_scenarios.__name__, link_scenarios.__name__]
+MODULES = [*GUARD_MODULES, job_scenarios.__name__, link_scenarios.__name__, edge_scenarios.__name__]

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-pytest.register_assert_rewrite(*(f"{name}_scenarios" for name in ("guard", "job", "link", "order", "self", "trust")))
+pytest.register_assert_rewrite(
+    *(f"{name}_scenarios" for name in ("edge", "guard", "job", "link", "order", "self", "trust"))
+)
 
 from process_board import PROCESS_KINDS  # noqa: E402
 from virtual_board import EmulatedBoard, PicoBoard, VirtualKind  # noqa: E402

@@ -9,7 +9,7 @@ import pytest
 from emulated_pico import EmulatedPico, PicoImage
 from mutants import MUTANTS
 from session_rig import configured
-from virtual_rig import VirtualRig
+from virtual_rig import VirtualRig, run_fault_sessions
 from wire_format import HOST
 
 from optodrive.link.session import board_link, board_requirements
@@ -23,7 +23,6 @@ FAULT_RATES += [
     for loss in (0.01, 0.05, 0.15, 0.3)
     if (seed, loss) not in FAULT_RATES
 ]
-FAULTS_EACH = 25_000
 CHIP_FAULTS = 5_000
 PICO_FAULTS = 1_000
 OFF_LATE_MAX_US = 100
@@ -36,16 +35,6 @@ ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 def make_rig(request, virtual):
     """Return a function that builds a rig with a board core."""
     return partial(VirtualRig, make_core=virtual(request.param).make_core)
-
-
-def run_fault_sessions(rig, faults=FAULTS_EACH):
-    """Run sessions until enough faults are injected. Return the number of sessions and pulses."""
-    sessions = pulses = 0
-    while rig.faults < faults:
-        rig.live(3000, patience_s=4.0)
-        pulses += rig.check()
-        sessions += 1
-    return sessions, pulses
 
 
 @pytest.mark.parametrize(("seed", "loss"), FAULT_RATES)

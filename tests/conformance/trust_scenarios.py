@@ -10,6 +10,8 @@ INPUTS = {"interlock": False, "key": False, "estop": True}
 """Unsafe levels."""
 REPORTED = {"interlock": 0b010, "key": 0b001, "estop": 0b111}
 """Inputs in STATUS while one is unsafe."""
+READ_S = 0.001
+"""Time in which a board has read an input."""
 
 # --- B9 -------------------------------------------------------------------------------------------------------------
 
@@ -155,6 +157,7 @@ def limits_tightened_in_a_fault_apply_after_it(bench):
     for count in (1, 2):
         host.board.next_step()
         host.wait(lambda count=count: len(host.board.of("input")) == count, "the emergency stop")
+        host.pause(READ_S)
     assert host.status().state == "FAULT"
     limits = host.frame("LIMITS", **tightened(max_on_us=10_000))
     assert host.order(limits, host.frame("CLEAR_FAULT")) == []
@@ -218,6 +221,7 @@ def key_edge_is_required_before_each_arming(bench):
         for count in (turned - 1, turned):
             host.board.next_step()
             host.wait(lambda count=count: len(host.board.of("input")) == count, "the key")
+            host.pause(READ_S)
         assert host.send_checked("CLEAR_FAULT") == []
         host.arm()
         assert host.send_checked("DISARM") == []

@@ -13,6 +13,8 @@ from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.memory_link import EXCHANGE_MIN_S, MemoryLink
 
+FAULTS_EACH = 25_000
+
 
 class Line:
     """One direction of a serial line with a byte rate, 0 for no limit."""
@@ -112,3 +114,13 @@ class VirtualRig(SessionRig):
         count = self.link.witness.check(self.log)
         self.log.clear()
         return count
+
+
+def run_fault_sessions(rig, faults=FAULTS_EACH):
+    """Run sessions until enough faults are injected. Return the number of sessions and pulses."""
+    sessions = pulses = 0
+    while rig.faults < faults:
+        rig.live(3000, patience_s=4.0)
+        pulses += rig.check()
+        sessions += 1
+    return sessions, pulses

@@ -20,10 +20,16 @@ export class Accounts {
 
   /** Count a pulse that is to begin at a time, or return the name of the fault that it would be. */
   begin(point, at, limits) {
-    const fault = this.exceedsOnTime(point, at, limits) || this.exceedsMeanPower(point, at, limits) ||
-      this.exceedsEnergy(point, at, limits);
+    const fault = this.lacksAccounts(point, at, limits) || this.exceedsOnTime(point, at, limits) ||
+      this.exceedsMeanPower(point, at, limits) || this.exceedsEnergy(point, at, limits) ||
+      this.lacksMemory();
     if (!fault) this.count(point, at, limits);
     return fault;
+  }
+
+  lacksAccounts(point, at, limits) {
+    const keys = keysOf(point, this.#settings.cell_codes);
+    return this.#grids.every((grid, k) => grid.has(keys[k]) || this.hasRoom(grid, at, limits)) ? "" : "CELLS";
   }
 
   exceedsOnTime(point, at, limits) {
@@ -31,21 +37,23 @@ export class Accounts {
     return most + point.on_us > limits.max_on_us ? "ON_TIME" : "";
   }
 
+  /** A pulse is remembered for a second after its end; of the power, only what falls into the second counts. */
   exceedsMeanPower(point, at, limits) {
-    const end = at + point.on_us;
     this.#window = this.#window.filter((pulse) => pulse.end > at - MEAN_WINDOW_US);
-    const recent = this.#window.filter((pulse) => pulse.end > end - MEAN_WINDOW_US);
-    if (recent.length >= this.#settings.window_pulses) return "PULSES";
-    const sum = recent.reduce((total, pulse) => total + pulse.onTimesDuty, point.on_us * point.duty);
+    const since = at + point.on_us - MEAN_WINDOW_US;
+    const sum = this.#window.reduce(
+      (total, { end, onUs, duty }) => total + Math.max(0, Math.min(onUs, end - since)) * duty, point.on_us * point.duty,
+    );
     return sum > MEAN_WINDOW_US * limits.mean_duty ? "MEAN_POWER" : "";
+  }
+
+  lacksMemory() {
+    return this.#window.length >= this.#settings.window_pulses ? "PULSES" : "";
   }
 
   exceedsEnergy(point, at, limits) {
     const most = Math.max(...this.cellsOf(point).map((cell) => this.energyUj(cell, at, limits)));
-    if (most + pulseUj(point, limits) > limits.spot_uj) return "SPOT";
-    const keys = keysOf(point, this.#settings.cell_codes);
-    const hasRoom = this.#grids.every((grid, k) => grid.has(keys[k]) || this.hasRoom(grid, at, limits));
-    return hasRoom ? "" : "CELLS";
+    return most + pulseUj(point, limits) > limits.spot_uj ? "SPOT" : "";
   }
 
   hasRoom(grid, at, limits) {
@@ -57,7 +65,7 @@ export class Accounts {
 
   count(point, at, limits) {
     const end = at + point.on_us;
-    this.#window.push({ end, onTimesDuty: point.on_us * point.duty });
+    this.#window.push({ end, onUs: point.on_us, duty: point.duty });
     keysOf(point, this.#settings.cell_codes).forEach((key, k) => {
       const cell = this.#grids[k].get(key);
       const onUs = this.onTime(cell, at, limits) + point.on_us;

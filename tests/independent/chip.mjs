@@ -48,8 +48,6 @@ export class Chip {
     if (this.inputs[name] === value) return;
     this.inputs[name] = value;
     this.log({ event: "input", input: name, value });
-    this.board.machine.now = this.now;
-    this.board.machine.setInput(name, value); // the pin's edge is an interrupt
   }
 
   inject(fault) {
@@ -64,7 +62,7 @@ export class Chip {
     this.now = this.bootUs = now;
     if (this.board) {
       this.board.machine.now = now;
-      this.board.machine.closeGate("boot");
+      this.board.machine.closeGate("reset");
     }
     this.isLoopStopped = this.isTickStopped = false;
     this.tickResumesAt = 0;
@@ -124,6 +122,7 @@ export class Chip {
     if (this.isTickLate()) machine.fail("TICK");
     this.tickedAt = this.now;
     this.hasTicked = true;
+    for (const [name, value] of Object.entries(this.inputs)) machine.setInput(name, value);
     if (this.sampleReadback()) machine.fail("READBACK");
     this.board.run(this.now);
   }

@@ -6,4 +6,6 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))
-pytest.register_assert_rewrite(*(f"{name}_scenarios" for name in ("guard", "job", "link", "order", "self", "trust")))
+pytest.register_assert_rewrite(
+    *(f"{name}_scenarios" for name in ("edge", "guard", "job", "link", "order", "self", "trust"))
+)

@@ -15,7 +15,7 @@ class IndependentCore:
 
     def __init__(self, settings, sink, seed=0, guard=""):
         self._sink = sink
-        self.gate_edges = []
+        self.gate, self.state, self.gate_edges = False, "BOOT", []
         self._output = b""
         self._process = subprocess.Popen(
             javascript(HERE / "board_process.mjs", *[guard] * bool(guard)),
@@ -32,6 +32,8 @@ class IndependentCore:
         self._output += bytes.fromhex(answer["data"])
         self.gate_edges += map(tuple, answer["edges"])
         for entry in answer["log"]:
+            self.gate = entry.get("on", self.gate)
+            self.state = entry.get("state", self.state)
             self._sink(entry)
 
     def advance(self, now_us):

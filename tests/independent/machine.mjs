@@ -213,7 +213,7 @@ export class Machine {
   }
 
   endJob({ job, end_index }) {
-    if (!this.job || this.job.number !== job || this.job.endIndex !== null) return "STATE";
+    if (!this.job || this.job.number !== job) return "STATE";
     if (end_index !== this.nextNumber) return "INDEX";
     this.job.endIndex = end_index;
     if (this.doneIndex === end_index && !this.current) this.finishJob();
@@ -336,10 +336,11 @@ export class Machine {
     this.hooks.log({ event: "gate", on, reason });
   }
 
-  /** Turn the gate off if it is on, and account for the pulse that ends. */
+  /** Turn the gate off if it is on, and account for the pulse that ends; a reset leaves nothing to account for. */
   closeGate(reason) {
     if (!this.isGateOn) return;
     this.setGate(false, reason);
+    if (reason === "reset") return;
     const { index, x, y, duty, on_us, offAt } = this.current;
     const onAt = offAt - on_us;
     this.hooks.log({ event: "pulse", index, x, y, duty, on_us: onAt, off_us: this.now });

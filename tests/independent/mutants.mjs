@@ -33,7 +33,7 @@ const BREAK = {
     Accounts.prototype.onTime = () => 0;
   },
   B5: () => {
-    Accounts.prototype.exceedsMeanPower = () => "";
+    Accounts.prototype.exceedsMeanPower = Accounts.prototype.lacksMemory = () => "";
   },
   B6: () => {
     Accounts.prototype.energyUj = () => 0;
