@@ -125,9 +125,9 @@ def _examine_board(config: "Config", clock: "Clock", root: Path) -> list["Findin
     from optodrive.cli.doctor_board import check_board
     from optodrive.cli.doctor_port import check_port
 
-    if config.board.transport == "helios":
-        from optodrive.cli.doctor_helios import check_helios
+    if config.board.is_dac:
+        from optodrive.cli.doctor_dac import check_dac
 
-        return list(check_helios(config, clock))
+        return list(check_dac(config, clock))
     port, free = check_port(config.board, root)
     return [*port, *(check_board(config, clock) if free else [])]

@@ -15,9 +15,9 @@ from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.device.config_sections import (
+    DAC_HALF_RANGE_CODES,
+    DAC_POWER_STEPS,
     HALF_RANGE_CODES,
-    HELIOS_HALF_RANGE_CODES,
-    HELIOS_POWER_STEPS,
     POWER_STEPS,
     BoardSection,
     DaemonSection,
@@ -179,7 +179,7 @@ class Config(Section):
                 )
 
     def _check_converter_codes(self) -> None:
-        steps = HELIOS_HALF_RANGE_CODES if self.board.transport == "helios" else HALF_RANGE_CODES
+        steps = DAC_HALF_RANGE_CODES if self.board.is_dac else HALF_RANGE_CODES
         if self.scanner.half_range_codes != steps:
             expected = f"{steps}, the converter's steps behind board.transport '{self.board.transport}'"
             raise ConflictError("scanner.half_range_codes", self.scanner.half_range_codes, expected)
@@ -248,7 +248,7 @@ class Config(Section):
     @property
     def min_power_w(self) -> float:
         """Laser power of the board's smallest duty step, W. The board rounds down."""
-        steps = HELIOS_POWER_STEPS if self.board.transport == "helios" else POWER_STEPS
+        steps = DAC_POWER_STEPS.get(self.board.transport, POWER_STEPS)
         return self.laser.max_power_w / steps
 
     @property

@@ -14,16 +14,17 @@ WIRE_ON_MAX_S = 65_535e-6
 
 HALF_RANGE_CODES = 32_767
 """Codes of the board's converter from the centre to the end of a mirror's range."""
-HELIOS_HALF_RANGE_CODES = 2_047
-"""Half range of a Helios, whose converter has 12 bits."""
+DAC_HALF_RANGE_CODES = 2_047
+"""Half range of a laser DAC: 12 bits, which every converter behind one has."""
 POWER_STEPS = 65_535
 """Steps of the board's duty from zero to the laser's full power."""
-HELIOS_POWER_STEPS = 255
-HELIOS_TIMING_SLACK_POINTS = 5
-"""On a Helios a pulse starts up to two points late (rounding; the end of a frame) and ends up to three points early
+DAC_POWER_STEPS = {"helios": 255}
+"""The same of the laser DACs, by transport."""
+DAC_TIMING_SLACK_POINTS = 5
+"""On a laser DAC a pulse starts up to two points late (rounding; the end of a chunk) and ends up to three points early
 (the same, and the dark point before an immediately following pulse)."""
-HELIOS_POINT_EXCESS_S = 1e-8
-"""A point lasts up to one tick of the board's clock longer than requested, s."""
+DAC_POINT_EXCESS_S = {"helios": 1e-8}
+"""A point lasts up to one tick of the DAC's clock longer than requested, s."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -143,7 +144,7 @@ class ScannerSection(ServoSection):
     mirrors: Annotated[str, Field(min_length=1)] | None = None
     """File of measured servos that replace the stated one, relative to the configuration's folder."""
     half_range_codes: int = HALF_RANGE_CODES
-    """Codes of the converter from the centre to the end of the range: 32767, for a Helios 2047."""
+    """Codes of the converter from the centre to the end of the range: 32767, for a laser DAC 2047."""
 
     @property
     def rad_per_code(self) -> float:
@@ -225,7 +226,7 @@ class BoardSection(Section):
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 1_000_000
     """Bit rate of the serial port, 1/s."""
     uid: str = ""
-    """The only board, or name of a Helios, that is accepted; empty: any."""
+    """The only board, or name of a laser DAC, that is accepted; empty: any."""
     lease_s: Annotated[float, Field(ge=0.02, le=1.0), PlausibleRange(1e-3, 1.0, "s")] = 0.1
     """Time after the last lease until the board closes the gate, s."""
     stream_lead_s: Annotated[float, Field(ge=0.01, le=0.2), PlausibleRange(1e-3, 0.2, "s")] = 0.03
@@ -237,9 +238,9 @@ class BoardSection(Section):
     serial_number: str = ""
     """USB serial number; empty: the only board of its kind."""
     points_per_s: Annotated[int, Field(ge=20_000, le=50_000)] = 40_000
-    """Point rate of a Helios, 1/s."""
+    """Point rate of a laser DAC, 1/s."""
     interlock_watched: bool = False
-    """Statement that an external interlock cuts the laser's supply; a Helios emits nothing without it."""
+    """Statement that an external interlock cuts the laser's supply; a laser DAC emits nothing without it."""
 
     @model_validator(mode="after")
     def _check_address(self) -> Self:
@@ -262,8 +263,14 @@ class BoardSection(Section):
     @property
     def timing_slack_s(self) -> float:
         """Largest reduction of the interval between two planned times on this board, s, and zero for ticks."""
-        point_s = 1.0 / self.points_per_s + HELIOS_POINT_EXCESS_S
-        return HELIOS_TIMING_SLACK_POINTS * point_s if self.transport == "helios" else 0.0
+        if not self.is_dac:
+            return 0.0
+        return DAC_TIMING_SLACK_POINTS * (1.0 / self.points_per_s + DAC_POINT_EXCESS_S[self.transport])
+
+    @property
+    def is_dac(self) -> bool:
+        """Whether the transport is a laser DAC, which does not speak the board's protocol."""
+        return self.transport in DAC_POWER_STEPS
 
 
 class SensorSection(Section):

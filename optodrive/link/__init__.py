@@ -1,1 +1,1 @@
-"""From a limited plan to executed pulses and back: protocol, transports, board session, Helios, simulator."""
+"""From a limited plan to executed pulses and back: protocol, transports, board session, laser DACs, simulator."""

@@ -15,8 +15,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
 from optodrive.device.settling import SettlingTable
 from optodrive.link.board_setup import build_board_requirements
-from optodrive.link.helios.encoding import PointScale, decode, encode
-from optodrive.link.helios.frames import parse_points
+from optodrive.link.dac.encoding import PointScale, decode, encode
 from optodrive.link.protocol.quantisation import CENTRE_CODE, quantise
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
@@ -84,7 +83,7 @@ def helios_overhang_m(display, plan):
     """Return the same for a Helios' points, decoded from the bytes of its frames."""
     scale = PointScale.from_config(display.config)
     frames = [frame.data for frame in encode(plan, scale)]
-    points = np.concatenate([parse_points(data)[0] for data in frames]).astype(np.int64)
+    points = np.concatenate([np.frombuffer(data[:-5], dtype=np.uint8).reshape(-1, 7) for data in frames]).astype(int)
     codes = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2]
     begin = np.flatnonzero(np.append(True, (np.diff(codes[0]) != 0) | (np.diff(codes[1]) != 0)))
     angles = tuple(scale.to_angles_rad(code[begin]) for code in codes)

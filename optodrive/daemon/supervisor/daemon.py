@@ -60,7 +60,7 @@ def run(
         log = open_daemon_log()
         exit_stack.callback(log.close)
         for stage in config.list_stage_configs():
-            find_transport_factory(build_port_settings(stage))  # refuses a Helios
+            find_transport_factory(build_port_settings(stage))  # refuses a laser DAC
         if capture_path is not None and capture_path.exists():
             raise InputError("--capture", str(capture_path), "a name that is free: nothing is overwritten")
         set_nice(NICE)  # every process inherits it, link while it still loads

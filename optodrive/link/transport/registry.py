@@ -23,7 +23,7 @@ def iterate_transports() -> Iterator[TransportKind]:
 def find_transport_factory(port: PortSettings) -> Callable[[], Transport]:
     """Return a factory for the configured transport, which it does not open.
 
-    Raise InputError for a Helios, which does not use the board's protocol.
+    Raise InputError for a laser DAC, which does not use the board's protocol.
     """
     names = []
     for kind in iterate_transports():  # the search ends before the libraries of other transports are imported
@@ -33,7 +33,7 @@ def find_transport_factory(port: PortSettings) -> Callable[[], Transport]:
     raise InputError(
         "board.transport",
         port.transport,
-        f"one of {', '.join(sorted(names))}: the daemon cannot use a Helios, see `optodrive helios play`",
+        f"one of {', '.join(sorted(names))}: the daemon cannot use a laser DAC, see `optodrive dac play`",
     )
 
 

@@ -164,5 +164,5 @@ def test_the_registry_builds_the_configured_transport():
     assert find_factory(transport="serial", port="/dev/ttyX")().name == "/dev/ttyX"
     stated = get_args(BoardSection.model_fields["transport"].annotation)
     assert {*(kind.name for kind in iterate_transports()), "helios"} == set(stated)
-    with pytest.raises(InputError, match="the daemon cannot use a Helios"):
+    with pytest.raises(InputError, match="the daemon cannot use a laser DAC"):
         find_factory(transport="helios")

@@ -5,11 +5,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from helios.bench import build_display, build_train
+from dac.bench import build_display, build_train
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState
-from optodrive.link.helios import heat_memory
-from optodrive.link.helios.heat_memory import ZERO_OFFSET_S, HeatMemory
+from optodrive.link.dac import heat_memory
+from optodrive.link.dac.heat_memory import ZERO_OFFSET_S, HeatMemory
 from optodrive.planning.limiter.limiter import build_cold_budget_state
 from optodrive.planning.pipeline import plan_sequence
 

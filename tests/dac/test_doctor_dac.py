@@ -2,26 +2,31 @@
 
 import json
 
+import pytest
 import usb.backend.libusb1
 
-from helios.bench import Bench, build_config
-from helios.emulated import EmulatedHelios
-from optodrive.cli.doctor_helios import check_helios
+from dac.bench import Bench, build_config
+from dac.emulated_helios import EmulatedHelios
+from optodrive.cli.doctor_dac import check_dac
 from optodrive.cli.main import run
 from optodrive.core.clock import ManualClock
 from optodrive.device.config_file import locate_shipped
 
 
-def examine(bench, **board):
-    findings = check_helios(build_config(**board), bench.clock, bench.emulated)
-    return {finding.check: finding for finding in findings}
+@pytest.fixture
+def examine(monkeypatch):
+    def examine(bench, **board):
+        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: bench.emulated)
+        return {finding.check: finding for finding in check_dac(build_config(**board), bench.clock)}
+
+    return examine
 
 
-def test_a_helios_in_order():
+def test_a_helios_in_order(examine):
     bench = Bench()
     findings = examine(bench, uid="Helios 1163021877")
     assert {finding.status for finding in findings.values()} == {"ok"}
-    assert findings["board"].observation == "Helios 1163021877, firmware 6, stopped, shutter closed"
+    assert findings["board"].observation == "Helios 1163021877, firmware 6, stopped, its light off"
     assert findings["rate"].observation.startswith("39985.7 points/s for 40000 requested")
     assert "at most 50 ms" in findings["not reported"].observation
     assert not bench.device.shutter
@@ -29,20 +34,20 @@ def test_a_helios_in_order():
     assert not bench.device.light()
 
 
-def test_any_device_and_no_interlock_are_warnings():
+def test_any_device_and_no_interlock_are_warnings(examine):
     findings = examine(Bench(), interlock_watched=False)
     assert {check for check, finding in findings.items() if finding.status == "warning"} == {"board", "interlock"}
     assert 'board.uid = "Helios 1163021877"' in findings["board"].remedy
     assert "nothing is emitted before" in findings["interlock"].remedy
 
 
-def test_another_device_is_a_problem():
+def test_another_device_is_a_problem(examine):
     findings = examine(Bench(), uid="Helios 1")
     assert findings["port"].status == "problem"
     assert "Helios 1163021877" in findings["port"].observation
 
 
-def test_an_unplugged_device_is_a_problem():
+def test_an_unplugged_device_is_a_problem(examine):
     bench = Bench()
     bench.emulated.unplugged_at_s = 0.0
     findings = examine(bench)
@@ -51,13 +56,13 @@ def test_an_unplugged_device_is_a_problem():
     assert "a connected USB device" in findings["port"].remedy
 
 
-def test_a_device_that_takes_no_frames_is_a_problem():
+def test_a_device_that_takes_no_frames_is_a_problem(examine):
     bench = Bench()
     bench.emulated.busy = 1000
     assert examine(bench)["link"].status == "problem"
 
 
-def test_a_device_that_does_not_answer_is_a_problem():
+def test_a_device_that_does_not_answer_is_a_problem(examine):
     bench = Bench()
     bench.emulated.deaf = 1000
     findings = examine(bench)

@@ -6,9 +6,9 @@ import signal
 import pytest
 import usb.backend.libusb1
 
-from helios.bench import Bench, build_display, build_frame, build_train
-from helios.emulated import HostDeadError
-from optodrive.cli import helios as helios_cli
+from dac.bench import Bench, build_display, build_frame, build_train
+from dac.emulated_helios import HostDeadError
+from optodrive.cli import dac as dac_cli
 from optodrive.cli.main import run
 from optodrive.core.errors import LinkError
 from optodrive.device.config_file import locate_shipped
@@ -27,7 +27,7 @@ class Desk:
         monkeypatch.setenv("XDG_STATE_HOME", str(folder))
         monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: self.bench.emulated)
         monkeypatch.setattr("optodrive.core.clock.MonotonicClock", lambda: self.clock)
-        monkeypatch.setattr(helios_cli, "time_of_day", lambda: DAY_S + self.clock.now_s())
+        monkeypatch.setattr(dac_cli, "time_of_day", lambda: DAY_S + self.clock.now_s())
         self.frames = folder / "frames.json"
         self.ask(build_frame(build_display()))
 
@@ -42,7 +42,7 @@ class Desk:
         return ["--config", str(path)]
 
     def play(self, *options):
-        return run(["helios", "play", str(self.frames), *self.config(), *options])
+        return run(["dac", "play", str(self.frames), *self.config(), *options])
 
 
 @pytest.fixture
@@ -53,12 +53,13 @@ def desk(tmp_path, monkeypatch):
 def test_info_reports_identity_and_permission_to_emit(desk, capsys):
     assert run(["helios", "info", *desk.config(), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {
+        "device": "Helios",
         "name": "Helios 1163021877",
-        "firmware": 6,
+        "firmware": "6",
         "ready": True,
         "may_emit": True,
     }
-    assert run(["helios", "info"]) == 0
+    assert run(["helios", "info", *desk.config("false")]) == 0
     assert "may emit         no" in capsys.readouterr().out
 
 
@@ -66,13 +67,13 @@ def test_play_reports_what_the_laser_emitted(desk, capsys):
     assert desk.play("--json") == 0
     report = json.loads(capsys.readouterr().out)
     light = desk.bench.device.light()
-    playback = report["helios"]
+    playback = report["dac"]
     assert len(light) >= report["pulses"] > 0
     shone_j = sum((end_s - begin_s) * level / 255 * 2.45 for begin_s, end_s, _, _, level in light)
     assert playback["energy_j"] == pytest.approx(shone_j, rel=1e-6)
     assert 0.9 * playback["energy_planned_j"] < playback["energy_j"] <= playback["energy_planned_j"]
     assert playback["predicted_max_um"] < report["predicted_max_um"]
-    assert (playback["underruns"], playback["frames"]) == (0, desk.bench.device.frames_played)
+    assert (playback["underruns"], playback["chunks"]) == (0, desk.bench.device.frames_played)
     assert playback["points_per_s"] == pytest.approx(39_985.72, abs=0.01)
     assert not desk.bench.device.shutter
     assert not desk.bench.emulated.claimed
@@ -104,12 +105,18 @@ def test_without_an_external_interlock_one_line_and_no_emission(desk, capsys):
     assert not desk.bench.emulated.commands
 
 
+@pytest.mark.parametrize("command", ["info", "play"])
+def test_a_board_is_no_dac(desk, capsys, command):
+    assert run(["dac", command, *([str(desk.frames)] if command == "play" else [])]) == 2
+    assert "board.transport: got 'simulated', expected that of a laser DAC: helios" in capsys.readouterr().err
+
+
 def test_another_converter_width_is_rejected(desk, capsys):
     assert run(["helios", "play", str(desk.frames), *desk.config(steps=32767)]) == 2
     assert "scanner.half_range_codes: got 32767, expected 2047" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("number", helios_cli.TERMINATING_SIGNALS)
+@pytest.mark.parametrize("number", dac_cli.TERMINATING_SIGNALS)
 def test_a_signal_ends_emission_by_a_stop(desk, capsys, number):
     desk.ask(LONG)
     emulated, sent = desk.bench.emulated, []
@@ -162,4 +169,4 @@ def test_a_missing_helios_is_one_line(desk, capsys):
 
 def test_a_daemon_on_a_helios_is_rejected(desk, capsys):
     assert run(["serve", *desk.config()]) == 2
-    assert "the daemon cannot use a Helios, see `optodrive helios play`" in capsys.readouterr().err
+    assert "the daemon cannot use a laser DAC, see `optodrive dac play`" in capsys.readouterr().err

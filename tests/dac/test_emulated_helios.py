@@ -6,7 +6,7 @@ import pytest
 import usb.core
 import usb.util
 
-from helios.emulated import BYTES_PER_S, CLOCK_HZ, EmulatedHelios
+from dac.emulated_helios import BYTES_PER_S, CLOCK_HZ, EmulatedHelios
 from optodrive.core.clock import ManualClock
 
 

@@ -1,4 +1,4 @@
-"""`optodrive helios info | play`: play frames on a Helios laser DAC instead of the board."""
+"""`optodrive dac info | play`: play frames on a laser DAC instead of the board. Its former name is `helios`."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -25,10 +25,10 @@ from optodrive.core.types.push_options import PushOptions
 if TYPE_CHECKING:
     from optodrive.core.clock import Clock
     from optodrive.core.types.plans import BudgetState
-    from optodrive.link.helios.dac import Helios
-    from optodrive.link.helios.heat_memory import HeatMemory
-    from optodrive.link.helios.player import PlaybackReport
-    from optodrive.link.helios.verification import VerifiedFrames
+    from optodrive.link.dac.heat_memory import HeatMemory
+    from optodrive.link.dac.laser_dac import LaserDac
+    from optodrive.link.dac.player import PlaybackReport
+    from optodrive.link.dac.verification import VerifiedChunks
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.planned_sequence import PlannedSequence
 
@@ -42,24 +42,26 @@ class _TerminatedError(OptodriveError):
     exit_status = 130
 
 
-GROUP = typer.Typer(help="Play on a Helios laser DAC; see docs/how-to/use-a-helios-dac.md first.", no_args_is_help=True)
+GROUP = typer.Typer(help="Play on a laser DAC; see docs/how-to/use-a-laser-dac.md first.", no_args_is_help=True)
 
 
 @GROUP.command()
 def info(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Show the connected Helios and whether it may emit. It is stopped, and its shutter closed."""
+    """Show the configured DAC and whether it may emit. It is stopped, and its light switched off."""
     from optodrive.core.clock import MonotonicClock
-    from optodrive.link.helios.dac import Helios
+    from optodrive.link.dac.registry import build_dac
 
     board = load_run_config(config, None).board
-    with Helios(board, MonotonicClock()) as helios:
+    with build_dac(board, MonotonicClock()) as dac:
         document = {
-            "name": helios.name,
-            "firmware": helios.version,
-            "ready": helios.is_ready(),
-            "may_emit": board.transport == "helios" and board.interlock_watched,
+            "device": dac.format.label,
+            "name": dac.name,
+            "firmware": dac.firmware,
+            "ready": dac.is_ready(),
+            "may_emit": board.interlock_watched,
         }
     lines = [
+        f"device           {document['device']}",
         f"name             {document['name']}",
         f"firmware         {document['firmware']}",
         f"ready            {'yes' if document['ready'] else 'no'}",
@@ -77,12 +79,12 @@ def play(
     json: JsonOption = False,
     **options: Unpack[PushOptions],
 ) -> None:
-    """Plan, limit and verify frames, play them on a Helios, report the sent pulses. Ctrl-C switches the light off."""
+    """Plan, limit and verify frames, play them on a DAC, report the sent pulses. Ctrl-C switches the light off."""
     from optodrive.core.clock import MonotonicClock
-    from optodrive.link.helios.dac import Helios
-    from optodrive.link.helios.encoding import PointScale
-    from optodrive.link.helios.heat_memory import HeatMemory
-    from optodrive.link.helios.verification import encode_verified
+    from optodrive.link.dac.encoding import PointScale
+    from optodrive.link.dac.heat_memory import HeatMemory
+    from optodrive.link.dac.registry import build_dac
+    from optodrive.link.dac.verification import encode_verified
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.plan_summary import summarize_plan
@@ -90,12 +92,12 @@ def play(
 
     display, clock = DisplayModel.from_config(load_run_config(config, model)), MonotonicClock()
     display.config.select_stage(None)
-    helios = Helios(display.config.board, clock)
-    helios.require_interlock()
+    dac = build_dac(display.config.board, clock)
+    dac.require_interlock()
     sequence = load_sequence(frames, display.config)
     announce_compilation()
-    with _defer_signals() as raise_if_signalled, helios:
-        memory = HeatMemory.for_device(helios.name)
+    with _defer_signals() as raise_if_signalled, dac:
+        memory = HeatMemory.for_device(dac.name)
         heat, cold_budget = display.build_cold_state()
         budget = _recall_budget(memory, cold_budget, clock, raise_if_signalled)
         with show_progress("planning") as on_progress:
@@ -112,11 +114,11 @@ def play(
         )
         with show_progress("playing") as on_progress:
             playback = _play_and_store_heat(
-                helios, memory, planned_sequence, verified, clock, _combine_progress(raise_if_signalled, on_progress)
+                dac, memory, planned_sequence, verified, clock, _combine_progress(raise_if_signalled, on_progress)
             )
     summary = summarize_plan(planned_sequence, feasibility)
-    playback_summary = _summarize_playback(display, planned_sequence, verified, playback)
-    document = {**summary.model_dump(mode="json"), "helios": playback_summary}
+    playback_summary = _summarize_playback(dac, display, planned_sequence, verified, playback)
+    document = {**summary.model_dump(mode="json"), "dac": playback_summary}
     print_answer(document, [*format_plan_summary(summary), *_format_playback(playback_summary)], json)
 
 
@@ -165,29 +167,33 @@ def _recall_budget(
 
 
 def _play_and_store_heat(
-    helios: "Helios",
+    dac: "LaserDac",
     memory: "HeatMemory",
     planned_sequence: "PlannedSequence",
-    verified: "VerifiedFrames",
+    verified: "VerifiedChunks",
     clock: "Clock",
     on_progress: Callable[[float], None],
 ) -> "PlaybackReport":
     """Play, and save the heat before the first pulse and after the last: a killed playback counts in full."""
-    from optodrive.link.helios.heat_memory import ZERO_OFFSET_S
-    from optodrive.link.helios.player import play
+    from optodrive.link.dac.heat_memory import ZERO_OFFSET_S
+    from optodrive.link.dac.player import play
 
     memory.save(planned_sequence.budget, time_of_day() + ZERO_OFFSET_S)
     try:
-        return play(helios, verified, clock, on_progress)
+        return play(dac, verified, clock, on_progress)
     finally:
         memory.save(planned_sequence.budget, time_of_day() - min(verified.duration_s, planned_sequence.budget.at_s))
 
 
 def _summarize_playback(
-    display: "DisplayModel", planned_sequence: "PlannedSequence", verified: "VerifiedFrames", playback: "PlaybackReport"
+    dac: "LaserDac",
+    display: "DisplayModel",
+    planned_sequence: "PlannedSequence",
+    verified: "VerifiedChunks",
+    playback: "PlaybackReport",
 ) -> dict[str, Any]:
     from optodrive.core.units import m_to_um
-    from optodrive.link.helios.encoding import PointScale
+    from optodrive.link.dac.encoding import PointScale
 
     pulses, plan = verified.pulses, planned_sequence.plan
     response = display.build_cold_heat().apply_pulses(
@@ -195,7 +201,8 @@ def _summarize_playback(
     )
     return {
         "points_per_s": 1.0 / PointScale.from_config(display.config).point_s,
-        "frames": playback.frames,
+        "device": dac.format.label,
+        "chunks": playback.chunks,
         "energy_j": verified.energy_j,
         "energy_planned_j": float(plan.energy_j.sum()),
         "predicted_max_um": m_to_um(float(response.displacement_m.max())) if len(pulses) else 0.0,
@@ -206,7 +213,7 @@ def _summarize_playback(
 
 def _format_playback(playback: dict[str, Any]) -> list[str]:
     lines = [
-        f"sent             {playback['frames']} frames at {playback['points_per_s']:.1f} points/s",
+        f"sent             {playback['chunks']} chunks at {playback['points_per_s']:.1f} points/s",
         f"light            {playback['energy_j']:.4f} J of {playback['energy_planned_j']:.4f} J planned",
         f"highest          {playback['predicted_max_um']:.1f} µm predicted of the light sent",
     ]

@@ -1,17 +1,17 @@
-"""Test bench of the Helios DAC: configuration, emulated DAC, driver and plans."""
+"""Test bench of the laser DACs: configuration, emulated Helios, driver and plans."""
 
 from functools import cache
 
 import numpy as np
 
-from helios.emulated import EmulatedHelios
+from dac.emulated_helios import EmulatedHelios
 from optodrive.core.clock import ManualClock
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
 from optodrive.device.config_file import load_config
-from optodrive.link.helios.dac import Helios
-from optodrive.link.helios.encoding import PointScale
-from optodrive.link.helios.verification import encode_verified
+from optodrive.link.dac.devices.helios import Helios
+from optodrive.link.dac.encoding import PointScale
+from optodrive.link.dac.verification import encode_verified
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 
@@ -27,6 +27,11 @@ def build_config(name="display-16", **board):
 @cache
 def build_display(name="display-16", points_per_s=40_000):
     return DisplayModel.from_config(build_config(name, points_per_s=points_per_s))
+
+
+def raw_points(data):
+    """Return the points of a Helios' frame, [n, 7] bytes, without this package's parser."""
+    return np.frombuffer(data[:-5], dtype=np.uint8).reshape(-1, 7)
 
 
 def build_frame(display, height_m=20e-6, duration_s=1.0):

@@ -4,28 +4,29 @@ import errno
 
 import pytest
 
-from helios.bench import Bench, build_config
-from helios.emulated import EmulatedHelios, HostDeadError
+from dac.bench import Bench, build_config
+from dac.emulated_helios import EmulatedHelios, HostDeadError
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError
-from optodrive.link.helios import dac as dac_module
-from optodrive.link.helios.dac import Helios
-from optodrive.link.helios.frames import HeliosFrame
+from optodrive.link.dac.dac_format import Chunk
+from optodrive.link.dac.devices import helios as dac_module
+from optodrive.link.dac.devices.helios import Helios
+from optodrive.link.dac.devices.helios_frames import HELIOS
 from optodrive.link.transport.usb_device import find_device
 
 
 def frame(points=100, rate=40_000, level=0):
     import numpy as np
 
-    table = np.zeros((points, 7), dtype=np.uint8)
-    table[:-1, 3:] = level
-    return HeliosFrame.from_points(table, rate)
+    table = np.zeros((points, 3), dtype=np.int64)
+    table[:-1, 2] = level
+    return HELIOS.check(HELIOS.pack(table, rate, 0))
 
 
 def test_open_identifies_and_stops_the_dac():
     bench = Bench(name="Helios 77", version=6)
     with bench.helios as helios:
-        assert (helios.version, helios.name) == (6, "Helios 77")
+        assert (helios.firmware, helios.name) == ("6", "Helios 77")
         assert bench.device.host_version == dac_module.PROTOCOL_VERSION
         assert not bench.device.shutter
         assert bench.clock.now_s() >= dac_module.ENABLE_DELAY_S + dac_module.STOP_DELAY_S
@@ -41,14 +42,14 @@ def test_open_discards_a_stale_answer_before_its_queries():
     bench = Bench()
     bench.device.answer = b"\x83\x01"
     with bench.helios as helios:
-        assert helios.version == 6
+        assert helios.firmware == "6"
 
 
 def test_the_version_is_queried_twice_with_three_reads_each():
     bench = Bench()
     bench.emulated.deaf = 5  # five reads lose the answer
     with bench.helios as helios:
-        assert helios.version == 6
+        assert helios.firmware == "6"
     bench = Bench()
     bench.emulated.deaf = 6
     with pytest.raises(LinkError, match="does not answer query 4"):
@@ -111,7 +112,7 @@ def test_only_one_answer_means_ready(answers, ready):
 def test_a_missing_answer_is_not_ready_and_a_late_one_is_discarded():
     bench = Bench()
     with bench.helios as helios:
-        helios.open_shutter()
+        helios.start()
         bench.emulated.deaf = 1
         assert helios.is_ready() is False  # the answer "ready" is still in transit
         helios.send(frame(900))
@@ -125,7 +126,7 @@ def test_without_an_external_interlock_nothing_is_emitted(board):
     bench = Bench(config)
     with bench.helios as helios:
         with pytest.raises(InputError, match=r"board\.interlock_watched: got"):
-            helios.open_shutter()
+            helios.start()
         with pytest.raises(InputError, match="interlock_watched"):
             helios.send(frame())
     assert not bench.emulated.transfers
@@ -136,7 +137,7 @@ def test_send_validates_the_frame():
     bench = Bench()
     whole = frame()
     with bench.helios as helios, pytest.raises(LocalProtocolError, match="play once"):
-        helios.send(HeliosFrame(whole.data[:-1] + b"\0", whole.duration_s))
+        helios.send(Chunk(whole.data[:-1] + b"\0", whole.points, whole.duration_s))
     assert not bench.emulated.transfers
 
 
@@ -159,7 +160,7 @@ def test_any_exception_stops_the_dac_and_closes_the_shutter(error):
 
     def use():
         with bench.helios as helios:
-            helios.open_shutter()
+            helios.start()
             helios.send(frame(900, level=200))
             bench.clock.sleep(0.005)
             raise error
@@ -176,7 +177,7 @@ def test_any_exception_stops_the_dac_and_closes_the_shutter(error):
 def test_a_refused_stop_is_repeated():
     bench = Bench()
     with bench.helios as helios:
-        helios.open_shutter()
+        helios.start()
         bench.emulated.refused = 2
     assert not bench.device.shutter
 
@@ -185,7 +186,7 @@ def test_a_failed_stop_is_reported_and_the_device_released():
     bench = Bench()
     helios = bench.helios
     helios.open()
-    helios.open_shutter()
+    helios.start()
     helios.send(frame(900, level=200))
     bench.emulated.refused = 100
     with pytest.raises(LinkError, match="may not have received the stop"):
@@ -209,7 +210,7 @@ def test_an_unplugged_device_is_reported_and_can_be_closed():
 def test_a_killed_host_leaves_the_shutter_open_and_the_next_one_closes_it():
     bench = Bench()
     bench.helios.open()
-    bench.helios.open_shutter()
+    bench.helios.start()
     bench.emulated.dies_at_s = bench.clock.now_s()
     with pytest.raises(HostDeadError):
         bench.helios.is_ready()

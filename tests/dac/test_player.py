@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from helios.bench import Bench, build_config, build_display, build_frame, build_train, build_verified
-from helios.emulated import HostDeadError
+from dac.bench import Bench, build_config, build_display, build_frame, build_train, build_verified
+from dac.emulated_helios import HostDeadError
 from optodrive.core.errors import InputError, LinkError
-from optodrive.link.helios import player as player_module
-from optodrive.link.helios.encoding import PointScale
-from optodrive.link.helios.frames import HOST_LOSS_EMISSION_MAX_S, POINT_BYTES
-from optodrive.link.helios.player import play
+from optodrive.link.dac import player as player_module
+from optodrive.link.dac.devices.helios_frames import HELIOS, POINT_BYTES
+from optodrive.link.dac.encoding import PointScale
+from optodrive.link.dac.player import play
 
 
 def list_emissions(bench, since_s=0.0):
@@ -27,7 +27,7 @@ def test_the_emission_is_the_verified_one(name, rate):
         played = play(helios, verified, bench.clock)
     light, scale = list_emissions(bench), PointScale.from_config(display.config)
     assert played.underruns == 0
-    assert played.frames == len(verified.frames) == bench.device.frames_played
+    assert played.chunks == len(verified.chunks) == bench.device.frames_played
     assert len(light) == len(verified.pulses)
     start_s = np.array([stretch[0] for stretch in light])
     width_s = np.array([stretch[1] - stretch[0] for stretch in light])
@@ -80,7 +80,7 @@ def test_emission_ends_within_the_bound_after_the_host_was_killed(after_s):
     with pytest.raises(HostDeadError):
         play(bench.helios, verified, bench.clock)
     bench.emulated.pass_time(60.0)
-    assert bench.device.dark_from_s() <= killed_s + HOST_LOSS_EMISSION_MAX_S
+    assert bench.device.dark_from_s() <= killed_s + HELIOS.host_loss_max_s
     assert not any(bench.device.colour)
 
 
@@ -94,7 +94,7 @@ def test_the_bound_is_tight():
             play(bench.helios, verified, bench.clock)
         bench.emulated.pass_time(1.0)
         worst_s = max(worst_s, bench.device.dark_from_s() - killed_s)
-    assert 0.7 * HOST_LOSS_EMISSION_MAX_S < worst_s <= HOST_LOSS_EMISSION_MAX_S
+    assert 0.7 * HELIOS.host_loss_max_s < worst_s <= HELIOS.host_loss_max_s
 
 
 def test_a_mutant_without_play_once_emits_forever():
@@ -166,7 +166,7 @@ def test_without_an_interlock_the_shutter_stays_closed():
 def test_a_dac_that_is_never_ready_is_stopped():
     bench, verified = playing()
     bench.emulated.busy = 10_000
-    with pytest.raises(LinkError, match=r"not ready for a frame within 0\.5 s"):
+    with pytest.raises(LinkError, match=r"not ready for a chunk within 0\.5 s"):
         play(bench.helios, verified, bench.clock)
     assert not list_emissions(bench)
     assert not bench.device.shutter
@@ -210,4 +210,4 @@ def test_progress_is_told_from_nothing_to_all():
     assert shares[0] == 0.0
     assert shares[-1] == 1.0
     assert shares == sorted(shares)
-    assert player_module.READY_TIMEOUT_S > HOST_LOSS_EMISSION_MAX_S
+    assert HELIOS.host_loss_max_s < player_module.READY_TIMEOUT_S

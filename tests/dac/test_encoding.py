@@ -8,23 +8,24 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from helios.bench import build_display, build_frame, build_train, build_verified
+from dac.bench import build_display, build_frame, build_train, build_verified, raw_points
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import EMPTY_PLAN
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.link.helios.encoding import PointScale, decode, encode
-from optodrive.link.helios.frames import FRAME_MAX_S, HeliosFrame, is_whole_packets, parse_points, point_ticks
-from optodrive.link.helios.verification import verify_frames
+from optodrive.link.dac.dac_format import CHUNK_MAX_S
+from optodrive.link.dac.devices.helios_frames import HELIOS
+from optodrive.link.dac.encoding import PointScale, decode, encode
+from optodrive.link.dac.verification import verify_chunks
 from optodrive.planning.limiter.limiter import limit
 
 
 @pytest.mark.parametrize(("requested", "actual"), [(20_000, 19_996.43), (40_000, 39_985.72), (50_000, 49_977.69)])
 def test_the_rate_is_rounded_by_the_dac(requested, actual):
-    assert 112e6 / point_ticks(requested) == pytest.approx(actual, abs=0.01)
+    assert 112e6 / HELIOS.compute_point_ticks(requested) == pytest.approx(actual, abs=0.01)
 
 
 def test_which_frames_fill_whole_packets():
-    assert [points for points in range(4096) if is_whole_packets(points)] == list(range(45, 4096, 64))
+    assert [points for points in range(4096) if not HELIOS.accepts_length(points)] == list(range(45, 4096, 64))
 
 
 @st.composite
@@ -68,7 +69,7 @@ def test_emission_lies_within_the_plan_and_the_energy_loss_is_bounded(sequence, 
     assert (pulses.power_w <= plan.power_w[row] * (1 + 1e-9)).all()
     assert (np.abs(pulses.x_rad - plan.x_rad[row]) <= 0.5001 * scale.rad_per_code).all()
     assert (np.abs(pulses.y_rad - plan.y_rad[row]) <= 0.5001 * scale.rad_per_code).all()
-    blank_s = (np.cumsum([len(parse_points(frame.data)[0]) for frame in verified.frames]) - 1) * scale.point_s
+    blank_s = (np.cumsum([chunk.points for chunk in verified.chunks]) - 1) * scale.point_s
     touching = np.append(plan.start_s[1:] - plan_end_s[:-1] < scale.point_s, False)
     for index in np.flatnonzero(plan.power_w >= scale.full_power_w / 255):
         parts = row == index
@@ -78,13 +79,13 @@ def test_emission_lies_within_the_plan_and_the_energy_loss_is_bounded(sequence, 
         cuts = ((blank_s > plan.start_s[index] - 1e-9) & (blank_s + scale.point_s < plan_end_s[index] + 1e-9)).sum()
         assert on_s > plan.width_s[index] - (2 + cuts + touching[index]) * scale.point_s - 1e-9
         assert pulses.power_w[parts].min() > plan.power_w[index] - scale.full_power_w / 255
-    for frame in verified.frames:
-        points, points_per_s = parse_points(frame.data)
+    for frame in verified.chunks:
+        points = raw_points(frame.data)
         assert frame.data[-1] == 2
         assert not points[-1, 3:].any()
-        assert points_per_s == rate
-        assert not is_whole_packets(len(points))
-        assert frame.duration_s <= FRAME_MAX_S
+        assert int.from_bytes(frame.data[-5:-3], "little") == rate
+        assert len(frame.data) % 64
+        assert frame.duration_s <= CHUNK_MAX_S
 
 
 @settings(max_examples=60)
@@ -145,7 +146,7 @@ def test_mirrors_move_with_the_first_point_after_a_pulse():
     display = build_display()
     plan, verified = build_verified(display, build_frame(display))
     scale = PointScale.from_config(display.config)
-    points = np.concatenate([parse_points(frame.data)[0] for frame in verified.frames]).astype(int)
+    points = np.concatenate([raw_points(frame.data) for frame in verified.chunks]).astype(int)
     x, y, emitting = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2], points[:, 6] > 0
     ends = np.flatnonzero(emitting[:-1] & ~emitting[1:]) + 1
     ends = ends[x[ends] != x[ends - 1]]
@@ -180,9 +181,9 @@ def test_a_plan_without_pulses_emits_nothing():
     plan, _ = limit(EMPTY_PLAN, display.build_cold_state()[1], display.budget)
     frames = encode(plan, PointScale.from_config(display.config))
     assert len(decode([frame.data for frame in frames], PointScale.from_config(display.config))) == 0
-    frame = HeliosFrame.from_bytes(EMITTING * 2 + BLANK + GOOD)
+    frame = HELIOS.check(EMITTING * 2 + BLANK + GOOD)
     with pytest.raises(LocalProtocolError, match="exceeds the plan's pulses"):
-        verify_frames(
+        verify_chunks(
             [frame.data], plan, PointScale.from_config(display.config), display.build_cold_state()[1], display.budget
         )
 
@@ -210,7 +211,7 @@ EMITTING, BLANK = b"\x80\x08\x00" + b"\x01" * 4, b"\x80\x08\x00" + bytes(4)
         (BLANK * 1200 + struct.pack("<HHB", 40_000, 1200, 2), "the maximum is"),
         (BLANK * 3 + struct.pack("<HHB", 7, 3, 2), "the maximum is"),
         (BLANK * 3 + struct.pack("<HHB", 6, 3, 2), "accepts 7 to 65535"),
-        (BLANK * 45 + struct.pack("<HHB", 40_000, 45, 2), "fills whole packets"),
+        (BLANK * 45 + struct.pack("<HHB", 40_000, 45, 2), "on which the Helios stalls"),
         (BLANK * 4096 + struct.pack("<HHB", 65_535, 4096, 2), "at most 4095"),
         (struct.pack("<HHB", 40_000, 0, 2), "holds no point"),
         (b"", "holds no point"),
@@ -218,7 +219,7 @@ EMITTING, BLANK = b"\x80\x08\x00" + b"\x01" * 4, b"\x80\x08\x00" + bytes(4)
 )
 def test_unsafe_frames_are_rejected(data, words):
     with pytest.raises(LocalProtocolError, match=words):
-        HeliosFrame.from_bytes(data)
+        HELIOS.check(data)
 
 
 def _brighter(points):
@@ -251,14 +252,14 @@ def test_mutants_of_the_bytes_fail_verification(mutant):
     display = build_display()
     scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
     plan, verified = build_verified(display, build_frame(display))
-    frames = [frame.data for frame in verified.frames]
-    verify_frames(frames, plan, scale, budget, display.budget)
-    number = next(index for index, data in enumerate(frames) if parse_points(data)[0][:-3, 6].any())
-    points = parse_points(frames[number])[0].copy()
+    frames = [frame.data for frame in verified.chunks]
+    verify_chunks(frames, plan, scale, budget, display.budget)
+    number = next(index for index, data in enumerate(frames) if raw_points(data)[:-3, 6].any())
+    points = raw_points(frames[number]).copy()
     mutant(points)
     frames[number] = points.tobytes() + frames[number][-5:]
     with pytest.raises(LocalProtocolError, match=r"exceeds the plan's pulses|last point"):
-        verify_frames(frames, plan, scale, budget, display.budget)
+        verify_chunks(frames, plan, scale, budget, display.budget)
 
 
 def test_an_unlimited_plan_fails_verification():
@@ -268,7 +269,7 @@ def test_an_unlimited_plan_fails_verification():
     hot = replace(plan, power_w=np.full(len(plan), scale.full_power_w))
     frames = [frame.data for frame in encode(hot, scale)]
     with pytest.raises(LocalProtocolError, match="passes a cap"):
-        verify_frames(frames, hot, scale, budget, display.budget)
+        verify_chunks(frames, hot, scale, budget, display.budget)
 
 
 def test_a_wrong_rate_fails_verification():
@@ -276,6 +277,6 @@ def test_a_wrong_rate_fails_verification():
     display = build_display()
     scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
     plan, verified = build_verified(display, build_frame(display))
-    frames = [frame.data[:-5] + struct.pack("<H", 50_000) + frame.data[-3:] for frame in verified.frames]
+    frames = [frame.data[:-5] + struct.pack("<H", 50_000) + frame.data[-3:] for frame in verified.chunks]
     with pytest.raises(LocalProtocolError, match="exceeds the plan's pulses"):
-        verify_frames(frames, plan, scale, budget, display.budget)
+        verify_chunks(frames, plan, scale, budget, display.budget)

@@ -33,14 +33,14 @@ def read_boot() -> tuple[str, float]:
 
 
 class HeatMemory:
-    """File with the limiter's budget state after the last play on one Helios, in Unix time."""
+    """File with the limiter's budget state after the last play on one laser DAC, in Unix time."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @classmethod
     def for_device(cls, name: str) -> Self:
-        """Return the memory of the Helios of this name, in the user's state folder."""
+        """Return the memory of the DAC of this name, in the user's state folder."""
         folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "optodrive"
         return cls(folder / f"{re.sub('[^0-9A-Za-z]+', '-', name)}.npz")
 

@@ -1,12 +1,11 @@
 """Driver of a Helios laser DAC over pyusb: version, name, status, shutter, stop and frames.
 
 The driver omits the command that erases the firmware on purpose. The DAC has neither an interlock nor a watchdog for
-the host: docs/how-to/use-a-helios-dac.md describes the consequences.
+the host: docs/how-to/use-a-laser-dac.md describes the consequences.
 """
 
 from contextlib import suppress
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import usb.core
 import usb.util
@@ -15,7 +14,9 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError, escape_unprintable
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
-from optodrive.link.helios.frames import HOST_LOSS_EMISSION_MAX_S, HeliosFrame
+from optodrive.link.dac.dac_format import Chunk
+from optodrive.link.dac.devices.helios_frames import HELIOS
+from optodrive.link.dac.laser_dac import LaserDac
 from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
 
 VENDOR_ID, PRODUCT_ID = 0x1209, 0xE500
@@ -39,37 +40,20 @@ FRAME_TIMEOUT_S = 0.1
 """Longer than the USB transfer of the longest frame."""
 
 
-class Helios:
-    """One Helios DAC.
+class Helios(LaserDac):
+    """One Helios DAC, connected by USB. Its light is off while its shutter is closed.
 
-    open() and close(), and leaving the context for any reason, stop it and close its shutter.
-    version, name: firmware version and name, known after open()
     backend: of pyusb, None for libusb
     """
 
+    format = HELIOS
+    transport = "helios"
+
     def __init__(self, board: BoardSection, clock: Clock, backend: Any = None) -> None:
-        self.board = board
-        self.version = 0
-        self.name = "Helios"
-        self._clock = clock
+        super().__init__(board, clock)
         self._backend = backend
         self._device: Any = None
         self._answer_pending = False
-
-    def __enter__(self) -> Self:
-        """Open the DAC."""
-        self.open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the DAC. An error of closing does not replace an error of the block."""
-        if error is None:
-            self.close()
-        else:
-            with suppress(LinkError):
-                self.close()
 
     def open(self) -> None:
         """Claim, identify and stop the DAC.
@@ -91,7 +75,7 @@ class Helios:
         self._device.set_interface_altsetting(INTERFACE, ALTERNATE_SETTING)
         self._clock.sleep(ENABLE_DELAY_S)
         self._drain()
-        self.version = int.from_bytes(self._query(VERSION, 4)[:4], "little")
+        self.firmware = str(int.from_bytes(self._query(VERSION, 4)[:4], "little"))
         self._command(HOST_VERSION, PROTOCOL_VERSION)
         self.name = escape_unprintable(self._query(NAME, 1).split(b"\0")[0].decode("ascii", "replace"))
         if self.board.uid and self.board.uid != self.name:
@@ -124,7 +108,7 @@ class Helios:
         failures = [self._command_with_retries(STOP, 0), self._command_with_retries(SHUTTER, 0)]
         for failure in failures:
             if failure is not None:
-                bound = f"it plays for at most {format_quantity(HOST_LOSS_EMISSION_MAX_S, 's')} more"
+                bound = f"it plays for at most {format_quantity(HELIOS.host_loss_max_s, 's')} more"
                 raise LinkError(f"the Helios may not have received the stop and shutter commands, {bound}: {failure}")
         self._clock.sleep(STOP_DELAY_S)
 
@@ -139,9 +123,8 @@ class Helios:
                 return None
         return failure
 
-    def open_shutter(self) -> None:
-        """Open the shutter. Raise InputError unless the configuration declares an external interlock."""
-        self.require_interlock()
+    def _start(self) -> None:
+        """Open the shutter."""
         self._command(SHUTTER, 1)
 
     def is_ready(self) -> bool:
@@ -156,27 +139,12 @@ class Helios:
         self._answer_pending = answer not in (READY, b"\x83\x00")
         return answer == READY
 
-    def send(self, frame: HeliosFrame) -> None:
-        """Send one frame. The DAC must be ready.
-
-        Raise InputError unless the configuration declares an external interlock, LocalProtocolError for a frame that
-        could leave the laser on, and LinkError if the DAC does not accept the whole frame.
-        """
-        self.require_interlock()
-        HeliosFrame.from_bytes(frame.data)
-        written_bytes = self._write(FRAME_ENDPOINT, frame.data, FRAME_TIMEOUT_S)
-        if written_bytes != len(frame.data):
+    def _send(self, chunk: Chunk) -> None:
+        """Send one frame. Raise LinkError if the DAC does not accept the whole frame."""
+        written_bytes = self._write(FRAME_ENDPOINT, chunk.data, FRAME_TIMEOUT_S)
+        if written_bytes != len(chunk.data):
             raise LinkError(
-                f"link to the Helios lost: it accepted {written_bytes} of a frame's {len(frame.data)} bytes"
-            )
-
-    def require_interlock(self) -> None:
-        """Raise InputError unless the configuration declares an external interlock."""
-        if self.board.transport != "helios" or not self.board.interlock_watched:
-            raise InputError(
-                "board.interlock_watched",
-                self.board.interlock_watched,
-                'true, with transport "helios": it has no interlock, so an external one must cut the laser',
+                f"link to the Helios lost: it accepted {written_bytes} of a frame's {len(chunk.data)} bytes"
             )
 
     # --- transfers ----------------------------------------------------------------------------------------------

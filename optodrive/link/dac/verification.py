@@ -1,4 +1,4 @@
-"""Verification of the frame bytes before emission, against the plan and the caps."""
+"""Verification of the chunks' bytes before emission, against the plan and the caps."""
 
 from dataclasses import dataclass
 
@@ -7,8 +7,8 @@ import numpy as np
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan
-from optodrive.link.helios.encoding import PointPulses, PointScale, decode, encode
-from optodrive.link.helios.frames import HeliosFrame
+from optodrive.link.dac.dac_format import Chunk
+from optodrive.link.dac.encoding import PointPulses, PointScale, decode, encode
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import verify
 
@@ -17,46 +17,46 @@ POWER_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class VerifiedFrames:
-    """Frames that may be played, built by encode_verified().
+class VerifiedChunks:
+    """Chunks that may be played, built by encode_verified().
 
     pulses: [n] decoded pulses
     row: [n] plan row of each
     """
 
-    frames: tuple[HeliosFrame, ...]
+    chunks: tuple[Chunk, ...]
     pulses: PointPulses
     row: IntArray
 
     @property
     def duration_s(self) -> float:
         """Playing time without gaps, s."""
-        return sum(frame.duration_s for frame in self.frames)
+        return sum(chunk.duration_s for chunk in self.chunks)
 
     @property
     def energy_j(self) -> float:
-        """Incident optical energy, J."""
+        """Largest incident optical energy, J."""
         return float(self.pulses.power_w @ self.pulses.width_s)
 
 
-def encode_verified(plan: LimitedPlan, scale: PointScale, state: BudgetState, budget: Budget) -> VerifiedFrames:
+def encode_verified(plan: LimitedPlan, scale: PointScale, state: BudgetState, budget: Budget) -> VerifiedChunks:
     """Encode a plan that was limited from `state` and verify its bytes. Raise LocalProtocolError if they fail."""
-    frames = encode(plan, scale)
-    pulses, row = verify_frames([frame.data for frame in frames], plan, scale, state, budget)
-    return VerifiedFrames(frames, pulses, row)
+    chunks = encode(plan, scale)
+    pulses, row = verify_chunks([chunk.data for chunk in chunks], plan, scale, state, budget)
+    return VerifiedChunks(chunks, pulses, row)
 
 
-def verify_frames(
-    frames: list[bytes], plan: LimitedPlan, scale: PointScale, state: BudgetState, budget: Budget
+def verify_chunks(
+    chunks: list[bytes], plan: LimitedPlan, scale: PointScale, state: BudgetState, budget: Budget
 ) -> tuple[PointPulses, IntArray]:
-    """Return the pulses of frames and the plan row [n] of each.
+    """Return the pulses of chunks and the plan row [n] of each.
 
-    Raise LocalProtocolError if an emission is earlier, later, stronger or elsewhere than planned, if a frame is unsafe,
+    Raise LocalProtocolError if an emission is earlier, later, stronger or elsewhere than planned, if a chunk is unsafe,
     or if the pulses exceed a cap.
     """
-    for data in frames:
-        HeliosFrame.from_bytes(data)
-    pulses = decode(frames, scale)
+    for data in chunks:
+        scale.format.check(data)
+    pulses = decode(chunks, scale)
     row = np.searchsorted(plan.start_s, pulses.start_s + TIME_TOLERANCE_S, side="right") - 1
     end_s, plan_end_s = pulses.start_s + pulses.width_s, plan.start_s + plan.width_s
     tolerance_rad = (0.5 + 1e-6) * scale.rad_per_code

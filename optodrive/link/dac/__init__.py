@@ -1,0 +1,1 @@
+"""Laser DACs that can be bought: encoding, verification and playback, one for all devices."""

@@ -1,0 +1,1 @@
+"""Drivers of laser DACs, and the bytes of their points."""

@@ -1,0 +1,96 @@
+"""Base class of the drivers of laser DACs, which stop their DAC on every path out."""
+
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from types import TracebackType
+from typing import ClassVar, Self
+
+from optodrive.core.clock import Clock
+from optodrive.core.errors import InputError, LinkError
+from optodrive.device.config_sections import BoardSection
+from optodrive.link.dac.dac_format import Chunk, DacFormat
+
+
+class LaserDac(ABC):
+    """One laser DAC.
+
+    open() and close(), and leaving the context for any reason, stop it and switch its light off.
+    name, firmware: what it says of itself, known after open()
+    """
+
+    format: ClassVar[DacFormat]
+    transport: ClassVar[str]
+
+    def __init__(self, board: BoardSection, clock: Clock) -> None:
+        self.board = board
+        self.name = self.format.label
+        self.firmware = ""
+        self._clock = clock
+
+    def __enter__(self) -> Self:
+        """Open the DAC."""
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the DAC. An error of closing does not replace an error of the block."""
+        if error is None:
+            self.close()
+        else:
+            with suppress(LinkError):
+                self.close()
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect to the DAC, identify and stop it.
+
+        Raise InputError if it is not the configured one, LinkError if the link fails.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop and release the DAC. Raise LinkError if it may not have received the stop. Do nothing if closed."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop playback, switch the light off and wait until the DAC accepts points again.
+
+        Raise LinkError if it may not have received a command.
+        """
+
+    def start(self) -> None:
+        """Permit emission. Raise InputError unless the configuration declares an external interlock."""
+        self.require_interlock()
+        self._start()
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Permit emission."""
+
+    @abstractmethod
+    def is_ready(self) -> bool:
+        """Return whether the DAC accepts another chunk. A missing or unexpected answer counts as not ready."""
+
+    def send(self, chunk: Chunk) -> None:
+        """Send one chunk. The DAC must be ready.
+
+        Raise InputError unless the configuration declares an external interlock, LocalProtocolError for a chunk that
+        could leave the laser on, and LinkError if the DAC does not accept the whole chunk.
+        """
+        self.require_interlock()
+        self._send(self.format.check(chunk.data))
+
+    @abstractmethod
+    def _send(self, chunk: Chunk) -> None:
+        """Send one chunk that is safe."""
+
+    def require_interlock(self) -> None:
+        """Raise InputError unless the configuration declares an external interlock."""
+        if self.board.transport != self.transport or not self.board.interlock_watched:
+            raise InputError(
+                "board.interlock_watched",
+                self.board.interlock_watched,
+                f'true, with transport "{self.transport}": it has no interlock, so an external one must cut the laser',
+            )

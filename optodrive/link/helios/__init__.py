@@ -1,1 +1,0 @@
-"""Helios laser DAC: encoding, USB driver, verification and playback."""
