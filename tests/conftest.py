@@ -57,7 +57,8 @@ def pytest_addoption(parser):
 
 
 SLOW = (
-    *("test_processes.py", "test_stop_and_states.py", "test_safe_exits.py", "test_page.py", "test_plans_and_roles.py"),
+    *("test_pico_daemon.py", "test_processes.py", "test_stop_and_states.py", "test_safe_exits.py", "test_page.py"),
+    "test_plans_and_roles.py",
     *("test_link_process.py", "test_conformance_pty.py", "test_firmware_board.py", "test_home.py", "test_service.py"),
     *("test_security.py", "test_calibrate_loop.py", "test_telemetry.py", "test_openapi_document.py", "test_engine.py"),
     *("test_demo.py", "test_link_faults_virtual.py", "blind", "test_fuzz.py", "test_model.py", "test_recording.py"),
