@@ -66,13 +66,15 @@ ALLOWED = {
     "force": ("gas", "drive"),
 }
 """Quantities that a term in each place can depend on."""
+ADDED = ("absorber", "gas", "displacement", "force")
+"""Places whose functions are added, and would act on a pixel without light."""
 MIN_CAPACITY_SHARE = 0.1
 """Smallest 1 + f of a heat capacity C / (1 + f), below which the integrator's steps would be too long."""
 MAX_FEEDBACK = 0.8
 """Largest R b of a heat flow that the limiter bounds; its absorber stays warm five times as long."""
 SHORTEST_S = 2.5e-3
 """Shortest time constant that the integrator's longest step resolves."""
-NEGLIGIBLE = 1e-9
+NEGLIGIBLE = 1e-6
 
 
 class DiscoveredTerm(Section):
@@ -107,6 +109,9 @@ class DiscoveredTerm(Section):
             raise ValueError(f"low less than high, not {self.low:g} and {self.high:g}")
         if (self.memory_time_s is not None) != (self.depends_on == "memory"):
             raise ValueError("memory_time_s together with depends_on = 'memory', and only with it")
+        at_zero = float(np.interp(0.0, np.linspace(self.low, self.high, KNOTS), self.values))
+        if self.where in ADDED and abs(at_zero) > NEGLIGIBLE * max(map(abs, self.values)):
+            raise ValueError(f"values that are 0 where {self.depends_on} is 0: a cold pixel stays cold")
         if self.where == "heat_capacity" and 1.0 + min(self.values) < MIN_CAPACITY_SHARE:
             raise ValueError(f"values above {MIN_CAPACITY_SHARE - 1.0:g}, of which a heat capacity is divided by 1 + f")
         return self

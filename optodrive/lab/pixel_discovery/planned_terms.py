@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery import Curve
 from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.pixel_model import AFTER, LIGHT
-from optodrive.physics.discovered_term import KNOTS, UNITS, DiscoveredTerm
+from optodrive.physics.discovered_term import KNOTS, NEGLIGIBLE, UNITS, DiscoveredTerm
 
 RATE_OF_ABSORBER, RATE_OF_GAS = "dabsorber/dt", "dgas/dt"
 BASE = ("R", "C", "tau_g", "kappa", "phi")
@@ -40,9 +41,18 @@ def build_planned_terms(discovery: PixelDiscovery) -> PlannedTerms:
             refused.append("the light changes at random, otherwise in every run")
         elif AFTER in finding.depends_on:
             refused.append("light after the gate has closed has no bound in the limiter")
+        elif _acts_when_cold(finding, finding.curve):
+            refused.append(f"{finding.formula} acts on a pixel without light")
         else:
             terms.append(_build_term(finding, finding.curve, discovery.parameters, discovery.epsilon))
     return PlannedTerms(base, tuple(terms), tuple(refused))
+
+
+def _acts_when_cold(finding: PixelFinding, curve: Curve) -> bool:
+    """Return whether a term without a factor differs from 0 on a cold pixel in the dark."""
+    z = _choose_knots(float(curve.x[0]), float(curve.x[-1]))
+    at_zero = float(curve.evaluate(np.clip(np.zeros(1), z[0], z[-1]))[0])
+    return len(finding.depends_on) == 1 and abs(at_zero) > NEGLIGIBLE * float(np.abs(curve.evaluate(z)).max())
 
 
 def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float], epsilon: float) -> DiscoveredTerm:
@@ -51,8 +61,9 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
     Rates of the absorber become heat flows by its capacity, absorbed light becomes incident light.
     """
     variable, *factor = finding.depends_on
-    low, high = float(curve.x[0]), float(curve.x[-1])
-    values, where, depends_on = curve.evaluate(np.linspace(low, high, KNOTS)), finding.where, variable
+    z = _choose_knots(float(curve.x[0]), float(curve.x[-1]))
+    low, high, values = float(z[0]), float(z[-1]), curve.evaluate(z)
+    where, depends_on = finding.where, variable
     if finding.where == RATE_OF_GAS:
         where = "gas"
     elif finding.where == RATE_OF_ABSORBER:
@@ -77,3 +88,11 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
             "source": "a discovery",
         }
     )
+
+
+def _choose_knots(low: float, high: float) -> FloatArray:
+    """Return the knots [65] of a function over a range, one of them at 0 if it lies within, as does many a kink."""
+    if not low < 0.0 < high:
+        return np.linspace(low, high, KNOTS)
+    distance = (high - low) / (KNOTS - 2)
+    return np.asarray(distance * (np.arange(KNOTS) - np.ceil(-low / distance)))

@@ -120,13 +120,12 @@ def test_a_limiter_that_takes_the_memory_for_the_absorber_is_caught(name, monkey
     "terms",
     [
         [term("absorber", "gas", lambda z: 1e-4 * z)],
-        [term("absorber", "absorber", lambda z: 1e-4)],
         [term("absorber", "absorber", lambda z: 0.9 * z / R_K_PER_W)],
         [term("absorber", "memory", lambda z: 0.06 * z / R_K_PER_W, memory_time_s=0.2)],
         [term("light", "power", lambda z: 0.1, high=2.45)],
         [term("heat_capacity", "absorber", lambda z: -0.5), term("heat_capacity", "absorber", lambda z: -0.5)],
     ],
-    ids=["from the gas", "from nowhere", "runaway", "warm for long", "light in the dark", "no rate is left"],
+    ids=["from the gas", "runaway", "warm for long", "light in the dark", "no rate is left"],
 )
 def test_a_term_without_a_bound_is_refused_by_name(terms):
     with pytest.raises(InputError, match=r"terms\.discovered: .* a term that the limiter can bound"):
