@@ -9,12 +9,12 @@ Bound. With R the largest resistance of a bridge, f the function and θ the abso
   the nominal one, and so is every rise.
 - heat capacity C / (1 + f): warming is that of C under (1 + max f) times the power, since less flows off than
   (1 + f) θ / R; cooling is that of the largest capacity.
-- heat flow f(θ) ≤ b θ into the absorber: the bridge loses θ (1 / R − b) at least, as does a pixel of 1 / (1 − R b)
-  times the power on R with 1 / (1 − R b) times the capacity when it cools.
-- heat flow f(m) ≤ b m into the absorber, with m of a memory that follows it with τ: where a pixel cools in its slowest
-  mode, of rate λ, the memory is g = 1 / (1 − λ τ) times as warm as the absorber, so m ≤ g θ if θ is a bound that cools
-  no faster. With it the bridge loses θ (1 / R − b g) at least, as above; λ = (1 / R − b g) / C for the smallest C.
-  A memory much slower than the absorber has no such bound below the largest feedback.
+- heat flow f(θ) ≤ b θ into the absorber, or by the rise of a memory, which is never warmer than the absorber was: it
+  raises the absorber by R b of its own largest rise at most, which is therefore at most 1 / (1 − R b) times that
+  without the flow; so is the heat that reaches the wall. It does so later, with the time constant 1 / λ of the slowest
+  mode of absorber and memory. With λ τ = 1 − 1 / g, there the memory is g times as warm as the absorber, and
+  λ = (1 / R − b g) / C; without a memory g is 1.
+  All three are rises over the wall: a flow that followed the wall's own rise would feed on that of the whole panel.
 - heat flow by the rise of the gas: only one that is nowhere positive is bounded.
 - gas: it is at most τ max f warmer, of which a finger feels the share that the touch surface takes.
 - displacement and force heat nothing.
@@ -34,6 +34,7 @@ from optodrive.core.toml_model import Section
 from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import (
     ABSORBER,
+    FAR_END_K,
     GAS,
     POWER_W,
     SINCE_EDGE_S,
@@ -71,7 +72,7 @@ ADDED = ("absorber", "gas", "displacement", "force")
 MIN_CAPACITY_SHARE = 0.1
 """Smallest 1 + f of a heat capacity C / (1 + f), below which the integrator's steps would be too long."""
 MAX_FEEDBACK = 0.8
-"""Largest R b of a heat flow that the limiter bounds; its absorber stays warm five times as long."""
+"""Largest R b g of a heat flow that the limiter bounds: heat then leaves an absorber five times as slowly."""
 SHORTEST_S = 2.5e-3
 """Shortest time constant that the integrator's longest step resolves."""
 NEGLIGIBLE = 1e-6
@@ -80,8 +81,8 @@ NEGLIGIBLE = 1e-6
 class DiscoveredTerm(Section):
     """One function that a parameter set adds to the pixel, and where.
 
-    where: key of `UNITS`; depends_on: rises of absorber, gas or memory, K, the drive of the gas, half the absorber's
-    rise less the gas's, K, the incident power, W, or the time since the gate has opened, s; values: of the function at
+    where: key of `UNITS`; depends_on: rises of absorber, gas or memory, K, over the wall for a heat flow, the drive
+    of the gas, half the absorber's rise less the gas's, K, the incident power, W, or the time since the gate has opened, s; values: of the function at
     65 equal distances from low to high, constant beyond; light: relative to the power, on the power itself in W;
     heat_capacity: f in C / (1 + f); memory_time_s: time constant with which the memory follows the absorber
     """
@@ -137,11 +138,11 @@ def list_values(terms: Sequence[DiscoveredTerm]) -> dict[str, float]:
 @kernel
 def _evaluate(v: FloatArray, slot: int, y: FloatArray, s: int, c: FloatArray) -> float:
     """Return the function of a slot at the present states."""
-    quantity = int(v[slot + 1])
+    quantity, wall_k = int(v[slot + 1]), c[FAR_END_K] if v[slot] == HEAT_FLOW else 0.0
     if quantity == OF_ABSORBER:
-        z = y[ABSORBER]
+        z = y[ABSORBER] - wall_k
     elif quantity == OF_GAS:
-        z = y[GAS]
+        z = y[GAS] - wall_k
     elif quantity == OF_MEMORY:
         z = y[s]
     elif quantity == OF_DRIVE:
@@ -196,7 +197,7 @@ def heat_loss(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> 
 def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
     """Add to the gas's rate, and let the memory follow the absorber."""
     x[GAS] += _add_all(v, GAS_RATE, y, s, c)
-    x[s] = (y[ABSORBER] - y[s]) / v[MEMORY_TIME] if v[MEMORY_TIME] > 0.0 else 0.0
+    x[s] = (y[ABSORBER] - c[FAR_END_K] - y[s]) / v[MEMORY_TIME] if v[MEMORY_TIME] > 0.0 else 0.0
 
 
 @kernel
@@ -239,7 +240,7 @@ class Discovered(Term):
         """Return the bound of all functions together, see the theory of operation, or None if one of them has none."""
         row = self.pack(values)
         power = fastest = slowest = 1.0
-        rise_k, feedback = 0.0, 0.0
+        rise_k = feedback = late_feedback = 0.0
         slots = [row[slot * SLOT : (slot + 1) * SLOT] for slot in range(MAX_SLOTS)]
         for slot in sorted(slots, key=lambda slot: slot[0]):  # heat capacities before heat flows
             place, quantity = int(slot[0]), int(slot[1])
@@ -253,16 +254,18 @@ class Discovered(Term):
                 fastest, slowest = fastest + highest, slowest + lowest
             elif place == HEAT_FLOW and highest > 0.0:
                 own = inf if quantity == OF_GAS else ratio * envelope.r_k_per_w
+                feedback += own
                 if quantity == OF_MEMORY and own < inf:
                     absorber_s = envelope.r_k_per_w * envelope.c_j_per_k / fastest
                     own *= _find_memory_share(own, float(row[MEMORY_TIME]) / absorber_s)
-                feedback += own
+                late_feedback += own
             elif place == GAS_RATE:
                 rise_k += envelope.gas_share * envelope.tau_g_s * highest
-        if not power < inf or feedback > MAX_FEEDBACK or slowest < MIN_CAPACITY_SHARE:
+        if not power < inf or late_feedback > MAX_FEEDBACK or slowest < MIN_CAPACITY_SHARE:
             return None
-        warmer = 1.0 / (1.0 - feedback)
-        return HeatGainBound(power * fastest * warmer, warmer / slowest, rise_k)
+        return HeatGainBound(
+            power * fastest / (1.0 - feedback), 1.0 / slowest, 1.0 / (1.0 - late_feedback), uniform_rise_k=rise_k
+        )
 
 
 def _find_largest_ratio(slot: FloatArray) -> float:

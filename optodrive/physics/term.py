@@ -99,11 +99,13 @@ class OperatingEnvelope(NamedTuple):
 class HeatGainBound(NamedTuple):
     """Upper bound on the heat that a term adds.
 
-    Factors on the absorbed power and on the heat capacity of a hot absorber, and an additional rise of everything, K.
+    Factors on the absorbed power, on the heat capacity of a hot absorber, and on the time constant with which heat
+    leaves an absorber for its wall; an additional rise of everything, K.
     """
 
     power_factor: float = 1.0
     capacity_factor: float = 1.0
+    delay_factor: float = 1.0
     uniform_rise_k: float = 0.0
 
 

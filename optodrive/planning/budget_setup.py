@@ -134,7 +134,7 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
         0.0,
         max(powers_w),
         sum(powers_w),
-        r_k_per_w * (1 + config.limits.uncertainty.bridge_resistance) * _compute_bridge_factor(config, terms),
+        r_k_per_w * (1 + config.limits.uncertainty.bridge_resistance) * _compute_bridge_factor(config, terms) ** 2,
         float(pixels.c_j_per_k.min()) * (1 - config.limits.uncertainty.absorber_capacity),
         float(pixels.tau_g_s.max()) * (1 + config.limits.uncertainty.gas_lag),
         terms.get("touch_surface", {}).get("gas_share", 0.0) * (1 + config.limits.uncertainty.touch_share),
@@ -161,7 +161,7 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
 
 def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnvelope) -> HeatGainBound:
     """Combine the bounds of all terms outside the thermal bound."""
-    power = capacity = 1.0
+    power = capacity = delay = 1.0
     uniform_rise_k = 0.0
     for key in terms:
         if key in BOUNDED_TERMS:
@@ -173,8 +173,9 @@ def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnve
             )
         power *= term_gain.power_factor
         capacity *= term_gain.capacity_factor
+        delay *= term_gain.delay_factor
         uniform_rise_k += term_gain.uniform_rise_k
-    return HeatGainBound(power, capacity, uniform_rise_k)
+    return HeatGainBound(power, capacity, delay, uniform_rise_k)
 
 
 def _compute_uncertainty_factor(config: Config, terms: Mapping[str, TermValues], capacity: float) -> float:
@@ -228,6 +229,7 @@ def build_nominal_model(
         r_k_per_w=pixels.r_k_per_w,
         c_j_per_k=pixels.c_j_per_k,
         hot_capacity_factor=heat_gain.capacity_factor,
+        delay_factor=heat_gain.delay_factor,
         extra_rise_k=heat_gain.uniform_rise_k,
         tau_g_s=float(pixels.tau_g_s.max()),
         ambient_k=ambient_k,

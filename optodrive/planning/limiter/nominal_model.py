@@ -62,6 +62,7 @@ class NominalThermalModel:
     neighbours: [p, 4] neighbouring pixels, −1 for none; frame_edges: [p] number of edges at the frame
     walls, touch, panel: None if the model has no such node; without a panel the surroundings stay at ambient
     hot_capacity_factor: factor by which the capacity of a hot absorber may exceed C
+    delay_factor: factor by which the time constant of heat that leaves an absorber may exceed R C
     extra_rise_k: rise by terms outside the bound, already subtracted from the caps
     """
 
@@ -77,4 +78,5 @@ class NominalThermalModel:
     touch: NominalTouch | None
     panel: NominalPanel | None = None
     hot_capacity_factor: float = 1.0
+    delay_factor: float = 1.0
     extra_rise_k: float = 0.0

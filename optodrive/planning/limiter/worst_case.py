@@ -60,12 +60,13 @@ def build_heat_bound(
     c_high = model.c_j_per_k * (1 + uncertainty.absorber_capacity) * model.hot_capacity_factor
     knot_k, loss_k = _compute_loss_chords(model, uncertainty, caps)
     resistance_factor = float(knot_k[-1] / loss_k[-1])
-    tau_max_s = float((r_high * c_high).max()) * resistance_factor
+    late_j_per_k = c_high * model.delay_factor  # heat that a part behind the absorber returns counts as the absorber's
+    tau_max_s = float((r_high * late_j_per_k).max()) * resistance_factor
     slope_min = float(np.min(np.diff(loss_k) / np.diff(knot_k)))
-    lag_max_s = float((r_high * c_high).max()) / slope_min
+    lag_max_s = float((r_high * late_j_per_k).max()) / slope_min
 
     epsilon_max = float(epsilon.max())
-    wall = _build_wall_bound(model, uncertainty, epsilon_max, c_high, resistance_factor, tau_max_s, lag_max_s)
+    wall = _build_wall_bound(model, uncertainty, epsilon_max, late_j_per_k, resistance_factor, tau_max_s, lag_max_s)
     touch = _build_touch_bound(
         model, uncertainty, epsilon_max, float(r_high.max()) * resistance_factor, tau_max_s, wall
     )

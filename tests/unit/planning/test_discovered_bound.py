@@ -7,7 +7,6 @@ from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.units import ZERO_CELSIUS_K
-from optodrive.physics import discovered_term
 from optodrive.physics.discovered_term import KEY, KNOTS, UNITS, DiscoveredTerm, list_values
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
@@ -67,6 +66,12 @@ def build_hostile_plan(power_w, seed):
     width_s = generator.integers(25, 250, count) * 2e-4
     rest_s = generator.choice([5e-4, 5e-3, 0.03, 0.1], count)
     start_s = 0.01 + np.cumsum(np.concatenate([[0.0], (width_s + rest_s)[:-1]]))
+    return build_plan(start_s, width_s, power_w)
+
+
+def build_plan(start_s, width_s, power_w):
+    """Build pulses of one power on one pixel."""
+    count = len(start_s)
     pixel = np.full(count, 5)
     angles_rad = DISPLAY.scan_head.field.angles_rad(DISPLAY.layout.x_m, DISPLAY.layout.y_m)
     x_rad, y_rad = (angle_rad[pixel] for angle_rad in angles_rad)
@@ -107,13 +112,51 @@ def test_a_limiter_that_ignores_the_term_is_caught(name):
     assert max(shares) > 1.0
 
 
-@pytest.mark.parametrize("name", ["memory", "fast memory", "feedback and memory"])
-def test_a_limiter_that_takes_the_memory_for_the_absorber_is_caught(name, monkeypatch):
-    """Mutant: a memory that is never warmer than the absorber."""
-    monkeypatch.setattr(discovered_term, "_find_memory_share", lambda feedback, ratio: 1.0)
-    bounded = build_limits(HOT[name]).heat
-    monkeypatch.undo()
-    assert (bounded.epsilon < build_limits(HOT[name]).heat.epsilon).all()
+def build_warm_budget(terms):
+    """Build the budget of a pixel with a wall and a touch surface, whose caps alone bind."""
+    own = {key: load_parameters("surroundings").terms[key] for key in ("wall_heating", "touch_surface")}
+    parameters = load_parameters("calibrated").model_copy(update={"terms": own, "discovered": tuple(terms)})
+    loose = {"absorber_max_c": 400.0, "pixel_mean_max_w": 2.0, "display_mean_max_w": 2.0}
+    config = EXACT.model_copy(update={"limits": LIMITS.model_copy(update=loose)})
+    return build_budget(config, parameters, DISPLAY.pixels)
+
+
+def find_warmest_k(terms, budget, h_s=2e-4, until_s=8.0):
+    """Return the largest rises of wall and touch surface under limited pulses, integrated by Euler's method."""
+    pixel, surroundings = DISPLAY.pixels.elements[5], load_parameters("surroundings")
+    wall, touch = (surroundings.term_values(key) for key in ("wall_heating", "touch_surface"))
+    starts_s = np.arange(0.01, until_s - 0.5, 0.051)
+    width_s = np.full(len(starts_s), 0.05)
+    plan = build_plan(starts_s, width_s, 2.45)
+    limited, _ = limit(plan, build_cold_budget_state(len(DISPLAY.pixels)), budget)
+    power_w = np.zeros(round(until_s / h_s))
+    for start_s, wide_s, watts in zip(limited.start_s, limited.width_s, limited.power_w, strict=True):
+        power_w[round(start_s / h_s) : round((start_s + wide_s) / h_s)] = watts
+    (term_,) = terms
+    slope = term_.values[-1] / term_.high
+    absorber = gas = memory = wall_k = touch_k = 0.0
+    warmest = [0.0, 0.0]
+    for watts in power_w.tolist():
+        flow_w = (absorber - wall_k) / pixel.r_k_per_w
+        back_w = slope * (memory if term_.depends_on == "memory" else absorber - wall_k)
+        absorber += h_s * (pixel.epsilon * watts - flow_w + back_w) / pixel.c_j_per_k
+        gas += h_s * (0.5 * (absorber + wall_k) - gas) / pixel.tau_g_s
+        memory += h_s * (absorber - wall_k - memory) / (term_.memory_time_s or 1.0)
+        wall_k += h_s * (flow_w - wall_k / wall["resistance"]) / wall["capacity"]
+        drive_k = touch["gas_share"] * gas + touch["wall_share"] * wall_k
+        touch_k += h_s * (drive_k - touch_k) / touch["lag"]
+        warmest = [max(warmest[0], wall_k), max(warmest[1], touch_k)]
+    return warmest
+
+
+@pytest.mark.parametrize("name", ["memory", "fast memory", "feedback"])
+def test_a_finger_stays_below_its_cap(name):
+    """Also a mutant: the budget of the set without the term passes the cap."""
+    budget = build_warm_budget(HOT[name])
+    wall_k, touch_k = find_warmest_k(HOT[name], budget)
+    assert wall_k <= budget.caps.wall_k
+    assert 0.3 * budget.caps.touch_k < touch_k <= budget.caps.touch_k
+    assert find_warmest_k(HOT[name], build_warm_budget([]))[1] > budget.caps.touch_k
 
 
 @pytest.mark.parametrize(
