@@ -14,6 +14,7 @@ from optodrive.device.panel import complete_panel
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
 from optodrive.physics.terms import all_terms
+from optodrive.physics.terms.wall_heating import compute_capacity
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
 from optodrive.planning.limiter.nominal_model import (
@@ -92,7 +93,7 @@ def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelA
     """
     walls_j_per_k = 0.0
     if "wall_heating" in parameters.terms:
-        walls_j_per_k = len(pixels) * parameters.term_values("wall_heating")["capacity"]
+        walls_j_per_k = len(pixels) * compute_capacity(parameters.term_values("wall_heating"))
     if "panel_heating" in parameters.terms:
         values, where = parameters.term_values("panel_heating"), "terms.panel_heating.capacity"
         more = max(1.0, values["share"] / float(pixels.epsilon.min()))
@@ -152,7 +153,7 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
     # A rise of the absorbers also warms walls and touch surfaces, with a delay; each adds a small part.
     factor = 1.0
     if "wall_heating" in terms:
-        factor += 2.0 * c_j_per_k / terms["wall_heating"]["capacity"]
+        factor += 2.0 * c_j_per_k / compute_capacity(terms["wall_heating"])
     if "touch_surface" in terms:
         touch = terms["touch_surface"]
         factor += touch["gas_share"] * r_k_per_w * c_j_per_k / touch["lag"]
@@ -220,7 +221,7 @@ def build_nominal_model(
     if wall is not None:
         walls = NominalWalls(
             r_k_per_w=wall["resistance"],
-            c_j_per_k=wall["capacity"],
+            c_j_per_k=compute_capacity(wall),
             lateral_k_per_w=lateral["resistance"] if lateral else np.inf,
             frame_k_per_w=lateral["frame_resistance"] if lateral else np.inf,
         )
