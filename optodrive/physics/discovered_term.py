@@ -81,10 +81,11 @@ NEGLIGIBLE = 1e-6
 class DiscoveredTerm(Section):
     """One function that a parameter set adds to the pixel, and where.
 
-    where: key of `UNITS`; depends_on: rises of absorber, gas or memory, K, over the wall for a heat flow, the drive
-    of the gas, half the absorber's rise less the gas's, K, the incident power, W, or the time since the gate has opened, s; values: of the function at
-    65 equal distances from low to high, constant beyond; light: relative to the power, on the power itself in W;
-    heat_capacity: f in C / (1 + f); memory_time_s: time constant with which the memory follows the absorber
+    where: key of `UNITS`; depends_on: rises of absorber, gas or memory, K, over the wall for a heat flow, the drive of
+    the gas, half the absorber's rise less the gas's, K, the incident power, W, or the time since the gate has opened,
+    s; values: of the function at 65 equal distances from low to high, constant beyond; light: relative to the power, on
+    the power itself in W; heat_capacity: f in C / (1 + f); memory_time_s: time constant with which the memory follows
+    the absorber's rise over its wall
     """
 
     where: Literal["light", "heat_capacity", "absorber", "gas", "displacement", "force"]
