@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))
+TESTS = Path(__file__).parents[1]
+sys.path.insert(0, str(TESTS / "conformance"))
+sys.path.append(str(TESTS / "pico"))
 pytest.register_assert_rewrite(
     *(f"{name}_scenarios" for name in ("edge", "guard", "job", "link", "order", "self", "trust"))
 )

@@ -3,6 +3,7 @@
 import pytest
 from all_scenarios import SCENARIOS
 from independent_board import IndependentCore, independent_kind
+from process_board import has_subject
 from scenario import GUARDS, judge
 from test_conform_mutants import caught_by
 from test_conformance_pty import name_case
@@ -11,7 +12,9 @@ from virtual_rig import VirtualRig, run_fault_sessions
 LINK_FAULTS = 5000
 
 
-@pytest.mark.parametrize("case", SCENARIOS, ids=name_case)
+@pytest.mark.parametrize(
+    "case", [case for case in SCENARIOS if has_subject("independent", case.subject)], ids=name_case
+)
 def test_conforms(case):
     judge(independent_kind(), case)
 

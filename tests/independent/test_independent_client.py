@@ -2,30 +2,36 @@
 
 import json
 import subprocess
+from functools import partial
 from itertools import pairwise
 
 import pytest
 from bench import Bench
+from emulated_pico import EmulatedPico, PicoImage
+from emulated_usb_pico import EmulatedUsbPico
 from independent_board import independent_kind
 from independent_client import client_command, play
 from link_faults import LinkFaults
 from process_board import PROCESS_KINDS
 from scenario import audit
-from virtual_board import VirtualKind
+from virtual_board import EmulatedBoard, PicoBoard, VirtualKind
 
 from c_core import SeededCBoard, build_library
+from firmware_ports import build_emulated_chip
 from optodrive.link.simulator.board_core import BoardCore
 
 PLAYED = ["boot", "arm requested", "armed", "start", "job done", "start", "job done", "disarm"]
 PATIENT_MS = 60_000
 
 
-@pytest.fixture(scope="module", params=["python", "c", "independent"])
+@pytest.fixture(scope="module", params=["python", "c", "qemu", "independent"])
 def kind(request, tmp_path_factory):
     if request.param == "python":
         return VirtualKind("python", BoardCore)
     if request.param == "independent":
         return independent_kind()
+    if request.param == "qemu":
+        return VirtualKind("qemu", build_emulated_chip(tmp_path_factory.mktemp("chip"), 0), make_board=EmulatedBoard)
     library = build_library(tmp_path_factory.mktemp("core"))
     return VirtualKind("c", lambda *settings, **seed: SeededCBoard(library, *settings, **seed))
 
@@ -73,6 +79,17 @@ def play_virtually(kind, folder, loss=0.0, seed=0, **settings):
 
 
 def test_its_plan_is_played_in_virtual_time(kind, tmp_path):
+    board, report, _ = play_virtually(kind, tmp_path)
+    assert [reason for _, reason in board.states()] == PLAYED
+    assert_played(board, report, in_time=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pico", [EmulatedPico, EmulatedUsbPico])
+def test_its_plan_is_played_by_a_pico(tmp_path, pico):
+    built = tmp_path / "image"
+    built.mkdir()
+    kind = VirtualKind("pico", partial(pico, PicoImage(built)), make_board=PicoBoard)
     board, report, _ = play_virtually(kind, tmp_path)
     assert [reason for _, reason in board.states()] == PLAYED
     assert_played(board, report, in_time=True)
