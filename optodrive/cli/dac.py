@@ -1,4 +1,4 @@
-"""`optodrive dac info | play`: play frames on a laser DAC instead of the board. Its former name is `helios`."""
+"""`optodrive dac list | info | play`: play frames on a laser DAC instead of the board. Its former name is `helios`."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -43,6 +43,16 @@ class _TerminatedError(OptodriveError):
 
 
 GROUP = typer.Typer(help="Play on a laser DAC; see docs/how-to/use-a-laser-dac.md first.", no_args_is_help=True)
+
+
+@GROUP.command("list")
+def list_dacs(json: JsonOption = False) -> None:
+    """Show the laser DACs on USB and in the network within two seconds. None is played because it was found."""
+    from optodrive.cli.dac_list import summarize_dacs
+    from optodrive.core.clock import MonotonicClock
+    from optodrive.link.dac.discovery import find_dacs
+
+    print_answer(*summarize_dacs(find_dacs(MonotonicClock())), json)
 
 
 @GROUP.command()

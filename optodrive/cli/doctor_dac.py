@@ -53,7 +53,7 @@ def _check_interlock(config: Config) -> Finding:
 
 def _check_rate(config: Config) -> Finding:
     scale = PointScale.from_config(config)
-    point_s, stretch = scale.point_s, scale.stretch
+    point_s, stretch = scale.point_s, scale.format.stretch
     observation = f"{1.0 / point_s:.1f} points/s for {config.board.points_per_s} requested"
     longer = f", and lasts up to {100.0 * (stretch - 1.0):.2g} % longer at less power" if stretch > 1.0 else ""
     return report_ok(

@@ -18,12 +18,13 @@ DAC_HALF_RANGE_CODES = 2_047
 """Half range of a laser DAC: 12 bits, which every converter behind one has."""
 POWER_STEPS = 65_535
 """Steps of the board's duty from zero to the laser's full power."""
-DAC_POWER_STEPS = {"helios": 255}
+DAC_POWER_STEPS = {"helios": 255, "ether_dream": 4095}
 """The same of the laser DACs, by transport."""
+NETWORK_DACS = ("ether_dream",)
 DAC_TIMING_SLACK_POINTS = 5
 """On a laser DAC a pulse starts up to two points late (rounding; the end of a chunk) and ends up to three points early
 (the same, and the dark point before an immediately following pulse)."""
-DAC_POINT_EXCESS_S = {"helios": 1e-8}
+DAC_POINT_EXCESS_S = {"helios": 1e-8, "ether_dream": 5e-8}
 """A point lasts up to one tick of the DAC's clock longer than requested, s."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -219,10 +220,10 @@ class LimitsSection(Section):
 class BoardSection(Section):
     """The board and the way to reach it."""
 
-    transport: Literal["simulated", "serial", "usb", "helios"]
-    """The simulated board, a serial port, USB bulk endpoints, or a Helios laser DAC."""
+    transport: Literal["simulated", "serial", "usb", "helios", "ether_dream"]
+    """The simulated board, a serial port, USB bulk endpoints, or a laser DAC: Helios by USB, Ether Dream by network."""
     port: str = ""
-    """Serial device, or link of the simulated board's pseudo-terminal."""
+    """Serial device, link of the simulated board's pseudo-terminal, or address of a network DAC."""
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 1_000_000
     """Bit rate of the serial port, 1/s."""
     uid: str = ""
@@ -246,6 +247,8 @@ class BoardSection(Section):
     def _check_address(self) -> Self:
         if self.transport == "serial" and not self.port:
             raise ConflictError("port", self.port, "a device for transport 'serial', for example \"/dev/ttyACM0\"")
+        if self.transport in NETWORK_DACS and not self.port:
+            raise ConflictError("port", self.port, 'the DAC\'s address, for example "192.168.1.20"')
         for key, example in (("vendor_id", "0x1209"), ("product_id", "0x0001")):
             if self.transport == "usb" and getattr(self, key) is None:
                 raise ConflictError(key, None, f"a number for transport 'usb', for example {example}")
@@ -258,6 +261,8 @@ class BoardSection(Section):
             return ()
         if self.transport == "serial":
             return (self.transport, realpath(self.port))
+        if self.transport in NETWORK_DACS:
+            return (self.transport, self.port)
         return (self.transport, self.vendor_id, self.product_id, self.serial_number, self.uid)
 
     @property

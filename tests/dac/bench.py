@@ -29,6 +29,12 @@ def build_display(name="display-16", points_per_s=40_000):
     return DisplayModel.from_config(build_config(name, points_per_s=points_per_s))
 
 
+@cache
+def build_network_display(transport, name="display-16", points_per_s=40_000):
+    config = build_config(name, transport=transport, points_per_s=points_per_s, port="dac")
+    return DisplayModel.from_config(config)
+
+
 def raw_points(data):
     """Return the points of a Helios' frame, [n, 7] bytes, without this package's parser."""
     return np.frombuffer(data[:-5], dtype=np.uint8).reshape(-1, 7)

@@ -12,6 +12,8 @@ from optodrive.cli import dac as dac_cli
 from optodrive.cli.main import run
 from optodrive.core.errors import LinkError
 from optodrive.device.config_file import locate_shipped
+from optodrive.link.dac import discovery
+from optodrive.link.dac.discovery import FoundDac
 from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
 DAY_S = 1.7e9
@@ -61,6 +63,21 @@ def test_info_reports_identity_and_permission_to_emit(desk, capsys):
     }
     assert run(["helios", "info", *desk.config("false")]) == 0
     assert "may emit         no" in capsys.readouterr().out
+
+
+def test_list_shows_what_is_on_usb_and_in_the_network(desk, capsys, monkeypatch):
+    monkeypatch.setattr(discovery, "LISTENING_S", 0.0)
+    found = FoundDac("ether_dream", "00:04:a3:01:02:03", "192.168.1.20", "revision 1.0, idle")
+    monkeypatch.setattr(discovery, "find_ether_dreams", lambda clock: [found])
+    assert run(["dac", "list"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "helios                        Helios: USB bus 1 device 7; `info` asks for its name",
+        "ether_dream  192.168.1.20     00:04:a3:01:02:03: revision 1.0, idle",
+    ]
+    desk.bench.emulated.unplugged_at_s = 0.0
+    monkeypatch.setattr(discovery, "find_ether_dreams", lambda clock: [])
+    assert run(["dac", "list"]) == 0
+    assert capsys.readouterr().out == "no laser DAC found\n"
 
 
 def test_play_reports_what_the_laser_emitted(desk, capsys):

@@ -12,20 +12,22 @@ from dac.bench import build_display, build_frame, build_train, build_verified, r
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import EMPTY_PLAN
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.link.dac.dac_format import CHUNK_MAX_S
-from optodrive.link.dac.devices.helios_frames import HELIOS
 from optodrive.link.dac.encoding import PointScale, decode, encode
+from optodrive.link.dac.formats.base import CHUNK_MAX_S
+from optodrive.link.dac.formats.helios import HeliosFormat
 from optodrive.link.dac.verification import verify_chunks
 from optodrive.planning.limiter.limiter import limit
 
 
 @pytest.mark.parametrize(("requested", "actual"), [(20_000, 19_996.43), (40_000, 39_985.72), (50_000, 49_977.69)])
 def test_the_rate_is_rounded_by_the_dac(requested, actual):
-    assert 112e6 / HELIOS.compute_point_ticks(requested) == pytest.approx(actual, abs=0.01)
+    assert 112e6 / HeliosFormat(requested).point_ticks == pytest.approx(actual, abs=0.01)
 
 
 def test_which_frames_fill_whole_packets():
-    assert [points for points in range(4096) if not HELIOS.accepts_length(points)] == list(range(45, 4096, 64))
+    assert [points for points in range(4096) if not HeliosFormat(40_000).accepts_length(points)] == list(
+        range(45, 4096, 64)
+    )
 
 
 @st.composite
@@ -181,7 +183,7 @@ def test_a_plan_without_pulses_emits_nothing():
     plan, _ = limit(EMPTY_PLAN, display.build_cold_state()[1], display.budget)
     frames = encode(plan, PointScale.from_config(display.config))
     assert len(decode([frame.data for frame in frames], PointScale.from_config(display.config))) == 0
-    frame = HELIOS.check(EMITTING * 2 + BLANK + GOOD)
+    frame = HeliosFormat(40_000).check(EMITTING * 2 + BLANK + GOOD)
     with pytest.raises(LocalProtocolError, match="exceeds the plan's pulses"):
         verify_chunks(
             [frame.data], plan, PointScale.from_config(display.config), display.build_cold_state()[1], display.budget
@@ -219,7 +221,7 @@ EMITTING, BLANK = b"\x80\x08\x00" + b"\x01" * 4, b"\x80\x08\x00" + bytes(4)
 )
 def test_unsafe_frames_are_rejected(data, words):
     with pytest.raises(LocalProtocolError, match=words):
-        HELIOS.check(data)
+        HeliosFormat(40_000).check(data)
 
 
 def _brighter(points):

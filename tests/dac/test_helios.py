@@ -8,10 +8,10 @@ from dac.bench import Bench, build_config
 from dac.emulated_helios import EmulatedHelios, HostDeadError
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError
-from optodrive.link.dac.dac_format import Chunk
 from optodrive.link.dac.devices import helios as dac_module
 from optodrive.link.dac.devices.helios import Helios
-from optodrive.link.dac.devices.helios_frames import HELIOS
+from optodrive.link.dac.formats.base import Chunk
+from optodrive.link.dac.formats.helios import HeliosFormat
 from optodrive.link.transport.usb_device import find_device
 
 
@@ -20,7 +20,7 @@ def frame(points=100, rate=40_000, level=0):
 
     table = np.zeros((points, 3), dtype=np.int64)
     table[:-1, 2] = level
-    return HELIOS.check(HELIOS.pack(table, rate, 0))
+    return HeliosFormat(rate).check(HeliosFormat(rate).pack(table, 0))
 
 
 def test_open_identifies_and_stops_the_dac():

@@ -7,8 +7,8 @@ from dac.bench import Bench, build_config, build_display, build_frame, build_tra
 from dac.emulated_helios import HostDeadError
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.dac import player as player_module
-from optodrive.link.dac.devices.helios_frames import HELIOS, POINT_BYTES
 from optodrive.link.dac.encoding import PointScale
+from optodrive.link.dac.formats.helios import POINT_BYTES, HeliosFormat
 from optodrive.link.dac.player import play
 
 
@@ -80,7 +80,7 @@ def test_emission_ends_within_the_bound_after_the_host_was_killed(after_s):
     with pytest.raises(HostDeadError):
         play(bench.helios, verified, bench.clock)
     bench.emulated.pass_time(60.0)
-    assert bench.device.dark_from_s() <= killed_s + HELIOS.host_loss_max_s
+    assert bench.device.dark_from_s() <= killed_s + HeliosFormat.host_loss_max_s
     assert not any(bench.device.colour)
 
 
@@ -94,7 +94,7 @@ def test_the_bound_is_tight():
             play(bench.helios, verified, bench.clock)
         bench.emulated.pass_time(1.0)
         worst_s = max(worst_s, bench.device.dark_from_s() - killed_s)
-    assert 0.7 * HELIOS.host_loss_max_s < worst_s <= HELIOS.host_loss_max_s
+    assert 0.7 * HeliosFormat.host_loss_max_s < worst_s <= HeliosFormat.host_loss_max_s
 
 
 def test_a_mutant_without_play_once_emits_forever():
@@ -210,4 +210,4 @@ def test_progress_is_told_from_nothing_to_all():
     assert shares[0] == 0.0
     assert shares[-1] == 1.0
     assert shares == sorted(shares)
-    assert HELIOS.host_loss_max_s < player_module.READY_TIMEOUT_S
+    assert HeliosFormat.host_loss_max_s < player_module.READY_TIMEOUT_S

@@ -14,8 +14,8 @@ from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.device.config import Config
 from optodrive.device.config_sections import DAC_HALF_RANGE_CODES
-from optodrive.link.dac.dac_format import CHUNK_MAX_S, Chunk, DacFormat, PointTable
-from optodrive.link.dac.formats import find_format
+from optodrive.link.dac.formats.base import CHUNK_MAX_S, Chunk, DacFormat, PointTable
+from optodrive.link.dac.formats.registry import find_format
 from optodrive.link.protocol.dac_codes import DacScale
 
 TICKS_PER_PLAN_S = 1_000_000
@@ -26,32 +26,22 @@ TRAILING_POINTS = 2
 
 @dataclass(frozen=True)
 class PointScale(DacScale, bits=12):
-    """Scale factors between SI units and codes, levels and points of one kind of DAC.
-
-    points_per_s: requested rate; the actual rate of the DAC may be slightly lower
-    """
+    """Scale factors between SI units and codes, levels and points of one kind of DAC."""
 
     full_power_w: float
-    points_per_s: int
     format: DacFormat
 
     @classmethod
     def from_config(cls, config: Config) -> "PointScale":
         """Derive the scale. The codes span the scanner's whole range, the largest level is the laser's full power."""
         rad_per_code = config.scanner.range_rad / DAC_HALF_RANGE_CODES
-        return cls(
-            rad_per_code, config.laser.max_power_w, config.board.points_per_s, find_format(config.board.transport)
-        )
+        dac_format = find_format(config.board.transport)(config.board.points_per_s)
+        return cls(rad_per_code, config.laser.max_power_w, dac_format)
 
     @property
     def point_s(self) -> float:
         """Actual duration of a point, s."""
-        return self.format.compute_point_ticks(self.points_per_s) / self.format.clock_hz
-
-    @property
-    def stretch(self) -> float:
-        """Factor by which a point may last longer."""
-        return self.format.compute_stretch(self.points_per_s)
+        return self.format.point_ticks / self.format.clock_hz
 
     @property
     def points_max(self) -> int:
@@ -85,19 +75,16 @@ def encode(plan: LimitedPlan, scale: PointScale) -> tuple[Chunk, ...]:
     Power is rounded down. Every chunk ends with a blank point, which interrupts a pulse if necessary. Raise
     LocalProtocolError if pulses overlap or exceed the power range.
     """
-    points, ticks = _encode_points(plan, scale), scale.format.compute_point_ticks(scale.points_per_s)
+    points, ticks = _encode_points(plan, scale), scale.format.point_ticks
     return tuple(
-        scale.format.check(scale.format.pack(points[first:last], scale.points_per_s, first * ticks))
+        scale.format.check(scale.format.pack(points[first:last], first * ticks))
         for first, last in _split_chunks(points, scale)
     )
 
 
 def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     """Return all points of a plan, [n, 3], from the plan's zero."""
-    ticks, ticks_per_us = (
-        scale.format.compute_point_ticks(scale.points_per_s),
-        scale.format.clock_hz // TICKS_PER_PLAN_S,
-    )
+    ticks, ticks_per_us = scale.format.point_ticks, scale.format.clock_hz // TICKS_PER_PLAN_S
     level_max = scale.format.level_max
     start = np.rint(plan.start_s * 1e6).astype(np.int64) * ticks_per_us
     end = start + np.rint(plan.width_s * 1e6).astype(np.int64) * ticks_per_us
@@ -106,7 +93,7 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     share = plan.power_w / scale.full_power_w
     if len(plan) and not 0 <= share.min() <= share.max() <= 1 + 1e-12:
         raise LocalProtocolError(f"powers of {share.min():g} to {share.max():g} leave the range 0 to 1 of the laser's")
-    level = np.floor(share / scale.stretch * level_max * (1 + 1e-12)).astype(np.int64)
+    level = np.floor(share / scale.format.stretch * level_max * (1 + 1e-12)).astype(np.int64)
     first, last = -(-start // ticks) + scale.format.settling_points, end // ticks
     last[:-1] -= last[:-1] == first[1:]  # a blank point separates adjacent pulses
     emitting = (level > 0) & (last > first)  # the mirrors skip pulses without emission
@@ -173,5 +160,5 @@ def decode(chunks: Sequence[bytes], scale: PointScale) -> PointPulses:
         width_s=(begin_ticks[run_ends] - begin_ticks[run_starts]) / scale.format.clock_hz,
         x_rad=scale.to_angles_rad(x),
         y_rad=scale.to_angles_rad(y),
-        power_w=level / scale.format.level_max * scale.full_power_w * scale.stretch,
+        power_w=level / scale.format.level_max * scale.full_power_w * scale.format.stretch,
     )

@@ -8,7 +8,8 @@ from typing import ClassVar, Self
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config_sections import BoardSection
-from optodrive.link.dac.dac_format import Chunk, DacFormat
+from optodrive.link.dac.formats.base import Chunk
+from optodrive.link.dac.formats.registry import find_format
 
 
 class LaserDac(ABC):
@@ -18,11 +19,11 @@ class LaserDac(ABC):
     name, firmware: what it says of itself, known after open()
     """
 
-    format: ClassVar[DacFormat]
     transport: ClassVar[str]
 
     def __init__(self, board: BoardSection, clock: Clock) -> None:
         self.board = board
+        self.format = find_format(self.transport)(board.points_per_s)
         self.name = self.format.label
         self.firmware = ""
         self._clock = clock

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import LinkError
-from optodrive.link.dac.dac_format import Chunk
+from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.laser_dac import LaserDac
 from optodrive.link.dac.verification import VerifiedChunks
 
@@ -65,7 +65,7 @@ def _send_chunks(
         if number and now_s > end_s:
             underruns, underrun_s = underruns + 1, underrun_s + now_s - end_s
         end_s = max(end_s, now_s) + chunk.duration_s
-    while clock.now_s() < end_s:
+    while clock.now_s() < end_s + dac.format.lag_max_s:
         on_progress(1.0)
         clock.sleep(POLL_INTERVAL_S)
     return PlaybackReport(len(chunks), underruns, underrun_s)

@@ -3,7 +3,7 @@
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError
 from optodrive.device.config_sections import BoardSection
-from optodrive.link.dac.formats import FORMATS
+from optodrive.link.dac.formats.registry import FORMATS
 from optodrive.link.dac.laser_dac import LaserDac
 
 
@@ -16,4 +16,8 @@ def build_dac(board: BoardSection, clock: Clock) -> LaserDac:
         from optodrive.link.dac.devices.helios import Helios
 
         return Helios(board, clock)
+    if board.transport == "ether_dream":
+        from optodrive.link.dac.devices.ether_dream import EtherDream
+
+        return EtherDream(board, clock)
     raise InputError("board.transport", board.transport, f"that of a laser DAC: {', '.join(FORMATS)}")

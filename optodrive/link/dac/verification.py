@@ -7,8 +7,8 @@ import numpy as np
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan
-from optodrive.link.dac.dac_format import Chunk
 from optodrive.link.dac.encoding import PointPulses, PointScale, decode, encode
+from optodrive.link.dac.formats.base import Chunk
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import verify
 

@@ -1,1 +1,1 @@
-"""Drivers of laser DACs, and the bytes of their points."""
+"""Drivers of laser DACs."""

@@ -14,8 +14,7 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError, escape_unprintable
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
-from optodrive.link.dac.dac_format import Chunk
-from optodrive.link.dac.devices.helios_frames import HELIOS
+from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.laser_dac import LaserDac
 from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
 
@@ -46,7 +45,6 @@ class Helios(LaserDac):
     backend: of pyusb, None for libusb
     """
 
-    format = HELIOS
     transport = "helios"
 
     def __init__(self, board: BoardSection, clock: Clock, backend: Any = None) -> None:
@@ -108,7 +106,7 @@ class Helios(LaserDac):
         failures = [self._command_with_retries(STOP, 0), self._command_with_retries(SHUTTER, 0)]
         for failure in failures:
             if failure is not None:
-                bound = f"it plays for at most {format_quantity(HELIOS.host_loss_max_s, 's')} more"
+                bound = f"it plays for at most {format_quantity(self.format.host_loss_max_s, 's')} more"
                 raise LinkError(f"the Helios may not have received the stop and shutter commands, {bound}: {failure}")
         self._clock.sleep(STOP_DELAY_S)
 

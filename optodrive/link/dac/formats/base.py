@@ -6,7 +6,7 @@ arming, no lease and no report, so all safety lies in what it is given and when.
 - Points are cut into chunks of at most 25 ms that are played once and end dark. A device that runs empty therefore ends
   on a dark point, whether it then blanks its outputs or holds the last one until a time-out of its own.
 - At most one chunk waits behind the one that plays. A dead host leaves that much light, `host_loss_max_s`.
-- A device may play slower than it is asked to, `compute_stretch`. Levels are lower by that factor, so that a pulse
+- A device may play slower than it is asked to, `stretch`. Levels are lower by that factor, so that a pulse
   never has more energy than planned, however long it lasts.
 
 A device driver adds nothing to this but bytes, flow control and a stop. Encoder, proof and player do not know it.
@@ -40,13 +40,15 @@ class Chunk:
 
 
 class DacFormat(ABC):
-    """Properties of one kind of laser DAC and the bytes of its chunks.
+    """Properties of one kind of laser DAC at a requested rate, and the bytes of its chunks.
 
+    points_per_s: requested rate
     label: its name in messages
     level_max: number of steps of power
     clock_hz: clock that a point lasts whole ticks of
     points_max: maximum number of points of a chunk
     host_loss_max_s: maximum emission after the last byte of a dead host
+    lag_max_s: maximum time by which playback ends later than the host expects
     fixed_length: every chunk of a plan has the same number of points
     settling_points: dark points that precede a pulse in addition to the planned dark time
     """
@@ -56,15 +58,21 @@ class DacFormat(ABC):
     clock_hz: ClassVar[int]
     points_max: ClassVar[int]
     host_loss_max_s: ClassVar[float]
+    lag_max_s: ClassVar[float] = 0.0
     fixed_length: ClassVar[bool] = False
     settling_points: ClassVar[int] = 0
 
-    @abstractmethod
-    def compute_point_ticks(self, points_per_s: int) -> int:
-        """Return the duration of a point in clock ticks at a requested rate."""
+    def __init__(self, points_per_s: int) -> None:
+        self.points_per_s = points_per_s
 
-    def compute_stretch(self, points_per_s: int) -> float:
-        """Return the factor by which a point may last longer than its ticks."""
+    @property
+    @abstractmethod
+    def point_ticks(self) -> int:
+        """Duration of a point in clock ticks."""
+
+    @property
+    def stretch(self) -> float:
+        """Factor by which a point may last longer than its ticks."""
         return 1.0
 
     def accepts_length(self, points: int) -> bool:
@@ -72,7 +80,7 @@ class DacFormat(ABC):
         return True
 
     @abstractmethod
-    def pack(self, points: PointTable, points_per_s: int, begin_ticks: int) -> bytes:
+    def pack(self, points: PointTable, begin_ticks: int) -> bytes:
         """Return the bytes of points [n, 3] that begin at a tick of the plan."""
 
     @abstractmethod

@@ -1,0 +1,1 @@
+"""Properties and bytes of the laser DACs."""
