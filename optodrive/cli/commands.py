@@ -26,6 +26,7 @@ MODULES = {
     "patterns": ("patterns",),
     "plan": ("plan",),
     "simulate": ("simulate",),
+    "study": ("study",),
     "dac": ("dac", "helios"),
     "recording": ("recording",),
     "diagnose": ("diagnose",),

@@ -24,6 +24,54 @@ STEP_S = 0.005
 START_LEAD_S = 0.05
 
 
+class VirtualBoards:
+    """New simulated boards of a configuration, connected and armed, whose time passes only while they are called.
+
+    One oscillator per board counts from the first plan to the last: the ticks of all plans are on one time line.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._scales = build_scales(config)
+        self._boards = _build_boards(config)
+        _connect(self._boards)
+        self._boards.arm()
+        while self._boards.state != BoardState.ARMED:
+            _step(self._boards)
+
+    @property
+    def now_s(self) -> float:
+        """Time of the boards, s."""
+        return self._boards.board_s()
+
+    @property
+    def tick_s(self) -> float:
+        """Duration of a tick of `ExecutedPulses`, s."""
+        return self._boards.tick_s
+
+    def play(self, prepared: PlannedSequence, on_progress: Callable[[float], None] | None = None) -> ExecutedPulses:
+        """Stream a plan and return the pulses that the boards report, with times from the plan's zero.
+
+        Raise BoardFaultError if a board disarms or enters FAULT.
+        """
+        points = StagePoints.from_plan(prepared.plan, self._scales)
+        job = self._boards.begin(points, self._boards.board_s() + START_LEAD_S)
+        while sum(points.counts) and not job.is_finished:
+            _step(self._boards)
+            if on_progress is not None:
+                on_progress(job.executed_count / len(prepared.plan))
+        return job.build_executed(prepared.plan, self._scales)
+
+    def wait(self, duration_s: float) -> None:
+        """Let time pass with the boards armed and dark. Raise BoardFaultError as `play`."""
+        end_s = self.now_s + duration_s
+        while self.now_s < end_s:
+            _step(self._boards)
+
+    def close(self) -> None:
+        """Disarm the boards and close their links."""
+        self._boards.close()
+
+
 def execute(
     display: DisplayModel, prepared: PlannedSequence, on_progress: Callable[[float], None] | None = None
 ) -> ExecutedPulses:
@@ -32,20 +80,9 @@ def execute(
     Their times count from the plan's zero, or from the first pulse of a board whose clock let it begin earlier.
     Raise BoardFaultError if a board disarms or enters FAULT.
     """
-    boards = _build_boards(display.config)
-    _connect(boards)
-    boards.arm()
-    while boards.state != BoardState.ARMED:
-        _step(boards)
-    scales = build_scales(display.config)
-    points = StagePoints.from_plan(prepared.plan, scales)
-    job = boards.begin(points, boards.board_s() + START_LEAD_S)
-    while sum(points.counts) and not job.is_finished:
-        _step(boards)
-        if on_progress is not None:
-            on_progress(job.executed_count / len(prepared.plan))
+    boards = VirtualBoards(display.config)
+    executed = boards.play(prepared, on_progress)
     boards.close()
-    executed = job.build_executed(prepared.plan, scales)
     early_s = -min(0.0, float(executed.start_s.min(initial=0.0)))
     return replace(executed, start_s=executed.start_s + early_s)
 

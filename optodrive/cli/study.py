@@ -1,0 +1,175 @@
+"""`optodrive study`: run a study with people, or with simulated participants in virtual time."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from optodrive.cli.options import ConfigOption, JsonOption, UrlOption
+from optodrive.cli.output import announce_compilation, print_answer, show_progress
+from optodrive.core.daemon_url import DEFAULT_URL
+from optodrive.core.errors import InputError
+
+if TYPE_CHECKING:
+    from optodrive.study.study_file import Study
+
+PARTICIPANTS_MAX = 1000
+
+
+def study(
+    source: Annotated[str, typer.Argument(metavar="STUDY", help="A study file, or experiment-1 to experiment-6.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FOLDER", help="Dataset (BIDS); a session begun in it goes on.")
+    ],
+    participant: Annotated[
+        str | None,
+        typer.Option(
+            "--participant",
+            metavar="ID",
+            help="A person's code: answers at this terminal, on the daemon's armed display.",
+        ),
+    ] = None,
+    participants: Annotated[
+        int,
+        typer.Option("--participants", metavar="N", help="Number of simulated participants, without --participant."),
+    ] = 1,
+    url: UrlOption = DEFAULT_URL,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Run a study and write its dataset. Without --participant, participant and display are simulated, in virtual time.
+
+    Every trial is on the disk before the next begins: the same command after an interruption goes on where it ended.
+    """
+    from optodrive.core.files import check_output
+    from optodrive.study.dataset import SIMULATED_PREFIX, check_participant, write_dataset
+    from optodrive.study.study_file import load_study
+
+    design = load_study(source)
+    check_output("--out", out, folder=True, may_exist=True)
+    if not 1 <= participants <= PARTICIPANTS_MAX:
+        raise InputError("--participants", participants, f"1 to {PARTICIPANTS_MAX}")
+    if participant is None:
+        sessions = _simulate(design, out, participants, config)
+    else:
+        check_participant("--participant", participant)
+        if participant.startswith(SIMULATED_PREFIX):
+            raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
+        sessions = {participant: _run_person(design, out, participant, url)}
+    write_dataset(out)
+    report = _build_report(design, sessions, out)
+    print_answer(report, _format_report(report), json)
+
+
+def _simulate(design: "Study", out: Path, participants: int, config: str | None) -> dict[str, list[dict[str, Any]]]:
+    """Run the sessions of simulated participants and return the records of their trials."""
+    from optodrive.device.config_file import load_config
+    from optodrive.planning.display_model import DisplayModel
+    from optodrive.study.dataset import SIMULATED_PREFIX, build_log_path
+    from optodrive.study.observers import Observer, Participant
+    from optodrive.study.presenter import VirtualPresenter
+    from optodrive.study.session import SimulatedRespondent, draw_order, run_session
+    from optodrive.study.trial_log import TrialLog
+
+    if design.simulation is None:
+        raise InputError(f"study {design.name}: simulation", None, "an observer, to simulate a participant")
+    display = DisplayModel.from_config(load_config(config))
+    observer, sessions = Observer(design, display, Participant()), {}
+    announce_compilation()
+    with show_progress("simulating") as on_progress:
+        for number in range(1, participants + 1):
+            name = f"{SIMULATED_PREFIX}{number:02}"
+            with TrialLog(build_log_path(out, design, name), design, name, draw_order(design, name)) as log:
+                if log.next_trial is not None:
+                    log.begin_run("simulated board in virtual time")
+                    presenter = VirtualPresenter(display)
+                    respondent = SimulatedRespondent(observer, design.seed, number, presenter)
+                    run_session(design, log, presenter, respondent)
+                    presenter.close()
+                sessions[name] = list(log.trials.values())
+            on_progress(number / participants)
+    return sessions
+
+
+def _run_person(design: "Study", out: Path, participant: str, url: str) -> list[dict[str, Any]]:
+    """Run a person's session and return the records of the trials."""
+    from optodrive.client.display import Display
+    from optodrive.study.daemon_presenter import DaemonPresenter
+    from optodrive.study.dataset import build_log_path
+    from optodrive.study.session import draw_order, run_session
+    from optodrive.study.terminal import TerminalRespondent
+    from optodrive.study.trial_log import TrialLog
+
+    with TrialLog(
+        build_log_path(out, design, participant), design, participant, draw_order(design, participant)
+    ) as log:
+        if log.next_trial is not None:
+            presenter = DaemonPresenter(Display(url), {"study": design.name, "participant": participant})
+            log.begin_run(url)
+            try:
+                run_session(design, log, presenter, TerminalRespondent(design))
+            except EOFError:
+                raise InputError("answer", None, "a line; the session goes on with the same command") from None
+            finally:
+                presenter.close()
+        return list(log.trials.values())
+
+
+def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], out: Path) -> dict[str, Any]:
+    from optodrive.study.results import Accuracy, count_correct, fit_magnitudes
+
+    published, records = design.published, [record for session in sessions.values() for record in session]
+    report: dict[str, Any] = {
+        "study": design.name,
+        "participants": {name: len(session) for name, session in sessions.items()},
+        "trials": len(records),
+        "stimuli_per_trial": sum(len(record["presentations"]) for record in records) / len(records),
+        "repeated": sum(record["attempt"] > 1 for record in records),
+        "chance_level": design.response.chance_level,
+    }
+    if design.response.correct_factor is not None:
+        counted = count_correct(records)
+        report |= {"correct": counted.correct, "accuracy": counted.share}
+    elif design.response.kind == "magnitude":
+        report["line"] = fit_magnitudes(design, list(sessions.values()))._asdict()
+    if published is not None:
+        report["published"] = published.model_dump(mode="json") | {"trials": published.trials}
+        if published.correct is not None:
+            report["published"]["interval"] = list(Accuracy(published.correct, published.trials).interval)
+    return report | {"written": str(out)}
+
+
+def _format_report(report: dict[str, Any]) -> Iterator[str]:
+    yield f"study            {report['study']}"
+    yield f"participants     {len(report['participants'])}, {report['trials']} trials in all"
+    if report["repeated"]:
+        yield f"repeated         {report['repeated']} trials whose first attempt was interrupted or spoiled"
+    if "accuracy" in report:
+        yield (
+            f"correct          {report['correct']} of {report['trials']}, {100 * report['accuracy']:.1f} % "
+            f"(by chance {100 * report['chance_level']:.1f} %)"
+        )
+    if "line" in report:
+        line = report["line"]
+        means, values = line["r_squared"], line["participants_r_squared"]
+        yield f"line             r² {means:.3f} of the means, {values:.2f} of all values"
+    yield from _format_published(report.get("published"))
+    yield f"written          {report['written']}"
+
+
+def _format_published(published: dict[str, Any] | None) -> Iterator[str]:
+    if published is None:
+        return
+    counts = f"{published['participants']} participants, {published['trials']} trials"
+    if published["correct"] is not None:
+        low, high = published["interval"]
+        share = published["correct"] / published["trials"]
+        yield (
+            f"published        {counts}, {published['correct']} correct: {100 * share:.1f} % "
+            f"(95 % interval {100 * low:.1f} to {100 * high:.1f} %), {published['source']}"
+        )
+    elif published["r_squared"] is not None:
+        yield f"published        {counts}, r² {published['r_squared']:.2f}, {published['source']}"
+    for contradiction in published["contradictions"]:
+        yield f"contradiction    {contradiction}"

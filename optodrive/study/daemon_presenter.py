@@ -1,0 +1,64 @@
+"""Presentation on the display of a running daemon."""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from optodrive.client.display import Display
+from optodrive.client.plan import Plan
+from optodrive.study.presenter import TIME_TOLERANCE_S, Presentation
+from optodrive.study.study_file import Value
+
+
+class DaemonPresenter:
+    """The display behind a daemon whose board is armed already.
+
+    labels: recorded with every plan
+    """
+
+    def __init__(self, display: Display, labels: Mapping[str, str | int | float | bool]) -> None:
+        self._display, self._labels = display, labels
+
+    def present(self, pattern: str, parameters: Mapping[str, Value]) -> Presentation:
+        """Play a pattern and wait for its end. Raise the daemon's error if it is refused or fails."""
+        arguments: dict[str, Any] = {**parameters, "policy": "refuse"}
+        plan = self._display.play(pattern, labels=self._labels, **arguments)
+        columns = plan.executed_pulses
+        start_s = np.asarray([] if columns is None else columns.start_s, dtype=np.float64)
+        return Presentation(
+            onset_s=0.0 if plan.onset is None else plan.onset.board_s,
+            pixel=np.asarray([] if columns is None else columns.pixel, dtype=np.int64),
+            start_s=start_s - start_s.min(initial=np.inf) if len(start_s) else start_s,
+            width_s=np.asarray([] if columns is None else columns.width_s, dtype=np.float64),
+            power_w=np.asarray([] if columns is None else columns.power_w, dtype=np.float64),
+            fault=find_fault(plan),
+        )
+
+    def wait(self, duration_s: float) -> None:
+        """Wait by the computer's clock."""
+        time.sleep(duration_s)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._display.close()
+
+
+def find_fault(plan: Plan) -> str | None:
+    """Return how a plan's executed pulses differ from those planned, None if every one is as planned."""
+    planned, executed = plan.pulses, plan.executed_pulses
+    if executed is None or not plan.executed_complete or plan.executed != plan.planned:
+        return f"{plan.executed} of {plan.planned} pulses executed"
+    if plan.summary.trimmed.pulses:
+        return f"{plan.summary.trimmed.pulses} pulses trimmed by a limit"
+    if planned is None:
+        return "too many pulses to be compared"
+    if list(planned.pixel) != list(executed.pixel):
+        return "another order of pixels"
+    late_s = np.abs(np.asarray(planned.start_s) - planned.start_s[0] - executed.start_s + executed.start_s[0]).max()
+    if late_s > TIME_TOLERANCE_S:
+        return f"a pulse {1e6 * late_s:.0f} µs off its time"
+    if not np.allclose(planned.width_s, executed.width_s, rtol=0.0, atol=TIME_TOLERANCE_S):
+        return "another pulse width"
+    return None

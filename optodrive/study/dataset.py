@@ -1,0 +1,156 @@
+"""Datasets in the Brain Imaging Data Structure (BIDS), built from the logs of sessions.
+
+A dataset's folder holds the logs under `sourcedata`, and one table of trials with its description per participant and
+task under `sub-ID/beh`. Tables are always written anew from the logs, so that an interrupted run leaves nothing wrong.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from optodrive.core.errors import InputError
+from optodrive.core.files import create_folder, lock_folder, write_text
+from optodrive.study.study_file import Study
+from optodrive.study.trial_log import read_log
+
+BIDS_VERSION = "1.10.0"
+LOG_SUFFIX = "_trials.jsonl"
+ID_MAX = 20
+SIMULATED_PREFIX = "sim"
+"""Beginning of the identifiers of simulated participants."""
+
+README = """# Tactile studies
+
+Trials of studies that `optodrive study` ran on an optotactile display.
+
+- `sub-*/beh/*_beh.tsv` has one row per trial, in the order of the session. The `.json` beside it describes its columns,
+  the question, the answers and the design.
+- `sourcedata/sub-*/*_trials.jsonl` are the logs from which these tables are built: every stimulus as requested and as
+  the display executed it, pulse by pulse, every attempt, and every answer.
+- Participants are known by identifiers only. Those that begin with `sim` are simulated.
+"""
+
+COLUMNS: dict[str, dict[str, Any]] = {
+    "trial": {"Description": "Number of the trial in the session's order, from 1"},
+    "run": {"Description": "Number of the program's run; a session that was interrupted has several"},
+    "attempt": {
+        "Description": "Number of the attempt that counts; more than 1 after an interruption or a failed stimulus"
+    },
+    "answer": {"Description": "The participant's answer"},
+    "is_correct": {"Description": "Whether the answer is the correct one", "Levels": {"0": "no", "1": "yes"}},
+    "response_time": {"Description": "Time from the end of the stimulus to the answer", "Units": "s"},
+    "presentations": {"Description": "Number of times for which the stimulus was shown before the answer"},
+    "stimulus_onset": {
+        "Description": "Gate on of the first pulse of the last presentation, by the clock of the display's board, "
+        "which begins anew when the board restarts",
+        "Units": "s",
+    },
+    "stimulus_duration": {"Description": "Time from the first pulse's start to the last one's end", "Units": "s"},
+    "executed_pulses": {"Description": "Number of light pulses of the last presentation that the board executed"},
+}
+
+
+def check_participant(option: str, participant: str) -> None:
+    """Raise InputError unless an identifier is one that a dataset can have."""
+    if not (participant.isascii() and participant.isalnum() and len(participant) <= ID_MAX):
+        raise InputError(option, participant, f"1 to {ID_MAX} letters and digits, a code and not a name")
+
+
+def build_log_path(folder: Path, study: Study, participant: str) -> Path:
+    """Return the path of a session's log in a dataset, and create its folder."""
+    sub = f"sub-{participant}"
+    create_folder(folder / "sourcedata" / sub)
+    return folder / "sourcedata" / sub / f"{sub}_task-{study.task}{LOG_SUFFIX}"
+
+
+def write_dataset(folder: Path) -> None:
+    """Write the tables of all logs of a dataset. A description and a README that exist are kept."""
+    with lock_folder(folder):
+        logs = sorted((folder / "sourcedata").glob(f"sub-*/*{LOG_SUFFIX}"))
+        for name, text in (
+            ("dataset_description.json", _dump(_describe_dataset())),
+            ("README.md", README),
+            ("participants.json", _dump(_describe_participants())),
+        ):
+            if not (folder / name).exists():
+                write_text(folder / name, text)
+        participants = sorted({path.parent.name for path in logs})
+        rows = [[one, "simulated" if one.startswith(f"sub-{SIMULATED_PREFIX}") else "person"] for one in participants]
+        write_text(folder / "participants.tsv", _format_table(["participant_id", "kind"], rows))
+        for path in logs:
+            _write_task(folder, path)
+
+
+def _write_task(folder: Path, path: Path) -> None:
+    head, trials = read_log(path)
+    beh = folder / path.parent.name / "beh"
+    create_folder(beh)
+    stem, factors = path.name.removesuffix(LOG_SUFFIX) + "_beh", list(head["study"]["factors"])
+    rows = [_build_row(record, factors) for record in trials]
+    write_text(beh / f"{stem}.tsv", _format_table([*list(COLUMNS)[:3], *factors, *list(COLUMNS)[3:]], rows))
+    write_text(beh / f"{stem}.json", _dump(_describe_task(head["study"])))
+
+
+def _build_row(record: Mapping[str, Any], factors: Sequence[str]) -> list[str]:
+    last = record["presentations"][-1]
+    executed, correct = last["executed"], record["is_correct"]
+    ends_s = [start_s + width_s for start_s, width_s in zip(executed["start_s"], executed["width_s"], strict=True)]
+    cells = [
+        record["trial"] + 1,
+        record["run"],
+        record["attempt"],
+        *(record["condition"][factor] for factor in factors),
+    ]
+    cells += [record["answer"], "n/a" if correct is None else int(correct), record["response_time_s"]]
+    cells += [len(record["presentations"]), last["onset_s"], round(max(ends_s), 6), len(executed["pixel"])]
+    return [str(cell) for cell in cells]
+
+
+def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sidecar of a table: BIDS fields, columns, and the design."""
+    response, columns = study["response"], {name: dict(column) for name, column in COLUMNS.items()}
+    if response["answers"]:
+        columns["answer"]["Levels"] = {answer: answer for answer in response["answers"]}
+    else:
+        columns["answer"]["Description"] += ", a magnitude between 0 and 1"
+    for factor, values in study["factors"].items():
+        columns[factor] = {
+            "Description": f"Parameter `{factor}` of the stimulus `{study['stimulus']['pattern']}`",
+            "Levels": {str(value): str(value) for value in values},
+        }
+    return {
+        "TaskName": study["name"].replace("-", ""),
+        "TaskDescription": f"{study['title']}: {study['repetitions']} trials per condition in random order",
+        "Instructions": response["question"],
+        **columns,
+        "StimulusPresentation": {"SoftwareName": "optodrive", "SoftwareVersion": version("optodrive")},
+        "Design": study,
+    }
+
+
+def _describe_dataset() -> dict[str, Any]:
+    return {
+        "Name": "Tactile studies on an optotactile display",
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "raw",
+        "GeneratedBy": [{"Name": "optodrive", "Version": version("optodrive")}],
+    }
+
+
+def _describe_participants() -> dict[str, Any]:
+    return {
+        "kind": {
+            "Description": "Whether the participant is a person or simulated",
+            "Levels": {"person": "a person", "simulated": "a model of a participant"},
+        }
+    }
+
+
+def _format_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "".join("\t".join(row) + "\n" for row in [head, *rows])
+
+
+def _dump(document: object) -> str:
+    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"

@@ -1,0 +1,162 @@
+"""Simulated participants: how an observer with a channel model, an unsure sense of place and lapses answers.
+
+Theory of operation. A participant perceives from the executed pulses, never from the request. Two numbers are fitted to
+the paper's accuracies; everything else is from the literature or from the geometry:
+
+- `localisation_sd_m`: standard deviation, per axis, of the perceived place of a pixel stimulated for 0.5 s. A place
+  that is stimulated for another time t has sqrt(0.5 s / t) times that, as an average over independent samples has. Its
+  time ends when the next place begins, or 100 ms after its last pulse (persistence and backward masking).
+- `lapse`: share of trials in which the answer is a guess.
+
+Linear motion is the mean step from the first to the last place. Rotation is the sign of the area that the perceived
+path encloses. A localisation is the nearest of the places. The odd one of three is the one whose channel signals
+(`sensation`) differ most from those of the others, with a Weber fraction of 0.2 (Craig 1972; Forta et al. 2012 find
+0.2 to 0.6). A magnitude is the perceived intensity with noise of the same kind. Fingers are not confused.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.stimuli.experiments import compute_finger_places
+from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.study.presenter import Presentation
+from optodrive.study.sensation import ChannelSignals, compute_signals
+from optodrive.study.study_file import Study
+
+REFERENCE_S, PERSISTENCE_S = 0.5, 0.1
+WEBER_FRACTION = 0.2
+TRACE_STEP_S = 1e-3
+STIMULUS_PAUSE_S = 0.2
+"""Pause without a pulse that separates two stimuli on one pixel."""
+MAGNITUDE_BOUNDS = (0.01, 0.99)
+FULL_SCALE = 1.25
+"""End of the scale of magnitudes, as a factor of the intensity at the highest power."""
+
+
+@dataclass(frozen=True)
+class Participant:
+    """A simulated participant. The defaults are fitted to the paper (docs/explanation/perception.md)."""
+
+    localisation_sd_m: float = 1.35e-3
+    lapse: float = 0.025
+
+
+class Visits(NamedTuple):
+    """Places in the order of stimulation: pixel [n], position_m [n, 2] in x and y, exposure_s [n]."""
+
+    pixel: list[int]
+    position_m: FloatArray
+    exposure_s: FloatArray
+
+
+class Observer:
+    """Answers of one simulated participant in a study.
+
+    sensitivity: [p] factor of the felt displacement by pixel, 1 by default
+    """
+
+    def __init__(self, study: Study, display: DisplayModel, participant: Participant) -> None:
+        if study.simulation is None:
+            raise ValueError(f"study {study.name} states no observer")
+        self._study, self._display, self._participant = study, display, participant
+        self._layout, self._lattice = display.layout, Lattice.from_config(display.config)
+        self._pitch_m = display.config.display.pitch_m
+        rules: dict[str, Callable[[Presentation, np.random.Generator], str | float]] = {
+            "linear-motion": self._judge_linear_motion,
+            "rotation": self._judge_rotation,
+            "localisation": self._locate,
+            "intensity": self._rate,
+            "oddball": self._find_odd,
+            "digits": self._name_digits,
+        }
+        self._perceive = rules[study.simulation.observer]
+
+    def answer(self, shown: Presentation, rng: np.random.Generator) -> str | float:
+        """Return the answer to a presentation: one of the study's, or a magnitude."""
+        if rng.random() < self._participant.lapse:
+            answers = self._study.response.answers
+            return answers[int(rng.integers(len(answers)))] if answers else float(rng.uniform(*MAGNITUDE_BOUNDS))
+        return self._perceive(shown, rng)
+
+    def list_visits(self, shown: Presentation) -> Visits:
+        """Return the places of a presentation, with the time for which each is felt alone."""
+        firsts = np.flatnonzero(np.diff(shown.pixel, prepend=-1))
+        lasts = np.append(firsts[1:], len(shown.pixel)) - 1
+        start_s, end_s = shown.start_s[firsts], (shown.start_s + shown.width_s)[lasts]
+        exposure_s = np.minimum(end_s + PERSISTENCE_S, np.append(start_s[1:], np.inf)) - start_s
+        pixel = shown.pixel[firsts]
+        return Visits(pixel.tolist(), np.column_stack([self._layout.x_m[pixel], self._layout.y_m[pixel]]), exposure_s)
+
+    def _perceive_places(self, visits: Visits, rng: np.random.Generator) -> FloatArray:
+        """Return perceived places, m, [n, 2]."""
+        sd_m = self._participant.localisation_sd_m * np.sqrt(REFERENCE_S / visits.exposure_s)
+        return np.asarray(visits.position_m + sd_m[:, None] * rng.standard_normal((len(sd_m), 2)))
+
+    def _judge_linear_motion(self, shown: Presentation, rng: np.random.Generator) -> str:
+        visits = self.list_visits(shown)
+        passes = self._perceive_places(visits, rng).reshape(-1, 3, 2)
+        x_m, y_m = (passes[:, 2] - passes[:, 0]).mean(axis=0)
+        if abs(x_m) > abs(y_m):
+            return "right" if x_m > 0.0 else "left"
+        return "up" if y_m > 0.0 else "down"
+
+    def _judge_rotation(self, shown: Presentation, rng: np.random.Generator) -> str:
+        x_m, y_m = self._perceive_places(self.list_visits(shown), rng).T
+        area_m2 = 0.5 * np.sum(x_m * np.roll(y_m, -1) - y_m * np.roll(x_m, -1))
+        return "ccw" if area_m2 > 0.0 else "cw"
+
+    def _locate(self, shown: Presentation, rng: np.random.Generator) -> str:
+        visits = self.list_visits(shown)
+        centre_m = visits.position_m[0]
+        if len(visits.pixel) == 1:  # the target is the reference, twice
+            last_s = shown.start_s[np.argmax(np.diff(shown.start_s)) + 1]
+            visits = Visits(visits.pixel, visits.position_m, np.array([shown.duration_s - last_s + PERSISTENCE_S]))
+        right, up = np.clip(np.rint((self._perceive_places(visits, rng)[-1] - centre_m) / self._pitch_m), -1, 1)
+        return str(int(3 * (1 - up) + right + 2))
+
+    def _rate(self, shown: Presentation, rng: np.random.Generator) -> float:
+        intensity = self.feel(shown)[0].intensity
+        noisy = intensity * np.exp(WEBER_FRACTION * rng.standard_normal())
+        brightest = self.feel_at_full_power(shown).intensity
+        return float(np.clip(noisy / (FULL_SCALE * brightest), *MAGNITUDE_BOUNDS))
+
+    def _find_odd(self, shown: Presentation, rng: np.random.Generator) -> str:
+        felt = np.log1p([list(signals) for signals in self.feel(shown)])
+        noisy = felt + WEBER_FRACTION * rng.standard_normal(felt.shape)
+        distances = [np.linalg.norm(noisy - one, axis=1).sum() for one in noisy]
+        return str(1 + int(np.argmax(distances)))
+
+    def _name_digits(self, shown: Presentation, rng: np.random.Generator) -> str:
+        del rng
+        columns = {
+            digit: {column for _, column in compute_finger_places(digit, self._pitch_m)} for digit in (2, 3, 4, 5)
+        }
+        middle = int(self._layout.column[self._lattice.pixels_around(None, [(0, 0)], "centre", "a middle")[0]])
+        felt = {int(column) - middle for column in self._layout.column[shown.pixel]}
+        return "-".join(str(digit) for digit, places in columns.items() if places & felt)
+
+    def feel(self, shown: Presentation) -> list[ChannelSignals]:
+        """Return the channels' signals of each stimulus on one pixel. Stimuli are separated by pauses."""
+        firsts = np.flatnonzero(np.diff(shown.start_s, prepend=-np.inf) > STIMULUS_PAUSE_S)
+        groups = np.split(np.arange(len(shown.pixel)), firsts[1:])
+        return [self._feel_pulses(shown, rows, shown.power_w) for rows in groups]
+
+    def feel_at_full_power(self, shown: Presentation) -> ChannelSignals:
+        """Return the signals of the first stimulus as if at the laser's highest power."""
+        firsts = np.flatnonzero(np.diff(shown.start_s, prepend=-np.inf) > STIMULUS_PAUSE_S)
+        rows = np.split(np.arange(len(shown.pixel)), firsts[1:])[0]
+        return self._feel_pulses(shown, rows, np.full(len(shown.pixel), self._display.config.laser.max_power_w))
+
+    def _feel_pulses(self, shown: Presentation, rows: IntArray, power_w: FloatArray) -> ChannelSignals:
+        pixel = int(shown.pixel[rows[0]])
+        start_s = shown.start_s[rows] - shown.start_s[rows[0]]
+        end_s = float(start_s[-1] + shown.width_s[rows[-1]] + PERSISTENCE_S)
+        pulses = np.column_stack([start_s, shown.width_s[rows], power_w[rows], shown.pixel[rows]])
+        t_s = np.arange(0.0, end_s, TRACE_STEP_S)
+        cold = self._display.build_cold_heat()
+        return compute_signals(cold.simulate_displacement_m(pulses, pixel, t_s), TRACE_STEP_S)

@@ -1,0 +1,127 @@
+"""Presentation of stimuli and its interface, and simulated boards in virtual time that present them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from optodrive.core.errors import RefusedError
+from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.link.simulator.virtual_run import START_LEAD_S, VirtualBoards
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.feasibility.check import check_feasibility
+from optodrive.planning.limiter.limiter import shift_state
+from optodrive.planning.planned_sequence import PlannedSequence
+from optodrive.planning.stimuli.pattern_registry import build_pattern
+from optodrive.study.study_file import Value
+
+TIME_TOLERANCE_S = 2e-6
+"""Rounding of a start to ticks of the board, twice."""
+COOLING_STEP_S, COOLING_MAX_S = 5.0, 600.0
+"""Step and total of the waiting for a display that is too warm for a stimulus."""
+
+
+@dataclass(frozen=True, eq=False)
+class Presentation:
+    """A stimulus as the board reports it, one row per pulse, all arrays [n].
+
+    onset_s: gate on of the first pulse on the board's clock; start_s: counted from it
+    fault: how it differs from the request, None if it is as requested; cooling_s: waited for before it
+    """
+
+    onset_s: float
+    pixel: IntArray
+    start_s: FloatArray
+    width_s: FloatArray
+    power_w: FloatArray
+    fault: str | None
+    cooling_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first pulse's start to the last one's end, s."""
+        return float((self.start_s + self.width_s).max(initial=0.0))
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the presentation as JSON values."""
+        columns = ("pixel", "start_s", "width_s", "power_w")
+        pulses = {name: np.round(getattr(self, name), 9).tolist() for name in columns}
+        return {"onset_s": round(self.onset_s, 9), "cooling_s": self.cooling_s, "executed": pulses}
+
+
+class Presenter(Protocol):
+    """Interface of a display that shows stimuli."""
+
+    def present(self, pattern: str, parameters: Mapping[str, Value]) -> Presentation:
+        """Show a pattern and wait for its end. Raise an OptodriveError if it cannot be shown."""
+
+    def wait(self, duration_s: float) -> None:
+        """Let time pass between two stimuli."""
+
+    def close(self) -> None:
+        """Leave the display dark."""
+
+
+class VirtualPresenter:
+    """Simulated boards in virtual time. Heat and limits go on from stimulus to stimulus, as in a daemon."""
+
+    def __init__(self, display: DisplayModel) -> None:
+        self.display = display
+        self._boards = VirtualBoards(display.config)
+        self._heat, self._budget = display.build_cold_state()
+        self._zero_s = self._boards.now_s  # of heat and budget
+
+    def present(self, pattern: str, parameters: Mapping[str, Value]) -> Presentation:
+        """Show a pattern. Raise RefusedError if the display stays too warm for it, and BoardFaultError."""
+        sequence = build_pattern(pattern, dict(parameters), self.display.config)
+        cooling_s = 0.0
+        while True:
+            shift_s = self._zero_s - self._boards.now_s - START_LEAD_S
+            heat, budget = self._heat.copy_shifted(shift_s), shift_state(self._budget, shift_s)
+            try:
+                planned, _ = check_feasibility(self.display, sequence, heat, budget, policy="refuse")
+                break
+            except RefusedError:
+                if cooling_s >= COOLING_MAX_S:
+                    raise
+                self._boards.wait(COOLING_STEP_S)
+                cooling_s += COOLING_STEP_S
+        self._zero_s = self._boards.now_s + START_LEAD_S
+        self._heat, self._budget = planned.heat, planned.budget
+        executed = self._boards.play(planned)
+        onset_s = float(executed.on_tick[0]) * self._boards.tick_s if len(executed) else 0.0
+        start_s = executed.start_s - executed.start_s.min(initial=np.inf) if len(executed) else executed.start_s
+        shown = Presentation(onset_s, executed.pixel, start_s, executed.width_s, executed.power_w, None, cooling_s)
+        fault = find_fault(planned, shown) if executed.complete else "pulses without a report"
+        return Presentation(onset_s, shown.pixel, start_s, shown.width_s, shown.power_w, fault, cooling_s)
+
+    def wait(self, duration_s: float) -> None:
+        """Let virtual time pass."""
+        self._boards.wait(duration_s)
+
+    def close(self) -> None:
+        """Disarm the simulated boards."""
+        self._boards.close()
+
+
+def find_fault(planned: PlannedSequence, shown: Presentation) -> str | None:
+    """Return how executed pulses differ from a plan, None if every pulse is as planned."""
+    plan = planned.plan
+    if len(plan) != len(shown.pixel):
+        return f"{len(shown.pixel)} of {len(plan)} pulses executed"
+    if not len(plan):
+        return "no pulse"
+    if (plan.trimmed_j > 0.0).any():
+        return "trimmed by a limit"
+    if (plan.pixel != shown.pixel).any():
+        return "another order of pixels"
+    late_s = np.abs(plan.start_s - plan.start_s[0] - shown.start_s).max()
+    if late_s > TIME_TOLERANCE_S:
+        return f"a pulse {1e6 * late_s:.0f} µs off its time"
+    if not np.allclose(plan.width_s, shown.width_s, rtol=0.0, atol=TIME_TOLERANCE_S):
+        return "another pulse width"
+    return None

@@ -1,0 +1,103 @@
+"""Results of a study: accuracy with its binomial interval, and the line of magnitude estimates."""
+
+from collections.abc import Callable, Sequence
+from math import exp, lgamma, log
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optodrive.study.study_file import Study, Value
+
+CONFIDENCE = 0.95
+BISECTIONS = 60
+
+
+class Interval(NamedTuple):
+    """Interval of a share."""
+
+    low: float
+    high: float
+
+    def contains(self, share: float) -> bool:
+        """Return whether a share lies within."""
+        return self.low <= share <= self.high
+
+
+class Accuracy(NamedTuple):
+    """Correct answers of a number of trials."""
+
+    correct: int
+    trials: int
+
+    @property
+    def share(self) -> float:
+        """Share of correct answers."""
+        return self.correct / self.trials
+
+    @property
+    def interval(self) -> Interval:
+        """Exact 95 % interval of the probability of a correct answer (Clopper and Pearson 1934)."""
+        tail, k, n = (1.0 - CONFIDENCE) / 2.0, self.correct, self.trials
+        low = 0.0 if k == 0 else _bisect(lambda p: 1.0 - _sum_binomial(k - 1, n, p) - tail)
+        high = 1.0 if k == n else _bisect(lambda p: tail - _sum_binomial(k, n, p))
+        return Interval(low, high)
+
+
+class Line(NamedTuple):
+    """Regression of magnitudes on a factor: slope, intercept, and r² of the means and of the participants' values."""
+
+    slope: float
+    intercept: float
+    r_squared: float
+    participants_r_squared: float
+
+
+def count_correct(records: Sequence[dict[str, Any]]) -> Accuracy:
+    """Count the correct answers of trials."""
+    return Accuracy(sum(bool(record["is_correct"]) for record in records), len(records))
+
+
+def fit_magnitudes(study: Study, sessions: Sequence[Sequence[dict[str, Any]]]) -> Line:
+    """Fit a line to the magnitudes of participants over the study's first factor.
+
+    As in Text S5: the geometric mean of a participant's answers per level, divided by the grand geometric mean.
+    """
+    factor, levels = next(iter(study.factors.items()))
+    means = np.array([[_geometric_mean(records, factor, level) for level in levels] for records in sessions])
+    values = means / np.exp(np.log(means).mean(axis=1, keepdims=True))
+    x = np.array([float(level) for level in levels])
+    mean = values.mean(axis=0)
+    slope, intercept = np.polyfit(x, mean, 1)
+    fitted = slope * x + intercept
+    return Line(float(slope), float(intercept), _explained(mean, fitted), _explained(values, fitted[None, :]))
+
+
+def _geometric_mean(records: Sequence[dict[str, Any]], factor: str, level: Value) -> float:
+    return float(np.exp(np.mean([log(record["answer"]) for record in records if record["condition"][factor] == level])))
+
+
+def _explained(values: Any, fitted: Any) -> float:
+    return 1.0 - float(np.sum((values - fitted) ** 2) / np.sum((values - values.mean()) ** 2))
+
+
+def _sum_binomial(successes: int, trials: int, probability: float) -> float:
+    """Return the probability of at most this number of successes."""
+    return sum(
+        exp(
+            lgamma(trials + 1)
+            - lgamma(k + 1)
+            - lgamma(trials - k + 1)
+            + k * log(probability)
+            + (trials - k) * log(1.0 - probability)
+        )
+        for k in range(successes + 1)
+    )
+
+
+def _bisect(function: Callable[[float], float]) -> float:
+    """Return the root of a function that increases on 0 to 1."""
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if function(middle) < 0.0 else (low, middle)
+    return 0.5 * (low + high)

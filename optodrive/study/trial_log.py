@@ -1,0 +1,227 @@
+"""The log of a session: every trial is on the disk before the next one begins.
+
+Theory of operation. The log is a text file to which one JSON object per line is appended; each line is on the disk
+(fsync) before the session goes on. A trial is two lines: `begun` before its stimulus, `trial` with its answer. The
+second line alone makes a trial count, so that a process may end at any instant:
+
+- before `begun`: nothing was shown; the trial comes next.
+- after `begun`: the stimulus may have been shown. The next run appends `interrupted`, and the trial is repeated as its
+  next attempt, which its line states.
+- within a line: the line has no end. It never counted; the next run removes it, and the case above applies.
+- after `trial`: it counts, once. The order of trials stands in the first line, never computed anew.
+
+A lock on the file keeps a second process from appending to the same session.
+"""
+
+import fcntl
+import json
+import os
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from optodrive.core.errors import BusyError, InputError, Unquoted
+from optodrive.study.study_file import Study, Value
+
+FORMAT, VERSION = "optodrive-trials", 1
+LOG_BYTES_MAX = 500_000_000
+
+
+class TrialLog:
+    """Log of one participant's session, as a context manager.
+
+    order: the conditions of all trials; trials: the records of those that count, by their index
+    run: number of the present run of the session, from 1
+    """
+
+    def __init__(self, path: Path, study: Study, participant: str, order: Sequence[Mapping[str, Value]]) -> None:
+        """Open or create the log. `order` is recorded in a new log, and ignored for one that exists.
+
+        Raise InputError for a log of another study or participant, or one that is damaged; BusyError if another process
+        has it open.
+        """
+        self.path = path
+        self.trials: dict[int, dict[str, Any]] = {}
+        self.is_familiarised = False
+        self.run = 0
+        self._attempts: dict[int, int] = {}
+        self._open_trial: int | None = None
+        is_new = not path.exists()
+        self._file = _open_locked(path)
+        try:
+            records = self._read_records()
+            if not records:
+                records = [_build_head(study, participant, order)]
+                self._append(records[0])
+            if is_new:
+                _sync_folder(path.parent)
+            _check_head(path, records[0], study, participant)
+            self.order: list[dict[str, Value]] = records[0]["order"]
+            for number, record in enumerate(records[1:], start=2):
+                self._apply(record, f"{path}: line {number}")
+            if self._open_trial is not None:
+                self._append({"record": "interrupted", "trial": self._open_trial, "attempt": self.attempt})
+                self._open_trial = None
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    @property
+    def next_trial(self) -> int | None:
+        """Index of the next trial that does not count yet, None after the last."""
+        return next((index for index in range(len(self.order)) if index not in self.trials), None)
+
+    @property
+    def attempt(self) -> int:
+        """Number of the present attempt at the begun trial, from 1."""
+        return self._attempts[self._require_open()]
+
+    def begin(self, trial: int) -> int:
+        """Record that a trial's stimulus is about to be shown, and return the number of this attempt."""
+        attempt = self._attempts.get(trial, 0) + 1
+        self._write({"record": "begun", "trial": trial, "attempt": attempt, "condition": self.order[trial]})
+        return attempt
+
+    def spoil(self, reason: str) -> None:
+        """Record that the begun trial's stimulus was not as requested. The trial is repeated."""
+        self._write({"record": "spoiled", "trial": self._require_open(), "attempt": self.attempt, "reason": reason})
+
+    def complete(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Record the answer of the begun trial, which then counts. Return its record."""
+        trial = self._require_open()
+        head = {"record": "trial", "trial": trial, "attempt": self.attempt, "condition": self.order[trial]}
+        head["run"] = self.run
+        record = {**head, **fields}
+        self._write(record)
+        return record
+
+    def begin_run(self, presenter: str) -> None:
+        """Record that a run of the session begins, and who presents: times of the board count anew."""
+        self._write({"record": "run", "presenter": presenter, "started": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"})
+
+    def record_familiarisation(self, presentations: Sequence[Mapping[str, Any]]) -> None:
+        """Record that each stimulus was shown once before the trials."""
+        self._write({"record": "familiarised", "presentations": list(presentations)})
+
+    def _append(self, record: Mapping[str, Any]) -> None:
+        """Append a record. It is on the disk when this returns."""
+        line = json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n"
+        self._file.write(line.encode())
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def _require_open(self) -> int:
+        """Return the trial that was begun last. Raise ValueError if none was, which is a bug."""
+        if self._open_trial is None:
+            raise ValueError("no trial was begun")
+        return self._open_trial
+
+    def _write(self, record: dict[str, Any]) -> None:
+        self._append(record)
+        self._apply(record, str(self.path))
+
+    def _apply(self, record: dict[str, Any], place: str) -> None:
+        """Follow a record. Raise InputError for one that cannot come here."""
+        kind, trial = record.get("record"), record.get("trial", -1)
+        if kind == "familiarised":
+            self.is_familiarised = True
+        elif kind == "run":
+            self.run += 1
+        elif kind == "begun" and self._open_trial is None and trial not in self.trials and _is_index(trial, self.order):
+            self._open_trial, self._attempts[trial] = trial, record["attempt"]
+        elif kind in ("trial", "spoiled", "interrupted") and self._open_trial is not None and trial == self._open_trial:
+            self._open_trial = None
+            if kind == "trial":
+                self.trials[trial] = record
+        elif kind in ("begun", "trial", "spoiled", "interrupted"):
+            raise InputError(place, Unquoted(f"{kind} of trial {trial}"), "a record that continues the ones before it")
+
+    def _read_records(self) -> list[dict[str, Any]]:
+        """Read all records, and remove a last line without its end."""
+        self._file.seek(0)
+        content = self._file.read(LOG_BYTES_MAX + 1)
+        if len(content) > LOG_BYTES_MAX:
+            raise InputError(str(self.path), Unquoted("a larger file"), f"at most {LOG_BYTES_MAX} bytes")
+        whole = content[: content.rfind(b"\n") + 1]
+        if len(whole) < len(content):
+            self._file.truncate(len(whole))
+            os.fsync(self._file.fileno())
+        return [_parse_line(f"{self.path}: line {k}", line) for k, line in enumerate(whole.splitlines(), start=1)]
+
+
+def read_log(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the first record of a log and the trials that count, in order. Raise InputError."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+    lines = content[: content.rfind(b"\n") + 1].splitlines()
+    records = [_parse_line(f"{path}: line {k}", line) for k, line in enumerate(lines, start=1)]
+    if not records or records[0].get("format") != FORMAT:
+        raise InputError(str(path), Unquoted("another file"), "the log of a session")
+    trials = [record for record in records if record.get("record") == "trial"]
+    return records[0], sorted(trials, key=lambda record: int(record["trial"]))
+
+
+def _open_locked(path: Path) -> Any:
+    try:
+        file = path.open("a+b")
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a file that can be written") from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise BusyError(f"{path} is open in another process: one runs this session already") from None
+    return file
+
+
+def _build_head(study: Study, participant: str, order: Sequence[Mapping[str, Value]]) -> dict[str, Any]:
+    design = study.model_dump(mode="json")
+    head = {"record": "session", "format": FORMAT, "version": VERSION, "participant": participant}
+    return {**head, "study": design, "order": [dict(condition) for condition in order]}
+
+
+def _check_head(path: Path, head: dict[str, Any], study: Study, participant: str) -> None:
+    if head.get("format") != FORMAT or head.get("version") != VERSION:
+        raise InputError(str(path), Unquoted("another format or version"), f"{FORMAT}, version {VERSION}")
+    if head["participant"] != participant:
+        raise InputError(f"{path}: participant", head["participant"], f"{participant!r}")
+    design = study.model_dump(mode="json")
+    changed = [key for key in design if head["study"].get(key) != design[key]]
+    if changed:
+        expected = "the study with which the session began; a changed one needs another folder"
+        raise InputError(f"{path}: study", Unquoted(f"another {', '.join(changed)}"), expected)
+
+
+def _is_index(trial: object, order: Sequence[object]) -> bool:
+    return isinstance(trial, int) and 0 <= trial < len(order)
+
+
+def _parse_line(place: str, line: bytes) -> dict[str, Any]:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        record = None
+    if not isinstance(record, dict):
+        raise InputError(place, Unquoted("a damaged line"), "one JSON object")
+    return record
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put a new file's name on the disk."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

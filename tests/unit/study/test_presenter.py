@@ -1,0 +1,68 @@
+"""Stimuli on simulated boards in virtual time, and the comparison of executed with planned pulses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from optodrive.core.errors import RefusedError
+from optodrive.device.config_file import load_config
+from optodrive.planning.display_model import DisplayModel
+from optodrive.study.observers import Observer, Participant
+from optodrive.study.presenter import VirtualPresenter
+from optodrive.study.session import SimulatedRespondent, draw_order, run_session
+from optodrive.study.study_file import load_study
+from optodrive.study.trial_log import TrialLog
+
+
+@pytest.fixture(scope="module")
+def display():
+    return DisplayModel.from_config(load_config())
+
+
+def test_onsets_are_on_one_clock_of_the_board(display):
+    presenter = VirtualPresenter(display)
+    shown = []
+    for _ in range(2):
+        shown.append(presenter.present("experiment-4", {"level": 1}))
+        presenter.wait(1.0)
+    presenter.close()
+    first, second = shown
+    assert first.fault is second.fault is None
+    assert second.onset_s > first.onset_s + first.duration_s + 1.0 > 2.0
+    assert first.start_s == pytest.approx(0.05 * np.arange(20), abs=1e-6)
+    assert first.power_w == pytest.approx(0.5, rel=1e-3)
+
+
+class FaultyPresenter(VirtualPresenter):
+    """Drops the last pulse of some presentations, as a board does that was reset."""
+
+    faults = 0
+
+    def present(self, pattern, parameters):
+        shown = super().present(pattern, parameters)
+        self.faults -= 1
+        return shown if self.faults < 0 else replace(shown, pixel=shown.pixel[:-1], fault="19 of 20 pulses executed")
+
+
+@pytest.mark.parametrize("faults", [1, 4])
+def test_a_stimulus_that_was_not_as_requested_is_marked_and_repeated(display, tmp_path, faults):
+    study = load_study("experiment-6").model_copy(update={"repetitions": 1, "familiarisation": False})
+    presenter = FaultyPresenter(display)
+    presenter.faults = faults
+    respondent = SimulatedRespondent(Observer(study, display, Participant()), 0, 1, presenter)
+    with TrialLog(tmp_path / "log.jsonl", study, "01", draw_order(study, "01")) as log:
+        run_session(study, log, presenter, respondent)
+        assert [log.trials[index]["attempt"] for index in range(6)] == [faults + 1, 1, 1, 1, 1, 1]
+    assert (tmp_path / "log.jsonl").read_text().count('"record": "spoiled"') == faults
+
+
+def test_a_display_that_never_shows_it_as_requested_ends_the_run(display, tmp_path):
+    study = load_study("experiment-6").model_copy(update={"repetitions": 1, "familiarisation": False})
+    presenter = FaultyPresenter(display)
+    presenter.faults = 5
+    respondent = SimulatedRespondent(Observer(study, display, Participant()), 0, 1, presenter)
+    with TrialLog(tmp_path / "log.jsonl", study, "01", draw_order(study, "01")) as log:
+        with pytest.raises(RefusedError, match="trial 1: 5 stimuli were not as requested"):
+            run_session(study, log, presenter, respondent)
+        assert not log.trials
