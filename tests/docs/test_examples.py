@@ -69,6 +69,7 @@ SCENARIOS = {
         write_recordings,
         ["docs/explanation/diagnosis.md:Diagnosis", "docs/explanation/diagnosis.md:Planning with a diagnosed model"],
     ),
+    "studies": (write_checkout, ["docs/how-to/run-a-study.md:The paper's experiments, simulated"]),
     "film": (write_film, ["docs/explanation/diagnosis.md:Whole displays"]),
     "recordings": (write_recordings, ["docs/reference/recordings.md:Recordings"]),
     "recordings-python": (write_film, ["docs/reference/recordings.md:From Python"]),
