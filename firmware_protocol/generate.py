@@ -1,4 +1,4 @@
-"""Generate core/messages.h, model/transitions.pml and the page's board_states.js from messages.toml, after a change."""
+"""Generate header, model, the states of Python and web page, and PROTOCOL.md's transitions from messages.toml."""
 
 import tomllib
 from pathlib import Path
@@ -6,6 +6,8 @@ from typing import Any
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "optodrive" / "daemon" / "page"
+STATES_MODULE = HERE.parent / "optodrive" / "link" / "protocol" / "state_table.py"
+BEGIN, END = "<!-- transitions of messages.toml -->\n", "<!-- end of the transitions -->\n"
 SIZES = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2, "bytes12": 12}
 PREFIXES = {"state": "STATE", "fault": "FAULT", "nak_reason": "NAK", "reason": "REASON"}
 Table = dict[str, Any]
@@ -19,7 +21,7 @@ def build_header(table: Table) -> str:
         format_numbers(table),
         *(format_enumeration(prefix, table["enumerations"][name]) for name, prefix in PREFIXES.items()),
         format_state_groups(table["state_group"]),
-        format_transitions(table["transition"]),
+        format_transitions(table),
         format_input_bits(table["enumerations"]["input_bit"]),
         "\n".join(f"#define MESSAGE_{entry['name']} 0x{entry['id']:02x}" for entry in table["message"]),
         "\n\n".join(format_offsets(entry["name"].upper(), entry["fields"], table) for entry in table["message"]),
@@ -94,15 +96,78 @@ def format_state_groups(groups: dict[str, list[str]]) -> str:
     return "\n".join(lines)
 
 
-def format_transitions(transitions: list[Table]) -> str:
-    """Return T(from, event, to) of each transition of the state machine; an event is the reason in EVENT."""
+def list_transitions(table: Table) -> dict[tuple[str, str], Table]:
+    """Return the entry of each state and event, once where several conditions cause the event."""
+    found: dict[tuple[str, str], Table] = {}
+    for entry in table["transition"]:
+        for state in entry["from"]:
+            known = found.setdefault((state, entry["event"]), entry)
+            if (known["to"], known["drops"]) != (entry["to"], entry["drops"]):
+                raise ValueError(f"{entry['event']} in {state}: two entries differ, expected one state and one effect")
+    return found
+
+
+def format_transitions(table: Table) -> str:
+    """Return T(from, event, to, drops) of each transition; an event is the reason in EVENT."""
     rows = [
-        f"    T({constant_name('STATE', state)}, {constant_name('REASON', entry['event'])},"
-        f" {constant_name('STATE', entry['to'])})"
-        for entry in transitions
-        for state in entry["from"]
+        f"    T({constant_name('STATE', state)}, {constant_name('REASON', event)},"
+        f" {constant_name('STATE', entry['to'])}, {int(entry['drops'])})"
+        for (state, event), entry in list_transitions(table).items()
     ]
     return "#define STATE_TRANSITIONS(T) \\\n" + " \\\n".join(rows)
+
+
+def build_states_module(table: Table) -> str:
+    """Return the Python module of states, events, groups of states and transitions."""
+    states, events = table["enumerations"]["state"], table["enumerations"]["reason"]
+    names = {event: event.replace(" ", "_").upper() or "NONE" for event in events}
+    lines = [
+        '"""Generated from firmware_protocol/messages.toml by generate.py: do not edit."""',
+        "",
+        "from enum import StrEnum",
+        "from typing import NamedTuple",
+        "",
+        "",
+        "class BoardState(StrEnum):",
+        '    """A state of the board, in the order of its number on the wire."""',
+        "",
+        *(f'    {state} = "{state}"' for state in states),
+        "",
+        "",
+        "class EventReason(StrEnum):",
+        '    """An event of the state machine, as EVENT reports it, in the order of its number on the wire."""',
+        "",
+        *(f'    {names[event]} = "{event}"' for event in events),
+        "",
+        "",
+        "class Transition(NamedTuple):",
+        '    """State that an event leads to, and whether queue and job are dropped."""',
+        "",
+        "    to: BoardState",
+        "    drops: bool",
+        "",
+        "",
+    ]
+    for name, members in table["state_group"].items():
+        listed = ", ".join(f"BoardState.{state}" for state in members)
+        lines.append(f"{name.upper()}_STATES = ({listed})")
+    lines.append("TRANSITIONS = {")
+    for (state, event), entry in list_transitions(table).items():
+        after = f"Transition(BoardState.{entry['to']}, drops={entry['drops']})"
+        lines.append(f"    (BoardState.{state}, EventReason.{names[event]}): {after},")
+    return "\n".join([*lines, "}"]) + "\n"
+
+
+def build_protocol_page(table: Table, page: str) -> str:
+    """Return PROTOCOL.md with the table of transitions."""
+    before, _, rest = page.partition(BEGIN)
+    states = [state for state in table["enumerations"]["state"] if state != "FAULT"]
+    rows = ["| from | on | to | reason | drops queue and job |", "|---|---|---|---|---|"]
+    for entry in table["transition"]:
+        listed = "any but FAULT" if entry["from"] == states else ", ".join(entry["from"])
+        drops = "yes" if entry["drops"] else ""
+        rows.append(f"| {listed} | {entry['when']} | {entry['to']} | {entry['event']} | {drops} |")
+    return before + BEGIN + "\n" + "\n".join(rows) + "\n\n" + END + rest.partition(END)[2]
 
 
 def format_input_bits(words: list[str]) -> str:
@@ -169,3 +234,6 @@ if __name__ == "__main__":
     (HERE / "core" / "messages.h").write_text(build_header(messages), encoding="utf-8")
     (HERE / "model" / "transitions.pml").write_text(build_model_table(messages), encoding="utf-8")
     (PAGE / "board_states.js").write_text(build_page_module(messages), encoding="utf-8")
+    STATES_MODULE.write_text(build_states_module(messages), encoding="utf-8")
+    protocol = HERE / "PROTOCOL.md"
+    protocol.write_text(build_protocol_page(messages, protocol.read_text(encoding="utf-8")), encoding="utf-8")

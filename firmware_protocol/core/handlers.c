@@ -274,10 +274,11 @@ static uint8_t on_flush(struct board *b) {
     if (!is_armed(b)) {
         return NAK_STATE;
     }
-    if (b->state != STATE_ARMED) {
+    if (b->state == STATE_ARMED) {
+        drop_queue(b);
+    } else {
         change_state(b, REASON_FLUSH);
     }
-    drop_queue(b);
     return NO_REFUSAL;
 }
 

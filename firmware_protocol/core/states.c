@@ -27,6 +27,12 @@ void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n) 
     }
 }
 
+void drop_queue(struct board *b) {
+    b->queue.count = 0;
+    b->job.active = false;
+    b->done_index = b->next_index;
+}
+
 static void trace(struct board *b, struct board_trace event) {
     if (b->hal.trace) {
         event.at_us = b->now_us;
@@ -75,46 +81,49 @@ static void close_gate(struct board *b, enum reason reason) {
     b->has_current_point = false;
 }
 
-/* Returns the state after an event; FAULT if the table has no such transition, which no caller causes. */
-static enum state next_state(uint8_t state, enum reason event) {
-#define TRANSITION(from, reason, to) \
+struct transition {
+    uint8_t to;
+    bool drops;
+};
+
+/* Returns what an event leads to; FAULT if the table has no such transition, which no caller causes. */
+static struct transition find_transition(uint8_t state, enum reason event) {
+#define TRANSITION(from, reason, next, drops_all) \
     if (state == (from) && event == (reason)) { \
-        return to; \
+        return (struct transition){.to = (next), .drops = (drops_all)}; \
     }
     STATE_TRANSITIONS(TRANSITION)
 #undef TRANSITION
-    return STATE_FAULT;
+    return (struct transition){.to = STATE_FAULT, .drops = true};
 }
 
 void change_state(struct board *b, enum reason event) {
-    enum state state = next_state(b->state, event);
-    if (state != STATE_RUNNING) {
+    struct transition next = find_transition(b->state, event);
+    if (next.to != STATE_RUNNING) {
         close_gate(b, event);
     }
     uint8_t before = b->state, body[EVENT_SIZE];
-    b->state = (uint8_t)state;
+    b->state = next.to;
     b->hal.set_indicator(b->hal.context, is_leased(b->state));
-    b->hal.set_relay(b->hal.context, state != STATE_FAULT);
+    b->hal.set_relay(b->hal.context, next.to != STATE_FAULT);
     trace(b, (struct board_trace){.kind = TRACE_STATE, .state = b->state, .before = before, .reason = (uint8_t)event});
     body[EVENT_STATE_AT] = b->state;
     body[EVENT_FAULT_AT] = b->fault;
     body[EVENT_REASON_AT] = (uint8_t)event;
     put_u64(body + EVENT_TICK_AT, b->now_us - b->epoch_us);
     send_message(b, MESSAGE_EVENT, body, sizeof body);
-}
-
-void drop_queue(struct board *b) {
-    b->queue.count = 0;
-    b->job.active = false;
-    b->done_index = b->next_index;
+    if (next.drops) {
+        drop_queue(b);
+    }
 }
 
 void disarm(struct board *b, enum reason reason) {
     b->confirmed = b->nonce_valid = false;
-    if (!(STATES_IDLE >> b->state & 1u)) {
+    if (STATES_IDLE >> b->state & 1u) {
+        drop_queue(b);
+    } else {
         change_state(b, reason);
     }
-    drop_queue(b);
 }
 
 void enter_fault(struct board *b, enum fault fault) {
@@ -124,5 +133,4 @@ void enter_fault(struct board *b, enum fault fault) {
         change_state(b, REASON_FAULT);
     }
     b->confirmed = b->nonce_valid = false;
-    drop_queue(b);
 }

@@ -7,13 +7,13 @@
     (from == RUNNING && to == ARMED) || \
     (from == HOLD && to == ARMED) || \
     (from == RUNNING && to == HOLD) || \
-    (from == HOLD && to == RUNNING) || \
     (from == RUNNING && to == DISARMED) || \
+    (from == RUNNING && to == FAULT) || \
+    (from == HOLD && to == RUNNING) || \
     (from == HOLD && to == DISARMED) || \
     (from == ARMED && to == DISARMED) || \
     (from == DISARMED && to == FAULT) || \
     (from == ARMING && to == FAULT) || \
     (from == ARMED && to == FAULT) || \
-    (from == RUNNING && to == FAULT) || \
     (from == HOLD && to == FAULT) || \
     (from == FAULT && to == DISARMED))

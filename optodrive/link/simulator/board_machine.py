@@ -16,7 +16,7 @@ from optodrive.link.protocol.states import (
     LEASED_STATES,
     BoardState,
     EventReason,
-    next_state,
+    find_transition,
 )
 from optodrive.link.simulator.board_limits import BoardSettings, tighten
 from optodrive.link.simulator.execution_records import ExecutionRecord, ExecutionRecords
@@ -239,13 +239,15 @@ class BoardMachine:
 
     def _change_state(self, event: EventReason) -> None:
         """Change to the state that the event leads to, and report it. Only RUNNING leaves the gate as it is."""
-        state = next_state(self.state, event)
+        state, drops = find_transition(self.state, event)
         if state != BoardState.RUNNING:
             self._close_gate(event)
         previous, self.state = self.state, state
         self._log("state", state=state, before=previous, reason=event)
         fault = m.FAULTS.index(self.fault)
         self._event_sink(m.Event(m.STATES.index(state), fault, m.EVENT_REASONS.index(event), self.current_tick))
+        if drops:
+            self.queue.drop()
 
     def _close_gate(self, reason: str) -> None:
         """Close the gate and record the emission of an interrupted pulse."""
@@ -259,9 +261,10 @@ class BoardMachine:
         """Drop the queue and leave any armed state. DISARMED and FAULT stay."""
         self._confirmed = False
         self._board_nonce = None
-        if self.state not in IDLE_STATES:
+        if self.state in IDLE_STATES:
+            self.queue.drop()
+        else:
             self._change_state(event)
-        self.queue.drop()
 
     def _enter_fault(self, fault: str) -> None:
         if self.state != BoardState.FAULT:
@@ -270,7 +273,6 @@ class BoardMachine:
             self._change_state(EventReason.FAULT)
         self._confirmed = False
         self._board_nonce = None
-        self.queue.drop()
 
     def set_input(self, name: str, value: bool) -> None:
         """Change an input: interlock (True: closed), key (True: on), estop (True: pressed)."""
@@ -419,9 +421,10 @@ class BoardMachine:
         """Drop the queue and the job. The board stays armed."""
         if self.state not in ARMED_STATES:
             return "STATE"
-        if self.state != BoardState.ARMED:
+        if self.state == BoardState.ARMED:
+            self.queue.drop()
+        else:
             self._change_state(EventReason.FLUSH)
-        self.queue.drop()
         return ""
 
     def _log(self, event: str, **fields: object) -> None:
