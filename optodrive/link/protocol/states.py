@@ -27,7 +27,7 @@ UNARMED_STATES = tuple(state for state in BoardState if state not in ARMED_STATE
 
 
 def find_transition(state: BoardState, event: EventReason) -> Transition:
-    """Return what an event leads to. Raise LocalProtocolError for an event that the state does not know."""
+    """Return the transition of an event. Raise LocalProtocolError for an event that the state does not know."""
     try:
         return TRANSITIONS[state, event]
     except KeyError:
