@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, UrlOption
+from optodrive.cli.options import ConfigOption, HoldOption, JsonOption, UrlOption
 from optodrive.cli.output import announce_compilation, print_answer, show_progress
 from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError
@@ -35,6 +35,7 @@ def study(
         typer.Option("--participants", metavar="N", help="Number of simulated participants, without --participant."),
     ] = 1,
     url: UrlOption = DEFAULT_URL,
+    hold: HoldOption = False,
     config: ConfigOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -56,7 +57,7 @@ def study(
         check_participant("--participant", participant)
         if participant.startswith(SIMULATED_PREFIX):
             raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
-        sessions = {participant: _run_person(design, out, participant, url)}
+        sessions = {participant: _run_person(design, out, participant, url, hold)}
     write_dataset(out)
     report = _build_report(design, sessions, out)
     print_answer(report, _format_report(report), json)
@@ -92,7 +93,7 @@ def _simulate(design: "Study", out: Path, participants: int, config: str | None)
     return sessions
 
 
-def _run_person(design: "Study", out: Path, participant: str, url: str) -> list[dict[str, Any]]:
+def _run_person(design: "Study", out: Path, participant: str, url: str, hold: bool) -> list[dict[str, Any]]:
     """Run a person's session and return the records of the trials."""
     from optodrive.client.display import Display
     from optodrive.study.daemon_presenter import DaemonPresenter
@@ -105,14 +106,15 @@ def _run_person(design: "Study", out: Path, participant: str, url: str) -> list[
         build_log_path(out, design, participant), design, participant, draw_order(design, participant)
     ) as log:
         if log.next_trial is not None:
-            presenter = DaemonPresenter(Display(url), {"study": design.name, "participant": participant})
-            log.begin_run(url)
-            try:
-                run_session(design, log, presenter, TerminalRespondent(design))
-            except EOFError:
-                raise InputError("answer", None, "a line; the session goes on with the same command") from None
-            finally:
-                presenter.close()
+            with Display(url) as display:  # stops what was started, also after an error
+                if hold:
+                    display.arm(hold=True)
+                presenter = DaemonPresenter(display, {"study": design.name, "participant": participant})
+                log.begin_run(url)
+                try:
+                    run_session(design, log, presenter, TerminalRespondent(design))
+                except EOFError:
+                    raise InputError("answer", None, "a line; the session goes on with the same command") from None
         return list(log.trials.values())
 
 

@@ -40,10 +40,6 @@ class DaemonPresenter:
         """Wait by the computer's clock."""
         time.sleep(duration_s)
 
-    def close(self) -> None:
-        """Close the connection."""
-        self._display.close()
-
 
 def find_fault(plan: Plan) -> str | None:
     """Return how a plan's executed pulses differ from those planned, None if every one is as planned."""

@@ -62,9 +62,6 @@ class Presenter(Protocol):
     def wait(self, duration_s: float) -> None:
         """Let time pass between two stimuli."""
 
-    def close(self) -> None:
-        """Leave the display dark."""
-
 
 class VirtualPresenter:
     """Simulated boards in virtual time. Heat and limits go on from stimulus to stimulus, as in a daemon."""

@@ -1,6 +1,8 @@
 """The log of a session: what counts after an end at any byte."""
 
 import json
+import os
+import stat
 
 import pytest
 
@@ -117,3 +119,21 @@ def test_a_damaged_line_is_told_and_nothing_is_changed(tmp_path, line, says):
     with pytest.raises(InputError, match=says):
         open_log(path)
     assert path.read_bytes() == before
+
+
+def test_every_line_is_on_the_disk_before_the_session_goes_on(tmp_path, monkeypatch):
+    path, synced = tmp_path / "log.jsonl", []
+    fsync = os.fsync
+
+    def record(descriptor):
+        fsync(descriptor)
+        synced.append(os.fstat(descriptor).st_size if stat.S_ISREG(os.fstat(descriptor).st_mode) else "folder")
+
+    monkeypatch.setattr(os, "fsync", record)
+    with open_log(path) as log:
+        assert synced == [path.stat().st_size, "folder"]  # the new file's name, too
+        log.begin(0)
+        assert synced[-1] == path.stat().st_size
+        log.complete(ANSWER)
+        assert synced[-1] == path.stat().st_size
+        assert len(synced) == 4

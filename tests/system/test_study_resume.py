@@ -1,0 +1,161 @@
+"""kill -9 at random moments of a study, of its daemon, and of both: no trial is lost or doubled."""
+
+import copy
+import os
+import random
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from forked_process import OPTODRIVE, start_process
+from rig import TOKEN, wait_for
+from study_rig import TRIALS, find_defects, read_records, write_study
+
+KILLS_MAX = 3
+SESSIONS = [*range(8), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 100))]
+VALIDATOR = Path(sys.executable).with_name("bids-validator-deno")
+
+
+def start_study(folder, *arguments, **options):
+    command = [OPTODRIVE, "study", write_study(folder), "--out", folder / "data", *arguments]
+    return start_process(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def log_path(folder, participant="sim01"):
+    return folder / f"data/sourcedata/sub-{participant}/sub-{participant}_task-short_trials.jsonl"
+
+
+def has_reached(process, path, size):
+    """Return whether a log has a size, or its process has ended before."""
+    return process.poll() is not None or (path.exists() and path.stat().st_size >= size)
+
+
+@pytest.fixture(scope="module")
+def whole_size(tmp_path_factory):
+    """Size of the log of a session without an interruption, bytes."""
+    folder = tmp_path_factory.mktemp("whole")
+    process = start_study(folder)
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert find_defects(read_records(log_path(folder))) == []
+    return log_path(folder).stat().st_size
+
+
+@pytest.mark.parametrize("seed", SESSIONS)
+def test_a_study_killed_at_random_moments_has_every_trial_once(tmp_path, whole_size, seed):
+    rng, path = random.Random(seed), log_path(tmp_path)
+    for _ in range(rng.randint(1, KILLS_MAX)):
+        process = start_study(tmp_path)
+        wait_for(partial(has_reached, process, path, rng.randrange(whole_size)), "the moment", rng.uniform(0.0, 0.005))
+        process.kill()
+        process.communicate()
+    process = start_study(tmp_path)
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    records = read_records(path)
+    assert find_defects(records) == []
+    assert sum(record["record"] == "trial" for record in records) == TRIALS
+    table = (tmp_path / "data/sub-sim01/beh/sub-sim01_task-short_beh.tsv").read_text().splitlines()
+    assert len(table) == 1 + TRIALS
+    assert subprocess.run([VALIDATOR, tmp_path / "data"], capture_output=True).returncode == 0
+
+
+def lose(records):
+    del records[max(k for k, record in enumerate(records) if record["record"] == "trial")]
+
+
+def double(records):
+    records += records[-2:]
+
+
+def distort(records):
+    records[-1]["presentations"][0]["executed"]["width_s"][3] += 2e-4
+
+
+def drop_pulse(records):
+    for column in records[-1]["presentations"][0]["executed"].values():
+        del column[-1]
+
+
+def leave_unmarked(records):
+    records.insert(-2, copy.deepcopy(records[-2]))
+
+
+@pytest.mark.parametrize("change", [lose, double, distort, drop_pulse, leave_unmarked])
+def test_the_check_finds_a_defect(tmp_path, change):
+    start_study(tmp_path).communicate()
+    records = read_records(log_path(tmp_path))
+    assert find_defects(records) == []
+    change(records)
+    assert find_defects(records)
+
+
+class Person:
+    """A participant's terminal: answers every question of the process with the first answer."""
+
+    def __init__(self, folder, daemon):
+        self.process = start_study(
+            folder,
+            *("--participant", "07", "--hold", "--url", daemon.url),
+            stdin=subprocess.PIPE,
+            env={**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(folder)},
+        )
+        self.process.stdin.write("2-3\n" * TRIALS)
+        self.process.stdin.flush()
+
+    def kill(self):
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))])
+@pytest.mark.parametrize("victim", ["study", "daemon", "link"])
+def test_a_persons_session_goes_on_after_a_kill(tmp_path, board, make_daemon, victim, seed):
+    rng, path = random.Random(seed), log_path(tmp_path, "07")
+    daemon = make_daemon(board)
+    person = Person(tmp_path, daemon)
+    begun = rng.randrange(1, 4)
+    wait_for(lambda: sum(r["record"] == "begun" for r in read_records(path)) >= begun, "a trial")
+    pulses = len(board.of("pulse"))
+    wait_for(lambda: len(board.of("pulse")) > pulses, "light")
+    if victim == "study":
+        person.kill()
+        wait_for(lambda: daemon.board_state() == "DISARMED", "disarmed")
+    else:
+        pid = daemon.process.pid if victim == "daemon" else daemon.find_process("link")
+        os.kill(pid, signal.SIGKILL)
+        _, errors = person.process.communicate()
+        assert person.process.returncode != 0
+        assert "Traceback" not in errors
+    wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "disarmed")
+    assert board.of("gate")[-1]["on"] is False
+    if victim != "study":
+        daemon.stop()
+        daemon = make_daemon(board)
+    person = Person(tmp_path, daemon)
+    _, errors = person.process.communicate()
+    assert person.process.returncode == 0, errors
+    records = read_records(path)
+    assert find_defects(records) == []
+    assert any(record["record"] in ("interrupted", "spoiled") for record in records)
+    logged = [(pulse["on_us"], pulse["off_us"]) for pulse in board.all_of("pulse")]
+    for record in records:
+        if record["record"] == "trial":
+            assert_on_the_board(record["presentations"][-1], logged)
+
+
+def assert_on_the_board(presentation, logged):
+    """Assert that the board's own log has a presentation's pulses, one after the other, with their widths and times."""
+    executed = presentation["executed"]
+    starts_us = [round(1e6 * start_s) for start_s in executed["start_s"]]
+    widths_us = [round(1e6 * width_s) for width_s in executed["width_s"]]
+    count = len(starts_us)
+    assert any(
+        [off - on for on, off in logged[k : k + count]] == widths_us
+        and all(abs(on - logged[k][0] - at) <= 2 for (on, _), at in zip(logged[k : k + count], starts_us, strict=True))
+        for k in range(len(logged) - count + 1)
+    )
