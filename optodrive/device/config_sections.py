@@ -18,13 +18,13 @@ DAC_HALF_RANGE_CODES = 2_047
 """Half range of a laser DAC: 12 bits, which every converter behind one has."""
 POWER_STEPS = 65_535
 """Steps of the board's duty from zero to the laser's full power."""
-DAC_POWER_STEPS = {"helios": 255, "ether_dream": 4095}
+DAC_POWER_STEPS = {"helios": 255, "ether_dream": 4095, "idn": 255}
 """The same of the laser DACs, by transport."""
-NETWORK_DACS = ("ether_dream",)
-DAC_TIMING_SLACK_POINTS = 5
+NETWORK_DACS = ("ether_dream", "idn")
+DAC_TIMING_SLACK_POINTS = {"helios": 5, "ether_dream": 5, "idn": 6}
 """On a laser DAC a pulse starts up to two points late (rounding; the end of a chunk) and ends up to three points early
-(the same, and the dark point before an immediately following pulse)."""
-DAC_POINT_EXCESS_S = {"helios": 1e-8, "ether_dream": 5e-8}
+(the same, and the dark point before an immediately following pulse); on IDN one more dark point precedes a pulse."""
+DAC_POINT_EXCESS_S = {"helios": 1e-8, "ether_dream": 5e-8, "idn": 1e-6}
 """A point lasts up to one tick of the DAC's clock longer than requested, s."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -220,8 +220,8 @@ class LimitsSection(Section):
 class BoardSection(Section):
     """The board and the way to reach it."""
 
-    transport: Literal["simulated", "serial", "usb", "helios", "ether_dream"]
-    """The simulated board, a serial port, USB bulk endpoints, or a laser DAC: Helios by USB, Ether Dream by network."""
+    transport: Literal["simulated", "serial", "usb", "helios", "ether_dream", "idn"]
+    """The simulated board, a serial port, USB bulk endpoints, or a laser DAC: by USB (Helios) or network."""
     port: str = ""
     """Serial device, link of the simulated board's pseudo-terminal, or address of a network DAC."""
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 1_000_000
@@ -270,7 +270,7 @@ class BoardSection(Section):
         """Largest reduction of the interval between two planned times on this board, s, and zero for ticks."""
         if not self.is_dac:
             return 0.0
-        return DAC_TIMING_SLACK_POINTS * (1.0 / self.points_per_s + DAC_POINT_EXCESS_S[self.transport])
+        return DAC_TIMING_SLACK_POINTS[self.transport] * (1.0 / self.points_per_s + DAC_POINT_EXCESS_S[self.transport])
 
     @property
     def is_dac(self) -> bool:

@@ -10,8 +10,8 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
 from optodrive.device.config_file import load_config
 from optodrive.link.dac.devices.helios import Helios
-from optodrive.link.dac.encoding import PointScale
-from optodrive.link.dac.verification import encode_verified
+from optodrive.link.dac.encoding import PointScale, decode, encode
+from optodrive.link.dac.verification import VerifiedChunks, encode_verified
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 
@@ -48,10 +48,14 @@ def build_train(width_s=0.02, gap_s=0.02, power_w=1.0, pixel=5, duration_s=0.3):
     return FrameSequence(trains=(PulseTrain(pixel, 0.0, duration_s, width_s, gap_s, power_w),))
 
 
-def build_verified(display, sequence):
-    """Return a plan and its verified frames."""
+def build_verified(display, sequence, proven=True):
+    """Return a plan and its verified chunks, or chunks that no proof has seen."""
     heat, budget = display.build_cold_state()
     plan = plan_sequence(display, sequence, heat, budget).plan
+    if not proven:
+        scale = PointScale.from_config(display.config)
+        chunks = encode(plan, scale)
+        return plan, VerifiedChunks(chunks, decode([chunk.data for chunk in chunks], scale), np.zeros(0, dtype=int))
     return plan, encode_verified(plan, PointScale.from_config(display.config), budget, display.budget)
 
 

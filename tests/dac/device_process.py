@@ -16,8 +16,9 @@ from contextlib import suppress
 import numpy as np
 
 from dac.emulated_ether_dream import CLOCK_HZ, Connection, EtherDreamCore
+from dac.emulated_idn import IdnCore
 
-ETHER_DREAM_PORT = 7765
+ETHER_DREAM_PORT, IDN_PORT = 7765, 7255
 REST_S = 2.0
 """How much longer a device runs in its own time than in that of the test, which hears nothing more of it."""
 
@@ -107,6 +108,34 @@ def serve_ether_dream(address, broadcast_port, started, stopped, **device):
         "played": core.played,
         "starved": core.starved,
         "counters": json.dumps({"flags": core.playback_flags}),
+    }
+
+
+def serve_idn(address, broadcast_port, started, stopped, **device):
+    """Serve an IDN device, which states itself when it is asked only. Its log is as an Ether Dream's."""
+    core, zero_s = IdnCore(**device), time.monotonic()
+    arrivals_s = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
+        radio.bind((address, IDN_PORT))
+        radio.settimeout(0.01)
+        started()
+        while not stopped:
+            with suppress(TimeoutError):
+                data, source = radio.recvfrom(65_536)
+                now_s = time.monotonic() - zero_s
+                if data[0] in (0x40, 0x41):
+                    arrivals_s.append(now_s)
+                for answer in core.receive(data, now_s, source):
+                    radio.sendto(answer, source)
+        core.advance(time.monotonic() - zero_s + REST_S)
+    return {
+        "table": core.log.table(core.now_s),
+        "end_s": core.now_s,
+        "arrivals_s": np.array(arrivals_s),
+        "zero_s": zero_s,
+        "played": core.log.count,
+        "dropped": core.dropped,
+        "speeds": np.array(core.speeds),
     }
 
 

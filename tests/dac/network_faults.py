@@ -66,7 +66,7 @@ class UdpProxy:
     """
 
     def __init__(self, address, target, seed, lost=0.0, repeated=0.0, delayed=0.0, delay_s=0.05):
-        self.target, self.rng = target, random.Random(seed)
+        self.address, self.rng = address, random.Random(seed)
         self.shares, self.delay_s = (lost, repeated, delayed), delay_s
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind((address, target[1]))

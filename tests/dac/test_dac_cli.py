@@ -66,7 +66,7 @@ def test_info_reports_identity_and_permission_to_emit(desk, capsys):
 
 
 def test_list_shows_what_is_on_usb_and_in_the_network(desk, capsys, monkeypatch):
-    monkeypatch.setattr(discovery, "LISTENING_S", 0.0)
+    monkeypatch.setattr(discovery, "find_idn_devices", lambda clock: [])
     found = FoundDac("ether_dream", "00:04:a3:01:02:03", "192.168.1.20", "revision 1.0, idle")
     monkeypatch.setattr(discovery, "find_ether_dreams", lambda clock: [found])
     assert run(["dac", "list"]) == 0

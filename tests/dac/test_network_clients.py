@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from ether_dream import ether_dream as foreign
 
-from dac.device_process import DeviceProcess, serve_ether_dream
+from dac.device_process import DeviceProcess, serve_ether_dream, serve_idn
 from optodrive.core.clock import MonotonicClock
-from optodrive.link.dac.discovery import find_ether_dreams
+from optodrive.link.dac.discovery import find_ether_dreams, find_idn_devices
 
 HERE = Path(__file__).parent
 MODULES = HERE.parents[1] / ".node"
@@ -101,6 +101,15 @@ def test_discovery_lists_a_device_and_survives_what_else_arrives(tmp_path):
     assert genuine.description == "revision 1.0, 1799 points, up to 100000 points/s, idle"
     assert false.port == "127.0.0.1"
     assert all("\x1b" not in dac.name + dac.description for dac in found)
+
+
+def test_a_scan_lists_an_idn_device(tmp_path):
+    device = DeviceProcess(serve_idn, tmp_path)
+    found = find_idn_devices(MonotonicClock(), 1.0, (device.address, 7255))
+    device.finish()
+    (dac,) = found
+    assert (dac.transport, dac.name, dac.port) == ("idn", "IDN 01020304050607", device.address)
+    assert dac.description == "emulated, protocol 0.1, in order"
 
 
 @pytest.mark.parametrize("data", [b"", bytes(35), bytes(37)])

@@ -10,10 +10,11 @@ from typing import Any
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, escape_unprintable
-from optodrive.link.dac.formats import ether_dream as ether_dream
+from optodrive.link.dac.formats import ether_dream, idn
 
 LISTENING_S = 1.5
 """An Ether Dream states itself once per second."""
+ANSWERING_S = 0.5
 DATAGRAM_BYTES = 2048
 FOUND_MAX = 64
 """Found devices that are listed; a flood of false ones ends here."""
@@ -34,7 +35,7 @@ class FoundDac:
 
 def find_dacs(clock: Clock) -> list[FoundDac]:
     """Return the laser DACs on USB and in the network."""
-    return [*find_helios(), *find_ether_dreams(clock)]
+    return [*find_helios(), *find_ether_dreams(clock), *find_idn_devices(clock)]
 
 
 def find_helios(backend: Any = None) -> list[FoundDac]:
@@ -77,6 +78,40 @@ def find_ether_dreams(
             if dac is not None:
                 found.setdefault(dac.port, dac)
     return sorted(found.values(), key=lambda dac: dac.port)
+
+
+def find_idn_devices(
+    clock: Clock, listening_s: float = ANSWERING_S, address: tuple[str, int] = ("255.255.255.255", idn.UDP_PORT)
+) -> list[FoundDac]:
+    """Return the IDN devices that answer a scan of the local network within listening_s."""
+    found: dict[str, FoundDac] = {}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
+        radio.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        try:
+            radio.sendto(idn.PACKET.pack(idn.SCAN, 0, 1), address)
+        except OSError:  # a computer without a network
+            return []
+        until_s = clock.now_s() + listening_s
+        while len(found) < FOUND_MAX and (left_s := until_s - clock.now_s()) > 0.0:
+            radio.settimeout(left_s)
+            try:
+                data, (host, _) = radio.recvfrom(DATAGRAM_BYTES)
+            except TimeoutError:
+                break
+            dac = _parse_scan(data, host)
+            if dac is not None:
+                found.setdefault(dac.port, dac)
+    return sorted(found.values(), key=lambda dac: dac.port)
+
+
+def _parse_scan(data: bytes, host: str) -> FoundDac | None:
+    """Return the IDN device that a datagram states, None if it states none."""
+    if len(data) < idn.PACKET.size + idn.SCAN_BODY.size or data[0] != idn.SCAN_ANSWER:
+        return None
+    _, version, status, _, unit, name = idn.SCAN_BODY.unpack_from(data, idn.PACKET.size)
+    state = "out of order" if status & (idn.MALFUNCTION | idn.OFFLINE) else "in order"
+    host_name = escape_unprintable(idn.decode_name(name))
+    return FoundDac("idn", idn.name_unit(unit), host, f"{host_name}, protocol {version >> 4}.{version & 15}, {state}")
 
 
 def _parse_broadcast(data: bytes, host: str) -> FoundDac | None:

@@ -20,4 +20,8 @@ def build_dac(board: BoardSection, clock: Clock) -> LaserDac:
         from optodrive.link.dac.devices.ether_dream import EtherDream
 
         return EtherDream(board, clock)
+    if board.transport == "idn":
+        from optodrive.link.dac.devices.idn import Idn
+
+        return Idn(board, clock)
     raise InputError("board.transport", board.transport, f"that of a laser DAC: {', '.join(FORMATS)}")

@@ -4,8 +4,9 @@ from optodrive.core.errors import InputError
 from optodrive.link.dac.formats.base import DacFormat
 from optodrive.link.dac.formats.ether_dream import EtherDreamFormat
 from optodrive.link.dac.formats.helios import HeliosFormat
+from optodrive.link.dac.formats.idn import IdnFormat
 
-FORMATS: dict[str, type[DacFormat]] = {"helios": HeliosFormat, "ether_dream": EtherDreamFormat}
+FORMATS: dict[str, type[DacFormat]] = {"helios": HeliosFormat, "ether_dream": EtherDreamFormat, "idn": IdnFormat}
 
 
 def find_format(transport: str) -> type[DacFormat]:
