@@ -177,7 +177,7 @@ _PATTERN_LIST = (
     ),
     Pattern(
         "text",
-        "text in braille, uncontracted English",
+        "text in braille: uncontracted English, or by a table of liblouis",
         (
             PatternParameter("text", "text", None, "text to show", required=True),
             _height_parameter(150.0, "peak height of a dot"),
@@ -185,6 +185,7 @@ _PATTERN_LIST = (
             _integer_parameter("dot_step", 1, "pitches between the dots of a cell", 1, 10),
             _integer_parameter("cell_gap", 1, "empty columns between cells", 0, 20),
             _integer_parameter("line_gap", 1, "empty rows between lines", 0, 20),
+            PatternParameter("table", "text", None, "table of liblouis, such as en-ueb-g2 or de-g1"),
         ),
         build_text,
     ),

@@ -10,6 +10,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.braille import SPACE, Cell, encode_lines
+from optodrive.planning.stimuli.liblouis import translate_lines
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture, sequence_end_s
 
@@ -44,12 +45,14 @@ def build_text(
     dot_step: int = 1,
     cell_gap: int = 1,
     line_gap: int = 1,
+    table: str | None = None,
 ) -> FrameSequence:
     """Build text in braille from the top left, each page for `seconds` or as long as the beam needs.
 
-    Raises InputError (bad_text, does_not_fit).
+    table: of liblouis; without one, text is uncontracted English. Raises InputError (bad_text, does_not_fit, and with a
+    table bad_table, missing_library).
     """
-    lines = encode_lines(text, f"{where}: text")
+    lines = encode_lines(text, f"{where}: text") if table is None else translate_lines(text, table, where)
     if not any(lines):
         raise InputError(f"{where}: text", text, "at least one character to show", code="bad_text")
     estimator, spacing = BeamTimeEstimator(config), Spacing(dot_step, cell_gap, line_gap)

@@ -1,0 +1,152 @@
+"""Text by tables of liblouis: the cells of `lou_translate`, on the pixels of the display; wrong input in one line."""
+
+import ctypes
+import random
+import subprocess
+from pathlib import Path
+from shutil import which
+
+import numpy as np
+import pytest
+
+from optodrive.core.errors import InputError
+from optodrive.device.config_file import load_config
+from optodrive.planning.stimuli import liblouis
+from optodrive.planning.stimuli.liblouis import LIBRARY, translate_lines
+from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.planning.stimuli.text import Spacing, build_text, find_line_slots
+
+ALPHABETS = {
+    "en-ueb-g1": "abcdefghijklmnopqrstuvwxyzABCXYZ0123456789,.;:!?-()'\"",
+    "en-ueb-g2": "abcdefghijklmnopqrstuvwxyzABCXYZ0123456789,.;:!?-()'\"",
+    "de-g1": "abcdefghijklmnopqrstuvwxyzäöüßÄÖÜ0123456789,.;:!?-()",
+    "de-g2": "abcdefghijklmnopqrstuvwxyzäöüß0123456789,.;:!?-()",
+    "fr-bfu-comp6": "abcdefghijklmnopqrstuvwxyzàâçéèêëîïôûù0123456789,.;:!?-()",
+    "es-g1": "abcdefghijklmnopqrstuvwxyzáéíóúñü0123456789,.;:!?-()",
+    "it-it-comp6": "abcdefghijklmnopqrstuvwxyzàèéìòù0123456789,.;:!?-()",
+    "nl-NL-g0": "abcdefghijklmnopqrstuvwxyzëïé0123456789,.;:!?-()",
+    "Pl-Pl-g1": "abcdefghijklmnopqrstuvwxyząćęłńóśźż0123456789,.;:!?-()",
+    "pt-pt-g1": "abcdefghijklmnopqrstuvwxyzáâãàçéêíóôõú0123456789,.;:!?-()",
+    "ru-litbrl": "абвгдежзийклмнопрстуфхцчшщъыьэюяАБВ0123456789,.;:!?-()",
+}
+"""Ten languages, and contracted English and German."""
+ENGLISH = [
+    "the",
+    "and",
+    "for",
+    "with",
+    "people",
+    "ability",
+    "know",
+    "little",
+    "under",
+    "mother",
+    "quick",
+    "would",
+    "shall",
+    "braille",
+]
+
+
+def has_library():
+    try:
+        ctypes.CDLL(LIBRARY)
+    except OSError:
+        return False
+    return which("lou_translate") is not None
+
+
+needs_library = pytest.mark.skipif(not has_library(), reason="liblouis is not installed: scripts/test-packages")
+
+
+def draw_lines(table, count):
+    """Return lines of random words, in English half of them real ones, which have contractions."""
+    rng = random.Random(table)
+    words = lambda: "".join(rng.choices(ALPHABETS[table], k=rng.randint(1, 9)))  # noqa: E731
+    real = lambda: rng.choice(ENGLISH) if table.startswith("en") and rng.random() < 0.5 else words()  # noqa: E731
+    return [" ".join(real() for _ in range(rng.randint(1, 6))) for _ in range(count)]
+
+
+def judge(table, lines):
+    """Return the cells of each line by liblouis's own program, as characters of Unicode's braille block."""
+    (file,) = [path.name for path in liblouis.TABLES.glob(f"{table}.*") if path.suffix in liblouis.SUFFIXES]
+    given = "".join(line + "\n" for line in lines)
+    done = subprocess.run(
+        ["lou_translate", f"unicode.dis,{file}"], input=given, capture_output=True, text=True, check=True
+    )
+    return done.stdout.split("\n")[: len(lines)]
+
+
+def to_unicode(words):
+    return "\u2800".join("".join(chr(0x2800 + sum(1 << dot - 1 for dot in cell)) for cell in word) for word in words)
+
+
+def check_table(table, count):
+    lines = draw_lines(table, count)
+    expected = [
+        "\u2800".join(line.replace(" ", "\u2800").split("\u2800")).strip("\u2800") for line in judge(table, lines)
+    ]
+    found = [to_unicode(words) for words in translate_lines("\n".join(lines), table, "text")]
+    assert [row for row in zip(lines, found, expected, strict=True) if row[1] != row[2]] == []
+
+
+@needs_library
+@pytest.mark.parametrize("table", sorted(ALPHABETS))
+def test_cells_are_those_of_the_librarys_own_program(table):
+    check_table(table, 100)
+
+
+@needs_library
+@pytest.mark.slow
+@pytest.mark.parametrize("table", sorted(ALPHABETS))
+def test_a_thousand_strings_have_the_cells_of_the_librarys_own_program(table):
+    check_table(table, 1000)
+
+
+@needs_library
+def test_the_cells_stand_on_the_display():
+    config = load_config("display-1511")
+    lines = draw_lines("en-ueb-g2", 12)
+    frames = build_text(config, "t", "\n".join(lines), 1e-4, 0.0, table="en-ueb-g2").frames
+    lattice = Lattice.from_config(config)
+    slots = find_line_slots(lattice, Spacing(1, 1, 1))
+    shown = []
+    for target_m in dict.fromkeys(page.target_m.tobytes() for page in frames):
+        raised = np.frombuffer(target_m) > 0.0
+        for line in slots:
+            cells = [frozenset(dot for dot, pixel in slot.items() if raised[pixel]) for slot in line]
+            shown += to_unicode([cells]).strip("\u2800").split("\u2800")
+    expected = [word for line in judge("en-ueb-g2", lines) for word in line.replace(" ", "\u2800").split("\u2800")]
+    assert "".join(shown) == "".join(expected)
+
+
+@needs_library
+@pytest.mark.parametrize(
+    ("text", "table", "message"),
+    [
+        ("a", "en-ueb-g9", "expected a table in .*, nearest is 'en-ueb-g"),
+        ("a", "../../../etc/passwd", "expected a table in .*, such as en-ueb-g2"),
+        ("a", "en-ueb-g2.ctb,de-g1.ctb", "expected a table in"),
+        ("a", "", "expected a table in"),
+        ("Ä", "de-de-comp8", "expected a table of six dots, not de-de-comp8.ctb"),
+    ],
+)
+def test_a_wrong_table_is_refused_in_one_line(text, table, message):
+    with pytest.raises(InputError, match=message) as refused:
+        translate_lines(text, table, "text")
+    assert "\n" not in str(refused.value)
+
+
+def test_without_the_library_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(liblouis, "LIBRARY", "liblouis-that-is-missing.so")
+    liblouis._load_library.cache_clear()
+    try:
+        with pytest.raises(InputError, match=r"t: table: .*apt-get install liblouis20 liblouis-data") as refused:
+            translate_lines("a", "en-ueb-g2", "t")
+        assert refused.value.code == "missing_library"
+    finally:
+        liblouis._load_library.cache_clear()
+
+
+def test_the_tables_folder_is_debians():
+    assert Path("/usr/share/liblouis/tables") == liblouis.TABLES
