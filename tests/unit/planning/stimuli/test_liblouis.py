@@ -43,7 +43,6 @@ ENGLISH = [
     "mother",
     "quick",
     "would",
-    "shall",
     "braille",
 ]
 
