@@ -32,6 +32,9 @@ class Light:
     moves_s: np.ndarray
     moves_rad: tuple
 
+    def __len__(self):
+        return len(self.start_s)
+
 
 def read_light(table, display, sample_s, first_sample=0):
     """Read a log. sample_s: nominal period of a sample; first_sample: number of the plan's first one."""
@@ -79,7 +82,7 @@ def judge(light, plan, display):
 def judge_place(light, display, rows=2000):
     """Return how far the focus extends beyond an absorber, m; negative if it never does."""
     worst_m = -np.inf
-    for first in range(0, len(light.start_s), rows):
+    for first in range(0, len(light), rows):
         some = slice(first, first + rows)
         worst_m = max(
             worst_m,

@@ -7,14 +7,11 @@ between the pixels, and the panel itself.
 import pytest
 
 from displays import DISPLAYS
-from optodrive.core.units import ZERO_CELSIUS_K
-from optodrive.device.neighbours import Neighbours
-from optodrive.physics.parameters import load_parameters
-from optodrive.planning.budget_setup import build_nominal_model, build_nominal_panel
 from optodrive.planning.limiter.limiter import build_cold_budget_state, concatenate, limit
 from optodrive.planning.limiter.nominal_model import Uncertainty
 from optodrive.planning.limiter.worst_case import build_heat_bound
-from reference_models.thermal_display import TOUCHED, build_plan, build_true_display, upper_factors
+from reference_models.shipped_display import build_model, build_worst_factors
+from reference_models.thermal_display import TOUCHED, build_plan, build_true_display
 
 HOUR_S = 3600.0
 REST_S = 1.2e-3
@@ -22,21 +19,6 @@ BATCH = 20_000
 FULL_W = 2.45
 MINUTES = 0.13
 """Eight minutes, in hours: three time constants of the smallest panels."""
-
-
-def build_model(name):
-    display = DISPLAYS[name]
-    parameters, config = load_parameters(display.config.pixel_model.parameters), display.config
-    neighbours, ambient_k = Neighbours.from_display(config.display), config.ambient_c + ZERO_CELSIUS_K
-    panel = build_nominal_panel(config, parameters, display.pixels)
-    return build_nominal_model(parameters, display.pixels, neighbours, ambient_k, panel=panel)
-
-
-def build_worst_factors(name, capacity_sign):
-    """Return the parameters with the highest steady temperatures, and the smallest or the largest capacities."""
-    unsure = Uncertainty(**DISPLAYS[name].config.limits.uncertainty.model_dump())
-    capacities = ("absorber_capacity", "wall_capacity", "touch_lag", "gas_lag", "panel_capacity")
-    return upper_factors(unsure) | {key: 1 + capacity_sign * getattr(unsure, key) for key in capacities}
 
 
 def visit(pixels, span_s, width_s, begin_s):

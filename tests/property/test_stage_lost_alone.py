@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from test_caps_over_hours import build_model, build_worst_factors
 
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
@@ -21,6 +20,7 @@ from optodrive.link.session.board_group import BoardGroup
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.caps import CapValues
 from planner_rig import build_frame
+from reference_models.shipped_display import build_model, build_worst_factors
 from reference_models.thermal_display import TOUCHED, build_true_display
 from stage_loss_rig import KINDS, LossRig
 
