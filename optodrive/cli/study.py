@@ -120,6 +120,7 @@ def _run_person(design: "Study", out: Path, participant: str, url: str, hold: bo
 
 def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], out: Path) -> dict[str, Any]:
     from optodrive.study.results import Accuracy, count_correct, fit_magnitudes
+    from optodrive.study.session import build_threshold_model, list_answered
 
     published, records = design.published, [record for session in sessions.values() for record in session]
     report: dict[str, Any] = {
@@ -135,6 +136,13 @@ def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], ou
         report |= {"correct": counted.correct, "accuracy": counted.share}
     elif design.response.kind == "magnitude":
         report["line"] = fit_magnitudes(design, list(sessions.values()))._asdict()
+    if design.procedure is not None:
+        model = build_threshold_model(design, design.procedure)
+        report["threshold_of"] = design.procedure.parameter
+        report["thresholds"] = {
+            name: model.estimate(list_answered(design.procedure, session))._asdict()
+            for name, session in sessions.items()
+        }
     if published is not None:
         report["published"] = published.model_dump(mode="json") | {"trials": published.trials}
         if published.correct is not None:
@@ -156,6 +164,9 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
         line = report["line"]
         means, values = line["r_squared"], line["participants_r_squared"]
         yield f"line             r² {means:.3f} of the means, {values:.2f} of all values"
+    for name, found in report.get("thresholds", {}).items():
+        interval = f"95 % interval {found['low']:.3g} to {found['high']:.3g}"
+        yield f"threshold        {name}: {report['threshold_of']} {found['threshold']:.3g} ({interval})"
     yield from _format_published(report.get("published"))
     yield f"written          {report['written']}"
 

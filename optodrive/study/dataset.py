@@ -87,7 +87,7 @@ def _write_task(folder: Path, path: Path) -> None:
     head, trials = read_log(path)
     beh = folder / path.parent.name / "beh"
     create_folder(beh)
-    stem, factors = path.name.removesuffix(LOG_SUFFIX) + "_beh", list(head["study"]["factors"])
+    stem, factors = path.name.removesuffix(LOG_SUFFIX) + "_beh", list(_list_varied(head["study"]))
     rows = [_build_row(record, factors) for record in trials]
     write_text(beh / f"{stem}.tsv", _format_table([*list(COLUMNS)[:3], *factors, *list(COLUMNS)[3:]], rows))
     write_text(beh / f"{stem}.json", _dump(_describe_task(head["study"])))
@@ -115,19 +115,32 @@ def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
         columns["answer"]["Levels"] = {answer: answer for answer in response["answers"]}
     else:
         columns["answer"]["Description"] += ", a magnitude between 0 and 1"
-    for factor, values in study["factors"].items():
+    for factor, values in _list_varied(study).items():
         columns[factor] = {
             "Description": f"Parameter `{factor}` of the stimulus `{study['stimulus']['pattern']}`",
             "Levels": {str(value): str(value) for value in values},
         }
     return {
         "TaskName": study["name"].replace("-", ""),
-        "TaskDescription": f"{study['title']}: {study['repetitions']} trials per condition in random order",
+        "TaskDescription": f"{study['title']}: {_describe_procedure(study)}",
         "Instructions": response["question"],
         **columns,
         "StimulusPresentation": {"SoftwareName": "optodrive", "SoftwareVersion": version("optodrive")},
         "Design": study,
     }
+
+
+def _list_varied(study: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Return the values of each parameter that varies between trials."""
+    procedure = study.get("procedure")
+    return {**study["factors"], **({procedure["parameter"]: procedure["levels"]} if procedure else {})}
+
+
+def _describe_procedure(study: Mapping[str, Any]) -> str:
+    procedure = study.get("procedure")
+    if procedure:
+        return f"threshold of {procedure['parameter']} by {procedure['kind']}, {procedure['trials']} trials"
+    return f"{study['repetitions']} trials per condition in random order"
 
 
 def _describe_dataset() -> dict[str, Any]:

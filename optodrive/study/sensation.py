@@ -43,14 +43,18 @@ def compute_threshold_m(frequency_hz: FloatArray) -> tuple[FloatArray, FloatArra
     return meissner_m, pacinian_m
 
 
-def compute_signals(displacement_m: FloatArray, dt_s: float) -> ChannelSignals:
-    """Return the channels' signals for a displacement [n] at steps of dt_s."""
+def compute_excitations(displacement_m: FloatArray, dt_s: float) -> tuple[float, float]:
+    """Return the weighted amplitudes of a displacement [n] at steps of dt_s, in units of each channel's threshold."""
     count = len(displacement_m)
     frequency_hz = np.asarray(np.fft.rfftfreq(count, dt_s), dtype=np.float64)
     is_felt = (frequency_hz >= FELT_MIN_HZ) & (frequency_hz <= FELT_MAX_HZ)
     amplitude_m = 2.0 / count * np.abs(np.fft.rfft(displacement_m - displacement_m.mean()))[is_felt]
-    excitations = [
-        float(np.sqrt(np.sum((amplitude_m / threshold_m) ** 2)))
-        for threshold_m in compute_threshold_m(frequency_hz[is_felt])
-    ]
-    return ChannelSignals(*(max(0.0, excitation - 1.0) for excitation in excitations))
+    meissner_m, pacinian_m = compute_threshold_m(frequency_hz[is_felt])
+    meissner, pacinian = (float(np.sqrt(np.sum((amplitude_m / m) ** 2))) for m in (meissner_m, pacinian_m))
+    return meissner, pacinian
+
+
+def compute_signals(displacement_m: FloatArray, dt_s: float) -> ChannelSignals:
+    """Return the channels' signals for a displacement [n] at steps of dt_s."""
+    meissner, pacinian = compute_excitations(displacement_m, dt_s)
+    return ChannelSignals(max(0.0, meissner - 1.0), max(0.0, pacinian - 1.0))

@@ -1,8 +1,10 @@
 """Sessions: the trials of one participant in a study, from the first that does not count yet to the last."""
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from math import ceil
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,7 +12,8 @@ import numpy as np
 from optodrive.core.errors import RefusedError
 from optodrive.study.observers import Observer
 from optodrive.study.presenter import Presentation, Presenter
-from optodrive.study.study_file import Study, Value
+from optodrive.study.study_file import ProcedureSection, Study, Value
+from optodrive.study.threshold import ThresholdModel, draw_constant_levels, select_staircase_level
 from optodrive.study.trial_log import TrialLog
 
 ATTEMPTS_MAX = 5
@@ -52,11 +55,52 @@ class SimulatedRespondent:
 def draw_order(study: Study, participant: str) -> list[dict[str, Value]]:
     """Return the conditions of a participant's trials in an order drawn from the study's seed.
 
-    Every condition comes `repetitions` times. The order is recorded in the session's log.
+    Every condition comes as often, `repetitions` times or, in a procedure, to within one. The order is recorded in the
+    session's log, with the levels of constant stimuli.
     """
-    order = [dict(condition) for condition in study.conditions for _ in range(study.repetitions)]
-    random.Random(f"{study.seed} {participant}").shuffle(order)
-    return order
+    seed, procedure = f"{study.seed} {participant}", study.procedure
+    repetitions = ceil(study.trial_count / len(study.conditions))
+    order = [dict(condition) for condition in study.conditions for _ in range(repetitions)]
+    random.Random(seed).shuffle(order)
+    order = order[: study.trial_count]
+    if procedure is None or procedure.kind != "constant":
+        return order
+    levels = draw_constant_levels(len(procedure.levels), procedure.trials, f"{seed} levels")
+    return [
+        {**condition, procedure.parameter: procedure.levels[level]}
+        for condition, level in zip(order, levels, strict=True)
+    ]
+
+
+def list_answered(procedure: ProcedureSection, records: Sequence[dict[str, Any]]) -> list[tuple[int, bool]]:
+    """Return level and correctness of trials, in order."""
+    return [
+        (procedure.levels.index(record["condition"][procedure.parameter]), bool(record["is_correct"]))
+        for record in records
+    ]
+
+
+def choose_condition(study: Study, log: TrialLog, trial: int) -> dict[str, Value]:
+    """Return a trial's condition, with the level that the procedure chooses by the answers so far."""
+    procedure, condition = study.procedure, log.order[trial]
+    if procedure is None or procedure.kind == "constant":
+        return condition
+    answered = list_answered(procedure, [log.trials[index] for index in sorted(log.trials)])
+    if procedure.kind == "staircase":
+        level = select_staircase_level(len(procedure.levels), answered)
+    else:
+        level = build_threshold_model(study, procedure).select_informative_level(answered)
+    return {**condition, procedure.parameter: procedure.levels[level]}
+
+
+@lru_cache(maxsize=4)
+def _build_model(levels: tuple[float, ...], chance: float) -> ThresholdModel:
+    return ThresholdModel(levels, chance)
+
+
+def build_threshold_model(study: Study, procedure: ProcedureSection) -> ThresholdModel:
+    """Return the model of a procedure's threshold."""
+    return _build_model(procedure.levels, 1.0 / len(study.response.answers))
 
 
 def run_session(
@@ -72,7 +116,9 @@ def run_session(
     can go on later.
     """
     if study.familiarisation and not log.is_familiarised:
-        log.record_familiarisation([_familiarise(study, presenter, condition) for condition in study.conditions])
+        strongest = {} if study.procedure is None else {study.procedure.parameter: study.procedure.levels[-1]}
+        shown = [_familiarise(study, presenter, {**condition, **strongest}) for condition in study.conditions]
+        log.record_familiarisation(shown)
     while (trial := log.next_trial) is not None:
         on_trial(_run_trial(study, log, presenter, respondent, trial))
         presenter.wait(study.pause_s)
@@ -86,9 +132,10 @@ def _familiarise(study: Study, presenter: Presenter, condition: dict[str, Value]
 
 def _run_trial(study: Study, log: TrialLog, presenter: Presenter, respondent: Respondent, trial: int) -> dict[str, Any]:
     """Run one trial until it counts and return its record."""
-    parameters = {**study.stimulus.parameters, **log.order[trial]}
+    condition = choose_condition(study, log, trial)
+    parameters = {**study.stimulus.parameters, **condition}
     for _ in range(ATTEMPTS_MAX):
-        attempt, presentations, response = log.begin(trial), [], None
+        attempt, presentations, response = log.begin(trial, condition), [], None
         while response is None:
             shown = presenter.present(study.stimulus.pattern, parameters)
             if shown.fault is not None:
@@ -98,7 +145,7 @@ def _run_trial(study: Study, log: TrialLog, presenter: Presenter, respondent: Re
         if response is None:
             log.spoil(str(shown.fault))
             continue
-        correct = study.find_correct_answer(log.order[trial])
+        correct = study.find_correct_answer(condition)
         return log.complete(
             {
                 "requested": {"pattern": study.stimulus.pattern, "parameters": parameters},

@@ -1,7 +1,7 @@
 """Study files: the design of an experiment with people, as TOML of a stated version."""
 
 from collections.abc import Mapping
-from itertools import product
+from itertools import pairwise, product
 from math import isclose
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from optodrive.core.errors import InputError
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import ConflictError, Name, Section, check_format, parse_table
+from optodrive.study.threshold import Procedure
 
 FORMAT, VERSION = "optodrive-study", 1
 EXPERIMENTS = Path(__file__).with_name("experiments")
@@ -59,10 +60,28 @@ class ResponseSection(Section):
         return self
 
 
+class ProcedureSection(Section):
+    """The choice of a level for each trial, to find the threshold of a parameter."""
+
+    kind: Procedure
+    """Every level as often, 1 up and 2 down, or the most informative level next."""
+    parameter: Name
+    """The pattern's parameter whose threshold is sought."""
+    levels: Annotated[tuple[Annotated[float, Field(gt=0.0)], ...], Field(min_length=3, max_length=100)]
+    """Values of the parameter in increasing order."""
+    trials: Annotated[int, Field(ge=1, le=1000)]
+
+    @model_validator(mode="after")
+    def _check_levels(self) -> "ProcedureSection":
+        if any(low >= high for low, high in pairwise(self.levels)):
+            raise ConflictError("levels", self.levels, "increasing values")
+        return self
+
+
 class SimulationSection(Section):
     """The simulated participant."""
 
-    observer: Literal["linear-motion", "rotation", "localisation", "intensity", "oddball", "digits"]
+    observer: Literal["linear-motion", "rotation", "localisation", "intensity", "oddball", "digits", "detection"]
     """The rule by which it answers."""
 
 
@@ -94,8 +113,8 @@ class Study(Section):
     title: Name
     seed: Annotated[int, Field(ge=0)]
     """Seed of the orders of trials; each participant's is recorded in the session's log."""
-    repetitions: Annotated[int, Field(ge=1, le=1000)]
-    """Number of trials with each condition."""
+    repetitions: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Number of trials with each condition; a procedure states its own number of trials."""
     pause_s: Annotated[float, Field(ge=0.0, le=600.0)]
     """Time from an answer to the next stimulus."""
     familiarisation: bool = False
@@ -104,6 +123,7 @@ class Study(Section):
     factors: dict[str, Annotated[tuple[Value, ...], Field(min_length=1)]]
     """Values of each factor; the conditions are their combinations."""
     response: ResponseSection
+    procedure: ProcedureSection | None = None
     simulation: SimulationSection | None = None
     published: PublishedSection | None = None
 
@@ -123,6 +143,13 @@ class Study(Section):
             for value in self.factors[correct]:
                 if str(value) not in self.response.answers:
                     raise ConflictError(f"factors.{correct}", value, "one of the answers")
+        if self.procedure is not None:
+            if correct is None:
+                raise ConflictError("response.correct_factor", correct, "a factor: a threshold needs correct answers")
+            if self.procedure.parameter in {**self.factors, **self.stimulus.parameters}:
+                raise ConflictError("procedure.parameter", self.procedure.parameter, "neither a factor nor a constant")
+            if self.repetitions != 1:
+                raise ConflictError("repetitions", self.repetitions, "none: the procedure states the number of trials")
         if self.trial_count > TRIALS_MAX:
             raise ConflictError("repetitions", self.repetitions, f"at most {TRIALS_MAX} trials in all")
         return self
@@ -135,7 +162,14 @@ class Study(Section):
     @property
     def trial_count(self) -> int:
         """Number of trials of one participant."""
+        if self.procedure is not None:
+            return self.procedure.trials
         return len(self.conditions) * self.repetitions
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Names of the stimulus' parameters that vary between trials."""
+        return (*self.factors, *(() if self.procedure is None else (self.procedure.parameter,)))
 
     @property
     def task(self) -> str:

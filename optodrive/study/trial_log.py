@@ -48,6 +48,7 @@ class TrialLog:
         self.run = 0
         self._attempts: dict[int, int] = {}
         self._open_trial: int | None = None
+        self._condition: dict[str, Value] = {}
         is_new = not path.exists()
         self._file = _open_locked(path)
         try:
@@ -86,10 +87,14 @@ class TrialLog:
         """Number of the present attempt at the begun trial, from 1."""
         return self._attempts[self._require_open()]
 
-    def begin(self, trial: int) -> int:
-        """Record that a trial's stimulus is about to be shown, and return the number of this attempt."""
+    def begin(self, trial: int, condition: Mapping[str, Value] | None = None) -> int:
+        """Record that a trial's stimulus is about to be shown, and return the number of this attempt.
+
+        condition: that of the order, and the level that a procedure chose; None for that of the order
+        """
         attempt = self._attempts.get(trial, 0) + 1
-        self._write({"record": "begun", "trial": trial, "attempt": attempt, "condition": self.order[trial]})
+        self._condition = dict(self.order[trial] if condition is None else condition)
+        self._write({"record": "begun", "trial": trial, "attempt": attempt, "condition": self._condition})
         return attempt
 
     def spoil(self, reason: str) -> None:
@@ -99,7 +104,7 @@ class TrialLog:
     def complete(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Record the answer of the begun trial, which then counts. Return its record."""
         trial = self._require_open()
-        head = {"record": "trial", "trial": trial, "attempt": self.attempt, "condition": self.order[trial]}
+        head = {"record": "trial", "trial": trial, "attempt": self.attempt, "condition": self._condition}
         head["run"] = self.run
         record = {**head, **fields}
         self._write(record)

@@ -69,7 +69,10 @@ SCENARIOS = {
         write_recordings,
         ["docs/explanation/diagnosis.md:Diagnosis", "docs/explanation/diagnosis.md:Planning with a diagnosed model"],
     ),
-    "studies": (write_checkout, ["docs/how-to/run-a-study.md:The paper's experiments, simulated"]),
+    "studies": (
+        write_checkout,
+        ["docs/how-to/run-a-study.md:The paper's experiments, simulated", "docs/how-to/run-a-study.md:Thresholds"],
+    ),
     "film": (write_film, ["docs/explanation/diagnosis.md:Whole displays"]),
     "recordings": (write_recordings, ["docs/reference/recordings.md:Recordings"]),
     "recordings-python": (write_film, ["docs/reference/recordings.md:From Python"]),

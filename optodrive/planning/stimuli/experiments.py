@@ -26,6 +26,9 @@ SPEEDS_S = {"16": 0.200, "32": 0.100, "64": 0.050}
 PULSE_AND_GAP_S = {"slow": 0.035, "fast": 0.010}
 """Pulse width, and equal gap, of the two kinds of stimulus in experiment 5, s."""
 
+DETECTION_PITCHES = 3
+"""Distance of the two places of a detection from the centre."""
+
 FINGERS_UP_M = {2: 0.0, 3: 7.2e-3, 4: 3.6e-3, 5: -10.8e-3}
 """Position of the fingertips of a right hand relative to the index finger, m; the paper gives no positions."""
 
@@ -84,6 +87,15 @@ def build_intensity(config: Config, where: str, level: int, centre: int | None) 
     (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "a place for the stimulus")
     power_w = min(0.5 + 0.25 * (level - 1), config.laser.max_power_w)
     return _build_sequence([build_slot_train(pixel, 0.0, 1.0, 0.025, 0.025, power_w)])
+
+
+def build_detection(config: Config, where: str, side: str, power_w: float, centre: int | None) -> FrameSequence:
+    """Build a stimulus for detection: the pixel three pitches left or right of a centre, 500 ms at 25/25 ms."""
+    column = -DETECTION_PITCHES if side == "left" else DETECTION_PITCHES
+    (pixel,) = Lattice.from_config(config).pixels_around(
+        centre, [(0, column)], where, "a pixel three pitches beside it"
+    )
+    return _build_sequence([build_slot_train(pixel, 0.0, 0.5, 0.025, 0.025, min(power_w, config.laser.max_power_w))])
 
 
 def build_temporal_pattern(

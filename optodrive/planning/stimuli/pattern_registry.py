@@ -109,6 +109,18 @@ _PATTERN_LIST = (
         "The paper does not state the positions of the fingers or the order within a square.",
         policy="refuse",
     ),
+    Pattern(
+        "detection",
+        "one of two pixels, left or right of a centre, at a power that may be too weak to be felt",
+        (
+            _choice_parameter("side", "left", "which of the two", ("left", "right")),
+            PatternParameter("power_mw", "number", 500.0, "power of the pulses", "mW", min=1.0, max=5000.0),
+            _CENTRE_PARAMETER,
+        ),
+        experiments.build_detection,
+        "500 ms at 25 ms on, 25 ms off, three pitches from the centre. A power above the laser's plays at the laser's.",
+        policy="refuse",
+    ),
     Pattern("showcase", "a moving dot, a ring, braille, two pairs of fingers", (), build_showcase),
     Pattern(
         "pixel",

@@ -54,9 +54,10 @@ def test_the_six_experiments_are_there():
     assert [name for name in PATTERNS if name.startswith("experiment")] == [f"experiment-{k}" for k in range(1, 7)]
 
 
-def test_only_the_experiments_are_refused_rather_than_trimmed():
+def test_only_stimuli_of_experiments_are_refused_rather_than_trimmed():
     assert {item.name for item in describe_patterns() if item.policy == "refuse"} == {
-        f"experiment-{k}" for k in range(1, 7)
+        "detection",
+        *(f"experiment-{k}" for k in range(1, 7)),
     }
     assert {item.policy for item in describe_patterns()} == {"refuse", "trim"}
 
