@@ -67,7 +67,7 @@ class IdnCore:
         self.unit, self.host, self.status = b"\x07\x01\x02\x03\x04\x05\x06\x07", b"emulated", 0x01
         self.dropped = 0
         self.speeds, self.backlog_s, self.backlog_max_s = [], 0.0, 0.0
-        self.datagrams = 0
+        self.datagrams, self.flags = 0, 0
 
     # --- time ---
 
@@ -126,8 +126,9 @@ class IdnCore:
             entry = struct.pack(">4B20s", 1, 0x80, 1, 0, b"Main")
             return answer(0x13, struct.pack(">4B", 4, 24, 0, 1) + entry)
         if command in (0x40, 0x41, 0x44, 0x45):
+            self.flags = 0
             result = self._take_message(command, body, source)
-            return answer(0x47, struct.pack(">BBHHBBI", 12, result, 0, 0, 0, 0, 0)) if command & 1 else []
+            return answer(0x47, struct.pack(">BBHHBBI", 12, result, self.flags, 0, 0, 0, 0)) if command & 1 else []
         return []
 
     def _take_message(self, command, body, source):
@@ -158,7 +159,9 @@ class IdnCore:
             closes = bool(flags & 2)
             if words:
                 self.fields = read_dictionary(struct.unpack_from(f">{2 * words}H", body, 12))
-        if kind in (0x01, 0x02) and self.fields:
+        if kind in (0x01, 0x02) and not self.fields:
+            self.flags = 0x2000
+        elif kind in (0x01, 0x02):
             (duration,) = struct.unpack_from(">I", body, at)
             samples = decode_samples(body[at + 4 :], self.fields)
             self._take_chunk(stamp, duration & 0xFFFFFF, samples, kind == 0x01)

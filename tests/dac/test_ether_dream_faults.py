@@ -20,7 +20,7 @@ from optodrive.link.dac.formats.ether_dream import EtherDreamFormat
 from optodrive.link.dac.player import play
 
 BOUND_S = EtherDreamFormat.host_loss_max_s
-MOMENTS = [range(3), pytest.param(range(3, 100), marks=pytest.mark.slow)]
+MOMENTS = [range(3), pytest.param(range(3, 100), marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
 IDS = ["some", "all"]
 
 
@@ -47,7 +47,8 @@ def judge_log(log, long_play):
     display, plan, _ = long_play
     find_rows(read_light(log["table"], display, PointScale.from_config(display.config).point_s), plan)
     assert log["table"][-1, 5] == 0.0
-    assert dark_from_s(log["table"]) <= log["arrivals_s"].max() + BOUND_S
+    last_s = log["arrivals_s"].max(initial=0.0)  # none, if the host was stopped before it connected
+    assert dark_from_s(log["table"]) <= last_s + BOUND_S
     return dark_from_s(log["table"])
 
 

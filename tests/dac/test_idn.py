@@ -148,16 +148,59 @@ def test_a_lost_acknowledgement_ends_playback():
 
 def test_duplicates_are_played_once():
     desk = Desk()
-    desk.radio.disturb = lambda number, data: [(0.0, data), (0.001 * (number % 7), data)]
+    desk.radio.disturb = lambda number, data: [(0.0, data), *([(0.001 * (number % 7), data)] if number > 4 else [])]
     assert desk.play(LONG).underruns == 0
     assert desk.core.dropped > 50
     desk.judge()
 
 
+@pytest.mark.parametrize("delay_s", [0.05, 0.3])
+def test_what_is_under_way_when_the_host_stops_emits_nothing(delay_s):
+    """A chunk that overtakes no stop finds a closed channel."""
+    desk, stopped = Desk(), []
+
+    def leave(share):
+        if share > 0.4:
+            stopped.append(desk.clock.now_s())
+            raise RuntimeError
+
+    desk.radio.disturb = lambda number, data: [(0.0, data), *([(delay_s, data)] if len(data) > 1000 else [])]
+    with pytest.raises(RuntimeError):
+        desk.play(LONG, leave)
+    desk.radio.pass_time(3.0)
+    assert dark_from_s(desk.table()) <= stopped[0] + BOUND_S
+    desk.judge()
+
+
+def test_a_configuration_with_every_chunk_is_played_after_the_stop(monkeypatch):
+    """Mutant: a late duplicate opens the channel again by itself."""
+    send = Idn._send_message
+    monkeypatch.setattr(Idn, "_send_message", lambda dac, message: send(dac, _with_configuration(message)))
+    desk = Desk()
+
+    def leave(share):
+        if share > 0.4:
+            raise RuntimeError
+
+    desk.radio.disturb = lambda number, data: [(0.0, data), *([(0.3, data)] if len(data) > 1000 else [])]
+    with pytest.raises(RuntimeError):
+        desk.play(LONG, leave)
+    desk.radio.pass_time(3.0)
+    with pytest.raises(AssertionError, match="light"):
+        desk.judge()
+
+
+def _with_configuration(message):
+    size, content, stamp = struct.unpack_from(">HHI", message)
+    if content != 0x8001:
+        return message
+    return struct.pack(">HHI", size + len(wire.CONFIGURATION), 0xC001, stamp) + wire.CONFIGURATION + message[8:]
+
+
 def test_late_duplicates_are_played_again_by_openidn():
     """Limit of that server, which no host can prevent: docs/how-to/use-a-laser-dac.md asks for a cable of its own."""
     desk = Desk(remembers_latest=False)
-    desk.radio.disturb = lambda number, data: [(0.0, data), (0.02, data)]
+    desk.radio.disturb = lambda number, data: [(0.0, data), *([(0.02, data)] if number > 4 else [])]
     desk.play(LONG)
     with pytest.raises(AssertionError, match="light"):
         desk.judge()
@@ -272,12 +315,12 @@ def good():
     [
         (lambda data: data[:-1], "no whole samples"),
         (lambda data: data[:20], "no whole samples"),
-        (lambda data: data[:-6], "size 1288"),
-        (lambda data: data[:9] + b"\x03" + data[10:], "content"),
+        (lambda data: data[:-6], "size 1272"),
+        (lambda data: data[:2] + b"\xc0" + data[3:], "content"),
         (lambda data: data[:-1] + b"\x01", "last point is not blank"),
-        (lambda data: data[:24] + b"\x01" + data[25:], "duration"),
-        (lambda data: data[:24] + struct.pack(">I", 210 * 200) + data[28:], "the maximum is"),
-        (lambda data: data[:24] + struct.pack(">I", 5251) + data[28:], "duration"),
+        (lambda data: data[:8] + b"\x01" + data[9:], "duration"),
+        (lambda data: data[:8] + struct.pack(">I", 210 * 200) + data[12:], "the maximum is"),
+        (lambda data: data[:8] + struct.pack(">I", 5251) + data[12:], "duration"),
     ],
 )
 def test_unsafe_messages_are_rejected(change, words):
@@ -295,6 +338,7 @@ def test_every_chunk_is_one_slice_and_one_datagram():
 
 def test_an_empty_device_holds_its_last_sample_until_its_time_out():
     core = IdnCore()
+    core.receive(struct.pack(">BBH", 0x40, 0, 0) + wire.build_configuration(wire.CONFIGURATION), 0.0)
     core.receive(struct.pack(">BBH", 0x40, 0, 1) + bytes(good()[:-1]) + b"\xff", 0.0)
     core.advance(5.0)
     assert dark_from_s(core.log.table(5.0)) == pytest.approx(1.0, abs=0.01)

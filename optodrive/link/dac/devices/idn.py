@@ -94,13 +94,14 @@ class Idn(LaserDac):
     def stop(self) -> None:
         """Close the channel and the connection. Raise LinkError if the device may not have received it."""
         self._end_s = self._clock.now_s()
-        closing = wire.MESSAGE.pack(wire.MESSAGE.size + len(wire.CLOSING), wire.VOID_CONTENT, 0) + wire.CLOSING
+        closing = wire.build_configuration(wire.CLOSING)
         if self._query(wire.CLOSE_ACKNOWLEDGED, closing, wire.ACKNOWLEDGEMENT) is None:
             bound = f"it plays for at most {format_quantity(self.format.host_loss_max_s, 's')} more"
             raise LinkError(f"the IDN device may not have received the stop, {bound}: it does not answer")
 
     def _start(self) -> None:
-        """Do nothing: the first chunk opens the channel."""
+        """Open the channel. Raise LinkError unless the device acknowledges it."""
+        self._send_message(wire.build_configuration(wire.CONFIGURATION))
 
     def is_ready(self) -> bool:
         """Return whether another chunk stays within the lead."""
@@ -109,14 +110,19 @@ class Idn(LaserDac):
 
     def _send(self, chunk: Chunk) -> None:
         """Send one chunk. Raise LinkError unless the device acknowledges it."""
-        answer = self._exchange(wire.MESSAGE_ACKNOWLEDGED, chunk.data, wire.ACKNOWLEDGEMENT)
+        self._send_message(chunk.data)
+        self._end_s = max(self._end_s, self._clock.now_s()) + chunk.duration_s
+
+    def _send_message(self, message: bytes) -> None:
+        answer = self._exchange(wire.MESSAGE_ACKNOWLEDGED, message, wire.ACKNOWLEDGEMENT)
         if answer is None or len(answer) < wire.ACKNOWLEDGEMENT_BODY.size:
             raise LinkError("the IDN device did not acknowledge a chunk; nothing more is emitted")
-        _, result = wire.ACKNOWLEDGEMENT_BODY.unpack_from(answer)
+        _, result, flags = wire.ACKNOWLEDGEMENT_BODY.unpack_from(answer)
         if result != wire.ACCEPTED:
             cause = REFUSALS.get(result, f"result {result:#04x}")
             raise LinkError(f"the IDN device refused a chunk: {cause}; nothing more is emitted")
-        self._end_s = max(self._end_s, self._clock.now_s()) + chunk.duration_s
+        if flags & wire.CHANNEL_CLOSED:
+            raise LinkError("the IDN device refused a chunk: its channel is closed; nothing more is emitted")
 
     # --- transfers ----------------------------------------------------------------------------------------------
 

@@ -12,6 +12,8 @@ those of OpenIDN's server (Grix/helios_openidn), the only one whose source is pu
   and the driver never sends further ahead than `LEAD_S`.
 - A chunk with a time stamp before the end of the one that came last is dropped. Of two late ones in order the second
   may be played again, which only a network without duplicates prevents.
+- Samples on a closed channel are dropped. The configuration that opens it is therefore not repeated with the samples:
+  what is under way when the host stops emits nothing when it arrives.
 """
 
 import struct
@@ -29,22 +31,24 @@ SCAN, SCAN_ANSWER = 0x10, 0x11
 MESSAGE_ACKNOWLEDGED, CLOSE_ACKNOWLEDGED, ACKNOWLEDGEMENT = 0x41, 0x45, 0x47
 SCAN_BODY = struct.Struct(">4B16s20s")
 """Size, protocol version, status, reserved, unit, host name."""
-ACKNOWLEDGEMENT_BODY = struct.Struct(">BB")
-"""Size and result; flags follow."""
+ACKNOWLEDGEMENT_BODY = struct.Struct(">BBH")
+"""Size, result, flags; more may follow."""
 ACCEPTED, NOT_CONNECTED, OCCUPIED, EXCLUDED = 0x00, 0xEB, 0xEC, 0xED
 MALFUNCTION, OFFLINE = 0x80, 0x40
 MESSAGE = struct.Struct(">HHI")
 """Size, content, time stamp in µs."""
-WAVE_CONTENT, VOID_CONTENT = 0xC001, 0xC000
-"""Channel 0 with a configuration, then samples or nothing."""
+WAVE_CONTENT, VOID_CONTENT = 0x8001, 0xC000
+"""Samples on channel 0, and a configuration of channel 0 without samples."""
 TAGS = (0x4200, 0x4010, 0x4210, 0x4010, 0x51CC, 0x5C10)
 """X and Y of 16 bits, blue and intensity of 8. Without the intensity OpenIDN drives its pin at full level."""
 CONFIGURATION = struct.pack(">4B6H", len(TAGS) // 2, 0x01, 0, 0x01, *TAGS)
 """Routed to the default service, as a stream of samples."""
 CLOSING = struct.pack(">4B", 0, 0x02, 0, 0)
+CHANNEL_CLOSED = 0x2000
+"""Flag of an acknowledgement: the samples came on a channel that is closed, and were dropped."""
 CHUNK = struct.Struct(">I")
 """Flags and duration in µs."""
-HEADER_BYTES = MESSAGE.size + len(CONFIGURATION) + CHUNK.size
+HEADER_BYTES = MESSAGE.size + CHUNK.size
 SAMPLE = np.dtype([("x", ">i2"), ("y", ">i2"), ("blue", "u1"), ("intensity", "u1")])
 CODE_STEP, CENTRE_CODE = 16, 2048
 SLICE_POINTS = 210
@@ -54,7 +58,7 @@ LEAD_S = 0.025
 
 
 class IdnFormat(DacFormat):
-    """Channel messages with a configuration and a wave chunk, whose duration is in whole µs."""
+    """Channel messages with a wave chunk, whose duration is in whole µs."""
 
     label = "IDN device"
     level_max = DAC_POWER_STEPS["idn"]
@@ -82,7 +86,7 @@ class IdnFormat(DacFormat):
         table["x"], table["y"] = ((points[:, axis] - CENTRE_CODE) * CODE_STEP for axis in (0, 1))
         table["blue"] = table["intensity"] = points[:, 2]
         header = MESSAGE.pack(HEADER_BYTES + table.nbytes, WAVE_CONTENT, begin_ticks & 0xFFFFFFFF)
-        return header + CONFIGURATION + CHUNK.pack(len(points) * self.point_ticks) + table.tobytes()
+        return header + CHUNK.pack(len(points) * self.point_ticks) + table.tobytes()
 
     def parse(self, data: bytes) -> tuple[PointTable, int]:
         """Return points and ticks of a channel message. Raise LocalProtocolError if inconsistent."""
@@ -90,9 +94,9 @@ class IdnFormat(DacFormat):
         if samples < 1 or len(data) != HEADER_BYTES + samples * SAMPLE.itemsize:
             raise LocalProtocolError(f"a message of {len(data)} bytes holds no whole samples")
         size, content, _ = MESSAGE.unpack_from(data)
-        if size != len(data) or content != WAVE_CONTENT or data[MESSAGE.size :][: len(CONFIGURATION)] != CONFIGURATION:
+        if size != len(data) or content != WAVE_CONTENT:
             raise LocalProtocolError(f"a message of content {content:#06x} and size {size} in {len(data)} bytes")
-        (duration,) = CHUNK.unpack_from(data, MESSAGE.size + len(CONFIGURATION))
+        (duration,) = CHUNK.unpack_from(data, MESSAGE.size)
         if duration >> 24 or duration % samples or not duration:
             raise LocalProtocolError(f"a chunk of {samples} samples and duration {duration:#x} µs")
         table = np.frombuffer(data, dtype=SAMPLE, offset=HEADER_BYTES)
@@ -109,3 +113,8 @@ def decode_name(field: bytes) -> str:
 def name_unit(unit: bytes) -> str:
     """Return the name of a unit by its field, whose first byte is a length."""
     return f"IDN {unit[1 : 1 + unit[0]].hex()}"
+
+
+def build_configuration(configuration: bytes) -> bytes:
+    """Return a channel message with a configuration and without samples."""
+    return MESSAGE.pack(MESSAGE.size + len(configuration), VOID_CONTENT, 0) + configuration
