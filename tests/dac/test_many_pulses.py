@@ -85,6 +85,11 @@ def test_some_pulses(transport, name):
     assert count_judged(transport, name, SOME) >= SOME
 
 
+def test_a_pulse_that_a_chunk_cuts_near_its_begin_passes_verification():
+    """The mirrors still ring where its first part ends, and a move was counted that they do not make there."""
+    assert count_judged("idn", "display-357", SOME, seed=3007) >= SOME
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(0)
 @pytest.mark.parametrize("part", range(4))

@@ -70,5 +70,22 @@ def verify_chunks(
     if violating.any():
         first = int(np.flatnonzero(violating)[0])
         raise LocalProtocolError(f"encoded emission at {pulses.start_s[first]:.6f} s exceeds the plan's pulses")
-    verify(plan, row, pulses, state, budget)
+    verify(plan, np.unique(row), _merge_parts(pulses, row), state, budget)
     return pulses, row
+
+
+def _merge_parts(pulses: PointPulses, row: IntArray) -> PointPulses:
+    """Return one pulse for each row of the plan, from the begin of its first part to the end of its last one.
+
+    It has more energy than its parts, and lies within the planned pulse. The bound on the mirrors' load counts the
+    largest possible move at each end of a pulse; at the end of a chunk within one, they stay.
+    """
+    first = np.unique(row, return_index=True)[1]
+    last = np.append(first[1:], len(row))[: len(first)] - 1
+    return PointPulses(
+        start_s=pulses.start_s[first],
+        width_s=pulses.start_s[last] + pulses.width_s[last] - pulses.start_s[first],
+        x_rad=pulses.x_rad[first],
+        y_rad=pulses.y_rad[first],
+        power_w=np.maximum.reduceat(pulses.power_w, first) if len(first) else pulses.power_w,
+    )
