@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from rest_reference import build_rest_reference
 
+from optodrive.core.field_docstrings import read_field_docstrings
 from optodrive.device.config import VERSION, Config
 from optodrive.physics.term_reference import build_example, describe_term
 from optodrive.physics.terms import discover_terms
@@ -84,7 +85,7 @@ def build_configuration_reference() -> str:
     for path, model in sections(Config):
         rows = [
             f"| `{name}` | {format_type(model.model_json_schema()['properties'][name])} | {format_default(info)} |"
-            f" {' '.join((info.description or '').split())} |"
+            f" {' '.join(read_field_docstrings(model).get(name, '').split())} |"
             for name, info in model.model_fields.items()
             if not is_table(info)
         ]

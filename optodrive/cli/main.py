@@ -14,13 +14,19 @@ from typing import Any
 from optodrive.cli.direct_stop import stop_directly
 from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
+from optodrive.core.garbage import collect_seldom, skip_last_collection
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its status."""
+    collect_seldom()
     # No command needs a multithreaded BLAS; starting its threads takes 0.1 s.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+    # Nor plugins of pydantic, for which it reads the entry points of everything that is installed.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    status = run(sys.argv[1:] if arguments is None else arguments)
+    skip_last_collection()
+    sys.exit(status)
 
 
 def run(arguments: list[str]) -> int:

@@ -44,7 +44,6 @@ def plan(
     from optodrive.core.files import check_output, write_text
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
-    from optodrive.planning.plan_picture import draw_plan
     from optodrive.planning.plan_summary import summarize_plan, write_plan_csv
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
@@ -58,6 +57,8 @@ def plan(
         )
     if out is not None:
         if out.suffix.lower() == ".svg":
+            from optodrive.planning.plan_picture import draw_plan
+
             write_text(out, draw_plan(planned_sequence, display))
         else:
             write_plan_csv(out, planned_sequence, display)

@@ -21,10 +21,15 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, ParamSpec, TypeVar
 
-import numba
 import numpy as np
+
+from optodrive.core.absent_modules import hide_modules
+
+with hide_modules("scipy", "yaml"):  # numba asks for a version, and reads a file of settings that nobody has
+    import numba
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.runtime.nrt import rtsys
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -172,6 +177,7 @@ class _KernelCacheImpl(CompileResultCacheImpl):
 
 
 _open_index: Callable[[str, str, str], Any] = IndexDataCacheFile  # numba has no types
+_initialize_runtime: Callable[[Any], None] = rtsys.initialize
 
 
 class _KernelCache(FunctionCache):
@@ -194,9 +200,15 @@ class _KernelCache(FunctionCache):
         return not Path(self.cache_path, f"{self.file_base}.nbi").exists()
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the cached machine code for a signature, None if there is none."""
+        """Return the cached machine code for a signature, None if there is none.
+
+        Numba would first load all that it can compile, a fifth of the time of `optodrive plan`. Machine code needs
+        only numba's run time, which unpacks arrays, and the modules of what it inlined. The compiler loads the rest
+        itself.
+        """
         _import_array_functions()
-        return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        _initialize_runtime(target_context)
+        return self._load_overload(sig, target_context)
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         self._open()

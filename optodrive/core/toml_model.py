@@ -3,9 +3,20 @@
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from optodrive.core.errors import MISSING, InputError, suggest_nearest
+from optodrive.core.field_docstrings import read_field_docstrings
 from optodrive.core.plausibility import check_table, collect_ranges
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -25,12 +36,19 @@ class ConflictError(ValueError):
 class Section(BaseModel):
     """Base of all tables of files: immutable, without unknown keys. Field docstrings are their descriptions.
 
-    Types are strict: a number is neither a boolean nor a text, and a whole number has no decimal point.
+    Types are strict: a number is neither a boolean nor a text, and a whole number has no decimal point. A validator is
+    built at its first use, because a command reads few of the files whose tables it imports.
     """
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON Schema with the fields' docstrings."""
+        schema = handler(core_schema)
+        for name, docstring in read_field_docstrings(cls).items():
+            handler.resolve_ref_schema(schema)["properties"][name]["description"] = docstring
+        return schema
 
     @model_validator(mode="before")
     @classmethod

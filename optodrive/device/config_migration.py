@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from optodrive.core.errors import MISSING, InputError
+from optodrive.core.field_docstrings import read_field_docstrings
 from optodrive.core.toml_file import parse_toml, read_toml
 from optodrive.core.toml_model import Section
 from optodrive.device.config import FORMAT, VERSION, Config
@@ -87,7 +88,7 @@ def _list_changes(table: dict[str, Any]) -> tuple[str, ...]:
         section = table.get(name, {})
         if isinstance(section, dict):
             changes += [
-                f"[{name}] add {key}: {inner.description}"
+                f"[{name}] add {key}: {read_field_docstrings(kind)[key]}"
                 for key, inner in kind.model_fields.items()
                 if inner.is_required() and key not in section
             ]

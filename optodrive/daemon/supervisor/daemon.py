@@ -1,7 +1,6 @@
 """Main function of the daemon: opens the sockets, tokens and runtime folder, and runs the supervisor."""
 
 import ctypes
-import gc
 import os
 import socket
 import sys
@@ -15,6 +14,7 @@ from optodrive.core.beat import BeatWriter
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
 from optodrive.core.forking import execute_module, fork_with_beat
+from optodrive.core.garbage import settle_memory
 from optodrive.core.scheduling import set_nice
 from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES
@@ -131,8 +131,7 @@ def _load_display(config: Config) -> "DisplayModel":
 
 def _prepare_memory() -> None:
     """Let forks of this process share its memory for as long as they can, and keep little of their own free."""
-    gc.collect()
-    gc.freeze()  # a collection in a child would copy every page that it visits
+    settle_memory()
     libc = ctypes.CDLL(None)
     libc.malloc_trim(0)
     libc.mallopt(M_ARENA_MAX, 1)  # by default, memory that one thread has freed is of no use to another

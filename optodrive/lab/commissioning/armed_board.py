@@ -3,13 +3,13 @@
 `close` sends ABORT. If the board does not receive it, the closed port and the lease turn the gate off.
 """
 
-import gc
 import sys
 from collections.abc import Callable
 from typing import Self
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import BoardFaultError, LinkError, NotReadyError
+from optodrive.core.garbage import settle_memory
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.device.config import Config
 from optodrive.link.board_setup import build_bench_requirements
@@ -57,8 +57,7 @@ class ArmedBoard:
         """Open the link and begin a session with the lease's priority."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         set_realtime_priority(LIGHT)
-        gc.collect()
-        gc.freeze()
+        settle_memory()
         self.session.connect()
         until_s = self._clock.now_s() + STATUS_TIMEOUT_S
         while self.session.board.temperature_c is None:  # until the first STATUS, which has faults and inputs

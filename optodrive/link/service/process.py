@@ -5,7 +5,6 @@ ends it.
 """
 
 import argparse
-import gc
 import select
 import signal
 import socket
@@ -19,6 +18,7 @@ from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import InputError, OptodriveError
 from optodrive.core.forking import die_with_parent
+from optodrive.core.garbage import settle_memory
 from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.link.service.client_sockets import ClientSockets
 from optodrive.link.service.link_service import LinkService
@@ -191,8 +191,7 @@ def main(arguments: list[str] | None = None) -> int:
             return error.exit_status
         exit_stack.callback(process.close)
         process.install_signals()
-        gc.collect()
-        gc.freeze()
+        settle_memory()
         set_realtime_priority(LIGHT)
         try:
             process.run()

@@ -140,6 +140,18 @@ print(total(3.0), sum(total.stats.cache_hits.values()), "scipy.linalg" in sys.mo
 """
 
 
+RUN_AND_COMPILE = """
+import sys
+sys.path.insert(0, {folder!r})
+import numpy as np
+from optodrive.core import kernels
+import main
+total = kernels.array_kernel(main.total)
+print(total(np.ones(3))[0], sum(total.stats.cache_hits.values()), "numba.typed.typedlist" in sys.modules)
+print(kernels.array_kernel(main.draw)(np.ones(3))[0], "numba.typed.typedlist" in sys.modules)
+"""
+
+
 def run_python(code, folder):
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", code]
@@ -188,3 +200,13 @@ def test_a_released_compiler_holds_no_memory_and_compiles_again():
     release_compiler()
     assert read_compiler_mib() < 1.0
     assert build_kernel(2.0)(1.0) == 3.0
+
+
+def test_loaded_machine_code_needs_nothing_of_the_compiler_which_loads_itself_when_needed(tmp_path):
+    code = "import numpy as np\ndef total(x):\n    return np.zeros(3) + x.max()\n"
+    changed = "def draw(x):\n    return np.append(x, {}) + 1.0\n"
+    (tmp_path / "main.py").write_text(code + changed.format(1.0))
+    run_python(RUN_AND_COMPILE.format(folder=str(tmp_path)), tmp_path)
+    (tmp_path / "main.py").write_text(code + changed.format(2.0))
+    words = run_python(RUN_AND_COMPILE.format(folder=str(tmp_path)), tmp_path)
+    assert words == ["1.0", "1", "False", "2.0", "True"]
