@@ -103,4 +103,4 @@ def _solve_duty(
         duty -= step
         if abs(step) < 1e-9:
             break
-    return min(1.0, duty)
+    return min(1.0, max(0.0, duty))  # rounding leaves a trace below 0 where the residual heat just fails

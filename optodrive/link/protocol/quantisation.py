@@ -110,8 +110,11 @@ def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
     start = np.rint(plan.start_s[rows] / scale.tick_s).astype(np.int64)
     width = np.rint(plan.width_s[rows] / scale.tick_s).astype(np.int64)
     duty = np.floor(plan.power_w[rows] / scale.full_power_w * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
-    if len(rows) and (width.max() > TICKS_MAX or width.min() < 1 or duty.max() > DUTY_MAX or duty.min() < 0):
-        raise LocalProtocolError("a pulse does not fit a point of the wire")
+    misfits = np.flatnonzero((width > TICKS_MAX) | (width < 1) | (duty > DUTY_MAX) | (duty < 0))
+    if len(misfits):
+        first = rows[misfits[0]]
+        found = f"{plan.width_s[first]:.4g} s at {plan.power_w[first]:.4g} W"
+        raise LocalProtocolError(f"a pulse of {found} does not fit a point of the wire")
     aim_row = rows[_find_next_gate_on(duty)]
     x, y = scale.to_codes(plan.x_rad[aim_row]), scale.to_codes(plan.y_rad[aim_row])
     gate_off = start - np.concatenate([[0], (start + width)[:-1]])

@@ -49,6 +49,14 @@ def test_the_pulse_reaches_its_target_from_any_heat(share, theta, gas_share):
     assert max(gas) * PIXEL.kappa_m_per_k == pytest.approx(target, rel=1e-4)
 
 
+@given(theta=st.floats(1.0, 80.0), gas_share=st.floats(0.1, 2.0))
+def test_heat_that_just_fails_the_target_asks_for_no_negative_power(theta, gas_share):
+    gamma = 0.5 * theta * gas_share
+    peak_k = pulse_peak(PIXEL, theta, gamma, 0.0, 1e-9)[0]
+    pulse = pulse_for_peak(PIXEL, theta, gamma, np.nextafter(peak_k, np.inf) * PIXEL.kappa_m_per_k, DRIVE)
+    assert pulse is None or pulse[1] >= 0.0
+
+
 def test_it_is_the_shortest_width_that_can():
     periods, duty = pulse_for_peak(PIXEL, 0.0, 0.0, 100e-6, DRIVE)
     shorter = pulse_peak(PIXEL, 0.0, 0.0, 2.45, (periods - 1) * DRIVE.period_s)[0] * PIXEL.kappa_m_per_k

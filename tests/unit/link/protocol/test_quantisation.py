@@ -142,7 +142,7 @@ def test_an_empty_plan_has_no_points():
         ([(0, 0.0656, 0, 0, 1)], "does not fit a point"),
         ([(0, 0.0, 0, 0, 1)], "does not fit a point"),
         ([(0, 0.001, 0, 0, 2.46)], "does not fit a point"),
-        ([(0, 0.001, 0, 0, -0.1)], "does not fit a point"),
+        ([(0, 0.001, 0, 0, -0.1)], r"a pulse of 0\.001 s at -0\.1 W does not fit a point"),
     ],
 )
 def test_a_plan_that_does_not_fit_the_wire_is_a_local_error(pulses, says):
