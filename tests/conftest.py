@@ -16,6 +16,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import forked_process
 from displays import DISPLAYS
 
+# Before any folder imports them: their assertions then explain themselves, whichever folder is collected first.
+pytest.register_assert_rewrite(
+    *(f"{name}_scenarios" for name in ("edge", "guard", "job", "link", "order", "self", "trust"))
+)
+
 settings.register_profile(
     "thorough", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
 )

@@ -5,22 +5,17 @@ from functools import cache, partial
 from pathlib import Path
 
 import pytest
-
-pytest.register_assert_rewrite(
-    *(f"{name}_scenarios" for name in ("edge", "guard", "job", "link", "order", "self", "trust"))
-)
-
-from process_board import PROCESS_KINDS  # noqa: E402
-from virtual_board import EmulatedBoard, PicoBoard, VirtualKind  # noqa: E402
+from process_board import PROCESS_KINDS
+from virtual_board import EmulatedBoard, PicoBoard, VirtualKind
 
 sys.path.append(str(Path(__file__).parents[1] / "pico"))
 
-from emulated_pico import EmulatedPico, PicoImage  # noqa: E402
-from emulated_usb_pico import EmulatedUsbPico  # noqa: E402
+from emulated_pico import EmulatedPico, PicoImage
+from emulated_usb_pico import EmulatedUsbPico
 
-from c_core import InterruptedCBoard, SeededCBoard, build_library  # noqa: E402
-from firmware_ports import build_emulated_chip  # noqa: E402
-from optodrive.link.simulator.board_core import BoardCore  # noqa: E402
+from c_core import InterruptedCBoard, SeededCBoard, build_library
+from firmware_ports import build_emulated_chip
+from optodrive.link.simulator.board_core import BoardCore
 
 PICOS = {"pico": EmulatedPico, "pico-usb": EmulatedUsbPico}
 """The Pico by the port of its host."""
