@@ -10,6 +10,7 @@ import pytest
 
 from dac.bench import build_config, build_network_display, build_train, build_verified
 from dac.device_process import DeviceProcess, HostProcess, draw_address, serve_ether_dream
+from dac.emulated_ether_dream import EtherDreamCore
 from dac.judge import find_rows, read_light
 from dac.network_faults import TcpProxy
 from dac.sample_log import dark_from_s
@@ -99,6 +100,47 @@ def test_a_second_client_that_only_looks_changes_nothing_of_what_is_emitted(tmp_
     log = device.finish()
     judge_log(log, long_play)
     assert said == "" or "ran out of points" in said  # the second on a computer that is too busy
+
+
+@pytest.mark.parametrize("seeds", MOMENTS, ids=IDS)
+def test_a_second_client_that_commands(tmp_path, long_play, seeds):
+    """Only the plan is emitted, and the end is dark, also after an emergency stop, its clearance, and nonsense."""
+    emitted = 0
+    for seed in seeds:
+        rng = random.Random(seed)
+        device = DeviceProcess(serve_ether_dream, tmp_path)
+        host = start_host(device.address, long_play)
+        with socket.create_connection((device.address, 7765)) as second:
+            time.sleep(rng.uniform(0.05, 0.95))
+            for _ in range(rng.randint(1, 4)):
+                second.sendall(
+                    rng.choice([b"s", b"\xff", b"\0", b"c", b"p", b"?", b"b\0\0\x40\x9c\0\0", b"q\x10\x27\0\0", b"Z"])
+                )
+        said = host.wait()
+        emitted += judge_log(device.finish(), long_play) > 0.0
+        assert said == "" or (said.startswith("LinkError: ") and "Ether Dream" in said and "\n" not in said)
+    assert emitted
+
+
+@pytest.mark.parametrize("seeds", MOMENTS, ids=IDS)
+def test_a_false_device_that_states_the_name_of_the_genuine_one_gets_no_connection(tmp_path, long_play, seeds):
+    with (
+        socket.create_server((draw_address(), 7765)) as false,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio,
+    ):
+        false.setblocking(False)
+        radio.bind((false.getsockname()[0], 0))
+        for seed in seeds:
+            device = DeviceProcess(serve_ether_dream, tmp_path)
+            host = start_host(device.address, long_play)
+            time.sleep(random.Random(seed).uniform(0.0, 0.9))
+            for _ in range(3):
+                radio.sendto(EtherDreamCore().broadcast(), ("127.0.0.1", 7654))
+            said = host.wait()
+            judge_log(device.finish(), long_play)
+            assert said == "" or "ran out of points" in said  # the second on a computer that is too busy
+        with pytest.raises(BlockingIOError):
+            false.accept()
 
 
 def test_a_chunk_that_ends_lit_is_seen_by_this_judge(tmp_path, long_play):

@@ -2,6 +2,8 @@
 
 import random
 import signal
+import socket
+import struct
 import time
 
 import pytest
@@ -86,3 +88,23 @@ def test_a_network_that_fails(tmp_path, long_play, seeds, fault):
         assert said == "" or (said.startswith("LinkError: ") and "IDN device" in said and "\n" not in said)
     assert emitted
     assert counts
+
+
+@pytest.mark.parametrize("seeds", MOMENTS, ids=IDS)
+def test_a_second_client_that_commands(tmp_path, long_play, seeds):
+    """Only the plan is emitted, and the end is dark, also after samples, ends of connections, and nonsense."""
+    emitted = 0
+    for seed in seeds:
+        rng = random.Random(seed)
+        device = DeviceProcess(serve_idn, tmp_path)
+        host = start_host(device.address, long_play)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+            time.sleep(rng.uniform(0.05, 0.95))
+            for _ in range(rng.randint(1, 20)):
+                command = rng.choice([0x40, 0x41, 0x44, 0x45, 0x10, 0x12, rng.randrange(256)])
+                body = rng.choice([b"", rng.choice(long_play[2].chunks).data, rng.randbytes(30)])
+                second.sendto(struct.pack(">BBH", command, 0, rng.randrange(65_536)) + body, (device.address, 7255))
+        said = host.wait()
+        emitted += judge_log(device.finish(), long_play) > 0.0
+        assert said == "" or (said.startswith("LinkError: ") and "IDN device" in said and "\n" not in said)
+    assert emitted
