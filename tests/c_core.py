@@ -118,6 +118,7 @@ def load(path):
         "shim_receive": ([handle, ctypes.c_char_p, size], None),
         "shim_link_lost": ([handle], None),
         "shim_set_inputs": ([handle, u32], None),
+        "shim_trigger": ([handle, u64], None),
         "shim_stick": ([handle, u32, u32], None),
         "shim_take_output": ([handle, ctypes.c_char_p], size),
         "shim_traces": ([handle, ctypes.POINTER(size)], ctypes.POINTER(Trace)),
@@ -158,6 +159,7 @@ class CBoard:
         values = entropy or [source.getrandbits(32) for _ in range(256)]
         library.shim_entropy(self._handle, (ctypes.c_uint32 * len(values))(*values), len(values))
         self.inputs = {"interlock": True, "key": True, "estop": False}
+        self._triggers = 0
         self._out = ctypes.create_string_buffer(OUT_MAX)
         library.shim_init(self._handle, 0, 0)
         self._drain()
@@ -239,6 +241,13 @@ class CBoard:
         bits = sum(INPUT_BITS[name] for name, on in self.inputs.items() if on)
         self._library.shim_set_inputs(self._handle, bits)
 
+    def receive_trigger(self, now_us):
+        """Receive a rising edge, which the next tick notices."""
+        self.advance(now_us)
+        self._triggers += 1
+        self._sink({"t_us": now_us, "event": "trigger", "count": self._triggers})
+        self._library.shim_trigger(self._handle, now_us)
+
     def stick(self, stuck, on=False):
         """Freeze the gate's readback at `on`, or release it."""
         self._library.shim_stick(self._handle, stuck, on)
@@ -252,6 +261,7 @@ class CBoard:
         self.advance(now_us)
         if self.gate:
             self._sink({"t_us": now_us, "event": "gate", "on": False, "reason": "reset"})
+        self._triggers = 0
         self._library.shim_init(self._handle, cause, now_us)
         self.bytes_to_send()
         self._drain()

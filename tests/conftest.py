@@ -18,7 +18,7 @@ from displays import DISPLAYS
 
 # Before any folder imports them: their assertions then explain themselves, whichever folder is collected first.
 pytest.register_assert_rewrite(
-    *(f"{name}_scenarios" for name in ("edge", "guard", "job", "link", "order", "self", "trust"))
+    *(f"{name}_scenarios" for name in ("edge", "guard", "job", "link", "order", "self", "trigger", "trust"))
 )
 
 settings.register_profile(

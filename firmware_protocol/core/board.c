@@ -26,8 +26,13 @@ static uint64_t hold_due_us(const struct board *b) {
     if (b->state == STATE_HOLD) {
         return b->hold_since_us + HOLD_MAX_US;
     }
-    bool waits = b->state == STATE_RUNNING && !b->has_current_point && b->job.active && !has_enough_points(b);
-    return waits ? b->job.start_us + HOLD_MAX_US : NEVER;
+    if (b->state != STATE_RUNNING || b->has_current_point || !b->job.active) {
+        return NEVER;
+    }
+    if (b->job.awaits_trigger) {
+        return MUTANT == 108 ? NEVER : b->job.start_us;
+    }
+    return has_enough_points(b) ? NEVER : b->job.start_us + HOLD_MAX_US;
 }
 
 static uint64_t point_due_us(const struct board *b) {
@@ -37,7 +42,7 @@ static uint64_t point_due_us(const struct board *b) {
     if (b->has_current_point) {
         return b->due_us;
     }
-    if (!has_enough_points(b)) {
+    if (b->job.awaits_trigger || !has_enough_points(b)) {
         return NEVER;
     }
     return b->job.start_us > b->now_us ? b->job.start_us : b->now_us;
@@ -108,6 +113,20 @@ static enum fault watch_inputs(struct board *b) {
     return find_input_fault(became_unsafe);
 }
 
+/* Starts the job that awaits an edge, if one came since its START_ON_TRIGGER. Several edges between two ticks count, but only
+   the last one has a time. */
+static void watch_trigger(struct board *b, uint64_t now_us) {
+    uint32_t count = b->hal.read_triggers(b->hal.context, &b->trigger_us);
+    bool came = count != b->triggers_read;
+    b->triggers_read = count;
+    uint64_t edge_us = MUTANT == 109 || b->trigger_us > now_us ? now_us : b->trigger_us;
+    bool waited = b->job.awaits_trigger && edge_us < b->job.start_us;
+    if (came && b->job.active && (waited || MUTANT == 110) && (edge_us >= b->job.accepted_us || MUTANT == 107)) {
+        b->job.awaits_trigger = false;
+        b->job.start_us = edge_us + b->job.delay_us;
+    }
+}
+
 static void watch_tick(struct board *b, uint64_t now_us) {
     watch_lateness(b, now_us);
     b->last_tick_us = now_us > b->last_tick_us ? now_us : b->last_tick_us;
@@ -139,6 +158,7 @@ void board_tick(struct board *b, uint64_t now_us) {
     watch_tick(b, now_us);
     watch_readback(b, now_us);
     enum fault input_fault = watch_inputs(b);
+    watch_trigger(b, now_us);
     advance(b, now_us);
     if (input_fault != FAULT_NONE) {
         enter_fault(b, input_fault);
@@ -301,6 +321,7 @@ void board_init(struct board *b, const struct board_hal *hal, const struct board
     b->x = b->y = CENTRE;
     hal->move_mirrors(hal->context, b->x, b->y); /* their position after a reset is unknown */
     b->inputs = hal->read_inputs(hal->context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
+    b->triggers_read = b->triggers_before = hal->read_triggers(hal->context, &b->trigger_us);
     link_begin(&b->link, 0);
     change_state(b, REASON_BOOT);
 }

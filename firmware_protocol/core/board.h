@@ -53,6 +53,7 @@ struct board_hal {
     bool (*read_gate)(void *context);
     void (*move_mirrors)(void *context, uint16_t x, uint16_t y);
     uint8_t (*read_inputs)(void *context); /* INPUT_ bits */
+    uint32_t (*read_triggers)(void *context, uint64_t *last_us); /* edges so far, and the time of the last one if any */
     void (*set_indicator)(void *context, bool on);
     void (*set_relay)(void *context, bool closed);
     uint32_t (*read_entropy)(void *context);
@@ -148,10 +149,11 @@ struct link {
 };
 
 struct job {
-    uint64_t start_us;
-    uint32_t number, end_index;
+    uint64_t start_us; /* while it awaits a trigger: when it gives up */
+    uint64_t accepted_us;
+    uint32_t number, end_index, delay_us;
     uint16_t watermark;
-    bool active, has_end;
+    bool active, has_end, awaits_trigger;
 };
 
 struct board {
@@ -175,6 +177,8 @@ struct board {
     uint32_t next_index, done_index;
 
     uint64_t lease_until_us, arming_since_us, hold_since_us;
+    uint64_t trigger_us; /* of the last edge */
+    uint32_t triggers_read, triggers_before; /* edges that the port has counted, and had at power-up or reset */
     uint32_t board_nonce, host_nonce;
     bool nonce_valid, confirmed, key_turned, version_supported;
 

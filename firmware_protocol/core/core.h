@@ -8,7 +8,9 @@
 /* make MUTANT=n disables guard Bn at the one place that enforces it, to prove that the tests detect it; 101 and 102
    remove the bounds checks of the receiver, 103 both what enforces B12: sequence numbers and indices; 104 lets the main
    loop run through points while the tick is late (B14), 105 a pulse begin in the tick that sees an unsafe input (B9), and
-   106 each agreement of the readback excuse the gate's other level (B14). */
+   106 each agreement of the readback excuse the gate's other level (B14); 107 lets an edge before START_ON_TRIGGER start
+   its job, 108 a job await its trigger without end, 109 delay_us count from the tick that noticed the edge, 110 each edge
+   restart the delay. */
 #ifndef MUTANT
 #define MUTANT 0
 #endif

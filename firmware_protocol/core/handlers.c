@@ -95,6 +95,14 @@ static void send_executed(struct board *b, uint32_t first_index) {
     }
 }
 
+static void send_triggers(struct board *b) {
+    uint32_t count = b->triggers_read - b->triggers_before;
+    uint8_t body[TRIGGERS_SIZE];
+    put_u32(body + TRIGGERS_COUNT_AT, count);
+    put_u64(body + TRIGGERS_TICK_AT, count > 0 ? b->trigger_us - b->epoch_us : 0);
+    send_message(b, MESSAGE_TRIGGERS, body, sizeof body);
+}
+
 void handle_unsequenced(struct board *b, const struct frame *frame) {
     switch (frame->type) {
     case MESSAGE_LEASE:
@@ -108,6 +116,9 @@ void handle_unsequenced(struct board *b, const struct frame *frame) {
         break;
     case MESSAGE_GET_EXECUTED:
         send_executed(b, get_u32(frame->body + GET_EXECUTED_FIRST_INDEX_AT));
+        break;
+    case MESSAGE_GET_TRIGGERS:
+        send_triggers(b);
         break;
     default:
         break;
@@ -188,6 +199,25 @@ static uint8_t on_start(struct board *b, const uint8_t *body) {
         uint64_t last = UINT64_MAX - HOLD_MAX_US - 1 - b->epoch_us;
         b->job.start_us = b->epoch_us + (tick < last ? tick : last);
     }
+    change_state(b, REASON_START);
+    return NO_REFUSAL;
+}
+
+static uint8_t on_start_on_trigger(struct board *b, const uint8_t *body) {
+    if (b->state != STATE_ARMED) {
+        return NAK_STATE;
+    }
+    if (get_u32(body + START_ON_TRIGGER_FIRST_INDEX_AT) != b->next_index - b->queue.count || b->queue.count == 0) {
+        return NAK_INDEX;
+    }
+    b->job = (struct job){
+        .active = true,
+        .awaits_trigger = true,
+        .number = get_u32(body + START_ON_TRIGGER_JOB_AT),
+        .delay_us = get_u32(body + START_ON_TRIGGER_DELAY_US_AT),
+        .accepted_us = b->now_us,
+        .start_us = b->now_us + (uint64_t)get_u16(body + START_ON_TRIGGER_WAIT_MS_AT) * MS,
+    };
     change_state(b, REASON_START);
     return NO_REFUSAL;
 }
@@ -290,6 +320,8 @@ uint8_t dispatch_sequenced(struct board *b, const struct frame *frame) {
         return on_data(b, frame->body, frame->length);
     case MESSAGE_START:
         return on_start(b, frame->body);
+    case MESSAGE_START_ON_TRIGGER:
+        return on_start_on_trigger(b, frame->body);
     case MESSAGE_END:
         return on_end(b, frame->body);
     case MESSAGE_ARM_REQ:

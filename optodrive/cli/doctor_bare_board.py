@@ -21,6 +21,8 @@ READ_S = 0.005
 CLOCK_SPAN_S = 2.0
 CLOCK_INTERVAL_S = 0.02
 LEASE_MS = 100
+TRIGGER_MINOR = 1
+"""Minor version of the protocol since which a board has a trigger input."""
 
 Answer = TypeVar("Answer", bound=m.Message)
 
@@ -88,6 +90,8 @@ def _examine(conversation: _Conversation) -> list[Finding]:
     status = conversation.get_status()
     findings = [_check_identity(peer, status), *_report_capacities(peer), check_inputs(status.inputs)]
     findings += _check_clock(conversation, peer.tick_hz)
+    if peer.minor >= TRIGGER_MINOR:
+        findings.append(_report_triggers(conversation.ask(m.GetTriggers(), m.Triggers), status))
     return [*findings, _check_stop(conversation, status)]
 
 
@@ -113,6 +117,14 @@ def _report_capacities(peer: m.HelloReply) -> list[Finding]:
         report_ok("capacities", f"{tables} of {peer.cell_codes} codes"),
         report_ok("limits", f"{pulse}, {spot}, lease {limits.lease_ms} ms"),
     ]
+
+
+def _report_triggers(triggers: m.Triggers, at_begin: m.Status) -> Finding:
+    """Return the finding on the trigger input, which saw some time of the examination."""
+    if not triggers.count:
+        return report_ok("trigger", "no edge yet")
+    seen = "during this examination" if triggers.tick > at_begin.tick else "before this examination"
+    return report_ok("trigger", f"{triggers.count} edges since power-up, the last one {seen}")
 
 
 def _check_clock(conversation: _Conversation, tick_hz: int) -> list[Finding]:

@@ -26,6 +26,8 @@ class Mutant(NamedTuple):
 MUTANTS = [Mutant("python", name.partition("_")[0].upper(), name) for name in mutants.MUTANTS]
 MUTANTS += [Mutant("c", guard, guard.removeprefix("B")) for guard in GUARDS]
 MUTANTS += [Mutant("c", "B14", "104")]
+RULES = [Mutant("c", "trigger", number) for number in ("108", "109", "110")]
+"""Boards that break a rule which is no guard."""
 
 
 def caught_by(kind, guard):
@@ -44,7 +46,7 @@ def assert_caught(mutant, scenario):
     assert scenario, "passes every scenario of its guard"
 
 
-@pytest.mark.parametrize("mutant", MUTANTS, ids="-".join)
+@pytest.mark.parametrize("mutant", [*MUTANTS, *RULES], ids="-".join)
 def test_caught(mutant, virtual, monkeypatch):
     if mutant.board == "python":
         monkeypatch.setattr(*mutants.MUTANTS[mutant.name]())

@@ -103,6 +103,8 @@ class VirtualBoard(BoardLog):
         step, now_us = self._steps.pop(0), self.clock.now_us()
         if "set" in step:
             self.core.set_input(step["set"], step["value"], now_us)
+        elif step["do"] == "trigger":
+            self.core.receive_trigger(now_us)
         elif step["do"] == "reset":
             self.core.reset(now_us)
             self._output = b""

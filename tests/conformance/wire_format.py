@@ -27,8 +27,21 @@ HOST = {
     "GET": (0x18, "", ()),
     "FLUSH": (0x19, "", ()),
     "GET_EXECUTED": (0x1A, "I", ("first_index",)),
+    "START_ON_TRIGGER": (0x1B, "IIIH", ("job", "first_index", "delay_us", "wait_ms")),
+    "GET_TRIGGERS": (0x1C, "", ()),
 }
-SEQUENCED = ("LIMITS", "DATA", "START", "END", "ARM_REQ", "ARM_CONFIRM", "DISARM", "CLEAR_FAULT", "FLUSH")
+SEQUENCED = (
+    "LIMITS",
+    "DATA",
+    "START",
+    "START_ON_TRIGGER",
+    "END",
+    "ARM_REQ",
+    "ARM_CONFIRM",
+    "DISARM",
+    "CLEAR_FAULT",
+    "FLUSH",
+)
 HELLO_REPLY = ("major", "minor", "host_nonce", "session", "firmware", "uid", "capabilities", "tick_hz", "queue_points")
 HELLO_REPLY += ("rx_window", "cell_codes", "cells", "window_pulses", "reset_cause", *LIMITS)
 STATUS = ("state", "fault", "inputs", "tick", "done_index", "queued", "crc_errors", "format_errors", "seq_errors")
@@ -40,6 +53,7 @@ BOARD = {
     0x91: ("NAK", "BB", ("next_seq", "reason")),
     0x92: ("EVENT", "BBBQ", ("state", "fault", "reason", "tick")),
     0x94: ("ARM_CHALLENGE", "II", ("host_nonce", "board_nonce")),
+    0x9C: ("TRIGGERS", "IQ", ("count", "tick")),
     0x98: ("STATUS", "BBBQIHHHHHQh", STATUS),
 }
 EXECUTED = 0x99

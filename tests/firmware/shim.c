@@ -22,6 +22,8 @@ struct shim {
     uint8_t inputs;
     uint8_t stuck, stuck_on, gate_on, indicator, relay, interrupted;
     uint16_t x, y;
+    uint32_t triggers;
+    uint64_t trigger_us;
     uint8_t out[OUT_MAX];
     size_t out_length;
     struct board_trace traces[TRACES_MAX];
@@ -51,6 +53,12 @@ static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     s->y = y;
 }
 static uint8_t read_inputs(void *context) { return ((struct shim *)context)->inputs; }
+static uint32_t read_triggers(void *context, uint64_t *last_us) {
+    const struct shim *s = context;
+    bool is_pending = s->triggers > 0 && s->now_us <= s->trigger_us; /* a tick at the very time of the edge misses it */
+    *last_us = is_pending ? *last_us : s->trigger_us;
+    return s->triggers - is_pending;
+}
 static void set_indicator(void *context, bool on) { ((struct shim *)context)->indicator = on; }
 static void set_relay(void *context, bool closed) { ((struct shim *)context)->relay = closed; }
 static uint32_t read_entropy(void *context) {
@@ -91,9 +99,21 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
                       uint32_t cells, uint32_t window_pulses, uint32_t key_edge) {
     struct shim *s = calloc(1, sizeof *s);
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
-    s->hal = (struct board_hal){s,         set_gate,     read_gate,           move_mirrors, read_inputs,    set_indicator,
-                                set_relay, read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog,
-                                hold_tick, trace};
+    s->hal = (struct board_hal){.context = s,
+                                .set_gate = set_gate,
+                                .read_gate = read_gate,
+                                .move_mirrors = move_mirrors,
+                                .read_inputs = read_inputs,
+                                .read_triggers = read_triggers,
+                                .set_indicator = set_indicator,
+                                .set_relay = set_relay,
+                                .read_entropy = read_entropy,
+                                .read_temperature_dc = read_temperature_dc,
+                                .send = send,
+                                .discard_output = discard_output,
+                                .feed_watchdog = feed_watchdog,
+                                .hold_tick = hold_tick,
+                                .trace = trace};
     limits_decode(&s->config.limits, limits);
     memcpy(s->config.uid, uid, sizeof s->config.uid);
     s->config.firmware = 0x00010000u;
@@ -143,6 +163,10 @@ void shim_loop(struct shim *s, uint64_t now_us) {
 
 void shim_receive(struct shim *s, const uint8_t *bytes, size_t n) { board_receive(&s->board, bytes, n, s->now_us); }
 void shim_link_lost(struct shim *s) { board_on_link_lost(&s->board, s->now_us); }
+void shim_trigger(struct shim *s, uint64_t at_us) {
+    s->triggers++;
+    s->trigger_us = at_us;
+}
 void shim_set_inputs(struct shim *s, uint32_t inputs) { s->inputs = (uint8_t)inputs; }
 void shim_stick(struct shim *s, uint32_t stuck, uint32_t on) {
     s->stuck = (uint8_t)stuck;

@@ -164,3 +164,38 @@ def test_an_entropy_that_repeats_itself_does_not_stop_the_board(library, tmp_pat
     sessions = [host.hello().session for _ in range(3)]
     assert 0 not in sessions
     assert all(one != other for one, other in pairwise(sessions))
+
+
+# --- the trigger ----------------------------------------------------------------------------------------------------
+
+
+def start_after_an_edge(library, tmp_path):
+    """Let an edge come that no tick has seen yet, then START_ON_TRIGGER without a tick between. Return the board."""
+    host = Bench(VirtualKind("c", partial(SeededCBoard, library)), tmp_path).ready(**BRIGHT)
+    host.order(host.data(here(300, duty=999)))
+    core, now_us = host.board.core, host.clock.now_us()
+    library.shim_trigger(core._handle, now_us - 50)
+    core.run_loop(host.frame("START_ON_TRIGGER", job=1, first_index=0, delay_us=1000, wait_ms=100))
+    core.advance(now_us + 10_000)
+    return host.board
+
+
+def test_an_edge_that_precedes_its_job_is_not_its_trigger(library, tmp_path):
+    board = start_after_an_edge(library, tmp_path)
+    assert (board.core.state, board.of("gate")) == ("RUNNING", [])
+
+
+def test_a_board_that_takes_an_earlier_edge_is_seen(libraries, tmp_path):
+    assert start_after_an_edge(libraries(107), tmp_path).of("gate")
+
+
+def test_an_edge_of_the_future_is_one_of_now(library, tmp_path):
+    """A port whose capture is wrong delays no job beyond its delay."""
+    host = Bench(VirtualKind("c", partial(SeededCBoard, library)), tmp_path).ready(**BRIGHT)
+    host.order(host.data(here(300, duty=999)))
+    core, now_us = host.board.core, host.clock.now_us()
+    core.run_loop(host.frame("START_ON_TRIGGER", job=1, first_index=0, delay_us=1000, wait_ms=100))
+    library.shim_trigger(core._handle, now_us + 50)
+    core.advance(now_us + 10_000)
+    (pulse,) = host.board.of("pulse")
+    assert pulse["on_us"] <= now_us + 1000 + 100

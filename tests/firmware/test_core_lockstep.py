@@ -10,6 +10,8 @@ from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
 CENTRE = 32768
 PATIENT = {"lease_ms": 60_000}
+LONGEST_NOTICE_US = 100
+"""The C core notices an edge at its next tick, the simulated board at once: only then both report it."""
 BOARDS = st.sampled_from(
     [
         BoardSettings(
@@ -61,6 +63,7 @@ USUAL = st.one_of(
     WAIT,
     st.tuples(st.just("queue"), POINTS),
     st.tuples(st.sampled_from(["start", "start later", "end", "lease", "get", "executed", "clock"]), st.none()),
+    st.tuples(st.sampled_from(["start on trigger", "trigger", "triggers"]), st.none()),
 )
 UNUSUAL = st.one_of(
     st.tuples(st.sampled_from(["arm", "hello", "short lease", "clear", "flush", "disarm", "abort"]), st.none()),
@@ -88,6 +91,8 @@ def messages(core, what, detail):
     return {
         "start": [m.Start(1, first, 0, 2)],
         "start later": [m.Start(1, first, core.machine.current_tick + 50_000, 1)],
+        "start on trigger": [m.StartOnTrigger(1, first, 5000, 300)],
+        "triggers": [m.GetTriggers()],
         "end": [m.End(1, core.machine.queue.next_index)],
         "clear": [m.ClearFault()],
         "lease": [m.Lease(60_000)],
@@ -125,6 +130,9 @@ def step(both, what, detail):
         both.set_input(detail, not core.machine.inputs[detail])
     elif what == "link lost":
         both.both(lambda board: board.on_link_lost(both.now_us))
+    elif what == "trigger":
+        both.both(lambda board: board.receive_trigger(both.now_us))
+        both.wait(LONGEST_NOTICE_US)
     elif what == "reset":
         both.both(lambda board: board.reset(both.now_us))
     elif what == "anything":

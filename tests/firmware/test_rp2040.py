@@ -89,7 +89,15 @@ def test_vectors(image, symbols):
     assert stack == RAM_END
     assert stack % 8 == 0
     assert stack - symbols["bss_end"] >= STACK_MIN
-    named = {0: "reset", 1: "halt", 2: "halt", 14: "systick_isr", 15: "timer_isr", 15 + 20: "uart_isr"}
+    named = {
+        0: "reset",
+        1: "halt",
+        2: "halt",
+        14: "systick_isr",
+        15: "timer_isr",
+        15 + 13: "trigger_isr",
+        15 + 20: "uart_isr",
+    }
     assert {k: handlers[k] for k in named} == {k: symbols[name] | 1 for k, name in named.items()}
     assert all(handler in (0, symbols["halt"] | 1) for k, handler in enumerate(handlers) if k not in named)
 

@@ -6,7 +6,7 @@ import { Machine } from "./machine.mjs";
 import { Splitter, encode, isSequenced } from "./wire.mjs";
 
 const MAJOR = 1;
-const MINOR = 0;
+const MINOR = 1;
 const TICK_HZ = 1_000_000;
 const RX_WINDOW = 8;
 const BEHIND_FROM = 128;
@@ -122,6 +122,7 @@ export class Board {
     if (message.name === "CLOCK") this.send("CLOCK_REPLY", { host_t: message.host_t, tick: machine.tick });
     if (message.name === "LEASE") machine.lease(message.ms);
     if (message.name === "GET") this.sendStatus();
+    if (message.name === "GET_TRIGGERS") this.send("TRIGGERS", machine.triggers);
     if (message.name === "GET_EXECUTED") {
       const at = this.records.findIndex((record) => record.index >= message.first_index);
       if (at >= 0) this.sendReport(at);
@@ -158,6 +159,8 @@ export class Board {
         return machine.addPoints(message.first_index, message.points);
       case "START":
         return machine.start(message);
+      case "START_ON_TRIGGER":
+        return machine.startOnTrigger(message);
       case "END":
         return machine.endJob(message);
       case "ARM_REQ":

@@ -2,7 +2,7 @@
 // answered by a line with the bytes for the host, the new entries of the log and the new edges of the gate.
 //
 //   {"uid": …, "queue_points": …, "max_on_us": …, …}
-//   {"do": "advance" | "receive" | "input" | "reset" | "inject" | "close", "at": µs, …}
+//   {"do": "advance" | "receive" | "input" | "trigger" | "reset" | "inject" | "close", "at": µs, …}
 
 import { readSync, writeSync } from "node:fs";
 
@@ -27,6 +27,7 @@ const ACTIONS = {
   advance: () => {},
   receive: (chip, { data }) => chip.receive(Buffer.from(data, "hex")),
   input: (chip, { name, value }) => chip.setInput(name, value),
+  trigger: (chip) => chip.trigger(),
   reset: (chip, { at }) => chip.reset(at),
   inject: (chip, { fault }) => chip.inject(fault),
   close: (chip) => chip.loseLink(),

@@ -17,6 +17,7 @@ export class Chip {
     this.log = (entry) => log({ t_us: this.now, ...entry });
     this.inputs = { interlock: true, key: true, estop: false };
     this.edges = [];
+    this.triggers = 0;
     this.isGateOn = false;
     this.reset(0, CAUSES.powerUp);
   }
@@ -50,6 +51,13 @@ export class Chip {
     this.log({ event: "input", input: name, value });
   }
 
+  /** An edge at the trigger input, whose time the timer captures for the next tick. */
+  trigger() {
+    this.capturedAt = this.now;
+    this.triggers += 1;
+    this.log({ event: "trigger", count: this.triggers });
+  }
+
   inject(fault) {
     if (fault === "stop_loop") this.isLoopStopped = true;
     if (fault === "stop_tick") this.isTickStopped = true;
@@ -70,6 +78,7 @@ export class Chip {
     this.differingUs = { on: 0, off: 0 };
     this.sampledAt = this.tickedAt = this.fedAt = now;
     this.hasTicked = false;
+    this.capturedAt = null;
     this.input = [];
     this.board = new Board(
       this.settings, { log: this.log, setGate: (on) => this.setGate(on) }, this.inputs, now, cause,
@@ -124,6 +133,8 @@ export class Chip {
     this.hasTicked = true;
     for (const [name, value] of Object.entries(this.inputs)) machine.setInput(name, value);
     if (this.sampleReadback()) machine.fail("READBACK");
+    if (this.capturedAt !== null) machine.noticeTrigger(this.capturedAt);
+    this.capturedAt = null;
     this.board.run(this.now);
   }
 

@@ -53,6 +53,10 @@ class IndependentCore:
         """Set an input."""
         self._request({"do": "input", "at": now_us, "name": name, "value": value})
 
+    def receive_trigger(self, now_us):
+        """Receive an edge at the trigger input."""
+        self._request({"do": "trigger", "at": now_us})
+
     def reset(self, now_us):
         """Reset the board."""
         self._request({"do": "reset", "at": now_us})

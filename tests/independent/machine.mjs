@@ -49,6 +49,7 @@ export class Machine {
     this.settledAt = now;
     this.isGateOn = false;
     this.laserOnTimesDuty = 0;
+    this.triggers = { count: 0, tick: 0 };
   }
 
   boot() {
@@ -212,6 +213,25 @@ export class Machine {
     return CONSUMED;
   }
 
+  startOnTrigger({ job, first_index, delay_us, wait_ms }) {
+    if (this.state !== "ARMED") return "STATE";
+    if (!this.queue.length || first_index !== this.queue[0].index) return "INDEX";
+    const trigger = { from: this.now, until: this.now + 1000 * wait_ms, delayUs: delay_us };
+    this.job = { number: job, watermark: 1, startAt: null, endIndex: null, beginsAt: null, trigger };
+    this.change("RUNNING", "start");
+    return CONSUMED;
+  }
+
+  /** Count an edge at the trigger input, and let the job that awaits one begin its delay after it. */
+  noticeTrigger(at) {
+    this.triggers = { count: (this.triggers.count + 1) % NUMBERS, tick: at - this.bootUs };
+    const trigger = this.job?.trigger;
+    if (!trigger || at < trigger.from || at >= trigger.until) return;
+    this.job.trigger = null;
+    this.job.startAt = at + trigger.delayUs;
+    this.refill();
+  }
+
   endJob({ job, end_index }) {
     if (!this.job || this.job.number !== job) return "STATE";
     if (end_index !== this.nextNumber) return "INDEX";
@@ -227,7 +247,7 @@ export class Machine {
 
   /** Let a job that waits for points go on as soon as it has enough. */
   refill() {
-    if (!this.job || this.current || this.job.beginsAt !== null) return;
+    if (!this.job || this.job.trigger || this.current || this.job.beginsAt !== null) return;
     const isWhole = this.job.endIndex !== null;
     if (!isWhole && this.queue.length < Math.max(1, this.job.watermark)) return;
     this.job.beginsAt = Math.max(this.now, this.job.startAt);
@@ -260,6 +280,7 @@ export class Machine {
   runningEvent() {
     const { job, current } = this;
     if (current) return current.isLit ? [current.offAt, () => this.endPulse()] : [current.onAt, () => this.endDark()];
+    if (job.trigger) return [job.trigger.until, () => this.change("DISARMED", "hold too long")];
     if (job.beginsAt !== null) return [job.beginsAt, () => this.beginPoint()];
     return [job.startAt + HOLD_US, () => this.change("DISARMED", "hold too long")];
   }

@@ -41,6 +41,8 @@ const MESSAGES = [
   message(0x18, "GET", ""),
   message(0x19, "FLUSH", "", { sequenced: true }),
   message(0x1a, "GET_EXECUTED", "u32 first_index"),
+  message(0x1b, "START_ON_TRIGGER", "u32 job, u32 first_index, u32 delay_us, u16 wait_ms", { sequenced: true }),
+  message(0x1c, "GET_TRIGGERS", ""),
   message(
     0x81,
     "HELLO_REPLY",
@@ -58,6 +60,7 @@ const MESSAGES = [
     "u8 state, u8 fault, u8 inputs, u64 tick, u32 done_index, u16 queued, u16 crc_errors, u16 format_errors, " +
       "u16 seq_errors, u16 underruns, u64 laser_on_us, i16 temperature_dc",
   ),
+  message(0x9c, "TRIGGERS", "u32 count, u64 tick"),
   message(0x99, "EXECUTED", "u32 first_index, u64 base_tick", { repeated: ["records", RECORD, RECORDS_MAX] }),
 ];
 const BY_NAME = new Map(MESSAGES.map((each) => [each.name, each]));

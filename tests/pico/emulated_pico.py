@@ -41,7 +41,8 @@ SYMBOLS = (
     "bss_end",
 )
 INPUT_PINS = {"interlock": 10, "key": 9, "estop": 8}
-HOST_CLOSED = 2
+HOST_CLOSED, TRIGGER = 2, 20
+PULSE_US = 2
 PWM_STEPS, DUTY_FULL = 2500, 65535
 BY_POINT, BY_RESET = -1, -2
 LATE_TICK_US = 700
@@ -116,6 +117,7 @@ class EmulatedPico:
         self._emission = None
         self.state, self.gate, self.inputs = "BOOT", False, {"interlock": True, "key": True, "estop": False}
         self.pins, self.mirrors, self.dac = [], [], []
+        self._triggers = 0
         self.nominal_us = []
         """Times at which the core commanded the edges of `pins`."""
         self.ticks_us = (0.0, 0.0)
@@ -176,6 +178,15 @@ class EmulatedPico:
         self._sink({"t_us": round(self.chip_us), "event": "input", "input": name, "value": value})
         self._command("pin", INPUT_PINS[name], value != (name == "estop"))
         self._command("run", self.chip_us + LOOP_US)
+
+    def receive_trigger(self, now_us):
+        """Give the trigger input a pulse of PULSE_US."""
+        self.advance(now_us)
+        self._triggers += 1
+        self._sink({"t_us": int(self.chip_us), "event": "trigger", "count": self._triggers})
+        self._command("pin", TRIGGER, True)
+        self._command("run", self.chip_us + PULSE_US)
+        self._command("pin", TRIGGER, False)
 
     def reset(self, now_us):
         """Pull the pin RUN low for a moment."""

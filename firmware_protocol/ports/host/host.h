@@ -49,6 +49,7 @@ enum step_kind {
     STEP_STOP_TICK,  /* stops the safety tick until the watchdog resets */
     STEP_LATE_TICK,  /* delays the safety tick by a millisecond */
     STEP_STICK_GATE, /* freezes the gate's readback until repair */
+    STEP_TRIGGER,    /* an edge at the trigger input */
 };
 
 struct step {
@@ -80,6 +81,7 @@ struct log {
 
 void log_trace(struct log *log, const struct board_trace *event);
 void log_input(struct log *log, uint64_t at_us, const char *name, bool value);
+void log_trigger(struct log *log, uint64_t at_us, uint32_t count);
 void log_port(struct log *log, uint64_t at_us, bool open);
 void log_lease(struct log *log, uint64_t at_us, uint64_t until_us);
 
@@ -128,6 +130,8 @@ struct port {
     uint64_t started_ns, at_us, watchdog_fed_us, ticks_resume_us;
     uint64_t exit_when_closed_us; /* UINT64_MAX: never */
     uint8_t inputs;
+    uint32_t triggers; /* edges so far */
+    uint64_t trigger_us;
     bool gate_on, readback_stuck, readback_value, loop_stopped, tick_stopped;
 };
 

@@ -75,6 +75,10 @@ void log_input(struct log *log, uint64_t at_us, const char *name, bool value) {
     write_line(log, at_us, "input", "\"input\": \"%s\", \"value\": %s", name, json_boolean(value));
 }
 
+void log_trigger(struct log *log, uint64_t at_us, uint32_t count) {
+    write_line(log, at_us, "trigger", "\"count\": %" PRIu32, count);
+}
+
 void log_port(struct log *log, uint64_t at_us, bool open) {
     write_line(log, at_us, "port", "\"open\": %s", json_boolean(open));
 }

@@ -54,6 +54,11 @@ static bool read_gate(void *context) {
 static void move_mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
 static void ignore_output(void *context, bool on) { (void)context, (void)on; }
 static uint8_t read_inputs(void *context) { return ((struct port *)context)->inputs; }
+static uint32_t read_triggers(void *context, uint64_t *last_us) {
+    const struct port *port = context;
+    *last_us = port->trigger_us;
+    return port->triggers;
+}
 static int16_t read_temperature_dc(void *context) {
     (void)context;
     return 250;
@@ -162,6 +167,10 @@ static void run_step(struct port *port, const struct step *step) {
     case STEP_LATE_TICK:
         port->ticks_resume_us = port->at_us + LATE_TICK_US;
         break;
+    case STEP_TRIGGER:
+        log_trigger(&port->log, port->at_us, ++port->triggers);
+        port->trigger_us = port->at_us;
+        break;
     case STEP_STICK_GATE:
         port->readback_value = port->gate_on;
         port->readback_stuck = true;
@@ -269,6 +278,7 @@ void port_run(struct port *port) {
         .read_gate = read_gate,
         .move_mirrors = move_mirrors,
         .read_inputs = read_inputs,
+        .read_triggers = read_triggers,
         .set_indicator = ignore_output,
         .set_relay = ignore_output,
         .read_entropy = read_entropy,

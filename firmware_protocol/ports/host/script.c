@@ -6,9 +6,10 @@
 
 static const char *const INPUTS[INPUT_COUNT] = INPUT_NAMES;
 static const char *const ACTIONS[] = {"",       "flip_bits", "drop_bytes", "hang",      "repair",
-                                      "reset",  "close",     "stop_loop",  "stop_tick", "late_tick", "stick_gate"};
+                                      "reset",  "close",     "stop_loop",  "stop_tick", "late_tick", "stick_gate",
+                                      "trigger"};
 #define ACTION_NAMES \
-    "one of flip_bits, drop_bytes, hang, repair, reset, close; of this board alone: stop_loop, stop_tick, late_tick, " \
+    "one of flip_bits, drop_bytes, hang, repair, reset, close, trigger; of this board alone: stop_loop, stop_tick, late_tick, " \
     "stick_gate"
 
 const char *input_name(uint8_t bit) {

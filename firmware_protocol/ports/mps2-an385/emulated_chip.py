@@ -107,6 +107,11 @@ class EmulatedChip:
         self._input_name = name
         self._command(b"I", bytes([self._inputs]))
 
+    def receive_trigger(self, now_us: int) -> None:
+        """Pass a rising edge to the trigger input."""
+        self.advance(now_us)
+        self._command(b"E")
+
     def reset(self, now_us: int) -> None:
         """Reset the core."""
         self.advance(now_us)
@@ -152,6 +157,8 @@ class EmulatedChip:
                 self._sink({"t_us": first, "event": "pin", "on": self.gate})
             elif kind == b"P":
                 self._sink({"t_us": first, "event": "lease", "until_us": second})
+            elif kind == b"E":
+                self._sink({"t_us": first, "event": "trigger", "count": second})
             elif kind == b"I":
                 value = bool(self._inputs & INPUT_BITS[self._input_name])
                 self._sink({"t_us": first, "event": "input", "input": self._input_name, "value": value})

@@ -1,8 +1,8 @@
 /* The board's core on a Cortex-M3 whose time is the emulator's.
 
    The bench simulates the environment. It sends the configuration when the chip requests it with the record C, then
-   commands: run until a time (U), bytes from the host (B), input levels (I), link lost (L), reset (R), and faults: the
-   main loop stops (H), the tick stops (K) or is late (T), the gate's readback freezes (S). Each ends with the record D: the
+   commands: run until a time (U), bytes from the host (B), input levels (I), an edge at the trigger input (E), link
+   lost (L), reset (R), and faults: the main loop stops (H), the tick stops (K) or is late (T), the gate's readback freezes (S). Each ends with the record D: the
    chip's time and that of its next due event. */
 
 #include <string.h>
@@ -16,7 +16,8 @@
 static struct board board;
 static uint8_t inputs = INPUT_INTERLOCK | INPUT_KEY;
 static bool gate_on, readback_stuck, readback_value, loop_stopped, tick_stopped;
-static uint32_t entropy_state;
+static uint32_t entropy_state, triggers;
+static uint64_t trigger_us;
 
 /* --- log --- */
 
@@ -59,6 +60,12 @@ static uint8_t on_inputs(void *context) {
     return inputs;
 }
 
+static uint32_t on_triggers(void *context, uint64_t *last_us) {
+    (void)context;
+    *last_us = trigger_us;
+    return triggers;
+}
+
 static void ignore_output(void *context, bool on) { (void)context, (void)on; }
 
 /* The emulated chip has no entropy source; the configuration contains a seed. */
@@ -94,6 +101,7 @@ static const struct board_hal hal = {
     .read_gate = on_gate_readback,
     .move_mirrors = on_mirrors,
     .read_inputs = on_inputs,
+    .read_triggers = on_triggers,
     .set_indicator = ignore_output,
     .set_relay = ignore_output,
     .read_entropy = on_entropy,
@@ -205,6 +213,11 @@ static void run(const struct command *command) {
         break;
     case 'I':
         set_inputs(command->bytes[0]);
+        break;
+    case 'E': /* as a capture register takes it: exact, and noticed by the next tick */
+        trigger_us = chip_now_us();
+        triggers++;
+        write_times('E', trigger_us, triggers);
         break;
     case 'L':
         board_on_link_lost(&board, chip_now_us());

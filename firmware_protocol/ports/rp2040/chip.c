@@ -114,6 +114,42 @@ void chip_release_alarm(void) {
     REGISTER(NVIC_ENABLE(TIMER_IRQ)) = NVIC_BIT(TIMER_IRQ);
 }
 
+/* --- trigger --- */
+
+static uint32_t trigger_pin;
+static volatile uint32_t trigger_count, trigger_low;
+
+void trigger_isr(void) {
+    trigger_low = REGISTER(TIMER_RAW_LOW);
+    CLEAR(IO_ENABLED_EDGES(trigger_pin)) = IO_RISING_EDGE(trigger_pin);
+    trigger_count++;
+    chip_fence();
+}
+
+static void await_edge(void) {
+    REGISTER(IO_EDGES(trigger_pin)) = IO_RISING_EDGE(trigger_pin); /* earlier edges */
+    SET(IO_ENABLED_EDGES(trigger_pin)) = IO_RISING_EDGE(trigger_pin);
+}
+
+void chip_start_trigger(uint32_t pin) {
+    trigger_pin = pin;
+    REGISTER(NVIC_PRIORITY(TIMER_IRQ)) |= NVIC_SECOND_PRIORITY(TIMER_IRQ);
+    REGISTER(NVIC_PRIORITY(UART_IRQ)) |= NVIC_SECOND_PRIORITY(UART_IRQ);
+    await_edge();
+    REGISTER(NVIC_ENABLE(IO_IRQ)) = NVIC_BIT(IO_IRQ);
+}
+
+uint32_t chip_read_triggers(uint64_t *last_us) {
+    uint32_t count = trigger_count;
+    if (!(REGISTER(IO_ENABLED_EDGES(trigger_pin)) & IO_RISING_EDGE(trigger_pin))) {
+        uint64_t now_us = chip_now_us();
+        count = trigger_count;
+        *last_us = now_us - (uint32_t)((uint32_t)now_us - trigger_low);
+        await_edge();
+    }
+    return count;
+}
+
 /* --- sleep: the processor's own timer ends it, so that the loop notices ticks that do not come --- */
 
 void systick_isr(void) {}

@@ -28,6 +28,12 @@ void chip_release_alarm(void);
 /* Completes the accesses before it, so that an interrupt disabled there does not come any more. */
 void chip_fence(void);
 
+/* Starts the capture of rising edges at a pin; its interrupt precedes all others, so that the time is exact. */
+void chip_start_trigger(uint32_t pin);
+/* Returns the number of edges so far, and the time of the last one if any. At most one counts between two calls: an
+   input that oscillates costs no more. */
+uint32_t chip_read_triggers(uint64_t *last_us);
+
 /* Sleeps until an interrupt, at most for CHIP_SLEEP_US even if the alarm has failed. */
 void chip_sleep(void);
 

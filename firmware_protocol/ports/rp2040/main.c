@@ -32,6 +32,10 @@ static uint8_t read_inputs(void *context) {
     return (uint8_t)((outputs_get(PIN_INTERLOCK) ? INPUT_INTERLOCK : 0) | (outputs_get(PIN_KEY) ? INPUT_KEY : 0) |
                      (outputs_get(PIN_ESTOP) ? 0 : INPUT_ESTOP));
 }
+static uint32_t read_triggers(void *context, uint64_t *last_us) {
+    (void)context;
+    return chip_read_triggers(last_us);
+}
 static void set_indicator(void *context, bool on) {
     (void)context;
     outputs_set(PIN_INDICATOR, on);
@@ -75,6 +79,7 @@ static const struct board_hal HAL = {
     .read_gate = read_gate,
     .move_mirrors = move_mirrors,
     .read_inputs = read_inputs,
+    .read_triggers = read_triggers,
     .set_indicator = set_indicator,
     .set_relay = set_relay,
     .read_entropy = read_entropy,
@@ -121,6 +126,7 @@ int main(void) {
     enum reset_cause cause = chip_reset_cause();
     chip_start(on_alarm);
     outputs_start();
+    chip_start_trigger(PIN_TRIGGER);
     host_start(SETTINGS.uid);
     last_tick_us = chip_now_us();
     board_init(&board, &HAL, &SETTINGS, cause, last_tick_us);

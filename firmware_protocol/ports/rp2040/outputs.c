@@ -89,6 +89,7 @@ void outputs_start(void) {
     configure_input(PIN_KEY, PAD_PULL_DOWN);
     configure_input(PIN_ESTOP, PAD_PULL_DOWN);
     configure_input(PIN_READBACK, PAD_PULL_UP); /* a broken wire reads as gate on */
+    configure_input(PIN_TRIGGER, PAD_PULL_DOWN);
     configure_input(PIN_HOST_CLOSED, PAD_PULL_UP); /* a broken wire reads as a closed port */
     configure_input(PIN_HOST_RX, PAD_PULL_UP);
     REGISTER(IO_CTRL(PIN_HOST_RX)) = IO_UART;

@@ -17,6 +17,7 @@
 #define PIN_DAC_SYNC 17u
 #define PIN_DAC_CLOCK 18u
 #define PIN_DAC_DATA 19u
+#define PIN_TRIGGER 20u    /* a rising edge starts the job that awaits it */
 #define PIN_TICK 22u       /* high while the tick runs, for an oscilloscope */
 
 #endif

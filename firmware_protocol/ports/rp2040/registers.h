@@ -41,6 +41,9 @@
 
 /* --- pins --- */
 #define IO_CTRL(pin) (IO_BANK0 + 0x4u + 8u * (pin))
+#define IO_EDGES(pin) (IO_INTERRUPTS + (pin) / 8u * 4u)             /* written bits are cleared */
+#define IO_ENABLED_EDGES(pin) (IO_INTERRUPTS_OF_CORE0 + (pin) / 8u * 4u)
+#define IO_RISING_EDGE(pin) BIT((pin) % 8u * 4u + 3u)
 #define IO_SPI 1u
 #define IO_UART 2u
 #define IO_PWM 4u
@@ -115,6 +118,8 @@
 #define NVIC_ENABLE(irq) (0xe000e100u + (irq) / 32u * 4u)
 #define NVIC_DISABLE(irq) (0xe000e180u + (irq) / 32u * 4u)
 #define NVIC_BIT(irq) BIT((irq) % 32u)
+#define NVIC_PRIORITY(irq) (0xe000e400u + (irq) / 4u * 4u)
+#define NVIC_SECOND_PRIORITY(irq) (0x40u << (irq) % 4u * 8u)
 #define TIMER_IRQ 0u
 
 #endif

@@ -43,6 +43,8 @@
 
 /* --- peripherals --- */
 #define IO_BANK0 0x40014000u
+#define IO_INTERRUPTS (IO_BANK0 + 0xf0u)
+#define IO_INTERRUPTS_OF_CORE0 (IO_BANK0 + 0x100u)
 #define PADS_BANK0 0x4001c000u
 #define SIO_IN 0xd0000004u
 #define SIO_OUT_SET 0xd0000014u
@@ -57,6 +59,7 @@
 #define ROSC_RANDOM_BIT 0x4006001cu
 
 /* --- interrupts --- */
+#define IO_IRQ 13u
 #define UART_IRQ 20u
 #define IRQS 26u
 

@@ -35,6 +35,8 @@
 
 /* --- peripherals --- */
 #define IO_BANK0 0x40028000u
+#define IO_INTERRUPTS (IO_BANK0 + 0x230u)
+#define IO_INTERRUPTS_OF_CORE0 (IO_BANK0 + 0x248u)
 #define PADS_BANK0 0x40038000u
 #define SIO_IN 0xd0000004u
 #define SIO_OUT_SET 0xd0000018u
@@ -49,6 +51,7 @@
 #define ROSC_RANDOM_BIT 0x400e8020u
 
 /* --- interrupts --- */
+#define IO_IRQ 21u
 #define UART_IRQ 33u
 #define IRQS 52u
 

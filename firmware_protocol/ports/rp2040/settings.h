@@ -7,7 +7,7 @@
 
 #define HOST_BAUD 1000000u
 #define GATE_HZ 50000u /* PWM frequency of the duty, within the bandwidth of the laser driver */
-#define FIRMWARE 0x00010000u
+#define FIRMWARE 0x00010100u
 #ifndef BOARD_UID
 #define BOARD_UID {'r', 'p', '2', '0', '4', '0', '-', '0', '0', '0', '0', '1'}
 #endif

@@ -14,7 +14,7 @@ from optodrive.core.errors import RemoteProtocolError
 from optodrive.link.protocol.states import BoardState, EventReason
 
 MAJOR = 1
-MINOR = 0
+MINOR = 1
 
 STATES = tuple(BoardState)
 FAULTS = (
@@ -275,6 +275,32 @@ class GetExecuted(Message, name="GET_EXECUTED", type_id=0x1A, layout="<I"):
     """Request the executed records from first_index again."""
 
     first_index: int
+
+
+@dataclass(frozen=True)
+class StartOnTrigger(Message, name="START_ON_TRIGGER", type_id=0x1B, layout="<IIIH", sequenced=True):
+    """Start a job delay_us after the next edge at the trigger input. Without one within wait_ms, the board disarms.
+
+    first_index: index of the job's first point, which must be queued
+    """
+
+    job: int
+    first_index: int
+    delay_us: int
+    wait_ms: int
+
+
+@dataclass(frozen=True)
+class GetTriggers(Message, name="GET_TRIGGERS", type_id=0x1C, layout="<"):
+    """Request TRIGGERS."""
+
+
+@dataclass(frozen=True)
+class Triggers(Message, name="TRIGGERS", type_id=0x9C, layout="<IQ"):
+    """Report the edges at the trigger input since power-up, modulo 2^32, and the last one's tick, 0 without any."""
+
+    count: int
+    tick: int
 
 
 @dataclass(frozen=True)

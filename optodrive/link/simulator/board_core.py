@@ -90,6 +90,11 @@ class BoardCore:
         self.advance(now_us)
         self.machine.set_input(name, value)
 
+    def receive_trigger(self, now_us: int) -> None:
+        """Receive a rising edge at the trigger input."""
+        self.advance(now_us)
+        self.machine.receive_trigger()
+
     def on_link_lost(self, now_us: int) -> None:
         """Disarm as after an ABORT: the host's end of the link closed (DTR dropped, BREAK)."""
         self.advance(now_us)
@@ -169,6 +174,8 @@ class BoardCore:
             report = self.machine.records.build_report(message.first_index)
             if report is not None:
                 self._send(report)
+        elif isinstance(message, m.GetTriggers):
+            self._send(m.Triggers(self.machine.triggers, self.machine.trigger_tick))
 
     # --- messages -----------------------------------------------------------------------------------------------
 
@@ -178,6 +185,7 @@ class BoardCore:
             m.Limits: self.machine.tighten_limits,
             m.Data: self._on_data,
             m.Start: self.machine.start_job,
+            m.StartOnTrigger: self.machine.start_job_on_trigger,
             m.End: self.machine.end_job,
             m.ArmReq: self._on_arm_req,
             m.ArmConfirm: self._on_arm_confirm,

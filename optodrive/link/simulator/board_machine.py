@@ -83,6 +83,7 @@ class BoardMachine:
         self._hold_since_us = 0
         self._underrun_times_us: deque[int] = deque()
         self._key_turned = False
+        self.triggers, self.trigger_tick = 0, 0
         self._is_version_supported = False
         self._change_state(EventReason.BOOT)
 
@@ -138,8 +139,11 @@ class BoardMachine:
         if self.state == BoardState.HOLD:
             return self._hold_since_us + HOLD_MAX_US
         job = self.queue.job
-        waits = self.state == BoardState.RUNNING and self._current_point is None and not self.queue.has_enough_points
-        return job.start_us + HOLD_MAX_US if waits and job is not None else None
+        if self.state != BoardState.RUNNING or self._current_point is not None or job is None:
+            return None
+        if job.trigger_delay_us is not None:
+            return job.expires_us
+        return None if self.queue.has_enough_points else job.start_us + HOLD_MAX_US
 
     def _point_due_us(self) -> int | None:
         if self.state != BoardState.RUNNING:
@@ -147,7 +151,9 @@ class BoardMachine:
         if self._current_point is not None:
             return self._due_us
         job = self.queue.job
-        return max(job.start_us, self.now_us) if job is not None and self.queue.has_enough_points else None
+        if job is None or job.trigger_delay_us is not None or not self.queue.has_enough_points:
+            return None
+        return max(job.start_us, self.now_us)
 
     # --- points -------------------------------------------------------------------------------------------------
 
@@ -283,6 +289,14 @@ class BoardMachine:
         if value != SAFE_INPUTS[name]:
             self._enter_fault(INPUT_FAULTS[name])
 
+    def receive_trigger(self) -> None:
+        """Count a rising edge at the trigger input, and start the job that awaits one."""
+        self.triggers, self.trigger_tick = self.triggers + 1, self.current_tick
+        job = self.queue.job
+        if job is not None and job.trigger_delay_us is not None:
+            job.start_us, job.trigger_delay_us = self.now_us + job.trigger_delay_us, None
+        self._log("trigger", count=self.triggers)
+
     def clear_fault(self) -> str:
         """Acknowledge a fault and forget the underruns."""
         if self.state != BoardState.FAULT:
@@ -401,6 +415,19 @@ class BoardMachine:
             return "INDEX"
         start_us = max(self.epoch_us + message.start_tick, self.now_us)
         self.queue.job = BoardJob(message.job, start_us, message.watermark)
+        self._change_state(EventReason.START)
+        return ""
+
+    def start_job_on_trigger(self, message: m.StartOnTrigger) -> str:
+        """Let a job start at the next trigger."""
+        if self.state != BoardState.ARMED:
+            return "STATE"
+        if message.first_index != self.queue.first_index or not self.queue:
+            return "INDEX"
+        expires_us = self.now_us + 1000 * message.wait_ms
+        self.queue.job = BoardJob(
+            message.job, self.now_us, watermark=1, trigger_delay_us=message.delay_us, expires_us=expires_us
+        )
         self._change_state(EventReason.START)
         return ""
 

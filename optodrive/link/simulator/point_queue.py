@@ -19,12 +19,19 @@ class QueuedPoint(NamedTuple):
 
 @dataclass
 class BoardJob:
-    """The job between START and its end. end_index: number after the last point, None before END."""
+    """The job between START and its end.
+
+    end_index: number after the last point, None before END
+    trigger_delay_us: from the edge that the job awaits to its start, None if it awaits none
+    expires_us: when it stops waiting for an edge
+    """
 
     number: int
     start_us: int
     watermark: int
     end_index: int | None = None
+    trigger_delay_us: int | None = None
+    expires_us: int = 0
 
 
 class PointQueue:

@@ -46,6 +46,9 @@ class BoardBackend(Protocol):
     def set_input(self, name: str, value: bool, now_us: int) -> None:
         """Change an input."""
 
+    def receive_trigger(self, now_us: int) -> None:
+        """Receive a rising edge at the trigger input."""
+
     def reset(self, now_us: int) -> None:
         """Lose and regain power."""
 
@@ -282,6 +285,8 @@ class PtyBoard:
             self._core.set_input(step.name, step.value, now_us)
         elif step.name == "reset":
             self._core.reset(now_us)
+        elif step.name == "trigger":
+            self._core.receive_trigger(now_us)
         elif step.name == "repair":
             self._faults.repair()
         elif step.name == "close":

@@ -7,7 +7,7 @@ value = false
 
 [[step]]
 at_s = 2.0
-do = "flip_bits"       # or "drop_bytes" (both with rate), "hang", "repair", "reset", "close"
+do = "flip_bits"       # or "drop_bytes" (both with rate), "hang", "repair", "reset", "close", "trigger"
 rate = 0.01
 
 With from = "light", at_s counts from the first pulse; with from = "signal", a step has no at_s, and each SIGUSR1 to the
@@ -28,7 +28,7 @@ from optodrive.link.protocol.messages import INPUTS
 SENSOR_ACTIONS = ("stick_x", "stick_y", "invert_readback", "blind_sensor", "unplug_sensor")
 """Faults of mirrors and spot sensor."""
 Origin = Literal["start", "light", "signal"]
-ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", *SENSOR_ACTIONS)
+ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", "trigger", *SENSOR_ACTIONS)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@
 struct driver {
     struct oracle oracle;
     uint64_t ticked_us;
-    uint32_t entropy, ticks;
+    uint64_t trigger_us;
+    uint32_t entropy, ticks, triggers;
     bool stuck, stuck_on;
 };
 
@@ -63,6 +64,11 @@ static uint8_t read_inputs(void *context) {
     (void)context;
     return o->inputs;
 }
+static uint32_t read_triggers(void *context, uint64_t *last_us) {
+    (void)context;
+    *last_us = driver.trigger_us;
+    return driver.triggers;
+}
 static void set_indicator(void *context, bool on) {
     (void)context;
     o->indicator = on;
@@ -90,9 +96,18 @@ static void feed_watchdog(void *context) {
     oracle_on_feed(o);
 }
 
-static const struct board_hal HAL = {NULL,      set_gate,     read_gate,           move_mirrors, read_inputs,    set_indicator,
-                                     set_relay, read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog,
-                                     NULL, NULL};
+static const struct board_hal HAL = {.set_gate = set_gate,
+                                     .read_gate = read_gate,
+                                     .move_mirrors = move_mirrors,
+                                     .read_inputs = read_inputs,
+                                     .read_triggers = read_triggers,
+                                     .set_indicator = set_indicator,
+                                     .set_relay = set_relay,
+                                     .read_entropy = read_entropy,
+                                     .read_temperature_dc = read_temperature_dc,
+                                     .send = send,
+                                     .discard_output = discard_output,
+                                     .feed_watchdog = feed_watchdog};
 
 /* --- time --- */
 
@@ -217,6 +232,15 @@ static void start(uint32_t first, uint64_t tick, uint16_t watermark) {
     put(&at, tick, 8);
     put(&at, watermark, 2);
     send_frame(0x11, body, sizeof body);
+}
+
+static void start_on_trigger(uint8_t how) {
+    uint8_t body[14], *at = body;
+    put(&at, o->job, 4);
+    put(&at, o->queue_count ? o->queue[o->queue_first % POINTS_MAX].index : o->next_index, 4);
+    put(&at, 100u * (how & 15u), 4);
+    put(&at, how >> 4, 2);
+    send_frame(0x1b, body, sizeof body);
 }
 
 static void end(uint32_t index) {
@@ -451,6 +475,14 @@ static void step(const struct board_config *config) {
             power_up(config);
         } else if (detail & 1) {
             send_frame(0x18, NULL, 0);
+        } else if (detail == 2) {
+            start_on_trigger(read_u8());
+        } else if (detail == 4) {
+            driver.trigger_us = o->now_us;
+            driver.triggers++;
+            tick();
+        } else if (detail == 6) {
+            send_frame(0x1c, NULL, 0);
         } else {
             wait(2100000, true);
         }

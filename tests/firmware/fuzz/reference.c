@@ -94,6 +94,8 @@ static const struct {
     {0x18, 0, 0, 0, false, {{0, 0}}},
     {0x19, 0, 0, 0, true, {{0, 0}}},
     {0x1a, 4, 0, 0, false, {{0, 0}}},
+    {0x1b, 14, 0, 0, true, {{0, 0}}},
+    {0x1c, 0, 0, 0, false, {{0, 0}}},
     {0x81, 77, 0, 0, false, {{0, 0}}},
     {0x83, 12, 0, 0, false, {{0, 0}}},
     {0x90, 8, 0, 0, false, {{7, 7}}},
@@ -101,6 +103,7 @@ static const struct {
     {0x92, 11, 0, 0, false, {{0, 7}, {1, 15}, {2, 17}}},
     {0x94, 8, 0, 0, false, {{0, 0}}},
     {0x98, 35, 0, 0, false, {{0, 7}, {1, 15}}},
+    {0x9c, 12, 0, 0, false, {{0, 0}}},
     {0x99, 12, 8, 28, false, {{0, 0}}},
 };
 #define MESSAGES_COUNT (sizeof MESSAGES / sizeof MESSAGES[0])

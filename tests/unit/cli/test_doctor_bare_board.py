@@ -8,13 +8,14 @@ from forked_process import SIMULATED, start_process
 from optodrive.cli.doctor_bare_board import check_bare_board
 from optodrive.cli.main import run
 from optodrive.core.clock import ManualClock
+from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.board_machine import BoardMachine
 from optodrive.link.simulator.memory_link import MemoryLink
 
-CHECKS = ["board", "capacities", "limits", "inputs", "clock", "link", "lease, stop"]
+CHECKS = ["board", "capacities", "limits", "inputs", "clock", "link", "trigger", "lease, stop"]
 
 
 class DriftingLink(MemoryLink):
@@ -74,6 +75,28 @@ def test_inputs_and_a_fault_are_named():
     assert findings["inputs"].observation == "the enclosure is open; the emergency stop is pressed"
     assert findings["board"].status == "warning"
     assert "FAULT INTERLOCK" in findings["board"].observation
+
+
+class PulsedLink(MemoryLink):
+    """A link to a board whose trigger input sees an edge with each message."""
+
+    def write(self, data):
+        self._core.receive_trigger(self._now_us())
+        super().write(data)
+
+
+def test_edges_at_the_trigger_input_are_counted():
+    assert examine()[0]["trigger"].observation == "no edge yet"
+    count, _, rest = examine(PulsedLink)[0]["trigger"].observation.partition(" ")
+    assert int(count) > 2
+    assert rest == "edges since power-up, the last one during this examination"
+
+
+def test_a_board_of_protocol_1_0_has_no_trigger(monkeypatch):
+    monkeypatch.setattr(m, "MINOR", 0)
+    findings, log = examine()
+    assert list(findings) == [check for check in CHECKS if check != "trigger"]
+    assert not [entry for entry in log if entry["event"] == "rx_error"]
 
 
 def test_a_board_that_a_lease_arms_is_a_problem(monkeypatch):
