@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from bench import BRIGHT, CENTRE, Bench, act, here, set_input
+from bench import BRIGHT, CENTRE, PATIENT, Bench, act, here, set_input
 from emulated_pico import PWM_STEPS, EmulatedPico, PicoImage
 from emulated_usb_pico import EmulatedUsbPico
 from virtual_board import PicoBoard, VirtualKind
@@ -107,16 +107,24 @@ def test_a_link_lost_or_broken_turns_the_gate_off_in_a_tick(bench):
     assert core.pins[-1][0] - now_us <= 400, "the time of a byte, of the receiver's time-out and of a turn of the loop"
 
 
-def flood(host):
-    """Send as many requests as a packet of USB and the window of the UART hold, whose answers nobody waits for."""
-    host.board.core.receive(b"".join(host.frame("CLOCK", host_t=k) for k in range(FLOOD_FRAMES)), host.clock.now_us())
+def flood(host, name):
+    """Send as many frames as a packet of USB and the window of the UART hold, whose answers nobody waits for.
+
+    name: of requests, or DATA, whose last frame is repeated: it is answered each time and carried out once
+    """
+    fields = [{"host_t": k} for k in range(FLOOD_FRAMES)]
+    if name == "DATA":
+        repeated = {"seq": (host.seq - 1) % 256, "first_index": 0, "points": [here(100, duty=999)] * 24}
+        fields = [repeated] * FLOOD_FRAMES
+    host.board.core.receive(b"".join(host.frame(name, **each) for each in fields), host.clock.now_us())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bench", [EmulatedPico, EmulatedUsbPico], ids=["uart", "usb"], indirect=True)
-@pytest.mark.parametrize("floods", [False, True], ids=["", "flooded"])
+@pytest.mark.parametrize("floods", ["", "CLOCK", "DATA"])
 def test_ticks_keep_their_time_at_a_full_queue_and_2000_pulses_a_second(bench, floods):
-    host = bench.ready(settle_us=0, settle_ns_per_code=0, queue_points=QUEUE_POINTS, spot_leak_uw=4_000_000_000)
+    tables = dict(queue_points=QUEUE_POINTS, spot_leak_uw=4_000_000_000)
+    host = bench.ready(settle_us=0, settle_ns_per_code=0, **tables, **PATIENT)  # its lease may wait behind a flood
     core = host.board.core
     points = [
         here(100, x=1000 + 1600 * (k % 39), y=1000 + 1600 * (k // 39 % 39), duty=999, dark_us=400) for k in range(4096)
@@ -129,7 +137,7 @@ def test_ticks_keep_their_time_at_a_full_queue_and_2000_pulses_a_second(bench, f
     while host.clock.now_s() < since_s + 1.0:
         host.lease()
         if floods:
-            flood(host)
+            flood(host, floods)
         host.receive()
         while more + 24 <= len(host.board.of("pulse")) + QUEUE_POINTS and more + 24 <= len(points):
             host.raw(host.data(*points[more : more + 24]))
