@@ -39,6 +39,7 @@ def crc_is_checked_before_type_and_length(bench):
 def frames_before_a_session_count_as_of_another_one(bench):
     host = bench.host(bench.board(**PATIENT))
     host.board.wait(lambda: host.board.of("port") and host.board.changes("boot"), "the board")
+    host.pause(0.2)  # a computer enumerates a device on USB only then
     for name, fields in (("GET", {}), ("LEASE", {"ms": 1}), ("ABORT", {})):
         host.send(name, **fields)
     host.pause(0.05)

@@ -150,11 +150,11 @@ def gap_is_refused_at_once_and_filled_in_order(bench):
 
 @scenario("go-back-N")
 def duplicate_frame_is_answered_but_not_executed(bench):
-    host = bench.ready(**PATIENT)
+    host = bench.ready(queue_points=1000, **PATIENT)
     taken = host.data(here(0))
     assert host.order(taken) == []
     answers, status = host.request(taken)
-    assert [(m.name, m.next_seq, m.free_points) for m in answers] == [("ACK", host.seq, 4096 - 1)]
+    assert [(m.name, m.next_seq, m.free_points) for m in answers] == [("ACK", host.seq, 1000 - 1)]
     assert status.queued == 1
     refused = host.frame("START", job=1, first_index=9, start_tick=0, watermark=1)
     for _ in range(3):

@@ -3,6 +3,7 @@
 The emulated chip plays in every run what the processes on ptys play; scripts/test --slow plays all.
 """
 
+import edge_scenarios
 import link_scenarios
 import pytest
 import trust_scenarios
@@ -12,7 +13,7 @@ from process_board import has_subject
 from scenario import GUARDS, audit_output, judge
 from test_conformance_pty import in_every_run, list_cases, name_case
 
-OF_A_PORT = (link_scenarios.__name__, trust_scenarios.__name__)
+OF_A_PORT = (link_scenarios.__name__, trust_scenarios.__name__, edge_scenarios.__name__)
 """Modules whose scenarios a port can change; the other guards see only what it has carried."""
 
 
