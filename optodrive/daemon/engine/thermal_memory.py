@@ -3,16 +3,14 @@
 import mmap
 import pickle
 import struct
-import zlib
-from functools import reduce
 from typing import NamedTuple
 
 from optodrive.daemon.engine.thermal_estimate import EndedPlan, ThermalEstimate
 
 SLOT_BYTES = 256 * 2**20
 """Room for one state. Memory that was never written costs nothing."""
-HEADER = struct.Struct("<QQI")
-"""Sequence number, length and CRC-32 of a state; sequence number 0: none."""
+HEADER = struct.Struct("<QQ")
+"""Sequence number and length of a state; sequence number 0: none."""
 LENGTH = struct.Struct("<Q")
 SHARE = struct.Struct("<d")
 
@@ -32,7 +30,8 @@ class SavedThermalState(NamedTuple):
 class ThermalMemory:
     """Two slots that are written in turn, so that a process which ends while it writes leaves the older state.
 
-    The supervisor creates it before it forks the planner. One process at a time uses it.
+    A slot gets its number once it is whole. No checksum is needed: the stores of a process that was killed are those of
+    its instructions up to there. The supervisor creates it before it forks the planner. One process at a time uses it.
     """
 
     def __init__(self) -> None:
@@ -60,27 +59,24 @@ class ThermalMemory:
             raise ValueError(f"a thermal state of {total_bytes} bytes exceeds its room")
         self._sequence += 1
         begin = self._sequence % 2 * SLOT_BYTES
-        HEADER.pack_into(self._map, begin, 0, 0, 0)
-        position, crc = begin + HEADER.size, 0
+        position = begin + HEADER.size
         for part in parts:
             LENGTH.pack_into(self._map, position, part.nbytes)
             position += LENGTH.size
             self._map[position : position + part.nbytes] = part
-            position, crc = position + part.nbytes, zlib.crc32(part, crc)
-        HEADER.pack_into(self._map, begin, self._sequence, total_bytes, crc)
+            position += part.nbytes
+        HEADER.pack_into(self._map, begin, self._sequence, total_bytes)
 
     def load(self) -> SavedThermalState | None:
         """Return the newest state, None if none was saved, and continue after it."""
-        slots = sorted((HEADER.unpack_from(self._map, begin), begin) for begin in (0, SLOT_BYTES))
-        for (sequence, length, crc), begin in reversed(slots):
-            if not sequence:
-                continue
-            self._sequence = max(self._sequence, sequence)
-            parts = self._read_parts(begin + HEADER.size, length)
-            if reduce(lambda total, part: zlib.crc32(part, total), parts, 0) == crc:
-                state: SavedThermalState = pickle.loads(parts[0], buffers=parts[1:])  # noqa: S301 - this program wrote it
-                return state
-        return None
+        slots = [(HEADER.unpack_from(self._map, begin), begin) for begin in (0, SLOT_BYTES)]
+        (sequence, length), begin = max(slots)
+        if not sequence:
+            return None
+        self._sequence = sequence
+        parts = self._read_parts(begin + HEADER.size, length)
+        state: SavedThermalState = pickle.loads(parts[0], buffers=parts[1:])  # noqa: S301 - this program wrote it
+        return state
 
     def _read_parts(self, begin: int, length: int) -> list[bytearray]:
         """Return copies of the parts of a state, the pickled frame first."""

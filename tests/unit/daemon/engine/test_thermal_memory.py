@@ -6,7 +6,7 @@ import pytest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.queue_thermal import HOLD_MAX_S
-from optodrive.daemon.engine.thermal_memory import HEADER, ThermalMemory
+from optodrive.daemon.engine.thermal_memory import HEADER, LENGTH, ThermalMemory
 from optodrive.planning.limiter.cap_checks import compute_levels
 from planner_rig import DISPLAY, InlineExecutor, build_frame, build_train
 
@@ -62,17 +62,41 @@ def test_time_without_a_planner_cools_the_display(rig):
     assert later[1].max() < at_once[1].max()
 
 
-def test_a_state_that_was_written_in_part_leaves_the_one_before(rig):
+class EndedError(Exception):
+    """In place of the end of the process."""
+
+
+class EndingLength:
+    """LENGTH of a process that ends before it writes a part."""
+
+    size, unpack_from = LENGTH.size, LENGTH.unpack_from
+
+    def __init__(self, part):
+        self._left = part
+
+    def pack_into(self, *where):
+        """Write a length, or end."""
+        if not self._left:
+            raise EndedError
+        self._left -= 1
+        LENGTH.pack_into(*where)
+
+
+@pytest.mark.parametrize("part", range(12))
+def test_a_state_that_was_written_in_part_leaves_the_one_before(rig, monkeypatch, part):
     memory = ThermalMemory()
     assert memory.load() is None
-    first = rig.queue.build_saved_state(1.0)
-    memory.save(first)
-    memory.save(rig.queue.build_saved_state(2.0))
-    memory._map[HEADER.size : HEADER.size + 8] = bytes(8)  # of the second state, in slot 0
+    states = [rig.queue.build_saved_state(float(k)) for k in range(4)]
+    for state in states[:3]:
+        memory.save(state)
+    with monkeypatch.context() as ending:
+        ending.setattr("optodrive.daemon.engine.thermal_memory.LENGTH", EndingLength(part))
+        with pytest.raises(EndedError):
+            memory.save(states[3])
     loaded = memory.load()
-    assert loaded.host_s == 1.0
-    np.testing.assert_array_equal(loaded.estimate.budget.rise_k, first.estimate.budget.rise_k)
-    memory.save(rig.queue.build_saved_state(3.0))
+    assert loaded.host_s == 2.0
+    np.testing.assert_array_equal(loaded.estimate.budget.rise_k, states[2].estimate.budget.rise_k)
+    memory.save(states[3])
     assert memory.load().host_s == 3.0
 
 
