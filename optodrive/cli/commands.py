@@ -23,6 +23,7 @@ MODULES = {
     "service": ("service",),
     "control": ("status", "arm", "disarm", "dim", "pause", "resume", "reload", "stop"),
     "play": ("push", "play"),
+    "braille": ("braille",),
     "patterns": ("patterns",),
     "plan": ("plan",),
     "simulate": ("simulate",),

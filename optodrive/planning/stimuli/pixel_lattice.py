@@ -27,10 +27,13 @@ class Lattice:
     @classmethod
     def from_config(cls, config: Config) -> "Lattice":
         """Build the lattice of a configured display."""
-        layout = build_pixel_layout(config.display)
-        index = np.full((config.display.rows, config.display.columns), -1, dtype=np.int64)
-        index[layout.row, layout.column] = np.arange(len(layout))
-        return cls(config.name, index, layout)
+        layout, shape = build_pixel_layout(config.display), (config.display.rows, config.display.columns)
+        return cls(config.name, _index_places(layout, shape), layout)
+
+    @classmethod
+    def from_layout(cls, name: str, layout: PixelLayout) -> "Lattice":
+        """Build the lattice of a layout, up to its last row and column."""
+        return cls(name, _index_places(layout, (int(layout.row.max()) + 1, int(layout.column.max()) + 1)), layout)
 
     def pixel_at(self, row: int, column: int) -> int | None:
         """Return the pixel at a place, or None if there is none."""
@@ -67,3 +70,9 @@ class Lattice:
                 )
             pixels.append(pixel)
         return pixels
+
+
+def _index_places(layout: PixelLayout, shape: tuple[int, int]) -> IntArray:
+    index = np.full(shape, -1, dtype=np.int64)
+    index[layout.row, layout.column] = np.arange(len(layout))
+    return index

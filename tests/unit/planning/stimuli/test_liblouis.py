@@ -1,50 +1,19 @@
 """Text by tables of liblouis: the cells of `lou_translate`, on the pixels of the display; wrong input in one line."""
 
 import ctypes
-import random
-import subprocess
 from pathlib import Path
 from shutil import which
 
 import numpy as np
 import pytest
 
+from liblouis_judge import ALPHABETS, draw_lines, judge
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import liblouis
 from optodrive.planning.stimuli.liblouis import LIBRARY, translate_lines
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.text import Spacing, build_text, find_line_slots
-
-ALPHABETS = {
-    "en-ueb-g1": "abcdefghijklmnopqrstuvwxyzABCXYZ0123456789,.;:!?-()'\"",
-    "en-ueb-g2": "abcdefghijklmnopqrstuvwxyzABCXYZ0123456789,.;:!?-()'\"",
-    "de-g1": "abcdefghijklmnopqrstuvwxyzäöüßÄÖÜ0123456789,.;:!?-()",
-    "de-g2": "abcdefghijklmnopqrstuvwxyzäöüß0123456789,.;:!?-()",
-    "fr-bfu-comp6": "abcdefghijklmnopqrstuvwxyzàâçéèêëîïôûù0123456789,.;:!?-()",
-    "es-g1": "abcdefghijklmnopqrstuvwxyzáéíóúñü0123456789,.;:!?-()",
-    "it-it-comp6": "abcdefghijklmnopqrstuvwxyzàèéìòù0123456789,.;:!?-()",
-    "nl-NL-g0": "abcdefghijklmnopqrstuvwxyzëïé0123456789,.;:!?-()",
-    "Pl-Pl-g1": "abcdefghijklmnopqrstuvwxyząćęłńóśźż0123456789,.;:!?-()",
-    "pt-pt-g1": "abcdefghijklmnopqrstuvwxyzáâãàçéêíóôõú0123456789,.;:!?-()",
-    "ru-litbrl": "абвгдежзийклмнопрстуфхцчшщъыьэюяАБВ0123456789,.;:!?-()",
-}
-"""Ten languages, and contracted English and German."""
-ENGLISH = [
-    "the",
-    "and",
-    "for",
-    "with",
-    "people",
-    "ability",
-    "know",
-    "little",
-    "under",
-    "mother",
-    "quick",
-    "would",
-    "braille",
-]
 
 
 def has_library():
@@ -58,33 +27,13 @@ def has_library():
 needs_library = pytest.mark.skipif(not has_library(), reason="liblouis is not installed: scripts/test-packages")
 
 
-def draw_lines(table, count):
-    """Return lines of random words, in English half of them real ones, which have contractions."""
-    rng = random.Random(table)
-    words = lambda: "".join(rng.choices(ALPHABETS[table], k=rng.randint(1, 9)))  # noqa: E731
-    real = lambda: rng.choice(ENGLISH) if table.startswith("en") and rng.random() < 0.5 else words()  # noqa: E731
-    return [" ".join(real() for _ in range(rng.randint(1, 6))) for _ in range(count)]
-
-
-def judge(table, lines):
-    """Return the cells of each line by liblouis's own program, as characters of Unicode's braille block."""
-    (file,) = [path.name for path in liblouis.TABLES.glob(f"{table}.*") if path.suffix in liblouis.SUFFIXES]
-    given = "".join(line + "\n" for line in lines)
-    done = subprocess.run(
-        ["lou_translate", f"unicode.dis,{file}"], input=given, capture_output=True, text=True, check=True
-    )
-    return done.stdout.split("\n")[: len(lines)]
-
-
 def to_unicode(words):
     return "\u2800".join("".join(chr(0x2800 + sum(1 << dot - 1 for dot in cell)) for cell in word) for word in words)
 
 
 def check_table(table, count):
-    lines = draw_lines(table, count)
-    expected = [
-        "\u2800".join(line.replace(" ", "\u2800").split("\u2800")).strip("\u2800") for line in judge(table, lines)
-    ]
+    lines, judged = zip(*judge(table, draw_lines(table, count)), strict=True)
+    expected = ["\u2800".join(line.replace(" ", "\u2800").split("\u2800")).strip("\u2800") for line in judged]
     found = [to_unicode(words) for words in translate_lines("\n".join(lines), table, "text")]
     assert [row for row in zip(lines, found, expected, strict=True) if row[1] != row[2]] == []
 
@@ -115,7 +64,7 @@ def test_the_cells_stand_on_the_display():
         for line in slots:
             cells = [frozenset(dot for dot, pixel in slot.items() if raised[pixel]) for slot in line]
             shown += to_unicode([cells]).strip("\u2800").split("\u2800")
-    expected = [word for line in judge("en-ueb-g2", lines) for word in line.replace(" ", "\u2800").split("\u2800")]
+    expected = [word for _, line in judge("en-ueb-g2", lines) for word in line.replace(" ", "\u2800").split("\u2800")]
     assert "".join(shown) == "".join(expected)
 
 

@@ -1,0 +1,79 @@
+"""A line of braille cells that screen readers know: the serial protocol of HumanWare's Brailliant displays, sans-I/O.
+
+A packet is ESC, its type, the number of its data bytes and these. BRLTTY (`-b hw`) and NVDA identify the display with
+INIT, write all cells with DISPLAY and receive keys. Facts of the protocol: drivers of BRLTTY 6.5 and NVDA.
+"""
+
+ESC = 0x1B
+INIT, INIT_REPLY = 0x00, 0x01
+DISPLAY = 0x02
+GET_KEYS, KEYS = 0x03, 0x04
+KEY_DOWN, KEY_UP = 0x05, 0x06
+GET_FIRMWARE, FIRMWARE = 0x0C, 0x0D
+KEEP_AWAKE, AWAKE = 0x0E, 0x0F
+
+HEADER_BYTES = 3
+MODEL = 0x10
+"""Brailliant with thumb keys; the reader takes the number of cells from INIT_REPLY."""
+CELLS_MAX = 80
+THUMB_KEYS = {"previous": 17, "left": 18, "right": 19, "next": 20}
+"""Numbers of the keys for reading: a line up, a window left, right, a line down."""
+FIRST_ROUTING_KEY = 80
+"""Number of the routing key over the first cell."""
+
+
+class CellLine:
+    """A display of `count` cells, at most CELLS_MAX.
+
+    cells: the dots of each, bit 0 is dot 1, as the reader wrote them last
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.cells = bytes(count)
+        self._received = b""
+
+    def receive(self, data: bytes) -> bytes:
+        """Process bytes of the reader. Return the answers. Bytes outside a packet are ignored."""
+        self._received += data
+        answers = b""
+        while (packet := self._take_packet()) is not None:
+            answers += self._answer(*packet)
+        return answers
+
+    def clear(self) -> None:
+        """Forget cells and a packet that has arrived in part: the reader is gone."""
+        self.cells, self._received = bytes(self.count), b""
+
+    def _take_packet(self) -> tuple[int, bytes] | None:
+        """Remove and return the next packet as (type, data), None if none is complete."""
+        self._received = self._received[self._received.find(ESC) :] if ESC in self._received else b""
+        if len(self._received) < HEADER_BYTES:
+            return None
+        _, kind, length = self._received[:HEADER_BYTES]
+        if len(self._received) < HEADER_BYTES + length:
+            return None
+        data = self._received[HEADER_BYTES : HEADER_BYTES + length]
+        self._received = self._received[HEADER_BYTES + length :]
+        return kind, data
+
+    def _answer(self, kind: int, data: bytes) -> bytes:
+        if kind == DISPLAY:
+            self.cells = data[: self.count].ljust(self.count, b"\0")
+        answers = {
+            INIT: (INIT_REPLY, bytes([0, MODEL, self.count])),  # 0: initialised
+            GET_KEYS: (KEYS, b""),  # none is held
+            GET_FIRMWARE: (FIRMWARE, bytes([1, 0, 0])),
+            KEEP_AWAKE: (AWAKE, b""),
+        }
+        return build_packet(*answers[kind]) if kind in answers else b""
+
+
+def build_packet(kind: int, data: bytes = b"") -> bytes:
+    """Build a packet."""
+    return bytes([ESC, kind, len(data)]) + data
+
+
+def build_key_press(key: int) -> bytes:
+    """Build the packets of a key that is pressed and released."""
+    return build_packet(KEY_DOWN, bytes([key])) + build_packet(KEY_UP, bytes([key]))

@@ -1,0 +1,90 @@
+"""An unmodified BRLTTY on a braille display's port, and a program that writes through it by BrlAPI."""
+
+import ctypes
+import os
+import shutil
+import subprocess
+from itertools import count
+
+from rig import wait_for
+
+BRLAPI = "libbrlapi.so.0.8"
+SOCKETS = count(100 + os.getpid() % 10_000 * 6)
+"""Numbers of BrlAPI's sockets, of which no two may be the same on a computer."""
+ROUTING_KEY = 0x2001_0000
+"""Key code of a routing key, whose lowest bits are the cell from 0."""
+
+
+def is_installed():
+    """Return whether BRLTTY and its library are installed."""
+    try:
+        ctypes.CDLL(BRLAPI)
+    except OSError:
+        return False
+    return shutil.which("brltty") is not None
+
+
+class BrlttyProcess:
+    """BRLTTY without a screen of its own."""
+
+    def __init__(self, folder, port):
+        self.host = f":{next(SOCKETS)}"
+        self._log = (folder / "brltty.log").open("a")
+        folders = [option for flag in "WU" for option in (f"-{flag}", str(folder))]
+        self.process = subprocess.Popen(
+            [
+                *("brltty", "-n", "-e", "-E", "-f", "/dev/null", "-x", "no", "-s", "no", "-b", "hw", "-l", "info"),
+                *("-d", f"serial:{port}", "-A", f"host={self.host},auth=none", *folders),
+            ],
+            stdout=self._log,
+            stderr=self._log,
+        )
+
+    def kill(self):
+        """End it at once."""
+        self.process.kill()
+        self.process.wait()
+        self._log.close()
+
+
+class Settings(ctypes.Structure):
+    _fields_ = (("auth", ctypes.c_char_p), ("host", ctypes.c_char_p))
+
+
+class Writer:
+    """A program that has the whole display of a BRLTTY."""
+
+    def __init__(self, brltty):
+        self._library = ctypes.CDLL(BRLAPI)
+        self._handle = ctypes.create_string_buffer(self._library.brlapi_getHandleSize())
+        settings = Settings(b"none", brltty.host.encode())
+
+        def connect():
+            return self._call("openConnection", ctypes.byref(settings), None) >= 0
+
+        wait_for(connect, "BrlAPI")
+        width, height = ctypes.c_uint(), ctypes.c_uint()
+
+        def has_display():
+            self._call("getDisplaySize", ctypes.byref(width), ctypes.byref(height))
+            return width.value * height.value
+
+        wait_for(has_display, "the display")
+        self.count = width.value * height.value
+        assert self._call("enterTtyModeWithPath", None, 0, None) >= 0
+
+    def _call(self, name, *arguments):
+        return getattr(self._library, f"brlapi__{name}")(self._handle, *arguments)
+
+    def write(self, cells):
+        """Show cells."""
+        assert self._call("writeDots", cells.ljust(self.count, b"\0")) == 0
+
+    def read_key(self):
+        """Return the code of a key that was pressed, None if none was."""
+        code = ctypes.c_uint64()
+        return code.value if self._call("readKey", 0, ctypes.byref(code)) == 1 else None
+
+    def close(self):
+        """End the connection."""
+        self._call("closeConnection")
