@@ -30,7 +30,7 @@ ELSEWHERE = {
     "python3 -m venv": "tests/system/test_wheel.py checks the wheel",
     "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",
     "openssl req -x509": "tests/system/test_tls_proxy.py makes its certificate so",
-    "optodrive braille": "tests/system/test_braille.py",
+    "optodrive braille": "tests/system/test_braille_command.py",
     "optodrive dac": "tests/dac plays on the DACs' own protocols; no device is here",
     "optodrive home": "a synopsis; tests/system/test_home.py",
     "optodrive doctor --config display.toml": "tests/system/test_stages.py",
