@@ -216,6 +216,6 @@ def test_without_a_daemon_one_line(tmp_path):
     done = subprocess.run(
         [OPTODRIVE, "braille", tmp_path / "tty", "--url", "http://127.0.0.1:9"], capture_output=True, text=True
     )
-    assert done.returncode == 3
+    assert done.returncode == 1
     assert done.stderr.startswith("optodrive: ")
     assert done.stderr.count("\n") == 1
