@@ -20,6 +20,7 @@ from worlds import (
     write_measured,
     write_recordings,
     write_script,
+    write_stimuli,
 )
 
 from optodrive.cli.commands import UsageError, build_app
@@ -60,7 +61,7 @@ COMPARED_ELSEWHERE = {"optodrive calibrate camera": "tests/accuracy/test_calibra
 SCENARIOS = {
     "readme": (write_checkout, ["README.md:Shell", "README.md:Python"]),
     "readme-rest": (write_checkout, ["README.md:REST"]),
-    "patterns": (write_checkout, ["docs/how-to/show-stimuli.md:Patterns"]),
+    "patterns": (write_stimuli, ["docs/how-to/show-stimuli.md:Patterns"]),
     "fits": (write_checkout, ["docs/how-to/show-stimuli.md:Whether it fits"]),
     "refusals": (write_recordings, ["docs/reference/recordings.md:Refusals"]),
     "quickstart": (write_checkout, ["docs/tutorials/quickstart.md:Quickstart"]),

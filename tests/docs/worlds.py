@@ -146,6 +146,16 @@ def write_checkout(folder):
     write_frames(folder)
 
 
+def write_stimuli(folder):
+    """Write what the examples of patterns play, beside a checkout."""
+    write_checkout(folder)
+    (folder / "page.brf").write_text(",HELLO _W4")
+    (folder / "graph.svg").write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 20 20"><path class="axes" d="M0 10H20M10 0V20"/>'
+        '<path d="M1 18C7 18 13 2 19 2"/></svg>'
+    )
+
+
 def write_recordings(folder):
     """Write recordings of a pixel whose membrane creeps, and a configuration."""
     write_frames(folder)

@@ -4,6 +4,8 @@ from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import bring_up, experiments, images, shapes
+from optodrive.planning.stimuli.braille_files import build_braille_file
+from optodrive.planning.stimuli.drawings import build_drawing
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
 from optodrive.planning.stimuli.sequence_file import validate_sequence
 from optodrive.planning.stimuli.showcase import build_showcase
@@ -206,6 +208,26 @@ _PATTERN_LIST = (
         "an image, bright is high",
         (_FILE_PARAMETER, _height_parameter(50.0, "height of white"), _SECONDS_PARAMETER, _INVERT_PARAMETER),
         images.build_image,
+    ),
+    Pattern(
+        "drawing",
+        "an SVG drawing with lines at three heights, by class: grid, axes, curve",
+        (
+            PatternParameter("file", "file", None, "SVG file", required=True),
+            _height_parameter(90.0, "height of class curve; axes two thirds, grid one third"),
+            _SECONDS_PARAMETER,
+        ),
+        build_drawing,
+    ),
+    Pattern(
+        "braille-file",
+        "pages of braille: a BRF or PEF file",
+        (
+            PatternParameter("file", "file", None, "BRF or PEF file", required=True),
+            _height_parameter(150.0, "peak height of a dot"),
+            PatternParameter("seconds", "number", 2.0, "minimum time per page", "s", min=0.0, max=600.0),
+        ),
+        build_braille_file,
     ),
     Pattern(
         "animation",

@@ -55,7 +55,19 @@ def build_text(
     lines = encode_lines(text, f"{where}: text") if table is None else translate_lines(text, table, where)
     if not any(lines):
         raise InputError(f"{where}: text", text, "at least one character to show", code="bad_text")
-    estimator, spacing = BeamTimeEstimator(config), Spacing(dot_step, cell_gap, line_gap)
+    return show_lines(config, where, lines, height_m, seconds, Spacing(dot_step, cell_gap, line_gap))
+
+
+def show_lines(
+    config: Config,
+    where: str,
+    lines: list[list[list[Cell]]],
+    height_m: float,
+    seconds: float,
+    spacing: Spacing,
+) -> FrameSequence:
+    """Build lines of words in braille, wrapped into pages as by build_text. Raises InputError (does_not_fit)."""
+    estimator = BeamTimeEstimator(config)
     slots = find_line_slots(estimator.lattice, spacing)
     if not slots:
         raise _too_small_error(config, where, spacing)

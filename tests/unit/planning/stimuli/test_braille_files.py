@@ -1,0 +1,89 @@
+"""BRF and PEF files: the cells that they state, on the display's lines; wrong files in one line."""
+
+import numpy as np
+import pytest
+
+from optodrive.core.errors import InputError
+from optodrive.device.config_file import load_config
+from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII, build_braille_file
+from optodrive.planning.stimuli.liblouis import TABLES
+from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.planning.stimuli.text import Spacing, build_text, find_line_slots
+
+PEF = (
+    '<?xml version="1.0" encoding="UTF-8"?><pef version="2008-1" xmlns="http://www.daisy.org/ns/2008/pef"><head/>'
+    '<body><volume cols="40" rows="25" rowgap="0" duplex="true"><section>{}</section></volume></body></pef>'
+)
+
+
+def read_cells(sequence, name="display-1511"):
+    """Return the cells of all pages, as characters of Unicode's braille block without spaces."""
+    slots = find_line_slots(Lattice.from_config(load_config(name)), Spacing(1, 1, 1))
+    cells = ""
+    for page in dict.fromkeys(frame.target_m.tobytes() for frame in sequence.frames):
+        raised = np.frombuffer(page) > 0.0
+        for line in slots:
+            cells += "".join(chr(0x2800 + sum(1 << dot - 1 for dot in slot if raised[slot[dot]])) for slot in line)
+    return cells.replace("\u2800", "")
+
+
+def show(file, name="display-1511"):
+    return build_braille_file(load_config(name), "t", file, 1e-4, 1.0)
+
+
+def test_braille_ascii_has_each_cell_once():
+    assert len(set(BRAILLE_ASCII)) == len(BRAILLE_ASCII) == 64
+
+
+@pytest.mark.skipif(not TABLES.exists(), reason="liblouis is not installed: scripts/test-packages")
+def test_braille_ascii_is_that_of_liblouis():
+    lines = (TABLES / "en-us-brf.dis").read_text().splitlines()
+    for character, dots in (line.split()[1:3] for line in lines if line.startswith("display ")):
+        value = sum(1 << int(dot) - 1 for dot in dots.replace("0", ""))
+        if value < 64 and not character.startswith("\\x") and character.upper() == character:
+            assert BRAILLE_ASCII[value] == character.replace("\\s", " ").replace("\\\\", "\\")
+
+
+def test_a_brf_file_has_the_cells_of_its_characters():
+    page = ",HELLO _W4\r\n#ABC 6/7\x0c,NEXT PAGE\x1a"
+    expected = [BRAILLE_ASCII.index(each) for each in page.replace("\r\n", "").replace("\x0c", "").rstrip("\x1a")]
+    assert read_cells(show(page.encode())) == "".join(chr(0x2800 + dots) for dots in expected if dots)
+    assert read_cells(show(page.lower().encode())) == read_cells(show(page.encode()))
+
+
+def test_a_pef_file_has_the_cells_of_its_rows():
+    rows = ["⠠⠓⠑⠇⠇⠕⠀⠸⠺⠲", "", "⠼⠁⠃⠉⠀⠖⠌⠶"]
+    section = "<page>" + "".join(f"<row>{row}</row>" for row in rows) + "</page><page><row>⠠⠝⠑⠭⠞</row></page>"
+    assert read_cells(show(PEF.format(section).encode())) == "".join([*rows, "⠠⠝⠑⠭⠞"]).replace("\u2800", "")
+
+
+def test_the_frames_are_those_of_the_same_text():
+    config = load_config("display-437")
+    shown = show(b"ABC DEF", "display-437")
+    text = build_text(config, "t", "abc def", 1e-4, 1.0)
+    assert [frame.target_m.tobytes() for frame in shown.frames] == [frame.target_m.tobytes() for frame in text.frames]
+
+
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        (b"", "braille with at least one raised dot"),
+        (b" \r\n\x0c", "braille with at least one raised dot"),
+        ("caf\u00e9".encode("latin-1"), r"file: row 1: got 'É', expected braille ASCII"),
+        (b"A\nB`", r"file: row 2: got '`', expected braille ASCII"),
+        (b"<pef", "well-formed XML"),
+        (b"<html></html>", "expected the root element {http://www.daisy.org/ns/2008/pef}pef"),
+        (b'<!DOCTYPE pef [<!ENTITY a "b">]><pef/>', "expected a PEF file without one"),
+        (PEF.format("<page><row>ab</row></page>").encode(), r"file: row 1: got 'a', expected cells of six dots"),
+        (PEF.format("<page><row>⡀</row></page>").encode(), "expected cells of six dots"),
+    ],
+)
+def test_another_file_is_refused_in_one_line(file, message):
+    with pytest.raises(InputError, match=message) as refused:
+        show(file)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_display_without_room_is_one_line():
+    with pytest.raises(InputError, match="expected a display with 3 × 2 pixels for a cell"):
+        show(b"ABC", "display-1")
