@@ -1,6 +1,7 @@
 """`optodrive study`: run a study with people, or with simulated participants in virtual time."""
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,7 @@ from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
+    from optodrive.study.presenter import Presenter
     from optodrive.study.study_file import Study
 
 PARTICIPANTS_MAX = 1000
@@ -34,6 +36,10 @@ def study(
         int,
         typer.Option("--participants", metavar="N", help="Number of simulated participants, without --participant."),
     ] = 1,
+    lsl: Annotated[
+        bool,
+        typer.Option("--lsl", help="Publish pulses and trials to the Lab Streaming Layer, once a recorder reads them."),
+    ] = False,
     url: UrlOption = DEFAULT_URL,
     hold: HoldOption = False,
     config: ConfigOption = None,
@@ -51,13 +57,15 @@ def study(
     check_output("--out", out, folder=True, may_exist=True)
     if not 1 <= participants <= PARTICIPANTS_MAX:
         raise InputError("--participants", participants, f"1 to {PARTICIPANTS_MAX}")
+    if participant is None and lsl:
+        raise InputError("--lsl", True, "--participant: a simulated board has no time of this computer")
     if participant is None:
         sessions = _simulate(design, out, participants, config)
     else:
         check_participant("--participant", participant)
         if participant.startswith(SIMULATED_PREFIX):
             raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
-        sessions = {participant: _run_person(design, out, participant, url, hold)}
+        sessions = {participant: _run_person(design, out, participant, url, hold, lsl)}
     write_dataset(out)
     report = _build_report(design, sessions, out)
     print_answer(report, _format_report(report), json)
@@ -93,11 +101,12 @@ def _simulate(design: "Study", out: Path, participants: int, config: str | None)
     return sessions
 
 
-def _run_person(design: "Study", out: Path, participant: str, url: str, hold: bool) -> list[dict[str, Any]]:
+def _run_person(design: "Study", out: Path, participant: str, url: str, hold: bool, lsl: bool) -> list[dict[str, Any]]:
     """Run a person's session and return the records of the trials."""
     from optodrive.client.display import Display
     from optodrive.study.daemon_presenter import DaemonPresenter
     from optodrive.study.dataset import build_log_path
+    from optodrive.study.lab_streams import LabStreams, PublishingPresenter
     from optodrive.study.session import draw_order, run_session
     from optodrive.study.terminal import TerminalRespondent
     from optodrive.study.trial_log import TrialLog
@@ -109,13 +118,25 @@ def _run_person(design: "Study", out: Path, participant: str, url: str, hold: bo
             with Display(url) as display:  # stops what was started, also after an error
                 if hold:
                     display.arm(hold=True)
-                presenter = DaemonPresenter(display, {"study": design.name, "participant": participant})
+                presenter: Presenter = DaemonPresenter(display, {"study": design.name, "participant": participant})
+                on_trial: Callable[[dict[str, Any]], None] = _ignore
+                streams = LabStreams(design.name, participant) if lsl else None
+                if streams is not None:
+                    print(f"waiting for a recorder of {' and '.join(streams.names)}", file=sys.stderr, flush=True)
+                    streams.wait_for_recorder()
+                    presenter, on_trial = PublishingPresenter(presenter, streams), streams.publish_trial
                 log.begin_run(url)
                 try:
-                    run_session(design, log, presenter, TerminalRespondent(design))
+                    run_session(design, log, presenter, TerminalRespondent(design), on_trial)
+                    if streams is not None:
+                        streams.finish()
                 except EOFError:
                     raise InputError("answer", None, "a line; the session goes on with the same command") from None
         return list(log.trials.values())
+
+
+def _ignore(record: dict[str, Any]) -> None:
+    pass
 
 
 def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], out: Path) -> dict[str, Any]:

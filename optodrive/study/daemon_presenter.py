@@ -34,6 +34,7 @@ class DaemonPresenter:
             width_s=np.asarray([] if columns is None else columns.width_s, dtype=np.float64),
             power_w=np.asarray([] if columns is None else columns.power_w, dtype=np.float64),
             fault=find_fault(plan),
+            onset_monotonic_s=None if plan.onset is None else plan.onset.monotonic_s,
         )
 
     def wait(self, duration_s: float) -> None:

@@ -28,6 +28,7 @@ class Presentation:
 
     onset_s: gate on of the first pulse on the board's clock; start_s: counted from it
     fault: how it differs from the request, None if it is as requested; cooling_s: waited for before it
+    onset_monotonic_s: onset_s on the host's CLOCK_MONOTONIC, None of a board in virtual time
     """
 
     onset_s: float
@@ -37,6 +38,7 @@ class Presentation:
     power_w: FloatArray
     fault: str | None
     cooling_s: float = 0.0
+    onset_monotonic_s: float | None = None
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
