@@ -1,126 +1,27 @@
 """`optodrive braille` under an unmodified BRLTTY: cells in the executed pulses, keys, and the end of either side."""
 
-import os
 import random
 import signal
 import subprocess
-from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
 import braille_reader
-from braille_reader import ROUTING_KEY, BrlttyProcess, Writer
-from forked_process import OPTODRIVE, start_process
+from braille_desk import COUNT, BrailleCommand, draw_text, is_dark, running_desk
+from braille_reader import ROUTING_KEY
+from forked_process import OPTODRIVE
 from optodrive.client.humanware import THUMB_KEYS
-from optodrive.client.reader_port import draw_cells, find_cell_pixels
-from optodrive.device.config import build_pixel_layout
-from optodrive.device.config_file import load_config
-from rig import TOKEN, running, wait_for
-from test_six_experiments import cell_codes
+from rig import running, wait_for
 
 pytestmark = pytest.mark.skipif(
     not braille_reader.is_installed(), reason="BRLTTY is not installed: scripts/test-packages"
 )
-LAYOUT = build_pixel_layout(load_config().display)
-PIXELS = find_cell_pixels(LAYOUT, "display-437")
-COUNT = len(PIXELS)
-
-
-class BrailleCommand:
-    """Process of `optodrive braille` on a daemon."""
-
-    def __init__(self, folder, daemon):
-        self.port, self.folder, self.daemon = folder / "braille", folder, daemon
-        self.start()
-
-    def start(self):
-        environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": self.daemon.url}
-        self.process = start_process(
-            [OPTODRIVE, "braille", self.port],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout.readline() == f"{COUNT} cells at {self.port}; Ctrl-C ends it\n"
-
-    def press(self, key):
-        self.process.stdin.write(f"{key}\n")
-        self.process.stdin.flush()
-
-    def stop(self, number=signal.SIGKILL):
-        self.process.send_signal(number)
-        out, errors = self.process.communicate()
-        return self.process.returncode, out, errors
-
-
-class Desk:
-    """A board, a daemon, `optodrive braille`, BRLTTY and a program that writes."""
-
-    def __init__(self, folder, board, daemon):
-        self.folder, self.board, self.daemon = folder, board, daemon
-        self.command = BrailleCommand(folder, daemon)
-        self.start_reader()
-
-    def start_reader(self):
-        self.reader = BrlttyProcess(self.folder, self.command.port)
-        self.writer = Writer(self.reader)
-
-    def stop(self):
-        self.writer.close()
-        self.reader.kill()
-        self.command.stop()
-
-    def find_emitted(self, since):
-        """Return the pixels of the board's pulses from number `since` on."""
-        codes = cell_codes()
-        pulses = self.board.of("pulse")[since:]
-        return {int(np.abs(codes - (pulse["x"], pulse["y"])).sum(axis=1).argmin()) for pulse in pulses}
-
-    def show(self, cells):
-        """Write cells, and wait until the board has emitted what they are, and since then nothing else."""
-        expected = set(draw_cells(cells, PIXELS, 1.0, len(LAYOUT)).nonzero()[0].tolist())
-        self.writer.write(cells)
-        since = len(self.board.of("pulse"))
-
-        def is_shown():
-            nonlocal since
-            if self.find_emitted(since) - expected:  # the rest of the cells before
-                since = len(self.board.of("pulse"))
-            return self.find_emitted(since) == expected and (expected or is_dark(self))
-
-        wait_for(is_shown, f"{cells.hex()}, after pulse {since}")
-        return since, expected
-
-
-def is_dark(desk):
-    """Return whether no plan waits or runs: the last frame has ended, and nothing is streamed any more."""
-    state = desk.daemon.state()["board"]
-    return state["state"] != "RUNNING" and not state["queued"]
-
-
-@contextmanager
-def running_desk(folder):
-    with running(folder) as (board, daemon):
-        daemon.arm()
-        desk = Desk(folder, board, daemon)
-        try:
-            yield desk
-        finally:
-            desk.stop()
 
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory):
     with running_desk(tmp_path_factory.mktemp("braille")) as desk:
         yield desk
-
-
-def draw_text(rng):
-    """Return random cells with some blank ones; dots 7 and 8 have no pixel."""
-    return bytes(rng.choice([0, rng.randrange(256)]) for _ in range(COUNT))
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(60, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
