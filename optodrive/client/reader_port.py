@@ -87,11 +87,12 @@ class ReaderPort:
                 self._press(os.read(source, READ_BYTES))
 
     def _forget_reader(self) -> None:
-        """Clear the cells, and restore the port's settings for the next reader.
+        """Clear the cells and keys that nobody read, and restore the port's settings for the next reader.
 
         The C library refuses settings of which a pseudo-terminal takes none: those of a reader before it, with parity.
         """
         self._line.clear()
+        termios.tcflush(self._terminal, termios.TCOFLUSH)
         termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
 
     def _press(self, text: bytes) -> None:
