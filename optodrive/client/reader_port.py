@@ -63,7 +63,7 @@ class ReaderPort:
         self._poll.register(terminal, select.POLLIN)
         self._poll.register(sys.stdin.fileno(), select.POLLIN)
         self._shown = bytes(line.count)
-        self._problem = ""
+        self._problem, self._has_reader = "", False
 
     def run(self) -> None:
         """Run until an exception ends it."""
@@ -79,6 +79,7 @@ class ReaderPort:
     def _take_input(self, wait_s: float) -> None:
         for source, events in self._poll.poll(1e3 * wait_s):
             if source == self._terminal and events & select.POLLIN:
+                self._has_reader = True
                 self._write(self._line.receive(os.read(self._terminal, READ_BYTES)))
             elif source == self._terminal:
                 self._forget_reader()
@@ -87,21 +88,24 @@ class ReaderPort:
                 self._press(os.read(source, READ_BYTES))
 
     def _forget_reader(self) -> None:
-        """Clear the cells and keys that nobody read, and restore the port's settings for the next reader.
+        """Clear the cells, and restore the port's settings for the next reader.
 
         The C library refuses settings of which a pseudo-terminal takes none: those of a reader before it, with parity.
         """
         self._line.clear()
-        termios.tcflush(self._terminal, termios.TCOFLUSH)
+        self._has_reader = False
         termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
 
     def _press(self, text: bytes) -> None:
-        """Press the keys of the lines of standard input."""
+        """Press the keys of the lines of standard input. Without a reader, the next one would find them."""
         if not text:
             self._poll.unregister(sys.stdin.fileno())
         for name in text.decode(errors="replace").splitlines():
             try:
-                self._write(build_key_press(parse_key(name, self._line.count)))
+                key = parse_key(name, self._line.count)
+                if not self._has_reader:
+                    raise InputError("key", name, "a reader that has opened the port")
+                self._write(build_key_press(key))
             except InputError as error:
                 self._report(str(error))
 
