@@ -29,6 +29,8 @@ FRAME_S = 0.1
 READ_BYTES = 4096
 MISSING_READER_S = 0.05
 """Wait without a reader, whose absence ends each wait for its bytes at once."""
+NOT_SHOWN = ("refused", "failed", "stopped")
+"""Statuses of frames that were not shown, or not to their end, although no newer one came."""
 SPACING = Spacing(dot_step=1, cell_gap=1, line_gap=1)
 
 
@@ -118,11 +120,13 @@ class ReaderPort:
         self._stream.send(draw_cells(cells, self._pixels, self._height_um, self._pixel_count))
         self._shown = cells
         for result in self._stream.results():
-            problem = result.error or (result.problem.detail if result.problem else "")
-            if problem != self._problem and (problem or result.executed):
-                self._problem = problem
-                if problem:
+            if result.status in NOT_SHOWN:
+                problem = result.error or (result.problem.detail if result.problem else result.status)
+                if problem != self._problem:
                     self._report(f"not shown: {problem}")
+                self._problem = problem
+            elif result.executed:
+                self._problem = ""
 
 
 def draw_cells(cells: bytes, pixels: list[CellSlot], height_um: float, pixel_count: int) -> FloatArray:

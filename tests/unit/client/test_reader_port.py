@@ -10,6 +10,7 @@ import pytest
 
 from optodrive.client.humanware import CellLine
 from optodrive.client.reader_port import FRAME_S, ReaderPort
+from optodrive.daemon.responses.stream import FrameResult
 from optodrive.link.simulator.pseudo_terminal import open_pty
 from rig import wait_for
 
@@ -26,7 +27,7 @@ class RecordedStream:
     """What the port shows."""
 
     def __init__(self):
-        self.frames, self.ended = [], False
+        self.frames, self.ended, self.coming = [], False, []
 
     def send(self, heights_um):
         if self.ended:
@@ -34,7 +35,8 @@ class RecordedStream:
         self.frames.append(heights_um.tolist())
 
     def results(self):
-        return []
+        coming, self.coming = self.coming, []
+        return coming
 
 
 class Desk:
@@ -120,4 +122,21 @@ def test_keys_that_nobody_read_are_not_those_of_the_next_reader(desk):
     reader = desk.open()
     os.write(reader, INIT)
     assert os.read(reader, len(REPLY)) == REPLY
+    os.close(reader)
+
+
+def test_only_frames_that_nothing_newer_replaced_are_reported_each_reason_once(desk):
+    results = [
+        FrameResult(frame=0, status="superseded", error="replaced by a newer plan"),
+        FrameResult(frame=1, status="cancelled", error="cancelled"),
+        FrameResult(frame=2, status="failed", error="the board is DISARMED"),
+        FrameResult(frame=3, status="failed", error="the board is DISARMED"),
+        FrameResult(frame=4, status="superseded", error="replaced by a newer plan", executed=3),
+        FrameResult(frame=5, status="failed", error="the board is DISARMED"),
+    ]
+    desk.stream.coming = results
+    reader = desk.open()
+    os.write(reader, b"\x1b\2\1\x05")
+    wait_for(lambda: len(desk.reports) == 2, "two reports")
+    assert desk.reports == ["not shown: the board is DISARMED"] * 2
     os.close(reader)
