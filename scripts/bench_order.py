@@ -11,6 +11,7 @@ import time
 import elkai
 import numpy as np
 from measuring import build_display, build_frames
+from trajectory_rows import measure_trajectories
 
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
@@ -171,6 +172,7 @@ def measure():
     bench = OrderBenchmark("display-1511")
     for name, frames in build_cases(bench):
         yield from measure_case(bench, name, frames)
+    yield from measure_trajectories(bench)
     perceived = OrderBenchmark("display-437")
     for name in EXPERIMENTS:
         yield from measure_experiment(perceived, name)
