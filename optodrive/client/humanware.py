@@ -4,6 +4,8 @@ A packet is ESC, its type, the number of its data bytes and these. BRLTTY (`-b h
 INIT, write all cells with DISPLAY and receive keys. Facts of the protocol: drivers of BRLTTY 6.5 and NVDA.
 """
 
+from collections.abc import Sequence
+
 ESC = 0x1B
 INIT, INIT_REPLY = 0x00, 0x01
 DISPLAY = 0x02
@@ -14,10 +16,27 @@ KEEP_AWAKE, AWAKE = 0x0E, 0x0F
 
 HEADER_BYTES = 3
 MODEL = 0x10
-"""Brailliant with thumb keys; the reader takes the number of cells from INIT_REPLY."""
+"""Display with thumb keys and a braille keyboard; the reader takes the number of cells from INIT_REPLY."""
 CELLS_MAX = 80
-THUMB_KEYS = {"previous": 17, "left": 18, "right": 19, "next": 20}
-"""Numbers of the keys for reading: a line up, a window left, right, a line down."""
+DOT = {dot: dot + 1 for dot in range(1, 9)}
+SPACE = 10
+NAMED_KEYS = {
+    "previous": (17,),
+    "left": (18,),
+    "right": (19,),
+    "next": (20,),
+    "home": (18, 19),
+    "cursor-up": (SPACE, DOT[1]),
+    "cursor-down": (SPACE, DOT[4]),
+    "cursor-left": (SPACE, DOT[3]),
+    "cursor-right": (SPACE, DOT[6]),
+    "enter": (DOT[8],),
+}
+"""Numbers of the keys that are pressed together.
+
+Thumb keys for reading: a line up, a window left, right, a line down; to the cursor. Keys of a keyboard are chords of
+the braille keyboard by BRLTTY's table `chords.kti`, because this model has no joystick.
+"""
 FIRST_ROUTING_KEY = 80
 """Number of the routing key over the first cell."""
 
@@ -74,6 +93,7 @@ def build_packet(kind: int, data: bytes = b"") -> bytes:
     return bytes([ESC, kind, len(data)]) + data
 
 
-def build_key_press(key: int) -> bytes:
-    """Build the packets of a key that is pressed and released."""
-    return build_packet(KEY_DOWN, bytes([key])) + build_packet(KEY_UP, bytes([key]))
+def build_key_press(keys: Sequence[int]) -> bytes:
+    """Build the packets of keys that are pressed together and released."""
+    downs = [build_packet(KEY_DOWN, bytes([key])) for key in keys]
+    return b"".join(downs + [build_packet(KEY_UP, bytes([key])) for key in reversed(keys)])

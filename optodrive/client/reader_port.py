@@ -17,7 +17,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from optodrive.client.humanware import CELLS_MAX, FIRST_ROUTING_KEY, THUMB_KEYS, CellLine, build_key_press
+from optodrive.client.humanware import CELLS_MAX, FIRST_ROUTING_KEY, NAMED_KEYS, CellLine, build_key_press
 from optodrive.client.stream import Stream
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
@@ -104,10 +104,10 @@ class ReaderPort:
             self._poll.unregister(sys.stdin.fileno())
         for name in text.decode(errors="replace").splitlines():
             try:
-                key = parse_key(name, self._line.count)
+                keys = parse_key(name, self._line.count)
                 if not self._has_reader:
                     raise InputError("key", name, "a reader that has opened the port")
-                self._write(build_key_press(key))
+                self._write(build_key_press(keys))
             except InputError as error:
                 self._report(str(error))
 
@@ -137,11 +137,11 @@ def draw_cells(cells: bytes, pixels: list[CellSlot], height_um: float, pixel_cou
     return heights_um
 
 
-def parse_key(text: str, cell_count: int) -> int:
-    """Return the number of a key by its name, or of `routing N` for cell N. Raise InputError for another name."""
+def parse_key(text: str, cell_count: int) -> tuple[int, ...]:
+    """Return the numbers of a key by its name, or of `routing N` for cell N. Raise InputError for another name."""
     name, _, number = text.strip().partition(" ")
     if name == "routing" and number.isdecimal() and 1 <= int(number) <= cell_count:
-        return FIRST_ROUTING_KEY + int(number) - 1
-    if name in THUMB_KEYS and not number:
-        return THUMB_KEYS[name]
-    raise InputError("key", text, f"{', '.join(THUMB_KEYS)}, or routing 1 to {cell_count}")
+        return (FIRST_ROUTING_KEY + int(number) - 1,)
+    if name in NAMED_KEYS and not number:
+        return NAMED_KEYS[name]
+    raise InputError("key", text, f"{', '.join(NAMED_KEYS)}, or routing 1 to {cell_count}")

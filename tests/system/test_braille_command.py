@@ -10,12 +10,15 @@ import braille_reader
 from braille_desk import COUNT, BrailleCommand, draw_text, is_dark, running_desk
 from braille_reader import ROUTING_KEY
 from forked_process import OPTODRIVE
-from optodrive.client.humanware import THUMB_KEYS
+from optodrive.client.humanware import NAMED_KEYS
 from rig import running, wait_for
 
 pytestmark = pytest.mark.skipif(
     not braille_reader.is_installed(), reason="BRLTTY is not installed: scripts/test-packages"
 )
+
+KEYBOARD = {"cursor-left": 0xFF51, "cursor-up": 0xFF52, "cursor-right": 0xFF53, "cursor-down": 0xFF54, "enter": 0xFF0D}
+"""Codes of BrlAPI, which are X11's."""
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +53,14 @@ def test_keys_come_back(desk):
 
     wait_for(presses("routing 7"), "a key: the first one ends BRLTTY's message")
     assert codes == [ROUTING_KEY | 6]
-    while desk.writer.read_key() is not None:
-        pass
+    desk.command.press("enter")
+    wait_for(lambda: desk.writer.read_key() == KEYBOARD["enter"], "the end of the routing keys")
     found = {}
-    for key in THUMB_KEYS:
+    for key in NAMED_KEYS:
         desk.command.press(key)
         found[key] = wait_for(lambda: desk.writer.read_key(), f"{key} with its code")
-    assert len(set(found.values())) == len(THUMB_KEYS)
+    assert len(set(found.values())) == len(NAMED_KEYS)
+    assert {key: code for key, code in found.items() if key in KEYBOARD} == KEYBOARD
 
 
 def test_a_wrong_key_is_one_line(desk):

@@ -63,10 +63,22 @@ def test_a_packet_in_part_is_forgotten_with_its_reader():
 
 
 def test_a_key_goes_down_and_up():
-    assert build_key_press(20) == bytes([0x1B, 5, 1, 20, 0x1B, 6, 1, 20])
+    assert build_key_press((20,)) == bytes([0x1B, 5, 1, 20, 0x1B, 6, 1, 20])
 
 
-@pytest.mark.parametrize(("text", "key"), [("next", 20), ("routing 1", 80), (" routing 35\n", 114)])
+def test_keys_of_a_chord_are_held_together():
+    held, chord = set(), set()
+    data = build_key_press((10, 2))
+    for start in range(0, len(data), 4):
+        _, kind, _, key = data[start : start + 4]
+        held = held | {key} if kind == 5 else held - {key}
+        chord = max(chord, held, key=len)
+    assert (chord, held) == ({10, 2}, set())
+
+
+@pytest.mark.parametrize(
+    ("text", "key"), [("next", (20,)), ("cursor-up", (10, 2)), ("routing 1", (80,)), (" routing 35\n", (114,))]
+)
 def test_keys_by_name(text, key):
     assert parse_key(text, 35) == key
 
@@ -74,7 +86,7 @@ def test_keys_by_name(text, key):
 @pytest.mark.parametrize("text", ["", "Next", "next 1", "routing", "routing 0", "routing 36", "routing x", "\x1b[2J"])
 def test_another_key_is_one_line(text):
     with pytest.raises(
-        InputError, match=r"key: got .*, expected previous, left, right, next, or routing 1 to 35"
+        InputError, match=r"key: got .*, expected previous, left, .*, enter, or routing 1 to 35"
     ) as raised:
         parse_key(text, 35)
     assert str(raised.value).isprintable()

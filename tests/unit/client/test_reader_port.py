@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import pytest
 
-from optodrive.client.humanware import CellLine
+from optodrive.client.humanware import NAMED_KEYS, CellLine
 from optodrive.client.reader_port import FRAME_S, ReaderPort
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.link.simulator.pseudo_terminal import open_pty
@@ -111,7 +111,7 @@ def test_keys_are_passed_on_and_wrong_ones_reported(desk):
     os.write(desk.keys, b"next\nnxet\nrouting 1\n")
     assert os.read(reader, 8) == b"\x1b\5\1\x14\x1b\6\1\x14"
     assert os.read(reader, 8) == b"\x1b\5\1\x50\x1b\6\1\x50"
-    assert desk.reports == ["key: got 'nxet', expected previous, left, right, next, or routing 1 to 1"]
+    assert desk.reports == [f"key: got 'nxet', expected {', '.join(NAMED_KEYS)}, or routing 1 to 1"]
     os.close(reader)
 
 
