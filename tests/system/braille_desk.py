@@ -100,9 +100,9 @@ def find_raised(cells):
 
 
 def is_dark(desk):
-    """Return whether no plan waits or runs: the last frame has ended, and nothing is streamed any more."""
+    """Return whether no plan waits or runs, nor holds for points: the last frame has ended, and none is streamed."""
     state = desk.daemon.state()["board"]
-    return state["state"] != "RUNNING" and not state["queued"]
+    return state["state"] in ("ARMED", "DISARMED") and not state["queued"]
 
 
 @contextmanager
