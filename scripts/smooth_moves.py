@@ -16,6 +16,7 @@ limit. So one table by whole pitches holds every move, and both axes of a diagon
 """
 
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import Self
 
 import clarabel
@@ -27,6 +28,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config import Config
 from optodrive.device.servo import Servo
+from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.planning.budget_setup import build_galvo_model
 from optodrive.planning.limiter.galvo_load import move_energy
 
@@ -48,6 +50,12 @@ MIN_DWELL_S = (2 * LEAD_SAMPLES + REST_SAMPLES) * SAMPLE_S
 """Shortest light between two moves, s."""
 GRID = (-1.0, 0.0, 1.0)
 """Places of the grid over the uncertainty, in half-widths."""
+SIGMAS = 3.0
+"""Half-width of an identified parameter, in its standard deviations."""
+HALF_WIDTH_MIN = 0.02
+"""Smallest relative half-width of an identified frequency or damping ratio: they drift with temperature."""
+MISFIT_MAX = 1.1
+"""Largest rms residual of an identified servo, times the noise."""
 DARK_SAMPLES_MAX = 100
 RAD_PER_UNIT = 1e-3
 """Unit of angle in the programme, rad: the solver takes numbers near one."""
@@ -64,6 +72,22 @@ class ServoRange:
     frequency: float
     damping: float
     delay_samples: int
+
+    @classmethod
+    def from_identified(cls, found: IdentifiedServo, tolerance_rad: float) -> Self | None:
+        """Return the range of a servo that `calibrate servo` identified, None if it does not suffice for smooth moves.
+
+        It does not if the steps were too small to show the slew limit, if the delay is uncertain by more than a sample,
+        if the model leaves a residual beyond the noise, or if the noise of every run could hide one beyond the reserve.
+        """
+        noise_rad = min(segment.noise_rad for segment in found.trace.segments)
+        is_noisy = noise_rad * sqrt(MISFIT_MAX**2 - 1.0) > RESERVE * tolerance_rad
+        is_uncertain = SIGMAS * found.sigma[2] > SAMPLE_S
+        if is_noisy or is_uncertain or not found.slew_identified or found.misfit > MISFIT_MAX:
+            return None
+        frequency = max(SIGMAS * float(found.sigma[0]), HALF_WIDTH_MIN)
+        damping = max(SIGMAS * float(found.sigma[1]) / found.servo.damping, HALF_WIDTH_MIN)
+        return cls(found.servo, frequency, damping, 1)
 
     def servo_at(self, frequency: float, damping: float, delay: float) -> Servo:
         """Return the servo at a place within the uncertainty, from −1 to 1 in each half-width."""
@@ -246,12 +270,10 @@ class SmoothTable:
         way_rad = to_rad - from_rad
         index = self.index_moves(way_rad)
         lengths = np.array([len(move.command_rad) for move in self.moves])
-        shapes = np.zeros((len(self.moves), lengths.max()))
-        for shape, move in zip(shapes, self.moves, strict=True):
-            shape[: len(move.command_rad)] = move.command_rad / move.distance_rad
-        # A shape ends with ones, so longer rows are cut, not filled.
-        is_used = np.arange(shapes.shape[1]) < lengths[index][:, None]
+        shapes = np.concatenate([move.command_rad / move.distance_rad for move in self.moves])
+        count = lengths[index]
+        pulse = np.repeat(np.arange(len(index)), count)
+        sample = np.arange(len(pulse)) - (np.cumsum(count) - count)[pulse]
         begin_s = close_s - LEAD_SAMPLES * SAMPLE_S - self.servos.servo.delay
-        times_s = begin_s[:, None] + np.arange(shapes.shape[1]) * SAMPLE_S
-        angles_rad = from_rad[:, None] + shapes[index][:, :, None] * way_rad[:, None]
-        return times_s[is_used], angles_rad[is_used]
+        share = shapes[(np.cumsum(lengths) - lengths)[index][pulse] + sample]
+        return begin_s[pulse] + sample * SAMPLE_S, from_rad[pulse] + share[:, None] * way_rad[pulse]

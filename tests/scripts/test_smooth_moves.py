@@ -11,22 +11,19 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.device.gate_timing import build_servo
+from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 from smooth_judge import TrueServo, judge
+from smooth_plans import CODE_RAD, CONFIG, PITCH_RAD, TOLERANCE_RAD, sample_plan
 
 sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 
 import smooth_moves
 from smooth_moves import MIN_DWELL_S, ServoRange, SmoothTable, compute_move
 
-CONFIG = DISPLAYS["display-1511"].config
 SERVO = build_servo(CONFIG.scanner)
 DECLARED = ServoRange(SERVO, 0.1, 0.1, 1)
 IDENTIFIED = ServoRange(SERVO, 0.05, 0.05, 1)
-PITCH_RAD = CONFIG.display.pitch_m / (2.0 * CONFIG.scanner.focal_length_m)
-CODE_RAD = CONFIG.scanner.rad_per_code
-TOLERANCE_RAD = min(CONFIG.tolerance_rad) - CODE_RAD
 DARK_SAMPLES = {DECLARED: (27, 38), IDENTIFIED: (20, 30)}
-PITCHES_MAX = 2
 FAST_PULSES, SLOW_PULSES = 10_000, 250_000
 PULSES_OF_A_SERVO = 500
 
@@ -48,31 +45,14 @@ def sample_servo(random, servos):
     return TrueServo(servo.frequency, servo.damping, servo.delay, servo.slew)
 
 
-def sample_plan(random, table, count):
-    """Return the light of a plan, on_s, off_s [n] and places_rad [n, 2]. Most pulses follow as soon as they may."""
-    steps = random.integers(-PITCHES_MAX, PITCHES_MAX + 1, (count, 2))
-    steps[random.random(count) < 0.5, random.integers(2)] = 0
-    steps[(steps == 0).all(axis=1)] = (1, 0)
-    places_rad = np.cumsum(steps, axis=0) * table.pitch_rad
-    places_rad = np.round(places_rad / CODE_RAD) * CODE_RAD
-    longer = random.random((2, count)) < 0.3
-    dwell_s = MIN_DWELL_S + np.where(longer[0], np.round(random.uniform(0.0, 3e-3, count), 6), 0.0)
-    dark_s = (
-        table.dark_s(np.diff(places_rad, axis=0))
-        + np.where(longer[1], np.round(random.uniform(0.0, 1e-3, count), 6), 0.0)[1:]
-    )
-    on_s = 0.01 + np.concatenate([[0.0], np.cumsum(dwell_s[:-1] + dark_s)])
-    return on_s, on_s + dwell_s, places_rad
-
-
-def measure_excursion(random, table, servos, pulses):
+def measure_excursion(random, table, servos, pulses, min_dwell_s=MIN_DWELL_S):
     """Return the largest distance of light from its pixel's centre, times the tolerance, over random plans."""
     worst = 0.0
     for _ in range(pulses // PULSES_OF_A_SERVO):
-        on_s, off_s, places_rad = sample_plan(random, table, PULSES_OF_A_SERVO)
+        on_s, off_s, places_rad = sample_plan(random, table, PULSES_OF_A_SERVO, min_dwell_s)
         times_s, command_rad = table.build_command(off_s[:-1], places_rad[:-1], places_rad[1:])
         command_rad = np.round(command_rad / CODE_RAD) * CODE_RAD
-        found = judge(times_s, command_rad, on_s, off_s, places_rad, sample_servo(random, servos))
+        found = judge(times_s, command_rad, on_s, off_s, places_rad, [sample_servo(random, servos)] * 2)
         worst = max(worst, *(found[0] / CONFIG.tolerance_rad))
     return worst
 
@@ -110,9 +90,23 @@ def test_a_gate_that_opens_early_is_caught():
     assert measure_excursion(np.random.default_rng(7), early, DECLARED, FAST_PULSES) > 1.0
 
 
-def test_a_dwell_that_is_too_short_is_caught(monkeypatch):
-    monkeypatch.setattr(sys.modules[__name__], "MIN_DWELL_S", 0.25 * MIN_DWELL_S)
-    assert measure_excursion(np.random.default_rng(6), build_table(DECLARED), DECLARED, FAST_PULSES) > 1.0
+def test_a_dwell_that_is_too_short_is_caught():
+    assert measure_excursion(np.random.default_rng(6), build_table(DECLARED), DECLARED, FAST_PULSES, 2e-4) > 1.0
+
+
+@pytest.mark.parametrize("servos", [DECLARED, IDENTIFIED], ids=["declared", "identified"])
+def test_light_of_a_full_frame_stays_on_the_absorbers(servos):
+    head, table, random = DISPLAYS["display-1511"].scan_head, build_table(servos), np.random.default_rng(8)
+    layout, places_rad = head.layout, np.column_stack([head.moves.x_rad, head.moves.y_rad])
+    order = compute_visiting_order(np.arange(len(layout)), layout.row, layout.column, *places_rad.T, None)
+    places_rad = np.round(places_rad[order] / CODE_RAD) * CODE_RAD
+    assert len(places_rad) == 1511
+    on_s = 0.01 + np.concatenate([[0.0], np.cumsum(2e-3 + table.dark_s(np.diff(places_rad, axis=0)))])
+    times_s, command_rad = table.build_command(on_s[:-1] + 2e-3, places_rad[:-1], places_rad[1:])
+    for _ in range(5):
+        servo = sample_servo(random, servos)
+        distance_rad, _heat = judge(times_s, command_rad, on_s, on_s + 2e-3, places_rad, [servo] * 2)
+        assert (distance_rad <= CONFIG.tolerance_rad).all()
 
 
 def test_the_stated_heat_is_that_of_the_judge():
@@ -120,7 +114,7 @@ def test_the_stated_heat_is_that_of_the_judge():
     (move,) = table.moves[:1]
     on_s, places_rad = np.array([0.01, 0.011 + move.dark_s]), np.array([[0.0, 0.0], [table.pitch_rad, 0.0]])
     command = table.build_command(on_s[:1] + 1e-3, places_rad[:1], places_rad[1:])
-    found = judge(*command, on_s, on_s + 1e-3, places_rad, TrueServo(*vars(SERVO).values()))
+    found = judge(*command, on_s, on_s + 1e-3, places_rad, [TrueServo(*vars(SERVO).values())] * 2)
     assert found[1][0] == pytest.approx(move.heat, rel=0.01)
     assert found[1][1] == 0.0
 
