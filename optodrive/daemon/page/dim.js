@@ -49,6 +49,7 @@ export class DimControl {
       this.#showValue(this.share);
       this.note.hidden = false;
       this.note.textContent = `Raising the power needs the role ${RAISING_ROLE}.`;
+      this.announce(this.note.textContent);
     }
   }
 

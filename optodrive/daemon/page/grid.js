@@ -42,6 +42,11 @@ export class Grid {
     return pixel;
   }
 
+  // Return the place of a pixel in words, counted from the top left as text is read.
+  describePlace(pixel) {
+    return `row ${this.rows - this.row(pixel)} of ${this.rows}, column ${this.column(pixel) + 1} of ${this.columns}`;
+  }
+
   centre() {
     return this.at(Math.floor(this.rows / 2), Math.floor(this.columns / 2));
   }

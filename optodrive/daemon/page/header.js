@@ -1,6 +1,9 @@
 // The header: its whole ground and its sign show whether the laser may emit; lamps show the safety inputs.
 
-import { ARMED_STATES, BoardState, INPUTS } from "./board_states.js";
+import { BoardState, INPUTS } from "./board_states.js";
+
+const EMITTING_STATES = [BoardState.RUNNING, BoardState.HOLD];
+const DARK_MS = 2000; // between the frames of a stream the board is ARMED for moments: these are not announced
 
 // The sign's outline differs between states, so that they differ without colour; drawn on 24 × 24.
 const SIGNS = {
@@ -38,6 +41,7 @@ export class Header {
     this.linkPill = find("link");
     this.announce = announce;
     this.announced = "";
+    this.darkTimer = null;
     this.lamps = INPUTS.map((input) => {
       const item = document.createElement("li");
       item.append(Object.assign(document.createElement("i"), { className: "lamp" }), document.createElement("span"));
@@ -87,7 +91,17 @@ export class Header {
     }
     setText(this.word, state);
     setText(this.meaning, meaning);
-    const isRoutine = ARMED_STATES.includes(state) && ARMED_STATES.includes(this.announced);
+    if (state === BoardState.ARMED && EMITTING_STATES.includes(this.announced)) {
+      this.darkTimer ??= setTimeout(() => this.#announceState(state, meaning), DARK_MS);
+    } else {
+      this.#announceState(state, meaning);
+    }
+  }
+
+  #announceState(state, meaning) {
+    clearTimeout(this.darkTimer);
+    this.darkTimer = null;
+    const isRoutine = EMITTING_STATES.includes(state) && EMITTING_STATES.includes(this.announced);
     if (this.announced && state !== this.announced && !isRoutine) {
       this.announce(`Board: ${state}, ${meaning}`);
     }
@@ -98,8 +112,12 @@ export class Header {
   #showInputs(inputs) {
     this.lamps.forEach(({ item, text, name, safe, words }, bit) => {
       const value = (inputs >> bit) & 1;
-      item.dataset.kind = inputs === null ? "unknown" : value === safe ? "safe" : "unsafe";
+      const kind = inputs === null ? "unknown" : value === safe ? "safe" : "unsafe";
       setText(text, `${name} ${inputs === null ? "unknown" : words[value]}`);
+      if ([kind, item.dataset.kind].every((each) => ["safe", "unsafe"].includes(each)) && kind !== item.dataset.kind) {
+        this.announce(text.textContent);
+      }
+      item.dataset.kind = kind;
     });
   }
 }

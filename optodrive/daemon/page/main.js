@@ -1,5 +1,6 @@
 // The page: telemetry goes to the views, controls send requests to the daemon.
 
+import { Announcer } from "./announcer.js";
 import { ArmControl } from "./arm.js";
 import { call } from "./api.js";
 import { LEASED_STATES } from "./board_states.js";
@@ -29,7 +30,8 @@ import { Trace } from "./trace.js";
 const find = (id) => document.getElementById(id);
 const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const telemetry = new Telemetry(reducedMotion ? 5 : 30);
-const announce = (text) => (find("said").textContent = text);
+const announcer = new Announcer(find("said"));
+const announce = (text) => announcer.say(text);
 
 // STOP first: it depends on nothing that follows.
 let plans = null;
@@ -43,6 +45,7 @@ new StopControl(
   },
   () => telemetry.pause(document.hidden),
   () => mayEmit(),
+  new Announcer(find("said-at-once")),
 );
 if (location.hash) {
   history.replaceState(null, "", location.pathname);
@@ -133,7 +136,7 @@ library.addEventListener("changed", onStimulusChange);
 drawing.addEventListener("selected", () => {
   trace.clear();
   describeSelected();
-  announce(find("picked").textContent);
+  announce(`${find("picked").textContent}, ${grid.describePlace(view.cursor)}`);
 });
 find("clear").addEventListener("click", () => drawing.clear());
 find("height").addEventListener("input", () => drawing.rescale(readNumber("height")));

@@ -23,6 +23,10 @@ export function buildFrames(heights, rateHz, seconds) {
   return { frames };
 }
 
+// A button that is disabled loses the focus; these keep it and do nothing.
+const setEnabled = (button, enabled) => button.setAttribute("aria-disabled", !enabled);
+const isEnabled = (button) => button.getAttribute("aria-disabled") !== "true";
+
 const readPolicy = () => document.querySelector('input[name="policy"]:checked').value;
 
 export class PlanControl extends EventTarget {
@@ -36,8 +40,8 @@ export class PlanControl extends EventTarget {
     this.result = find("result");
     this.previewed = null;
     this.abort = null;
-    this.previewButton.addEventListener("click", () => this.#preview());
-    this.playButton.addEventListener("click", () => this.#play());
+    this.previewButton.addEventListener("click", () => isEnabled(this.previewButton) && this.#preview());
+    this.playButton.addEventListener("click", () => isEnabled(this.playButton) && this.#play());
     for (const radio of document.querySelectorAll('input[name="policy"]')) {
       radio.addEventListener("change", () => this.invalidate());
     }
@@ -46,7 +50,7 @@ export class PlanControl extends EventTarget {
   // Discard the preview: the stimulus has changed.
   invalidate() {
     this.previewed = null;
-    this.playButton.disabled = true;
+    setEnabled(this.playButton, false);
     this.dispatchEvent(new CustomEvent("previewed", { detail: null }));
   }
 
@@ -60,20 +64,20 @@ export class PlanControl extends EventTarget {
     this.followed = null;
     this.abort = new AbortController();
     this.#showLines(["soft", "Planning …"]);
-    this.previewButton.disabled = true;
+    setEnabled(this.previewButton, false);
     try {
       const stimulus = { ...(await this.buildRequest()), policy: readPolicy() };
       const query = new URLSearchParams({ ...stimulus.query, policy: stimulus.policy, dry_run: true });
       const plan = await call("POST", `${stimulus.path}?${query}`, { body: stimulus.body, signal: this.abort.signal });
       this.previewed = stimulus;
-      this.playButton.disabled = false;
+      setEnabled(this.playButton, true);
       this.#showSummary(plan);
       this.result.scrollIntoView({ block: "nearest" }); // in a low window it is below the fold
       this.dispatchEvent(new CustomEvent("previewed", { detail: plan.pulses }));
     } catch (error) {
       this.#showError(error);
     } finally {
-      this.previewButton.disabled = false;
+      setEnabled(this.previewButton, true);
     }
   }
 
@@ -108,7 +112,7 @@ export class PlanControl extends EventTarget {
 
   async #play() {
     const stimulus = this.previewed;
-    this.playButton.disabled = true; // a second click would play it twice
+    setEnabled(this.playButton, false); // a second click would play it twice
     try {
       const query = new URLSearchParams({ ...stimulus.query, policy: stimulus.policy });
       const plan = await call("POST", `${stimulus.path}?${query}`, { body: stimulus.body });
@@ -118,7 +122,7 @@ export class PlanControl extends EventTarget {
     } catch (error) {
       this.#showError(error);
     }
-    this.playButton.disabled = this.previewed === null;
+    setEnabled(this.playButton, this.previewed !== null);
   }
 
   // Show the result once the plan has ended. The panel Playing shows its progress.

@@ -4,6 +4,7 @@ export class Status {
   // onControlAdded: called after a control has been added to the page
   constructor(find, acknowledge, onControlAdded) {
     this.alert = find("trouble");
+    this.nextPlace = find("laser-title");
     this.stats = find("figures");
     this.acknowledge = acknowledge;
     this.onControlAdded = onControlAdded;
@@ -58,9 +59,13 @@ export class Status {
   #showAlert(items) {
     const text = items.map((item) => item.textContent).join();
     if (text !== this.alertText) {
+      const hadFocus = this.alert.contains(document.activeElement);
       this.alertText = text;
       this.alert.replaceChildren(...items);
       this.alert.hidden = items.length === 0;
+      if (hadFocus) {
+        this.nextPlace.focus(); // the button that had it is gone
+      }
       this.onControlAdded();
     }
   }

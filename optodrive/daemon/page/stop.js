@@ -11,8 +11,10 @@ const FREE_MS = 100; // without an answer by then, the connections of other wind
 export class StopControl {
   // freeConnection: closes connections that may block the request; onAnswered: the daemon has answered
   // mayEmit(): returns whether the laser may emit; true if that is unknown
-  constructor(button, status, freeConnection, onAnswered, mayEmit) {
+  // announcer: says at once that STOP was answered, when nothing shows it any more
+  constructor(button, status, freeConnection, onAnswered, mayEmit, announcer) {
     this.status = status;
+    this.announcer = announcer;
     this.freeConnection = freeConnection;
     this.onAnswered = onAnswered;
     this.running = false;
@@ -52,6 +54,7 @@ export class StopControl {
       const response = await request("POST", "/v1/stop", { signal: AbortSignal.timeout(TIMEOUT_MS) });
       if (response.ok) {
         this.#show("");
+        this.announcer.say("STOP is done: the laser is off, and the board is not armed.");
         return true;
       }
       if (response.status === 401) {
