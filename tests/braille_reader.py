@@ -25,17 +25,18 @@ def is_installed():
 
 
 class BrlttyProcess:
-    """BRLTTY without a screen of its own."""
+    """BRLTTY with the given driver; its home is the folder."""
 
-    def __init__(self, folder, port):
+    def __init__(self, folder, *driver):
         self.host = f":{next(SOCKETS)}"
         self._log = (folder / "brltty.log").open("a")
         folders = [option for flag in "WU" for option in (f"-{flag}", str(folder))]
         self.process = subprocess.Popen(
             [
-                *("brltty", "-n", "-e", "-E", "-f", "/dev/null", "-x", "no", "-s", "no", "-b", "hw", "-l", "info"),
-                *("-d", f"serial:{port}", "-A", f"host={self.host},auth=none", *folders),
+                *("brltty", "-n", "-e", "-E", "-f", "/dev/null", "-s", "no", "-l", "info", *driver),
+                *("-A", f"host={self.host},auth=none", *folders),
             ],
+            env={**os.environ, "HOME": str(folder)},
             stdout=self._log,
             stderr=self._log,
         )
@@ -45,6 +46,17 @@ class BrlttyProcess:
         self.process.kill()
         self.process.wait()
         self._log.close()
+
+
+def drive_serial(port):
+    """Return the options for one line at a serial port, without a screen."""
+    return "-b", "hw", "-d", f"serial:{port}", "-x", "no"
+
+
+def drive_lines(number, key_file):
+    """Return the options for several lines at a server of BrlAPI, with a screen of braille ASCII in shared memory."""
+    server = f"ba:host=127.0.0.1:{number},auth=keyfile:{key_file}"
+    return "-b", "ba", "-B", server, "-x", "sc", "-t", "brf"
 
 
 class Settings(ctypes.Structure):

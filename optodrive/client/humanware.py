@@ -4,8 +4,6 @@ A packet is ESC, its type, the number of its data bytes and these. BRLTTY (`-b h
 INIT, write all cells with DISPLAY and receive keys. Facts of the protocol: drivers of BRLTTY 6.5 and NVDA.
 """
 
-from collections.abc import Sequence
-
 ESC = 0x1B
 INIT, INIT_REPLY = 0x00, 0x01
 DISPLAY = 0x02
@@ -44,16 +42,16 @@ FIRST_ROUTING_KEY = 80
 class CellLine:
     """A display of `count` cells, at most CELLS_MAX.
 
-    cells: the dots of each, bit 0 is dot 1, as the reader wrote them last
+    cells: the dots of each, bit 0 is dot 1, as the reader wrote them last; has_reader: whether one has written anything
     """
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self.cells = bytes(count)
-        self._received = b""
+        self.clear()
 
     def receive(self, data: bytes) -> bytes:
         """Process bytes of the reader. Return the answers. Bytes outside a packet are ignored."""
+        self.has_reader = True
         self._received += data
         answers = b""
         while (packet := self._take_packet()) is not None:
@@ -63,6 +61,13 @@ class CellLine:
     def clear(self) -> None:
         """Forget cells and a packet that has arrived in part: the reader is gone."""
         self.cells, self._received = bytes(self.count), b""
+        self.has_reader = False
+
+    def build_key_press(self, name: str, cell: int | None = None) -> bytes:
+        """Build the packets of a key of NAMED_KEYS, or of the routing key over a cell, from 0: pressed and released."""
+        keys = NAMED_KEYS[name] if cell is None else (FIRST_ROUTING_KEY + cell,)
+        downs = [build_packet(KEY_DOWN, bytes([key])) for key in keys]
+        return b"".join(downs + [build_packet(KEY_UP, bytes([key])) for key in reversed(keys)])
 
     def _take_packet(self) -> tuple[int, bytes] | None:
         """Remove and return the next packet as (type, data), None if none is complete."""
@@ -91,9 +96,3 @@ class CellLine:
 def build_packet(kind: int, data: bytes = b"") -> bytes:
     """Build a packet."""
     return bytes([ESC, kind, len(data)]) + data
-
-
-def build_key_press(keys: Sequence[int]) -> bytes:
-    """Build the packets of keys that are pressed together and released."""
-    downs = [build_packet(KEY_DOWN, bytes([key])) for key in keys]
-    return b"".join(downs + [build_packet(KEY_UP, bytes([key])) for key in reversed(keys)])

@@ -1,23 +1,22 @@
-"""The serial port that a screen reader opens to write the cells of the display.
+"""The port that a screen reader opens to write the cells of the display.
 
-Theory of operation. A pseudo-terminal takes the place of the serial port of a braille display, whose cells are those
-of the tactile display, line after line. Dots fall within a second without light, so all cells are streamed again every
-FRAME_S while any dot is up, and of these frames the newest wins. This process closes the reader's end of the port: a
-hang-up therefore means that no reader has it open, and the cells are cleared. The end of this process closes the
-stream, whose pulses the daemon drops.
+Theory of operation. A port takes the place of that of a braille display, whose cells are those of the tactile display.
+Dots fall within a second without light, so all cells are streamed again every FRAME_S while any dot is up, and of these
+frames the newest wins. When the reader is gone, the cells are cleared. The end of this process closes the stream, whose
+pulses the daemon drops.
 """
 
 import os
 import select
 import sys
-import termios
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from typing import Protocol
 
 import numpy as np
 
-from optodrive.client.humanware import CELLS_MAX, FIRST_ROUTING_KEY, NAMED_KEYS, CellLine, build_key_press
+from optodrive.client.humanware import CELLS_MAX, NAMED_KEYS
+from optodrive.client.reader_channels import READ_BYTES, ReaderChannel
 from optodrive.client.stream import Stream
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
@@ -26,46 +25,77 @@ from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.text import CellSlot, Spacing, find_line_slots
 
 FRAME_S = 0.1
-READ_BYTES = 4096
-MISSING_READER_S = 0.05
-"""Wait without a reader, whose absence ends each wait for its bytes at once."""
 NOT_SHOWN = ("refused", "failed", "stopped")
 """Statuses of frames that were not shown, or not to their end, although no newer one came."""
 SPACING = Spacing(dot_step=1, cell_gap=1, line_gap=1)
 
 
-def find_cell_pixels(layout: PixelLayout, name: str) -> list[CellSlot]:
-    """Return the pixel of each dot of each cell, line after line. Raise InputError if none fits the display."""
-    slots = [slot for line in find_line_slots(Lattice.from_layout(name, layout), SPACING) for slot in line]
-    if not slots:
+def find_cell_lines(layout: PixelLayout, name: str) -> list[list[CellSlot]]:
+    """Return the pixel of each dot of each cell, per line. Raise InputError if none fits the display."""
+    lines = find_line_slots(Lattice.from_layout(name, layout), SPACING)
+    if not lines:
         raise InputError("display", name, "room for a braille cell, 3 rows of 2 pixels", code="does_not_fit")
-    return slots[:CELLS_MAX]
+    return lines
+
+
+def join_lines(lines: list[list[CellSlot]]) -> list[CellSlot]:
+    """Return the cells of all lines as one line, as many as its protocol states."""
+    return [slot for line in lines for slot in line][:CELLS_MAX]
+
+
+def cut_rectangle(lines: list[list[CellSlot]], layout: PixelLayout) -> list[list[CellSlot]]:
+    """Return the largest rectangle of cells: adjacent lines, of each the cells in columns that all of them have."""
+    places = [{int(layout.column[slot[1]]): slot for slot in line} for line in lines]
+    spans = [places[begin:end] for begin in range(len(places)) for end in range(begin + 1, len(places) + 1)]
+    rectangles = []
+    for span in spans:
+        columns = sorted(set.intersection(*(set(line) for line in span)))
+        rectangles.append([[line[column] for column in columns] for line in span])
+    return max(rectangles, key=lambda rectangle: sum(map(len, rectangle)))
+
+
+class CellProtocol(Protocol):
+    """A display's side of a protocol of screen readers, without input or output.
+
+    count: of cells; cells: the dots of each, bit 0 is dot 1, as the reader wrote them last; has_reader: whether
+    there is one
+    """
+
+    count: int
+    cells: bytes
+    has_reader: bool
+
+    def receive(self, data: bytes) -> bytes:
+        """Process bytes of the reader. Return the answers."""
+
+    def clear(self) -> None:
+        """Forget cells and a packet that has arrived in part: the reader is gone."""
+
+    def build_key_press(self, name: str, cell: int | None = None) -> bytes:
+        """Build the packets of a key of NAMED_KEYS, or of the routing key over a cell, from 0."""
 
 
 class ReaderPort:
-    """The screen reader at the other end of a pseudo-terminal, and the keys of standard input.
+    """The screen reader at the other end of a port, and the keys of standard input.
 
     pixels: of each dot of each cell; report: takes a line on what was not shown or not understood
     """
 
     def __init__(
         self,
-        terminal: int,
-        line: CellLine,
+        channel: ReaderChannel,
+        protocol: CellProtocol,
         stream: Stream,
         pixels: list[CellSlot],
         height_um: float,
         pixel_count: int,
         report: Callable[[str], None],
     ) -> None:
-        self._terminal, self._line, self._stream, self._report = terminal, line, stream, report
+        self._channel, self._protocol, self._stream, self._report = channel, protocol, stream, report
         self._pixels, self._height_um, self._pixel_count = pixels, height_um, pixel_count
-        self._attributes = termios.tcgetattr(terminal)
-        self._poll = select.poll()
-        self._poll.register(terminal, select.POLLIN)
-        self._poll.register(sys.stdin.fileno(), select.POLLIN)
-        self._shown = bytes(line.count)
-        self._problem, self._has_reader = "", False
+        self._keys = [sys.stdin.fileno()]
+        self._shown = bytes(protocol.count)
+        self._problem = ""
 
     def run(self) -> None:
         """Run until an exception ends it."""
@@ -73,48 +103,35 @@ class ReaderPort:
         while True:
             self._take_input(max(0.0, due_s - time.monotonic()))
             is_due = time.monotonic() >= due_s
-            if self._line.cells != self._shown or (is_due and any(self._shown)):
-                self._show(self._line.cells)
+            if self._protocol.cells != self._shown or (is_due and any(self._shown)):
+                self._show(self._protocol.cells)
             if is_due:
                 due_s = time.monotonic() + FRAME_S
 
     def _take_input(self, wait_s: float) -> None:
-        for source, events in self._poll.poll(1e3 * wait_s):
-            if source == self._terminal and events & select.POLLIN:
-                self._has_reader = True
-                self._write(self._line.receive(os.read(self._terminal, READ_BYTES)))
-            elif source == self._terminal:
-                self._forget_reader()
-                time.sleep(MISSING_READER_S)
-            else:
-                self._press(os.read(source, READ_BYTES))
-
-    def _forget_reader(self) -> None:
-        """Clear the cells, and restore the port's settings for the next reader.
-
-        The C library refuses settings of which a pseudo-terminal takes none: those of a reader before it, with parity.
-        """
-        self._line.clear()
-        self._has_reader = False
-        termios.tcsetattr(self._terminal, termios.TCSANOW, self._attributes)
+        descriptors = self._channel.list_descriptors()
+        ready, _, _ = select.select(descriptors + self._keys, [], [], wait_s)
+        if any(descriptor in ready for descriptor in descriptors):
+            data = self._channel.receive()
+            if data is None:
+                self._protocol.clear()
+            elif data:
+                self._channel.send(self._protocol.receive(data))
+        if any(descriptor in ready for descriptor in self._keys):
+            self._press(os.read(self._keys[0], READ_BYTES))
 
     def _press(self, text: bytes) -> None:
         """Press the keys of the lines of standard input. Without a reader, the next one would find them."""
         if not text:
-            self._poll.unregister(sys.stdin.fileno())
-        for name in text.decode(errors="replace").splitlines():
+            self._keys = []
+        for line in text.decode(errors="replace").splitlines():
             try:
-                keys = parse_key(name, self._line.count)
-                if not self._has_reader:
-                    raise InputError("key", name, "a reader that has opened the port")
-                self._write(build_key_press(keys))
+                name, cell = parse_key(line, self._protocol.count)
+                if not self._protocol.has_reader:
+                    raise InputError("key", line, "a reader that has opened the port")
+                self._channel.send(self._protocol.build_key_press(name, cell))
             except InputError as error:
                 self._report(str(error))
-
-    def _write(self, data: bytes) -> None:
-        """Write to the reader. One that does not read loses the rest."""
-        with suppress(BlockingIOError):
-            os.write(self._terminal, data)
 
     def _show(self, cells: bytes) -> None:
         self._stream.send(draw_cells(cells, self._pixels, self._height_um, self._pixel_count))
@@ -137,11 +154,11 @@ def draw_cells(cells: bytes, pixels: list[CellSlot], height_um: float, pixel_cou
     return heights_um
 
 
-def parse_key(text: str, cell_count: int) -> tuple[int, ...]:
-    """Return the numbers of a key by its name, or of `routing N` for cell N. Raise InputError for another name."""
+def parse_key(text: str, cell_count: int) -> tuple[str, int | None]:
+    """Return the name of a key, and of `routing N` the cell from 0. Raise InputError for another name."""
     name, _, number = text.strip().partition(" ")
     if name == "routing" and number.isdecimal() and 1 <= int(number) <= cell_count:
-        return (FIRST_ROUTING_KEY + int(number) - 1,)
+        return name, int(number) - 1
     if name in NAMED_KEYS and not number:
-        return NAMED_KEYS[name]
+        return name, None
     raise InputError("key", text, f"{', '.join(NAMED_KEYS)}, or routing 1 to {cell_count}")

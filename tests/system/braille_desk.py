@@ -2,42 +2,67 @@
 
 import os
 import signal
+import socket
 import subprocess
 from contextlib import contextmanager
 
 import numpy as np
 
-from braille_reader import BrlttyProcess, Writer
+from braille_reader import BrlttyProcess, Writer, drive_lines, drive_serial
 from forked_process import OPTODRIVE, start_process
-from optodrive.client.reader_port import draw_cells, find_cell_pixels
+from optodrive.client.reader_channels import FIRST_PORT, HOST
+from optodrive.client.reader_port import draw_cells, find_cell_lines, join_lines
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from rig import TOKEN, running, wait_for
 from test_six_experiments import cell_codes
 
 LAYOUT = build_pixel_layout(load_config().display)
-PIXELS = find_cell_pixels(LAYOUT, "display-437")
+PIXELS = join_lines(find_cell_lines(LAYOUT, "display-437"))
 COUNT = len(PIXELS)
+
+
+class SerialLine:
+    """One line of cells at a serial port: arguments of the command, what it prints, and the options of BRLTTY."""
+
+    def __init__(self, folder):
+        self.port = folder / "braille"
+        self.arguments = [self.port]
+        self.opened = f"{COUNT} cells at {self.port}"
+        self.driver = drive_serial(self.port)
+
+
+class ServedLines:
+    """Several lines at a server of BrlAPI, as SerialLine."""
+
+    def __init__(self, folder):
+        key_file = folder / "key"
+        key_file.write_bytes(os.urandom(20))
+        with socket.create_server((HOST, 0)) as free:
+            number = free.getsockname()[1] - FIRST_PORT
+        self.arguments = [str(number), "--protocol", "brlapi", "--key-file", key_file]
+        self.opened = f"5 lines of 7 cells at {HOST}:{number}"
+        self.driver = drive_lines(number, key_file)
 
 
 class BrailleCommand:
     """Process of `optodrive braille` on a daemon."""
 
-    def __init__(self, folder, daemon):
-        self.port, self.folder, self.daemon = folder / "braille", folder, daemon
+    def __init__(self, place, daemon):
+        self.place, self.daemon = place, daemon
         self.start()
 
     def start(self):
         environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": self.daemon.url}
         self.process = start_process(
-            [OPTODRIVE, "braille", self.port],
+            [OPTODRIVE, "braille", *self.place.arguments],
             env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stdout.readline() == f"{COUNT} cells at {self.port}; Ctrl-C ends it\n"
+        assert self.process.stdout.readline() == f"{self.place.opened}; Ctrl-C ends it\n"
 
     def press(self, key):
         self.process.stdin.write(f"{key}\n")
@@ -52,13 +77,13 @@ class BrailleCommand:
 class Desk:
     """A board, a daemon, `optodrive braille`, BRLTTY and a program that writes."""
 
-    def __init__(self, folder, board, daemon):
+    def __init__(self, folder, board, daemon, kind):
         self.folder, self.board, self.daemon = folder, board, daemon
-        self.command = BrailleCommand(folder, daemon)
+        self.command = BrailleCommand(kind(folder), daemon)
         self.start_reader()
 
     def start_reader(self):
-        self.reader = BrlttyProcess(self.folder, self.command.port)
+        self.reader = BrlttyProcess(self.folder, *self.command.place.driver)
         self.writer = Writer(self.reader)
 
     def stop(self):
@@ -106,10 +131,10 @@ def is_dark(desk):
 
 
 @contextmanager
-def running_desk(folder):
+def running_desk(folder, kind=SerialLine):
     with running(folder) as (board, daemon):
         daemon.arm()
-        desk = Desk(folder, board, daemon)
+        desk = Desk(folder, board, daemon, kind)
         try:
             yield desk
         finally:

@@ -7,7 +7,7 @@ import subprocess
 import pytest
 
 import braille_reader
-from braille_desk import COUNT, BrailleCommand, draw_text, is_dark, running_desk
+from braille_desk import COUNT, BrailleCommand, SerialLine, draw_text, is_dark, running_desk
 from braille_reader import ROUTING_KEY
 from forked_process import OPTODRIVE
 from optodrive.client.humanware import NAMED_KEYS
@@ -102,10 +102,10 @@ def test_a_side_that_is_killed_is_dark_until_it_is_back(tmp_path, kill, count):
 
 def test_an_ended_command_leaves_no_port(tmp_path):
     with running(tmp_path) as (_, daemon):
-        command = BrailleCommand(tmp_path, daemon)
+        command = BrailleCommand(SerialLine(tmp_path), daemon)
         status, _, errors = command.stop(signal.SIGTERM)
         assert (status, errors) == (130, "optodrive: interrupted\n")
-        assert not command.port.is_symlink()
+        assert not command.place.port.is_symlink()
 
 
 def test_a_name_that_is_taken_is_one_line(tmp_path):

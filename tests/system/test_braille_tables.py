@@ -8,7 +8,7 @@ from contextlib import suppress
 import pytest
 
 import braille_reader
-from braille_reader import BrlttyProcess, Writer
+from braille_reader import BrlttyProcess, Writer, drive_serial
 from liblouis_judge import ALPHABETS, draw_lines, judge
 from optodrive.client.humanware import CELLS_MAX, CellLine
 from optodrive.link.simulator.pseudo_terminal import open_pty
@@ -44,7 +44,7 @@ class Line:
 def desk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     line = Line(folder)
-    reader = BrlttyProcess(folder, line.port)
+    reader = BrlttyProcess(folder, *drive_serial(line.port))
     writer = Writer(reader)
     yield line.line, writer
     writer.close()

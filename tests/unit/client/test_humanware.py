@@ -1,11 +1,12 @@
 """The protocol of a HumanWare display without a port, in any pieces and after any nonsense."""
 
 import random
+from itertools import pairwise
 
 import pytest
 
-from optodrive.client.humanware import CELLS_MAX, CellLine, build_key_press
-from optodrive.client.reader_port import draw_cells, find_cell_pixels, parse_key
+from optodrive.client.humanware import CELLS_MAX, CellLine
+from optodrive.client.reader_port import cut_rectangle, draw_cells, find_cell_lines, join_lines, parse_key
 from optodrive.core.errors import InputError
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
@@ -63,12 +64,16 @@ def test_a_packet_in_part_is_forgotten_with_its_reader():
 
 
 def test_a_key_goes_down_and_up():
-    assert build_key_press((20,)) == bytes([0x1B, 5, 1, 20, 0x1B, 6, 1, 20])
+    assert CellLine(4).build_key_press("next") == bytes([0x1B, 5, 1, 20, 0x1B, 6, 1, 20])
+
+
+def test_a_routing_key_is_that_over_its_cell():
+    assert CellLine(40).build_key_press("routing", 6) == bytes([0x1B, 5, 1, 86, 0x1B, 6, 1, 86])
 
 
 def test_keys_of_a_chord_are_held_together():
     held, chord = set(), set()
-    data = build_key_press((10, 2))
+    data = CellLine(4).build_key_press("cursor-up")
     for start in range(0, len(data), 4):
         _, kind, _, key = data[start : start + 4]
         held = held | {key} if kind == 5 else held - {key}
@@ -77,7 +82,7 @@ def test_keys_of_a_chord_are_held_together():
 
 
 @pytest.mark.parametrize(
-    ("text", "key"), [("next", (20,)), ("cursor-up", (10, 2)), ("routing 1", (80,)), (" routing 35\n", (114,))]
+    ("text", "key"), [("next", ("next", None)), ("routing 1", ("routing", 0)), (" routing 35\n", ("routing", 34))]
 )
 def test_keys_by_name(text, key):
     assert parse_key(text, 35) == key
@@ -96,7 +101,7 @@ def test_another_key_is_one_line(text):
 def test_each_dot_of_each_cell_has_a_pixel_of_its_own(name, count):
     config = load_config(name)
     layout = build_pixel_layout(config.display)
-    pixels = find_cell_pixels(layout, name)
+    pixels = join_lines(find_cell_lines(layout, name))
     assert len(pixels) == count
     used = [pixel for slot in pixels for pixel in slot.values()]
     assert len(set(used)) == len(used) == 6 * count
@@ -108,4 +113,18 @@ def test_each_dot_of_each_cell_has_a_pixel_of_its_own(name, count):
 def test_a_display_without_room_for_a_cell_is_one_line():
     layout = build_pixel_layout(load_config("display-1").display)
     with pytest.raises(InputError, match="display: got 'one', expected room for a braille cell"):
-        find_cell_pixels(layout, "one")
+        find_cell_lines(layout, "one")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("display-437", (5, 7)), ("display-1511", (10, 11)), ("display-16", (1, 1))]
+)
+def test_the_rectangle_of_cells_has_straight_columns_and_is_the_largest(name, shape):
+    config = load_config(name)
+    layout = build_pixel_layout(config.display)
+    rows = cut_rectangle(find_cell_lines(layout, name), layout)
+    assert (len(rows), {len(row) for row in rows}) == (shape[0], {shape[1]})
+    columns = [[int(layout.column[slot[1]]) for slot in row] for row in rows]
+    assert all(each == columns[0] for each in columns)
+    tops = [int(layout.row[row[0][1]]) for row in rows]
+    assert len({above - below for above, below in pairwise(tops)}) <= 1, "adjacent lines"

@@ -9,9 +9,9 @@ from contextlib import suppress
 import pytest
 
 from optodrive.client.humanware import NAMED_KEYS, CellLine
+from optodrive.client.reader_channels import SerialChannel
 from optodrive.client.reader_port import FRAME_S, ReaderPort
 from optodrive.daemon.responses.stream import FrameResult
-from optodrive.link.simulator.pseudo_terminal import open_pty
 from rig import wait_for
 
 PIXELS = [{dot: dot - 1 for dot in range(1, 7)}]
@@ -47,8 +47,9 @@ class Desk:
         self.input = os.fdopen(keys)
         monkeypatch.setattr("sys.stdin", self.input)
         self.path, self.stream, self.reports = folder / "braille", RecordedStream(), []
-        self.terminal, self.line = open_pty(self.path), CellLine(1)
-        self.port = ReaderPort(self.terminal, self.line, self.stream, PIXELS, 100.0, 6, self.reports.append)
+        self.channel, self.line = SerialChannel(self.path), CellLine(1)
+        (self.terminal,) = self.channel.list_descriptors()
+        self.port = ReaderPort(self.channel, self.line, self.stream, PIXELS, 100.0, 6, self.reports.append)
         self.thread = threading.Thread(target=self._run)
         self.thread.start()
 
@@ -73,7 +74,7 @@ class Desk:
         os.write(reader, b"\x1b\2\1\x01")  # it shows something, and so ends
         self.thread.join()
         os.close(reader)
-        os.close(self.terminal)
+        self.channel.close()
         os.close(self.keys)
         self.input.close()
 

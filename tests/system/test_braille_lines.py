@@ -1,0 +1,145 @@
+"""Several lines of braille under an unmodified BRLTTY: a screen of text in the executed pulses, keys, kills, rights."""
+
+import random
+import socket
+import subprocess
+
+import pytest
+
+import braille_reader
+from braille_desk import COUNT, ServedLines, draw_text, find_raised, is_dark, running_desk
+from braille_reader import ROUTING_KEY
+from forked_process import OPTODRIVE
+from optodrive.client.reader_channels import FIRST_PORT, HOST
+from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII
+from rig import wait_for
+from shared_screen import SharedScreen
+
+pytestmark = pytest.mark.skipif(
+    not braille_reader.is_installed(), reason="BRLTTY is not installed: scripts/test-packages"
+)
+ROWS, COLUMNS = 5, 7
+SHOWN = BRAILLE_ASCII.replace(" ", "")
+ROUTED_CELL = 10
+"""From 0, on the second line."""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lines")
+    screen = SharedScreen(folder, 12, 30)
+    with running_desk(folder, ServedLines) as desk:
+        yield desk, screen
+    screen.close()
+
+
+@pytest.fixture
+def desk(place):
+    return place[0]
+
+
+def dismiss_message(desk):
+    """Press a key until it comes back, because the first one only ends BRLTTY's message. Return its code."""
+
+    def pressed():
+        desk.command.press(f"routing {ROUTED_CELL + 1}")
+        return desk.writer.read_key()
+
+    code = wait_for(pressed, "a key")
+    desk.command.press("enter")
+    wait_for(lambda: desk.writer.read_key() == 0xFF0D, "the keyboard's key")
+    return code
+
+
+def test_a_program_writes_all_lines_and_gets_the_keys(desk):
+    rng = random.Random(1)
+    assert desk.writer.count == ROWS * COLUMNS == COUNT
+    for _ in range(2):
+        since, expected = desk.show(draw_text(rng))
+        before = len(desk.board.of("pulse"))
+        wait_for(lambda before=before: len(desk.board.of("pulse")) > before + 20, "the frame again")
+        assert desk.find_emitted(since) == expected
+    assert dismiss_message(desk) == ROUTING_KEY | ROUTED_CELL
+
+
+def wait_for_window(desk, lines):
+    """Wait until the board emits the dots of these lines of braille ASCII and no others."""
+    cells = bytes(BRAILLE_ASCII.index(chr(character)) for line in lines for character in line)
+    expected, since = find_raised(cells), len(desk.board.of("pulse"))
+
+    def is_shown():
+        nonlocal since
+        if desk.find_emitted(since) - expected:
+            since = len(desk.board.of("pulse"))
+        return desk.find_emitted(since) == expected
+
+    wait_for(is_shown, f"{lines}, after pulse {since}")
+
+
+def test_text_on_a_screen_is_read_by_window_and_keys_move_the_window(place):
+    desk, screen = place
+    desk.show(bytes(COUNT))
+    dismiss_message(desk)
+    desk.writer.close()  # BRLTTY itself has the display
+    rng = random.Random(2)
+    lines = [bytes(ord(rng.choice(SHOWN)) for _ in range(30)) for _ in range(12)]
+    screen.show(lines)
+    wait_for_window(desk, [line[:COLUMNS] for line in lines[:ROWS]])
+    desk.command.press("right")
+    wait_for_window(desk, [line[COLUMNS : 2 * COLUMNS] for line in lines[:ROWS]])
+    desk.command.press("next")
+    wait_for_window(desk, [line[COLUMNS : 2 * COLUMNS] for line in lines[1 : ROWS + 1]])
+    desk.command.press("home")
+    wait_for_window(desk, [line[:COLUMNS] for line in lines[:ROWS]])
+    screen.show([])
+    wait_for(lambda: is_dark(desk), "the dark of an empty screen")
+
+
+@pytest.fixture
+def own_desk(tmp_path):
+    screen = SharedScreen(tmp_path, 12, 30)
+    with running_desk(tmp_path, ServedLines) as desk:
+        yield desk
+    screen.close()
+
+
+def test_a_side_that_is_killed_is_dark_until_it_is_back(own_desk):
+    desk, rng = own_desk, random.Random(3)
+    desk.show(draw_text(rng))
+    desk.reader.kill()
+    desk.writer.close()
+    wait_for(lambda: is_dark(desk), "the dark after the reader")
+    desk.start_reader()
+    since, expected = desk.show(draw_text(rng))
+    assert desk.find_emitted(since) == expected
+    desk.command.stop()
+    wait_for(lambda: is_dark(desk), "the dark after the command")
+    desk.command.start()
+    desk.writer.write(draw_text(rng))  # of a display that is gone; BRLTTY looks for it every five seconds
+    since, expected = desk.show(draw_text(rng))
+    assert desk.find_emitted(since) == expected
+    assert not desk.board.of("fault")
+
+
+def test_a_client_without_the_key_neither_shows_nor_ends_what_is_shown(desk):
+    number = int(desk.command.place.arguments[0])
+    with socket.create_connection((HOST, FIRST_PORT + number)) as client:
+        assert client.recv(100) == b"", "one client has it"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["x"], "PORT: got 'x', expected the number of a server of BrlAPI, 0 to 61434"),
+        (["61435"], "PORT: got '61435', expected the number of a server of BrlAPI, 0 to 61434"),
+        (
+            ["1", "--key-file", "absent"],
+            "--key-file: got 'absent', expected a file that can be read: No such file or directory",
+        ),
+        (["1", "--key-file", "/dev/null"], "--key-file: got '/dev/null', expected a file that is not empty"),
+    ],
+)
+def test_a_wrong_place_is_one_line(tmp_path, arguments, message):
+    command = [OPTODRIVE, "braille", "--protocol", "brlapi", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", f"optodrive: {message}\n")
