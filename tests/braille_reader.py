@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from itertools import count
 
+from optodrive.core.forking import die_with_parent
 from rig import wait_for
 
 BRLAPI = "libbrlapi.so.0.8"
@@ -39,6 +40,7 @@ class BrlttyProcess:
             env={**os.environ, "HOME": str(folder)},
             stdout=self._log,
             stderr=self._log,
+            preexec_fn=die_with_parent,  # on a port that is gone it would take half a processor
         )
 
     def kill(self):
