@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 from itertools import count
+from pathlib import Path
 
 from optodrive.core.forking import die_with_parent
 from rig import wait_for
@@ -23,6 +24,12 @@ def is_installed():
     except OSError:
         return False
     return shutil.which("brltty") is not None
+
+
+def has_driver(name):
+    """Return whether BRLTTY is installed with a driver."""
+    program = shutil.which("brltty")
+    return bool(program) and (Path(program).resolve().parents[1] / f"lib/brltty/libbrlttyb{name}.so").exists()
 
 
 class BrlttyProcess:
@@ -53,6 +60,11 @@ class BrlttyProcess:
 def drive_serial(port):
     """Return the options for one line at a serial port, without a screen."""
     return "-b", "hw", "-d", f"serial:{port}", "-x", "no"
+
+
+def drive_dots(port):
+    """Return the options for several lines at a serial port, without a screen."""
+    return "-b", "dp", "-d", f"serial:{port}", "-x", "no"
 
 
 def drive_lines(number, key_file):

@@ -18,6 +18,7 @@ class ReaderProtocol(StrEnum):
     """Protocols of screen readers."""
 
     HUMANWARE = "humanware"
+    DOTPAD = "dotpad"
     BRLAPI = "brlapi"
 
 
@@ -27,7 +28,7 @@ def braille(
     ],
     protocol: Annotated[
         ReaderProtocol,
-        typer.Option("--protocol", help="humanware: one line, brltty -b hw; brlapi: several lines, brltty -b ba."),
+        typer.Option("--protocol", help="One line: humanware, brltty -b hw. Several: dotpad, -b dp; brlapi, -b ba."),
     ] = ReaderProtocol.HUMANWARE,
     key_file: Annotated[
         Path, typer.Option("--key-file", help="With brlapi: key that a client must be able to read.")
@@ -40,6 +41,7 @@ def braille(
     from optodrive.cli.signals import end_as_interrupted
     from optodrive.client.brlapi import CellPage
     from optodrive.client.display import Display
+    from optodrive.client.dotpad import CellGrid
     from optodrive.client.humanware import CellLine
     from optodrive.client.reader_channels import (
         HOST,
@@ -49,7 +51,14 @@ def braille(
         parse_number,
         read_key,
     )
-    from optodrive.client.reader_port import CellProtocol, ReaderPort, cut_rectangle, find_cell_lines, join_lines
+    from optodrive.client.reader_port import (
+        CellProtocol,
+        ReaderPort,
+        compute_pitch_m,
+        cut_rectangle,
+        find_cell_lines,
+        join_lines,
+    )
     from optodrive.link.simulator.pseudo_terminal import check_link_path
 
     is_server = protocol is ReaderProtocol.BRLAPI
@@ -62,21 +71,22 @@ def braille(
         places = find_cell_lines(layout, display.state().display)
         if hold:
             display.arm(hold=True)
+        places = [join_lines(places)] if protocol is ReaderProtocol.HUMANWARE else cut_rectangle(places, layout)
+        rows, columns = len(places), len(places[0])
         cells: CellProtocol
         channel: ReaderChannel
         if is_server:
-            places = cut_rectangle(places, layout)
-            page = CellPage(len(places), len(places[0]), key)
-            cells, channel = page, SocketChannel(number, page)
-            opened = f"{page.rows} lines of {page.columns} cells at {HOST}:{number}"
+            page = CellPage(rows, columns, key)
+            cells, channel, place = page, SocketChannel(number, page), f"{HOST}:{number}"
         else:
-            places = [join_lines(places)]
-            cells, channel = CellLine(len(places[0])), SerialChannel(Path(port))
-            opened = f"{cells.count} cells at {port}"
+            is_line = protocol is ReaderProtocol.HUMANWARE
+            cells = CellLine(columns) if is_line else CellGrid(rows, columns, compute_pitch_m(layout, places[0][0]))
+            channel, place = SerialChannel(Path(port)), port
+        size = f"{columns} cells" if rows == 1 else f"{rows} lines of {columns} cells"
         pixels = [slot for line in places for slot in line]
         try:
             with display.stream() as stream:
-                print(f"{opened}; Ctrl-C ends it", flush=True)
+                print(f"{size} at {place}; Ctrl-C ends it", flush=True)
                 ReaderPort(channel, cells, stream, pixels, height_um, len(layout), _report).run()
         finally:
             channel.close()

@@ -54,13 +54,13 @@ class PacketError(Exception):
 class CellPage:
     """A display of rows × columns cells, for one client at a time.
 
-    count: of cells; cells: the dots of each, row after row, bit 0 is dot 1, as the client wrote them last; has_reader:
-    whether a client has proved that it may read the key file
+    count: of cells; routing_count: of routing keys, one per cell; cells: the dots of each, row after row, bit 0 is
+    dot 1, as the client wrote them last; has_reader: whether a client has proved that it may read the key file
     """
 
     def __init__(self, rows: int, columns: int, key: bytes) -> None:
         self.rows, self.columns, self._key = rows, columns, key
-        self.count = rows * columns
+        self.count = self.routing_count = rows * columns
         self.clear()
 
     @property

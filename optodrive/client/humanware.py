@@ -42,11 +42,12 @@ FIRST_ROUTING_KEY = 80
 class CellLine:
     """A display of `count` cells, at most CELLS_MAX.
 
-    cells: the dots of each, bit 0 is dot 1, as the reader wrote them last; has_reader: whether one has written anything
+    routing_count: of routing keys, one per cell; cells: the dots of each, bit 0 is dot 1, as the reader wrote them
+    last; has_reader: whether one has written anything
     """
 
     def __init__(self, count: int) -> None:
-        self.count = count
+        self.count = self.routing_count = count
         self.clear()
 
     def receive(self, data: bytes) -> bytes:

@@ -54,14 +54,21 @@ def cut_rectangle(lines: list[list[CellSlot]], layout: PixelLayout) -> list[list
     return max(rectangles, key=lambda rectangle: sum(map(len, rectangle)))
 
 
+def compute_pitch_m(layout: PixelLayout, slot: CellSlot) -> float:
+    """Return the distance between the dots 1 and 2 of a cell."""
+    above, below = slot[1], slot[2]
+    return float(np.hypot(layout.x_m[above] - layout.x_m[below], layout.y_m[above] - layout.y_m[below]))
+
+
 class CellProtocol(Protocol):
     """A display's side of a protocol of screen readers, without input or output.
 
-    count: of cells; cells: the dots of each, bit 0 is dot 1, as the reader wrote them last; has_reader: whether
-    there is one
+    count: of cells; routing_count: of cells that have a routing key, the first ones; cells: the dots of each, bit 0 is
+    dot 1, as the reader wrote them last; has_reader: whether there is one
     """
 
     count: int
+    routing_count: int
     cells: bytes
     has_reader: bool
 
@@ -126,7 +133,7 @@ class ReaderPort:
             self._keys = []
         for line in text.decode(errors="replace").splitlines():
             try:
-                name, cell = parse_key(line, self._protocol.count)
+                name, cell = parse_key(line, self._protocol.routing_count)
                 if not self._protocol.has_reader:
                     raise InputError("key", line, "a reader that has opened the port")
                 self._channel.send(self._protocol.build_key_press(name, cell))
@@ -154,11 +161,11 @@ def draw_cells(cells: bytes, pixels: list[CellSlot], height_um: float, pixel_cou
     return heights_um
 
 
-def parse_key(text: str, cell_count: int) -> tuple[str, int | None]:
+def parse_key(text: str, routing_count: int) -> tuple[str, int | None]:
     """Return the name of a key, and of `routing N` the cell from 0. Raise InputError for another name."""
     name, _, number = text.strip().partition(" ")
-    if name == "routing" and number.isdecimal() and 1 <= int(number) <= cell_count:
+    if name == "routing" and number.isdecimal() and 1 <= int(number) <= routing_count:
         return name, int(number) - 1
     if name in NAMED_KEYS and not number:
         return name, None
-    raise InputError("key", text, f"{', '.join(NAMED_KEYS)}, or routing 1 to {cell_count}")
+    raise InputError("key", text, f"{', '.join(NAMED_KEYS)}, or routing 1 to {routing_count}")

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from braille_reader import BrlttyProcess, Writer, drive_lines, drive_serial
+from dotpad_reader import DotPadReader
 from forked_process import OPTODRIVE, start_process
 from optodrive.client.reader_channels import FIRST_PORT, HOST
 from optodrive.client.reader_port import draw_cells, find_cell_lines, join_lines
@@ -23,13 +24,17 @@ COUNT = len(PIXELS)
 
 
 class SerialLine:
-    """One line of cells at a serial port: arguments of the command, what it prints, and the options of BRLTTY."""
+    """One line of cells at a serial port: arguments of the command, what it prints, and its reader."""
 
     def __init__(self, folder):
         self.port = folder / "braille"
         self.arguments = [self.port]
         self.opened = f"{COUNT} cells at {self.port}"
-        self.driver = drive_serial(self.port)
+
+    def connect(self, folder):
+        """Start a reader. Return it, and a program that writes through it."""
+        reader = BrlttyProcess(folder, *drive_serial(self.port))
+        return reader, Writer(reader)
 
 
 class ServedLines:
@@ -42,7 +47,24 @@ class ServedLines:
             number = free.getsockname()[1] - FIRST_PORT
         self.arguments = [str(number), "--protocol", "brlapi", "--key-file", key_file]
         self.opened = f"5 lines of 7 cells at {HOST}:{number}"
-        self.driver = drive_lines(number, key_file)
+
+    def connect(self, folder):
+        number, *_, key_file = self.arguments
+        reader = BrlttyProcess(folder, *drive_lines(number, key_file))
+        return reader, Writer(reader)
+
+
+class DotGridLines:
+    """Several lines at a serial port by the DotPad's protocol, as SerialLine."""
+
+    def __init__(self, folder):
+        self.port = folder / "braille"
+        self.arguments = [self.port, "--protocol", "dotpad"]
+        self.opened = f"5 lines of 7 cells at {self.port}"
+
+    def connect(self, folder):
+        reader = DotPadReader(self.port)
+        return reader, reader
 
 
 class BrailleCommand:
@@ -83,8 +105,7 @@ class Desk:
         self.start_reader()
 
     def start_reader(self):
-        self.reader = BrlttyProcess(self.folder, *self.command.place.driver)
-        self.writer = Writer(self.reader)
+        self.reader, self.writer = self.command.place.connect(self.folder)
 
     def stop(self):
         self.writer.close()
