@@ -4,6 +4,7 @@ import os
 import signal
 import socket
 import subprocess
+from collections import Counter
 from contextlib import contextmanager
 
 import numpy as np
@@ -112,11 +113,12 @@ class Desk:
         self.reader.kill()
         self.command.stop()
 
-    def find_emitted(self, since):
-        """Return the pixels of the board's pulses from number `since` on."""
+    def find_emitted(self, since, times=1):
+        """Return the pixels that the board emitted at least so many times from pulse number `since` on."""
         codes = cell_codes()
         pulses = self.board.of("pulse")[since:]
-        return {int(np.abs(codes - (pulse["x"], pulse["y"])).sum(axis=1).argmin()) for pulse in pulses}
+        counts = Counter(int(np.abs(codes - (pulse["x"], pulse["y"])).sum(axis=1).argmin()) for pulse in pulses)
+        return {pixel for pixel, count in counts.items() if count >= times}
 
     def wait_for_light(self, cells):
         """Wait until the board emits a pulse that these cells have."""
@@ -125,7 +127,10 @@ class Desk:
         wait_for(lambda: self.find_emitted(since) & expected, "light")
 
     def show(self, cells):
-        """Write cells, and wait until the board has emitted what they are, and since then nothing else."""
+        """Write cells, and wait until the board has emitted what they are, and since then nothing else.
+
+        Each dot twice: the rest of a frame before may consist of these dots, too.
+        """
         expected = find_raised(cells)
         self.writer.write(cells)
         since = len(self.board.of("pulse"))
@@ -134,7 +139,7 @@ class Desk:
             nonlocal since
             if self.find_emitted(since) - expected:  # the rest of the cells before
                 since = len(self.board.of("pulse"))
-            return self.find_emitted(since) == expected and (expected or is_dark(self))
+            return self.find_emitted(since, times=2) == expected and (expected or is_dark(self))
 
         wait_for(is_shown, f"{cells.hex()}, after pulse {since}")
         return since, expected
