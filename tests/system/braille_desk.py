@@ -114,7 +114,7 @@ class Desk:
         self.command.stop()
 
     def find_emitted(self, since, times=1):
-        """Return the pixels that the board emitted at least so many times from pulse number `since` on."""
+        """Return the pixels that have at least `times` pulses from pulse number `since` on."""
         codes = cell_codes()
         pulses = self.board.of("pulse")[since:]
         counts = Counter(int(np.abs(codes - (pulse["x"], pulse["y"])).sum(axis=1).argmin()) for pulse in pulses)
