@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_limiter_caps import FULL_W, build_budget, check_caps, random_caps, random_mirrors
 
@@ -19,6 +19,7 @@ from optodrive.planning.limiter.limiter import build_cold_budget_state, commit_u
 from optodrive.planning.limiter.rest import limit_rest, replace_rest
 from reference_models.thermal_display import (
     KINDS,
+    TOUCHED,
     build_plan,
     build_sequence,
     build_true_display,
@@ -85,17 +86,18 @@ def cap_fractions(kind, seed, commit=commit_until):
         return {}
     executed = play_with_pauses(rng, requested, budget, len(model.epsilon), commit)
     real = build_true_display(model, upper_factors(unsure) if rng.random() < 0.3 else sample_factors(rng, unsure))
-    absorber, _, wall, touch, _ = real.peaks(executed)
+    peaks = real.peaks(executed)
     return {
-        "absorber": absorber / caps.absorber_k,
-        "wall": wall / caps.wall_k,
-        "touch": touch / caps.touch_k,
+        "absorber": peaks[0] / caps.absorber_k,
+        "wall": peaks[2] / caps.wall_k if model.walls is not None else 0.0,
+        "touched": max(peaks[row] for row in TOUCHED) / caps.touch_k,
         "galvo": galvo_peak(executed, budget) / caps.galvo_rad2_per_s4,
         "diode": window_peak_w(executed, caps.display_window_s) / caps.display_mean_w,
     }
 
 
 @settings(max_examples=40, deadline=None)
+@example(kind="ring", seed=116)  # no walls: the panel alone is warm
 @given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**40))
 def test_no_paused_sequence_exceeds_a_cap(kind, seed):
     check_caps(cap_fractions, kind, seed)
@@ -120,4 +122,4 @@ def test_a_rest_that_forgets_the_executed_pulses_lets_the_next_plan_exceed_a_cap
         with suppress(InputError):
             fractions = cap_fractions(KINDS[seed % len(KINDS)], seed, forget_heat)
             exceeded |= {name for name, fraction in fractions.items() if fraction > 1 + 1e-6}
-    assert exceeded & {"absorber", "wall", "touch"}
+    assert exceeded & {"absorber", "wall", "touched"}

@@ -20,6 +20,7 @@ OPTODRIVE = Path(sys.executable).with_name("optodrive")
 SIMULATED = (sys.executable, "-m", "optodrive.link.simulator.board_process")
 SHORT_INDICATOR = (sys.executable, str(Path(__file__).with_name("short_indicator_board.py")))
 FULL_INDICATOR = (*SHORT_INDICATOR, "--full-indicator")
+LONG_INDICATOR = (*SHORT_INDICATOR, "--long-indicator")
 PROGRAMS = {(str(OPTODRIVE),): "optodrive", SIMULATED: "board", SHORT_INDICATOR: "short_indicator_board"}
 LOADED_VARIABLES = ("HOME", "LD_", "NUMBA_", "OPENBLAS_", "PYTHON", "XDG_CACHE_HOME")
 """Beginnings of the variables that a process reads while it loads: with others than the server's, it starts anew."""
