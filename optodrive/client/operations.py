@@ -5,7 +5,7 @@ from typing import Any, Unpack
 
 from optodrive.client.api_request import ApiRequest
 from optodrive.client.exchange import ExchangePolicy, HttpIo
-from optodrive.client.heights import HeightsLike, convert_to_pixels
+from optodrive.client.heights import HeightsLike, encode_target
 from optodrive.client.plan import Plan, report_loss
 from optodrive.client.requests import (
     ARM,
@@ -113,9 +113,10 @@ class DisplayOperations:
 
     async def show(
         self,
-        heights_um: HeightsLike,
+        heights_um: HeightsLike | None = None,
         duration_s: float = 1.0,
         *,
+        intensity: HeightsLike | None = None,
         simultaneous: bool = False,
         wait: bool = True,
         labels: LabelsLike = None,
@@ -125,10 +126,12 @@ class DisplayOperations:
 
         heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
         positions without a pixel are ignored)
+        intensity: in the same forms, the perceived intensity in thresholds, in place of heights_um
         labels: recorded with the plan: at most 32 of text, numbers and truth values
         options: `policy` and `fit`, as PushOptions describes them
         """
-        body = build_frame_body(convert_to_pixels(heights_um, await self.layout()), duration_s, simultaneous)
+        target = encode_target(heights_um, intensity, await self.layout())
+        body = build_frame_body(target, duration_s, simultaneous)
         return await self.push(body, wait=wait, labels=labels, **options)
 
     async def push(
@@ -162,14 +165,16 @@ class DisplayOperations:
 
     async def preview(
         self,
-        heights_um: HeightsLike,
+        heights_um: HeightsLike | None = None,
         duration_s: float = 1.0,
         *,
+        intensity: HeightsLike | None = None,
         simultaneous: bool = False,
         **options: Unpack[PushOptions],
     ) -> Plan:
         """Plan a frame as `show` would. Nothing moves."""
-        body = build_frame_body(convert_to_pixels(heights_um, await self.layout()), duration_s, simultaneous)
+        target = encode_target(heights_um, intensity, await self.layout())
+        body = build_frame_body(target, duration_s, simultaneous)
         return await self._report(build_push_request(body, options, dry_run=True))
 
     async def plan(self, plan: Plan | str) -> Plan:

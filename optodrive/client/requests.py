@@ -9,9 +9,7 @@ from pydantic import BaseModel
 from optodrive.client import api_request
 from optodrive.client.api_request import ApiRequest
 from optodrive.client.body import encode_body
-from optodrive.client.heights import encode_json
 from optodrive.client.plan import Plan
-from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.push_options import PushOptions
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.state import StateReport
@@ -42,9 +40,12 @@ def build_dim_request(share: float) -> ApiRequest[StateReport]:
     return api_request.build_dim_request(share).parsed_by(_parse_state)
 
 
-def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bool) -> dict[str, Any]:
-    """Build the body of one frame that starts at once, in the form of FRAMES.json."""
-    frame: dict[str, Any] = {"show_at_s": 0.0, "duration_s": duration_s, "target_um": encode_json(heights_um)}
+def build_frame_body(target: Mapping[str, Any], duration_s: float, simultaneous: bool) -> dict[str, Any]:
+    """Build the body of one frame that starts at once, in the form of FRAMES.json.
+
+    target: target_um or intensity, by pixel
+    """
+    frame: dict[str, Any] = {"show_at_s": 0.0, "duration_s": duration_s, **target}
     return {"frames": [frame | ({"simultaneous": True} if simultaneous else {})]}
 
 

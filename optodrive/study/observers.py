@@ -21,18 +21,17 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.physics.sensation import PERSISTENCE_S, ChannelSignals, compute_pulse_excitations, compute_signals
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.stimuli.experiments import compute_finger_places
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.study.presenter import Presentation
-from optodrive.study.sensation import ChannelSignals, compute_excitations, compute_signals
 from optodrive.study.study_file import Study
 
-REFERENCE_S, PERSISTENCE_S = 0.5, 0.1
+REFERENCE_S = 0.5
 WEBER_FRACTION = 0.2
 DETECTION_SLOPE = 3.0
 """Slope of the Weibull function of detection over the amplitude; some 3 for vibration."""
-TRACE_STEP_S = 1e-3
 STIMULUS_PAUSE_S = 0.2
 """Pause without a pulse that separates two stimuli on one pixel."""
 MAGNITUDE_BOUNDS = (0.01, 0.99)
@@ -146,7 +145,7 @@ class Observer:
     def _detect(self, shown: Presentation, rng: np.random.Generator) -> str:
         """Name the side on which something is felt, and guess if nothing is."""
         rows = np.arange(len(shown.pixel))
-        strongest = max(compute_excitations(self._simulate_m(shown, rows, shown.power_w), TRACE_STEP_S))
+        strongest = max(self._excite(shown, rows, shown.power_w))
         if rng.random() < -np.expm1(-(strongest**DETECTION_SLOPE)):
             return "left" if self._layout.x_m[shown.pixel[0]] < 0.0 else "right"
         return self._study.response.answers[int(rng.integers(len(self._study.response.answers)))]
@@ -164,13 +163,10 @@ class Observer:
         return self._feel_pulses(shown, rows, np.full(len(shown.pixel), self._display.config.laser.max_power_w))
 
     def _feel_pulses(self, shown: Presentation, rows: IntArray, power_w: FloatArray) -> ChannelSignals:
-        return compute_signals(self._simulate_m(shown, rows, power_w), TRACE_STEP_S)
+        return compute_signals(self._excite(shown, rows, power_w))
 
-    def _simulate_m(self, shown: Presentation, rows: IntArray, power_w: FloatArray) -> FloatArray:
-        """Return the displacement of a stimulus on one cold pixel, m, at steps of TRACE_STEP_S."""
-        pixel = int(shown.pixel[rows[0]])
+    def _excite(self, shown: Presentation, rows: IntArray, power_w: FloatArray) -> tuple[float, float]:
+        """Return the weighted amplitudes of a stimulus on one cold pixel, in units of the channels' thresholds."""
         start_s = shown.start_s[rows] - shown.start_s[rows[0]]
-        end_s = float(start_s[-1] + shown.width_s[rows[-1]] + PERSISTENCE_S)
         pulses = np.column_stack([start_s, shown.width_s[rows], power_w[rows], shown.pixel[rows]])
-        t_s = np.arange(0.0, end_s, TRACE_STEP_S)
-        return self._display.build_cold_heat().simulate_displacement_m(pulses, pixel, t_s)
+        return compute_pulse_excitations(self._display.build_cold_heat(), pulses, int(shown.pixel[rows[0]]))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from optodrive.device.config_file import load_config
+from optodrive.physics.sensation import compute_excitations
 from optodrive.planning.display_model import DisplayModel
 from optodrive.study.observers import Observer, Participant
 from optodrive.study.presenter import VirtualPresenter
-from optodrive.study.sensation import compute_excitations
 from optodrive.study.session import SimulatedRespondent, build_threshold_model, draw_order, list_answered, run_session
 from optodrive.study.study_file import load_study
 from optodrive.study.threshold import (

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from optodrive.planning.stimuli.frame_json import ID_MAX
+from optodrive.planning.stimuli.frame_json import ID_MAX, TARGET_KEYS
 from optodrive.planning.stimuli.json_values import PRIORITY_MAX, TIME_MAX_S
 from optodrive.planning.stimuli.labels import KEY_MAX, LABELS_MAX, NUMBER_MAX, TEXT_MAX
 from optodrive.planning.stimuli.pattern_registry import describe_patterns
@@ -37,18 +37,33 @@ _TARGETS_SCHEMA: Schema = {
     ],
     "description": "heights by pixel, or one height per pixel",
 }
+_INTENSITY_SCHEMA: Schema = {"type": "number", "minimum": 0, "description": "in thresholds"}
+_INTENSITIES_SCHEMA: Schema = {
+    "oneOf": [
+        {
+            "type": "object",
+            "additionalProperties": _INTENSITY_SCHEMA,
+            "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"},
+        },
+        {"type": "array", "items": _INTENSITY_SCHEMA},
+    ],
+    "description": "perceived intensities by pixel, or one per pixel, in place of target_um",
+}
+_ONE_TARGET: list[Schema] = [{"required": [key]} for key in TARGET_KEYS]
 LIVE_FRAME_SCHEMA = _object_schema(
     {"target_um": _TARGETS_SCHEMA}, {"frame": {"type": "integer", "minimum": 0, "maximum": FRAME_NUMBER_MAX}}
 )
 """The schema of a streamed frame as text."""
 _FRAME_SCHEMA = _object_schema(
-    {"show_at_s": _START_SCHEMA, "duration_s": _DURATION_SCHEMA, "target_um": _TARGETS_SCHEMA},
+    {"show_at_s": _START_SCHEMA, "duration_s": _DURATION_SCHEMA},
     {
+        "target_um": _TARGETS_SCHEMA,
+        "intensity": _INTENSITIES_SCHEMA,
         "id": {"type": "string", "minLength": 1, "maxLength": ID_MAX},
         "simultaneous": {"type": "boolean"},
         "priority": _PRIORITY_SCHEMA,
     },
-)
+) | {"oneOf": _ONE_TARGET}
 _TRAIN_SCHEMAS: dict[str, Schema] = {
     "pixel": {"type": "integer", "minimum": 0},
     "start_s": _START_SCHEMA,
@@ -62,10 +77,14 @@ _HEIGHT_TRAIN_SCHEMA = _object_schema(
     {**_TRAIN_SCHEMAS, "period_s": _DURATION_SCHEMA, "target_um": _POSITIVE_SCHEMA},
     {"peak_to_peak_um": _POSITIVE_SCHEMA, "priority": _PRIORITY_SCHEMA},
 )
+_INTENSITY_TRAIN_SCHEMA = _object_schema(
+    {**_TRAIN_SCHEMAS, "period_s": _DURATION_SCHEMA, "intensity": {**_POSITIVE_SCHEMA, "description": "in thresholds"}},
+    {"priority": _PRIORITY_SCHEMA},
+)
 _FRAMES_SCHEMA: Schema = {"type": "array", "items": _FRAME_SCHEMA, "maxItems": FRAMES_MAX}
 _TRAINS_SCHEMA: Schema = {
     "type": "array",
-    "items": {"oneOf": [_PULSE_TRAIN_SCHEMA, _HEIGHT_TRAIN_SCHEMA]},
+    "items": {"oneOf": [_PULSE_TRAIN_SCHEMA, _HEIGHT_TRAIN_SCHEMA, _INTENSITY_TRAIN_SCHEMA]},
     "maxItems": TRAINS_MAX,
 }
 _LABELS_SCHEMA: Schema = {
@@ -90,10 +109,14 @@ SEQUENCE_SCHEMA: Schema = {
 }
 """The schema of FRAMES.json."""
 SEQUENCE_EXAMPLE: Schema = {
-    "frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"0": 50}}],
+    "frames": [
+        {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"0": 50}},
+        {"show_at_s": 1.5, "duration_s": 0.5, "intensity": {"0": 3}},
+    ],
     "trains": [
         {"pixel": 0, "start_s": 0.6, "duration_s": 0.2, "pulse_width_s": 0.02, "gap_s": 0.06, "power_w": 1.0},
         {"pixel": 0, "start_s": 1.0, "duration_s": 0.2, "period_s": 0.04, "target_um": 100, "peak_to_peak_um": 40},
+        {"pixel": 0, "start_s": 2.2, "duration_s": 0.2, "period_s": 0.04, "intensity": 3},
     ],
 }
 """An example that every shipped display can show."""

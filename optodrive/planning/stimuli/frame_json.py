@@ -1,19 +1,22 @@
-"""Parser of tactile frames in JSON, in order of time and with heights in µm."""
+"""Parser of tactile frames in JSON, in order of time and with heights in µm or perceived intensities."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.errors import MISSING, InputError, Unquoted
 from optodrive.core.plausibility import guess_unit
 from optodrive.core.plausible_ranges import FRAMES
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import TactileFrame
 from optodrive.core.units import m_to_um, um_to_m
+from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.json_values import require_number, require_object, require_priority, require_time
 
-FRAME_QUANTITIES = ("show_at_s", "duration_s", "target_um")
-"""Required keys of a frame."""
+FRAME_TIMES = ("show_at_s", "duration_s")
+"""Required keys of a frame, beside one of `TARGET_KEYS`."""
+TARGET_KEYS = ("target_um", "intensity")
+"""Keys that state the targets of a frame or the target of a train: exactly one of them."""
 HEIGHT = FRAMES["frames.target_um"]
 ID_MAX = 100
 """Largest length of a frame's identifier, characters."""
@@ -23,16 +26,20 @@ OVERLAP_TOLERANCE_S = 1e-9
 """Overlap of two frames that the rounding of their times may cause, s."""
 
 
-def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[TactileFrame, ...]:
+def parse_frames(
+    entries: list[object], where: str, pixel_count: int, intensity_model: IntensityModel
+) -> tuple[TactileFrame, ...]:
     """Parse the entries of `frames`. Raise InputError (bad_time, bad_target, bad_priority, unknown_pixel, …)."""
     pixel_by_name = {str(pixel): pixel for pixel in range(pixel_count)}
     frames: list[TactileFrame] = []
+    are_by_height: list[bool] = []
     for k, entry in enumerate(entries):
-        frame = _parse_frame(entry, f"{where}[{k}]", k, pixel_by_name)
+        frame, by_height = _parse_frame(entry, f"{where}[{k}]", k, pixel_by_name, intensity_model)
         if frames:
             _check_order(frames[-1], frame, f"{where}[{k}]", f"frames[{k - 1}]")
         frames.append(frame)
-    _check_heights(where, frames)
+        are_by_height.append(by_height)
+    _check_heights(where, [frame for frame, by_height in zip(frames, are_by_height, strict=True) if by_height])
     return tuple(frames)
 
 
@@ -44,16 +51,38 @@ def _check_heights(where: str, frames: list[TactileFrame]) -> None:
         raise InputError(f"{where}: target_um", Unquoted(f"at most {highest_um:g}"), expected, code="bad_target")
 
 
-def _parse_frame(entry: object, where: str, position: int, pixel_by_name: dict[str, int]) -> TactileFrame:
-    table = require_object(entry, where, ("id", *FRAME_QUANTITIES, "simultaneous", "priority"), FRAME_QUANTITIES)
+def _parse_frame(
+    entry: object, where: str, position: int, pixel_by_name: dict[str, int], intensity_model: IntensityModel
+) -> tuple[TactileFrame, bool]:
+    """Return a frame, and whether it states heights and not intensities."""
+    known = ("id", *FRAME_TIMES, *TARGET_KEYS, "simultaneous", "priority")
+    table = require_object(entry, where, known, FRAME_TIMES)
     expected = "a time ≥ 0 in s"
     show_at_s = require_time(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
     duration_s = require_time(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
     frame_id = _parse_frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
-    target_m = parse_targets_m(table["target_um"], f"{where}.target_um", pixel_by_name)
+    target_key = select_target_key(table, where)
+    place, by_height = f"{where}.{target_key}", target_key == "target_um"
+    if by_height:
+        target_m = parse_targets_m(table[target_key], place, pixel_by_name)
+    else:
+        intensity = _parse_by_pixel(
+            table[target_key], place, pixel_by_name, "intensities", '{"17": 8}', _parse_intensities
+        )
+        target_m = intensity_model.solve_targets_m(intensity, place)
     simultaneous = _parse_simultaneous(table, f"{where}.simultaneous")
     priority = require_priority(table.get("priority", 0), f"{where}.priority")
-    return TactileFrame(frame_id, show_at_s, duration_s, target_m, simultaneous, priority)
+    return TactileFrame(frame_id, show_at_s, duration_s, target_m, simultaneous, priority), by_height
+
+
+def select_target_key(table: Mapping[str, object], where: str) -> str:
+    """Return which of `TARGET_KEYS` a frame or train states. Raise InputError (missing_key, bad_target)."""
+    stated = [key for key in TARGET_KEYS if key in table]
+    if not stated:
+        raise InputError(f"{where}.target_um", MISSING, "this required key, or intensity", code="missing_key")
+    if len(stated) > 1:
+        raise InputError(where, "target_um and intensity", "one of them", code="bad_target")
+    return stated[0]
 
 
 def _parse_simultaneous(table: Mapping[str, object], where: str) -> bool:
@@ -84,20 +113,50 @@ def parse_targets_m(value: object, where: str, pixel_by_name: dict[str, int]) ->
 
     Raises InputError (bad_target, unknown_pixel).
     """
+    return _parse_by_pixel(value, where, pixel_by_name, "heights", '{"17": 50}', _parse_heights_m)
+
+
+def _parse_by_pixel(
+    value: object,
+    where: str,
+    pixel_by_name: dict[str, int],
+    kind: str,
+    example: str,
+    parse_values: Callable[[list[object], list[int] | range, str], FloatArray],
+) -> FloatArray:
+    """Parse an object of values by pixel, or a list of all, to [p], 0 for pixels that are not named."""
     if isinstance(value, dict):
         for key in value:
             if key not in pixel_by_name:
                 raise InputError(where, key, f"a pixel, 0…{len(pixel_by_name) - 1}", code="unknown_pixel")
         pixels = [pixel_by_name[key] for key in value]
-        target_m = np.zeros(len(pixel_by_name))
-        target_m[pixels] = _parse_heights_m(list(value.values()), pixels, where)
-        return target_m
+        values = np.zeros(len(pixel_by_name))
+        values[pixels] = parse_values(list(value.values()), pixels, where)
+        return values
     if not isinstance(value, list):
-        raise InputError(where, value, 'heights by pixel, {"17": 50}, or a list of all', code="bad_target")
+        raise InputError(where, value, f"{kind} by pixel, {example}, or a list of all", code="bad_target")
     if len(value) != len(pixel_by_name):
-        expected = f"{len(pixel_by_name)} heights, one per pixel"
+        expected = f"{len(pixel_by_name)} {kind}, one per pixel"
         raise InputError(where, f"a list of {len(value)}", expected, code="bad_target")
-    return _parse_heights_m(value, range(len(pixel_by_name)), where)
+    return parse_values(value, range(len(pixel_by_name)), where)
+
+
+def _parse_intensities(values: list[object], pixels: list[int] | range, where: str) -> FloatArray:
+    return np.array(
+        [
+            parse_intensity(value, f"{where}.{pixel}", is_zero_allowed=True)
+            for pixel, value in zip(pixels, values, strict=True)
+        ]
+    )
+
+
+def parse_intensity(value: object, where: str, *, is_zero_allowed: bool) -> float:
+    """Return a perceived intensity, in units of a threshold. Raise InputError (bad_target)."""
+    expected = f"an intensity {'≥' if is_zero_allowed else '>'} 0, in thresholds"
+    intensity = require_number(value, where, expected, "bad_target")
+    if intensity < 0 or (intensity == 0 and not is_zero_allowed):
+        raise InputError(where, value, expected, code="bad_target")
+    return intensity
 
 
 def _parse_heights_m(values: list[object], pixels: list[int] | range, where: str) -> FloatArray:

@@ -10,6 +10,7 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.core.units import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.planning.stimuli.frame_json import parse_frames
+from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.json_values import decode_json, require_list, require_object
 from optodrive.planning.stimuli.labels import Labels, parse_labels
 from optodrive.planning.stimuli.train_json import check_trains, parse_train, train_to_json, validate_train
@@ -69,7 +70,8 @@ def _compute_frames_max(pixel_count: int) -> int:
 def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
     """Return a sequence in the form of FRAMES.json.
 
-    Heights are rounded to 1e-9 µm, so that parsing restores the numbers.
+    Heights are rounded to 1e-9 µm, so that parsing restores the numbers. An intensity is written as the height that it
+    was converted to.
     """
     return {
         "frames": [_frame_to_json(frame) for frame in sequence.frames],
@@ -104,14 +106,19 @@ def _parse_decoded(decoded: object, config: Config, where: str) -> tuple[FrameSe
     train_list = require_list(table.get("trains", []), f"{where}: trains", TRAINS_MAX)
     if not frame_list and not train_list:
         raise InputError(where, "neither frames nor trains", "at least one of them", code="bad_json")
+    intensity_model = IntensityModel(config)
     sequence = FrameSequence(
-        frames=parse_frames(frame_list, f"{where}: frames", pixel_count),
-        trains=_parse_trains(train_list, f"{where}: trains", config, pixel_count),
+        frames=parse_frames(frame_list, f"{where}: frames", pixel_count, intensity_model),
+        trains=_parse_trains(train_list, f"{where}: trains", config, pixel_count, intensity_model),
     )
     return sequence, labels
 
 
-def _parse_trains(entries: list[object], where: str, config: Config, pixel_count: int) -> tuple[Train, ...]:
-    trains = tuple(parse_train(entry, f"{where}[{k}]", config, pixel_count) for k, entry in enumerate(entries))
+def _parse_trains(
+    entries: list[object], where: str, config: Config, pixel_count: int, intensity_model: IntensityModel
+) -> tuple[Train, ...]:
+    trains = tuple(
+        parse_train(entry, f"{where}[{k}]", config, pixel_count, intensity_model) for k, entry in enumerate(entries)
+    )
     check_trains(trains, where, config)
     return trains

@@ -13,11 +13,14 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain, Train
 from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config
+from optodrive.planning.stimuli.frame_json import TARGET_KEYS, parse_intensity, select_target_key
+from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.json_values import require_number, require_object, require_priority, require_time
 
 PULSE_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", "power_w")
-HEIGHT_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "period_s", "target_um", "peak_to_peak_um")
-HEIGHT_ONLY_KEYS = frozenset(HEIGHT_TRAIN_KEYS) - frozenset(PULSE_TRAIN_KEYS)
+HEIGHT_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "period_s")
+"""Required keys of a height train, beside one of `TARGET_KEYS`."""
+HEIGHT_ONLY_KEYS = frozenset({"period_s", *TARGET_KEYS, "peak_to_peak_um"})
 """Keys that only a height train has."""
 PLAUSIBLE = FRAMES
 LONG_INTERVAL_S = 1.0
@@ -33,13 +36,13 @@ PWM_TOLERANCE_PERIODS = 0.01
 """Largest deviation of a width from whole PWM periods, in periods; the width is rounded to whole periods."""
 
 
-def parse_train(value: object, where: str, config: Config, pixel_count: int) -> Train:
+def parse_train(value: object, where: str, config: Config, pixel_count: int, intensity_model: IntensityModel) -> Train:
     """Parse one entry of `trains` as a pulse train or a height train, by its keys.
 
     Raises InputError (bad_train, bad_time, bad_target, bad_priority, unknown_pixel, unknown_key, missing_key).
     """
     if isinstance(value, dict) and not HEIGHT_ONLY_KEYS.isdisjoint(value):
-        return _parse_height_train(value, where, config, pixel_count)
+        return _parse_height_train(value, where, config, pixel_count, intensity_model)
     table = require_object(value, where, (*PULSE_TRAIN_KEYS, "priority"), PULSE_TRAIN_KEYS)
     pixel, start_s, duration_s = _parse_pixel_and_time(table, where, pixel_count)
     gap_s = require_time(table["gap_s"], f"{where}.gap_s", "a gap ≥ 0 in s", "bad_train", positive=False)
@@ -58,10 +61,23 @@ def _parse_pixel_and_time(table: Mapping[str, object], where: str, pixel_count: 
     return pixel, start_s, duration_s
 
 
-def _parse_height_train(value: object, where: str, config: Config, pixel_count: int) -> HeightTrain:
-    table = require_object(value, where, (*HEIGHT_TRAIN_KEYS, "priority"), HEIGHT_TRAIN_KEYS[:-1])
+def _parse_height_train(
+    value: object, where: str, config: Config, pixel_count: int, intensity_model: IntensityModel
+) -> HeightTrain:
+    known = (*HEIGHT_TRAIN_KEYS, *TARGET_KEYS, "peak_to_peak_um", "priority")
+    table = require_object(value, where, known, HEIGHT_TRAIN_KEYS)
     pixel, start_s, duration_s = _parse_pixel_and_time(table, where, pixel_count)
     period_s = require_time(table["period_s"], f"{where}.period_s", "a period > 0 in s", "bad_train", positive=True)
+    priority = require_priority(table.get("priority", 0), f"{where}.priority")
+    if select_target_key(table, where) == "intensity":
+        if table.get("peak_to_peak_um") is not None:
+            expected = "none: an intensity makes the pulses as short as possible"
+            raise InputError(f"{where}.peak_to_peak_um", table["peak_to_peak_um"], expected, code="bad_train")
+        place = f"{where}.intensity"
+        intensity = parse_intensity(table["intensity"], place, is_zero_allowed=False)
+        _check_period(HeightTrain(pixel, start_s, duration_s, period_s, 0.0), where, config)
+        target_m = intensity_model.solve_train_m(pixel, period_s, duration_s, intensity, place)
+        return HeightTrain(pixel, start_s, duration_s, period_s, target_m, priority=priority)
     target_um = require_number(table["target_um"], f"{where}.target_um", "a height > 0 in µm", "bad_target")
     peak_to_peak_um = table.get("peak_to_peak_um")
     peak_to_peak_m = None
@@ -69,7 +85,6 @@ def _parse_height_train(value: object, where: str, config: Config, pixel_count: 
         peak_to_peak_m = um_to_m(
             require_number(peak_to_peak_um, f"{where}.peak_to_peak_um", "a height > 0 in µm", "bad_train")
         )
-    priority = require_priority(table.get("priority", 0), f"{where}.priority")
     train = HeightTrain(pixel, start_s, duration_s, period_s, um_to_m(target_um), peak_to_peak_m, priority)
     return _validate_height_train(train, where, config)
 
@@ -84,12 +99,16 @@ def _validate_height_train(train: HeightTrain, where: str, config: Config) -> He
         raise InputError(f"{where}.peak_to_peak_um", peak_to_peak_um, expected, code="bad_train")
     if train.peak_to_peak_m is not None:
         _check_height(f"{where}.peak_to_peak_um", train.peak_to_peak_m)
+    _check_period(train, where, config)
+    return train
+
+
+def _check_period(train: HeightTrain, where: str, config: Config) -> None:
     period_min_s = 1.0 / config.laser.pwm_hz + config.limits.pulse_gap_min_s
     if train.period_s < period_min_s * (1 - 1e-9):
         expected = f"at least {period_min_s:g} s, a PWM period and limits.pulse_gap_min_s"
         raise InputError(f"{where}.period_s", train.period_s, expected, code="bad_train")
     _check_repeats(f"{where}.period_s", train.period_s, 0.0, train.duration_s)
-    return train
 
 
 def _check_height(where: str, height_m: float) -> None:
@@ -219,7 +238,7 @@ def train_to_json(train: Train) -> dict[str, object]:
     """Return a train in the form of FRAMES.json. Heights are rounded to 1e-9 µm."""
     if isinstance(train, PulseTrain):
         return {key: getattr(train, key) for key in PULSE_TRAIN_KEYS}
-    entry: dict[str, object] = {key: getattr(train, key) for key in HEIGHT_TRAIN_KEYS[:4]}
+    entry: dict[str, object] = {key: getattr(train, key) for key in HEIGHT_TRAIN_KEYS}
     entry["target_um"] = round(m_to_um(train.target_m), 9)
     if train.peak_to_peak_m is not None:
         entry["peak_to_peak_um"] = round(m_to_um(train.peak_to_peak_m), 9)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from displays import DISPLAYS
-from optodrive.client.heights import convert_to_pixels, encode_frame, encode_json
+from optodrive.client.heights import convert_to_pixels, encode_frame, encode_json, encode_target
 from optodrive.client.picture import interpolate_colour, render_png
 from optodrive.core.errors import InputError
 from optodrive.device.config import build_pixel_layout
@@ -74,3 +74,14 @@ def test_the_picture_has_its_size_and_its_lightness_increases(any_display):
     lightness = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in (interpolate_colour(k / 50) for k in range(51))]
     assert lightness == sorted(lightness)
     assert render_png(layout, np.zeros(len(layout)))[:4] == b"\x89PNG"
+
+
+def test_a_frame_states_heights_or_intensities():
+    by_height = encode_target({17: 120.0}, None, LAYOUT)
+    assert by_height == {"target_um": {"17": 120.0}}
+    assert encode_target(None, {17: 8}, LAYOUT) == {"intensity": {"17": 8.0}}
+    for heights_um, intensity in ((None, None), ({17: 1.0}, {17: 1.0})):
+        with pytest.raises(InputError, match="expected one of them"):
+            encode_target(heights_um, intensity, LAYOUT)
+    with pytest.raises(InputError, match=r"intensity\[17\]: got -1.0, expected an intensity ≥ 0"):
+        encode_target(None, {17: -1.0}, LAYOUT)

@@ -33,7 +33,11 @@ def test_the_example_is_valid_on_every_display(name):
         {"frames": SEQUENCE_EXAMPLE["frames"], "train": []},
         {"frames": [{**SEQUENCE_EXAMPLE["frames"][0], "show_at_s": -1.0}]},
         {"frames": [{**SEQUENCE_EXAMPLE["frames"][0], "target_um": {"00": 1}}]},
+        {"frames": [{**SEQUENCE_EXAMPLE["frames"][0], "intensity": {"0": 1}}]},
+        {"frames": [{**SEQUENCE_EXAMPLE["frames"][1], "intensity": {"0": -1}}]},
+        {"frames": [{"show_at_s": 0.0, "duration_s": 0.5}]},
         {"trains": [{**SEQUENCE_EXAMPLE["trains"][0], "period_s": 0.1}]},
+        {"trains": [{**SEQUENCE_EXAMPLE["trains"][1], "intensity": 1}]},
         {"trains": [{**SEQUENCE_EXAMPLE["trains"][0], "pixel": 1.5}]},
     ],
 )

@@ -124,7 +124,8 @@ def test_a_frame_without_a_required_key_is_refused(key):
     frame = {name: value for name, value in FRAME.items() if name != key}
     assert refusal({"frames": [frame]}) == (
         "missing_key",
-        f"frames.json: frames[0].{key}: missing, expected this required key",
+        f"frames.json: frames[0].{key}: missing, expected this required key"
+        + (", or intensity" if key == "target_um" else ""),
     )
 
 

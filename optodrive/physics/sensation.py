@@ -7,6 +7,8 @@ Bolanowski et al. 1988 (doi 10.1121/1.397184): the Meissner channel (NP I) falls
 1 µm at 30 Hz and is flat above; the Pacinian channel falls by 12 dB per octave to -20 dB re 1 µm at 250 Hz for 2.9 cm²,
 and rises by 3 dB per halving of the contact area (Verrillo 1963), which makes -4 dB for a pixel of 3 mm diameter.
 The figures are round: individuals differ by 5 to 10 dB, and a soft membrane is no rigid contactor.
+
+The stimulus that is felt is the displacement from its first pulse until PERSISTENCE_S after its last.
 """
 
 from typing import NamedTuple
@@ -14,12 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
+from optodrive.physics.thermal_state import ThermalState
 
 MEISSNER_MIN_M, MEISSNER_CORNER_HZ, MEISSNER_DB_PER_OCTAVE = 3.2e-6, 30.0, 5.0
 PACINIAN_MIN_M, PACINIAN_BEST_HZ, PACINIAN_DB_PER_OCTAVE = 0.63e-6, 250.0, 12.0
 FELT_MIN_HZ, FELT_MAX_HZ = 2.0, 500.0
 """Range of frequencies of vibration; slower displacement is pressure."""
 WEAKER_SHARE = 0.5
+PERSISTENCE_S, TRACE_STEP_S = 0.1, 1e-3
 
 
 class ChannelSignals(NamedTuple):
@@ -54,7 +58,24 @@ def compute_excitations(displacement_m: FloatArray, dt_s: float) -> tuple[float,
     return meissner, pacinian
 
 
-def compute_signals(displacement_m: FloatArray, dt_s: float) -> ChannelSignals:
-    """Return the channels' signals for a displacement [n] at steps of dt_s."""
-    meissner, pacinian = compute_excitations(displacement_m, dt_s)
+def compute_pulse_excitations(heat: ThermalState, pulses: FloatArray, pixel: int) -> tuple[float, float]:
+    """Return the weighted amplitudes of a stimulus on one pixel, in units of each channel's threshold.
+
+    pulses: [n, 4] start_s, width_s, power_w, pixel in order. heat: before the first of them.
+    """
+    first_s, duration_s = pulses[0, 0], pulses[-1, 0] + pulses[-1, 1] + PERSISTENCE_S - pulses[0, 0]
+    count = round(duration_s / TRACE_STEP_S)
+    dt_s = duration_s / count
+    return compute_excitations(heat.simulate_displacement_m(pulses, pixel, first_s + dt_s * np.arange(count)), dt_s)
+
+
+def compute_signals(excitations: tuple[float, float]) -> ChannelSignals:
+    """Return the channels' signals for weighted amplitudes in units of their thresholds."""
+    meissner, pacinian = excitations
     return ChannelSignals(max(0.0, meissner - 1.0), max(0.0, pacinian - 1.0))
+
+
+def compute_intensity(excitations: FloatArray) -> FloatArray:
+    """Return the perceived intensity [n] for the weighted amplitudes of both channels, [n, 2]."""
+    signals = np.maximum(excitations - 1.0, 0.0)
+    return np.asarray(signals.max(axis=1) + WEAKER_SHARE * signals.min(axis=1), dtype=np.float64)

@@ -1,0 +1,175 @@
+"""Heights of frames and trains that are felt with a requested intensity.
+
+Theory of operation. `intensity` is the perceived intensity of the channel model (`optodrive.physics.sensation`), in
+units of a threshold: 0 is the threshold itself, and twice the number is felt twice as strong. It depends on the whole
+course of the displacement: of a frame, on the single pulse that raises a cold pixel to its height; of a train, on the
+pulses of its first second from the cold state, as the planner shapes them.
+
+Height and excitation of both channels are tabulated on the nominal pixel, from a low height to the largest one. A pixel
+of gain g moves g times as far by the same pulse: it has g times the excitation at g times the height. Intensity rises
+with the height of a single pulse. That of a train falls again where its pulses fill the period, because the membrane
+then hardly falls between them; the table ends at the maximum. So every intensity below it has one height.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from math import floor
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.quantity import format_quantity
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.stimuli import HeightTrain
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
+from optodrive.physics.parameters import load_parameters
+from optodrive.physics.pulse_for_height import DriveRange
+from optodrive.physics.sensation import compute_intensity, compute_pulse_excitations
+from optodrive.physics.thermal_state import ThermalState, build_cold_state
+from optodrive.planning.scheduler.periodic_pulses import (
+    build_pulse_recipe,
+    compute_next_pulse,
+    compute_steady_state,
+    limit_pulse_width,
+)
+
+HEIGHT_SPAN, SAMPLES = 300.0, 48
+"""Largest over smallest simulated height of a table, and their number."""
+PROPORTIONAL_SPAN, INTERPOLATED = 1000.0, 2048
+"""Factor by which a table goes on below the simulated heights, and number of its heights."""
+BELOW_MAX = 1.0 - 1e-9
+"""Factor of the largest height, which rounding then does not exceed."""
+TRAIN_FELT_S = 1.0
+"""Time from the start of a train that counts, s."""
+TRAIN_TABLES_MAX = 64
+"""Largest number of different periods and durations of trains with an intensity in a sequence."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationTable:
+    """Excitations of the channels [n, 2] by increasing height of the nominal pixel [n]."""
+
+    height_m: FloatArray
+    excitations: FloatArray
+
+    @classmethod
+    def tabulate(cls, max_m: float, excite: Callable[[float], tuple[float, float]]) -> "ExcitationTable":
+        """Interpolate excitations between some heights up to max_m. Below those they are proportional to the height."""
+        height_m = np.geomspace(max_m / HEIGHT_SPAN, max_m, SAMPLES)
+        excitations = np.array([excite(each_m) for each_m in height_m.tolist()])
+        height_m = np.append(height_m[0] / PROPORTIONAL_SPAN, height_m)
+        excitations = np.vstack([excitations[0] / PROPORTIONAL_SPAN, excitations])
+        fine_m = np.geomspace(height_m[0], max_m, INTERPOLATED)
+        columns = [np.exp(np.interp(np.log(fine_m), np.log(height_m), np.log(each))) for each in excitations.T]
+        return cls(fine_m, np.column_stack(columns))
+
+    def compute_max(self, factor: float) -> float:
+        """Return the largest intensity of a pixel whose excitation is `factor` times the nominal one."""
+        return float(compute_intensity(factor * self.excitations).max())
+
+    def solve_m(self, intensity: float, factor: float) -> float:
+        """Return the smallest nominal height of an intensity above 0, at most that of `compute_max`."""
+        felt = compute_intensity(factor * self.excitations)
+        first = int(np.argmax(felt >= intensity))
+        share = (intensity - felt[first - 1]) / (felt[first] - felt[first - 1])
+        return float(self.height_m[first - 1] + share * (self.height_m[first] - self.height_m[first - 1]))
+
+
+class IntensityModel:
+    """Converts intensities to heights for a configured display. Nothing is computed before the first conversion."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._train_tables: dict[tuple[float, float], ExcitationTable] = {}
+
+    def solve_targets_m(self, intensity: FloatArray, where: str) -> FloatArray:
+        """Return the peak heights of single pulses, m, [p], for intensities [p], 0 where that is 0.
+
+        Raises InputError (target_unreachable) for an intensity beyond the longest pulse at full power.
+        """
+        target_m = np.zeros(len(intensity))
+        for pixel in np.flatnonzero(intensity).tolist():
+            limits, drive = self._config.limits, self._drive
+            reach = (
+                f"the intensity of the longest pulse ({format_quantity(limits.pulse_width_max_s, 's')} "
+                f"at {format_quantity(drive.max_power_w, 'W')})"
+            )
+            target_m[pixel] = self._solve_m(
+                self._frame_table, pixel, float(intensity[pixel]), f"{where}.{pixel}", reach
+            )
+        return target_m
+
+    def solve_train_m(self, pixel: int, period_s: float, duration_s: float, intensity: float, where: str) -> float:
+        """Return the height of a train's pulses, m, for its intensity.
+
+        Raises InputError (target_unreachable, too_many).
+        """
+        key = (period_s, min(duration_s, TRAIN_FELT_S))
+        table = self._train_tables.get(key)
+        if table is None:
+            if len(self._train_tables) == TRAIN_TABLES_MAX:
+                expected = f"at most {TRAIN_TABLES_MAX} different periods and durations of trains with an intensity"
+                raise InputError(where, intensity, expected, code="too_many")
+            table = self._train_tables[key] = self._tabulate_train(*key)
+        reach = f"the largest of pulses every {format_quantity(period_s, 's', 4)}"
+        return self._solve_m(table, pixel, intensity, where, reach)
+
+    def _solve_m(self, table: ExcitationTable, pixel: int, intensity: float, where: str, reach: str) -> float:
+        gain = float(self._gain[pixel])
+        max_intensity = table.compute_max(gain)
+        if intensity > max_intensity:
+            expected = f"at most {floor(100.0 * max_intensity) / 100.0:g}, {reach}"
+            raise InputError(where, intensity, expected, code="target_unreachable")
+        return gain * table.solve_m(intensity, gain)
+
+    @cached_property
+    def _cold(self) -> ThermalState:
+        return build_cold_state(remove_pixel_map(self._config), load_parameters(self._config.pixel_model.parameters))
+
+    @cached_property
+    def _drive(self) -> DriveRange:
+        """Return the drive of the stage with the least power: a pixel may get any stage that reaches it."""
+        weakest = min(self._config.list_stage_configs(), key=lambda stage: stage.laser.max_power_w)
+        return DriveRange.from_laser(
+            weakest.laser.max_power_w, weakest.laser.pwm_hz, self._config.limits.pulse_width_max_s
+        )
+
+    @cached_property
+    def _gain(self) -> FloatArray:
+        """Return the displacement of each pixel over the nominal pixel's, [p]. A dead pixel has a gain, too."""
+        known = load_pixel_map(self._config)
+        return np.ones(len(build_pixel_layout(self._config.display))) if known is None else known.gain
+
+    @cached_property
+    def _frame_table(self) -> ExcitationTable:
+        drive, cold = self._drive, self._cold
+        max_m = BELOW_MAX * float(cold.max_displacement_m(drive)[0])
+
+        def excite(height_m: float) -> tuple[float, float]:
+            periods, duty = cold.solve_pulse(0, 0.0, height_m, drive) or (0, 0.0)
+            pulse = np.array([[0.0, periods * drive.period_s, duty * drive.max_power_w, 0.0]])
+            return compute_pulse_excitations(cold, pulse, 0)
+
+        return ExcitationTable.tabulate(max_m, excite)
+
+    def _tabulate_train(self, period_s: float, duration_s: float) -> ExcitationTable:
+        drive = limit_pulse_width(self._drive, round(1e6 * (period_s - self._config.limits.pulse_gap_min_s)))
+        longest = HeightTrain(0, 0.0, duration_s, period_s, 1.0)
+        max_m = BELOW_MAX * compute_steady_state(longest, self._cold, drive, drive.max_periods, 1.0).peak_m
+        return ExcitationTable.tabulate(
+            max_m,
+            lambda height_m: self._excite_by_train(HeightTrain(0, 0.0, duration_s, period_s, height_m), drive),
+        )
+
+    def _excite_by_train(self, train: HeightTrain, drive: DriveRange) -> tuple[float, float]:
+        """Return the excitations by the pulses that a train alone gets on a cold display."""
+        recipe, heat, pulses = build_pulse_recipe(train, self._cold, drive, "train"), self._cold.copy(), []
+        for start_s in train.pulse_starts_s().tolist():
+            shape = compute_next_pulse(train, recipe, heat, start_s, drive)
+            if shape is not None:
+                pulses.append((start_s, shape[0] * drive.period_s, shape[1] * drive.max_power_w, train.pixel))
+                start, width, power = (np.array([each]) for each in pulses[-1][:3])
+                heat.apply_pulses(np.array([train.pixel]), start, width, power)
+        return compute_pulse_excitations(self._cold, np.array(pulses, dtype=np.float64), train.pixel)
