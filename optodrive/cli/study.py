@@ -1,7 +1,9 @@
 """`optodrive study`: run a study with people, or with simulated participants in virtual time."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +15,12 @@ from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
+    from optodrive.study.page_respondent import PageRespondent
+    from optodrive.study.page_server import PageAddress
     from optodrive.study.presenter import Presenter
+    from optodrive.study.session import Respondent
     from optodrive.study.study_file import Study
+    from optodrive.study.trial_log import TrialLog
 
 PARTICIPANTS_MAX = 1000
 
@@ -40,6 +46,14 @@ def study(
         bool,
         typer.Option("--lsl", help="Publish pulses and trials to the Lab Streaming Layer, once a recorder reads them."),
     ] = False,
+    page: Annotated[
+        str | None,
+        typer.Option(
+            "--page",
+            metavar="[HOST:]PORT",
+            help="The person answers on a page in a browser, with an operator's page beside it. PORT 0: any free one.",
+        ),
+    ] = None,
     url: UrlOption = DEFAULT_URL,
     hold: HoldOption = False,
     config: ConfigOption = None,
@@ -57,6 +71,8 @@ def study(
     check_output("--out", out, folder=True, may_exist=True)
     if not 1 <= participants <= PARTICIPANTS_MAX:
         raise InputError("--participants", participants, f"1 to {PARTICIPANTS_MAX}")
+    if participant is None and page is not None:
+        raise InputError("--page", page, "--participant: a simulated participant needs no page")
     if participant is None and lsl:
         raise InputError("--lsl", True, "--participant: a simulated board has no time of this computer")
     if participant is None:
@@ -65,7 +81,7 @@ def study(
         check_participant("--participant", participant)
         if participant.startswith(SIMULATED_PREFIX):
             raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
-        sessions = {participant: _run_person(design, out, participant, url, hold, lsl)}
+        sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page)}
     write_dataset(out)
     report = _build_report(design, sessions, out)
     print_answer(report, _format_report(report), json)
@@ -101,42 +117,79 @@ def _simulate(design: "Study", out: Path, participants: int, config: str | None)
     return sessions
 
 
-def _run_person(design: "Study", out: Path, participant: str, url: str, hold: bool, lsl: bool) -> list[dict[str, Any]]:
+def _run_person(
+    design: "Study", out: Path, participant: str, url: str, hold: bool, lsl: bool, page: str | None
+) -> list[dict[str, Any]]:
     """Run a person's session and return the records of the trials."""
     from optodrive.client.display import Display
     from optodrive.study.daemon_presenter import DaemonPresenter
     from optodrive.study.dataset import build_log_path
     from optodrive.study.lab_streams import LabStreams, PublishingPresenter
+    from optodrive.study.page_server import parse_page_address
     from optodrive.study.session import draw_order, run_session
     from optodrive.study.terminal import TerminalRespondent
     from optodrive.study.trial_log import TrialLog
 
-    with TrialLog(
-        build_log_path(out, design, participant), design, participant, draw_order(design, participant)
-    ) as log:
-        if log.next_trial is not None:
-            with Display(url) as display:  # stops what was started, also after an error
-                if hold:
-                    display.arm(hold=True)
-                presenter: Presenter = DaemonPresenter(display, {"study": design.name, "participant": participant})
-                on_trial: Callable[[dict[str, Any]], None] = _ignore
-                streams = LabStreams(design.name, participant) if lsl else None
-                if streams is not None:
-                    print(f"waiting for a recorder of {' and '.join(streams.names)}", file=sys.stderr, flush=True)
-                    streams.wait_for_recorder()
-                    presenter, on_trial = PublishingPresenter(presenter, streams), streams.publish_trial
-                log.begin_run(url)
-                try:
-                    run_session(design, log, presenter, TerminalRespondent(design), on_trial)
-                    if streams is not None:
-                        streams.finish()
-                except EOFError:
-                    raise InputError("answer", None, "a line; the session goes on with the same command") from None
+    address = None if page is None else parse_page_address("--page", page)
+    with ExitStack() as stack:
+        log = stack.enter_context(
+            TrialLog(build_log_path(out, design, participant), design, participant, draw_order(design, participant))
+        )
+        if log.next_trial is None:
+            return list(log.trials.values())
+        display = stack.enter_context(Display(url))  # stops what was started, also after an error
+        if hold:
+            display.arm(hold=True)
+        presenter: Presenter = DaemonPresenter(display, {"study": design.name, "participant": participant})
+        respondent: Respondent = TerminalRespondent(design)
+        on_trial: list[Callable[[dict[str, Any]], None]] = []
+        streams = LabStreams(design.name, participant) if lsl else None
+        if streams is not None:
+            print(f"waiting for a recorder of {' and '.join(streams.names)}", file=sys.stderr, flush=True)
+            streams.wait_for_recorder()
+            presenter = PublishingPresenter(presenter, streams)
+            on_trial.append(streams.publish_trial)
+        if address is not None:
+            respondent = pages = stack.enter_context(_serve_pages(design, participant, log, address, url))
+            on_trial.append(pages.record_trial)
+        log.begin_run(url)
+        try:
+            run_session(design, log, presenter, respondent, partial(_call_all, on_trial))
+            if streams is not None:
+                streams.finish()
+        except EOFError:
+            raise InputError("answer", None, "a line; the session goes on with the same command") from None
         return list(log.trials.values())
 
 
-def _ignore(record: dict[str, Any]) -> None:
-    pass
+@contextmanager
+def _serve_pages(
+    design: "Study", participant: str, log: "TrialLog", address: "PageAddress", url: str
+) -> Iterator["PageRespondent"]:
+    """Serve the pages of the session and print their addresses."""
+    from optodrive.study.page_respondent import PageRespondent
+    from optodrive.study.page_server import StudyPages
+
+    respondent = PageRespondent(design, participant, log.trials)
+    with StudyPages(respondent, address, partial(_stop_display, url)) as pages:
+        print(f"participant      {pages.participant_url}", file=sys.stderr)
+        print(f"operator         {pages.operator_url}", file=sys.stderr, flush=True)
+        yield respondent
+
+
+def _stop_display(url: str) -> None:
+    """Stop as `optodrive stop` does: at the link process, else at the daemon."""
+    from optodrive.cli.direct_stop import stop_directly
+    from optodrive.client.display import Display
+
+    if stop_directly(url) is None:
+        with Display(url) as display:
+            display.stop()
+
+
+def _call_all(listeners: Sequence[Callable[[dict[str, Any]], None]], record: dict[str, Any]) -> None:
+    for listener in listeners:
+        listener(record)
 
 
 def _build_report(design: "Study", sessions: dict[str, list[dict[str, Any]]], out: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from optodrive.client.display import Display
 from optodrive.client.plan import Plan
+from optodrive.core.errors import RefusedError
 from optodrive.study.presenter import TIME_TOLERANCE_S, Presentation
 from optodrive.study.study_file import Value
 
@@ -22,9 +23,15 @@ class DaemonPresenter:
         self._display, self._labels = display, labels
 
     def present(self, pattern: str, parameters: Mapping[str, Value]) -> Presentation:
-        """Play a pattern and wait for its end. Raise the daemon's error if it is refused or fails."""
+        """Play a pattern and wait for its end. Raise the daemon's error if it is refused or fails.
+
+        Raise RefusedError if the daemon runs on another computer: response times need one clock.
+        """
         arguments: dict[str, Any] = {**parameters, "policy": "refuse"}
+        called_s = time.monotonic()
         plan = self._display.play(pattern, labels=self._labels, **arguments)
+        if plan.onset is not None and not called_s <= plan.onset.monotonic_s <= time.monotonic():
+            raise RefusedError("the daemon's clock is not that of this computer: run the study where the daemon runs")
         columns = plan.executed_pulses
         start_s = np.asarray([] if columns is None else columns.start_s, dtype=np.float64)
         return Presentation(
@@ -47,6 +54,8 @@ def find_fault(plan: Plan) -> str | None:
     planned, executed = plan.pulses, plan.executed_pulses
     if executed is None or not plan.executed_complete or plan.executed != plan.planned:
         return f"{plan.executed} of {plan.planned} pulses executed"
+    if plan.onset is None:
+        return "the board's clock is not synchronised: the time of the onset is not known"
     if plan.summary.trimmed.pulses:
         return f"{plan.summary.trimmed.pulses} pulses trimmed by a limit"
     if planned is None:

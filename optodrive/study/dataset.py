@@ -41,6 +41,14 @@ COLUMNS: dict[str, dict[str, Any]] = {
     "answer": {"Description": "The participant's answer"},
     "is_correct": {"Description": "Whether the answer is the correct one", "Levels": {"0": "no", "1": "yes"}},
     "response_time": {"Description": "Time from the end of the stimulus to the answer", "Units": "s"},
+    "response_latency": {
+        "Description": "Part of the response time that the way of the answer through browser and network may have "
+        "taken: the browser's delay after the key or touch, plus a round trip to it; n/a without a page",
+        "Units": "s",
+    },
+    "early_answers": {
+        "Description": "Number of answers before the end of the stimulus, which do not count; n/a without a page"
+    },
     "presentations": {"Description": "Number of times for which the stimulus was shown before the answer"},
     "stimulus_onset": {
         "Description": "Gate on of the first pulse of the last presentation, by the clock of the display's board, "
@@ -104,6 +112,7 @@ def _build_row(record: Mapping[str, Any], factors: Sequence[str]) -> list[str]:
         *(record["condition"][factor] for factor in factors),
     ]
     cells += [record["answer"], "n/a" if correct is None else int(correct), record["response_time_s"]]
+    cells += ["n/a" if record.get(name) is None else record[name] for name in ("response_latency_s", "early_answers")]
     cells += [len(record["presentations"]), last["onset_s"], round(max(ends_s), 6), len(executed["pixel"])]
     return [str(cell) for cell in cells]
 

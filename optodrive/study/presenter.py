@@ -48,6 +48,11 @@ class Presentation:
         """Time from the first pulse's start to the last one's end, s."""
         return float((self.start_s + self.width_s).max(initial=0.0))
 
+    @property
+    def end_monotonic_s(self) -> float | None:
+        """End of the last pulse on the host's CLOCK_MONOTONIC, s, None of a board in virtual time."""
+        return None if self.onset_monotonic_s is None else self.onset_monotonic_s + self.duration_s
+
     def to_record(self) -> dict[str, Any]:
         """Return the presentation as JSON values."""
         columns = ("pixel", "start_s", "width_s", "power_w")

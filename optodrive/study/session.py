@@ -1,11 +1,12 @@
 """Sessions: the trials of one participant in a study, from the first that does not count yet to the last."""
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import lru_cache
 from math import ceil
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -24,20 +25,48 @@ RESPONSE_MEDIAN_S, RESPONSE_SPREAD = 1.2, 0.35
 
 @dataclass(frozen=True)
 class Response:
-    """A participant's answer and the time from the end of the stimulus to it."""
+    """A participant's answer and the time from the end of the stimulus to it.
+
+    latency_s: the part of that time which the way of the answer may have taken; early_answers: number of answers before
+    the end of the stimulus, which do not count; both None if the respondent cannot tell
+    """
 
     answer: str | float
     response_time_s: float
+    latency_s: float | None = None
+    early_answers: int | None = None
 
 
-class Respondent(Protocol):
-    """Interface of who answers."""
+class RepeatReason(StrEnum):
+    """Why a stimulus is shown once more before its trial is answered."""
 
-    def respond(self, shown: Presentation, trial: int, attempt: int) -> Response | None:
-        """Return the answer to a presentation, None to have it repeated."""
+    REQUESTED = "requested"
+    """The participant asked for it."""
+    INTERRUPTED = "interrupted"
+    """The participant's page was lost or replaced, or the participant took a break, before the answer."""
 
 
-class SimulatedRespondent:
+class Respondent:
+    """Interface of who answers. One who is always ready inherits the methods that do nothing."""
+
+    def wait_until_ready(self) -> None:
+        """Wait until a stimulus may be shown."""
+
+    def announce_example(self, number: int, count: int) -> None:
+        """Tell that a stimulus without a question comes, `number` of `count`."""
+
+    def announce(self, trial: int, attempt: int, presentation: int, condition: Mapping[str, Value]) -> None:
+        """Tell that a trial's stimulus comes. presentation: its number within the attempt, from 1."""
+
+    def withdraw(self, fault: str) -> None:
+        """Tell that the announced stimulus was not as requested: there is no question about it."""
+
+    def respond(self, shown: Presentation, trial: int, attempt: int) -> Response | RepeatReason:
+        """Return the answer to a presentation, or why it is to be repeated."""
+        raise NotImplementedError
+
+
+class SimulatedRespondent(Respondent):
     """A simulated participant. Its answers follow from the study's seed, its number, the trial and the attempt."""
 
     def __init__(self, observer: Observer, seed: int, number: int, presenter: Presenter) -> None:
@@ -116,18 +145,25 @@ def run_session(
     can go on later.
     """
     if study.familiarisation and not log.is_familiarised:
-        strongest = {} if study.procedure is None else {study.procedure.parameter: study.procedure.levels[-1]}
-        shown = [_familiarise(study, presenter, {**condition, **strongest}) for condition in study.conditions]
-        log.record_familiarisation(shown)
+        log.record_familiarisation(_familiarise(study, presenter, respondent))
     while (trial := log.next_trial) is not None:
         on_trial(_run_trial(study, log, presenter, respondent, trial))
         presenter.wait(study.pause_s)
 
 
-def _familiarise(study: Study, presenter: Presenter, condition: dict[str, Value]) -> dict[str, Any]:
-    shown = presenter.present(study.stimulus.pattern, {**study.stimulus.parameters, **condition})
-    presenter.wait(study.pause_s)
-    return {"condition": condition, **shown.to_record()}
+def _familiarise(study: Study, presenter: Presenter, respondent: Respondent) -> list[dict[str, Any]]:
+    """Show each condition once and return the records of these presentations."""
+    strongest = {} if study.procedure is None else {study.procedure.parameter: study.procedure.levels[-1]}
+    records = []
+    for number, factors in enumerate(study.conditions, start=1):
+        condition = {**factors, **strongest}
+        respondent.wait_until_ready()
+        respondent.announce_example(number, len(study.conditions))
+        shown = presenter.present(study.stimulus.pattern, {**study.stimulus.parameters, **condition})
+        records.append({"condition": condition, **shown.to_record()})
+        respondent.wait_until_ready()  # shows that the example is over
+        presenter.wait(study.pause_s)
+    return records
 
 
 def _run_trial(study: Study, log: TrialLog, presenter: Presenter, respondent: Respondent, trial: int) -> dict[str, Any]:
@@ -135,24 +171,39 @@ def _run_trial(study: Study, log: TrialLog, presenter: Presenter, respondent: Re
     condition = choose_condition(study, log, trial)
     parameters = {**study.stimulus.parameters, **condition}
     for _ in range(ATTEMPTS_MAX):
-        attempt, presentations, response = log.begin(trial, condition), [], None
-        while response is None:
+        respondent.wait_until_ready()  # before the trial is begun: it is not interrupted while nobody is there
+        attempt = log.begin(trial, condition)
+        presentations: list[dict[str, Any]] = []
+        while True:
+            respondent.announce(trial, attempt, len(presentations) + 1, condition)
             shown = presenter.present(study.stimulus.pattern, parameters)
             if shown.fault is not None:
                 break
-            presentations.append(shown.to_record())
             response = respondent.respond(shown, trial, attempt)
-        if response is None:
-            log.spoil(str(shown.fault))
-            continue
-        correct = study.find_correct_answer(condition)
-        return log.complete(
-            {
-                "requested": {"pattern": study.stimulus.pattern, "parameters": parameters},
-                "presentations": presentations,
-                "answer": response.answer,
-                "is_correct": None if correct is None else response.answer == correct,
-                "response_time_s": response.response_time_s,
-            }
-        )
+            if isinstance(response, Response):
+                presentations.append(shown.to_record())
+                return log.complete(_build_record(study, condition, parameters, presentations, response))
+            presentations.append({**shown.to_record(), "repeated": response.value})
+            respondent.wait_until_ready()
+        log.spoil(shown.fault)
+        respondent.withdraw(shown.fault)
     raise RefusedError(f"trial {trial + 1}: {ATTEMPTS_MAX} stimuli were not as requested, the last {shown.fault}")
+
+
+def _build_record(
+    study: Study,
+    condition: dict[str, Value],
+    parameters: dict[str, Value],
+    presentations: list[dict[str, Any]],
+    response: Response,
+) -> dict[str, Any]:
+    correct = study.find_correct_answer(condition)
+    return {
+        "requested": {"pattern": study.stimulus.pattern, "parameters": parameters},
+        "presentations": presentations,
+        "answer": response.answer,
+        "is_correct": None if correct is None else response.answer == correct,
+        "response_time_s": response.response_time_s,
+        "response_latency_s": response.latency_s,
+        "early_answers": response.early_answers,
+    }

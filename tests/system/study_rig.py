@@ -14,7 +14,7 @@ version = 1
 name = "short"
 title = "Short"
 seed = 3
-repetitions = 3
+repetitions = {repetitions}
 pause_s = 0.0
 {more}
 
@@ -37,9 +37,9 @@ observer = "digits"
 TRIALS = 9
 
 
-def write_study(folder, more=""):
+def write_study(folder, more="", repetitions=3):
     path = folder / "short.toml"
-    path.write_text(SHORT.format(more=more))
+    path.write_text(SHORT.format(more=more, repetitions=repetitions))
     return path
 
 

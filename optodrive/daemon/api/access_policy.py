@@ -3,13 +3,12 @@
 The checks run in that order, before any route. STOP needs a token of any role; its rate and body are not checked.
 """
 
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from optodrive.daemon.api.audit import AuditLog
+from optodrive.daemon.api.host_check import LOOPBACK_NAMES, TEXT_MAX, check_host_and_origin
 from optodrive.daemon.api.rate_limit import RateLimiter
 from optodrive.daemon.api.refusal_audit import RefusalAudit
 from optodrive.daemon.api.revocation import RequestsInProgress
@@ -20,11 +19,6 @@ from optodrive.daemon.api.static_files import is_page_request, read_cookie_token
 from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
 from optodrive.daemon.responses.problem import Problem, build_problem
 from optodrive.device.config_sections import DaemonSection
-
-LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
-DEFAULT_PORTS = {"http": "80", "https": "443"}
-AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:/?#@\s]+)(?::([0-9]{0,5}))?")
-TEXT_MAX = 100
 
 
 @dataclass
@@ -88,7 +82,7 @@ class AccessPolicy:
 
     def check(self, request: RequestContext, table: RouteTable) -> Problem | None:
         """Identify token and route of a request. Return why it is refused, or None if it is accepted."""
-        problem = self._check_host_and_origin(request)
+        problem = check_host_and_origin(request.headers, self._hosts)
         if problem is not None:
             return problem
         route = table.find(request.method, request.path)
@@ -112,26 +106,11 @@ class AccessPolicy:
 
     def permits_stop(self, request: RequestContext) -> bool:
         """Return whether `check` accepts this request if it is for STOP, which needs a token of any role."""
-        return self._check_host_and_origin(request) is None and self.find_token(request) is not None
+        return check_host_and_origin(request.headers, self._hosts) is None and self.find_token(request) is not None
 
     def acquire_frame(self, request: RequestContext) -> float:
         """Count one streamed frame against the caller's rate, and return the time to wait first, s."""
         return self._rate_limiter.acquire((request.token.name, request.address, "frames"), self._now_s())
-
-    def _check_host_and_origin(self, request: RequestContext) -> Problem | None:
-        host = request.headers.get("host", "")
-        own = _parse_authority(host)
-        if own is None or own.name not in self._hosts:
-            detail = (
-                f"this daemon does not answer to host {host[:TEXT_MAX]!r}: "
-                "its names besides loopback are those in daemon.hosts of the configuration"
-            )
-            return build_problem(421, "host_not_allowed", "Misdirected request", detail)
-        origin = request.headers.get("origin")
-        if origin is not None and not _is_same_origin(origin, own):
-            detail = f"requests from origin {origin[:TEXT_MAX]!r} are not answered"
-            return build_problem(403, "origin_not_allowed", "Origin not allowed", detail)
-        return None
 
     def _check_rate(self, request: RequestContext) -> Problem | None:
         wait_s = self._rate_limiter.acquire((request.token.name, request.address), self._now_s())
@@ -173,26 +152,3 @@ def _read_presented_token(request: RequestContext) -> str:
     if not scheme and is_websocket_request(request.headers):
         return read_subprotocol_token(request.headers)
     return credentials.strip() if scheme.lower() == "bearer" else ""
-
-
-class _Authority(NamedTuple):
-    name: str
-    port: str
-
-
-def _parse_authority(text: str) -> _Authority | None:
-    match = AUTHORITY.fullmatch(text.strip().lower())
-    return None if match is None else _Authority(match[1], match[2] or "")
-
-
-def _is_same_origin(origin: str, own: _Authority) -> bool:
-    """Return whether an Origin is the one at which the browser found this daemon, as its Host header states.
-
-    https is possible only behind a proxy, for one of the configured names.
-    """
-    scheme, _, text = origin.strip().lower().partition("://")
-    authority = _parse_authority(text)
-    if authority is None or scheme not in DEFAULT_PORTS or (scheme == "https" and own.name in LOOPBACK_NAMES):
-        return False
-    default = DEFAULT_PORTS[scheme]
-    return authority.name == own.name and (authority.port or default) == (own.port or default)
