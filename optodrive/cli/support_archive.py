@@ -119,6 +119,8 @@ def _list_named_files(config: "Config | None") -> Iterator[tuple[str, Path]]:
                 yield f"{number}-{kind}.toml", Path(name)
     if config.display.pixel_map:
         yield "pixels.toml", Path(config.display.pixel_map)
+    if config.display.sensitivity_map:
+        yield "sensitivity.toml", Path(config.display.sensitivity_map)
     if config.pixel_model.parameters.endswith(".toml"):
         yield "model.toml", Path(config.pixel_model.parameters)
 

@@ -84,7 +84,11 @@ def list_named_files(table: dict[str, Any]) -> Iterator[tuple[dict[str, Any], st
     A parameter set is a file only with the suffix .toml.
     """
     stages = table.get("stages")
-    named = [(table.get("display"), "pixel_map"), (table.get("pixel_model"), "parameters")]
+    named = [
+        (table.get("display"), "pixel_map"),
+        (table.get("display"), "sensitivity_map"),
+        (table.get("pixel_model"), "parameters"),
+    ]
     for part in (table, *(stages if isinstance(stages, list) else ())):
         if isinstance(part, dict):
             named += [(part.get("scanner"), "field"), (part.get("scanner"), "mirrors")]

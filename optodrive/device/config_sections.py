@@ -60,6 +60,8 @@ class DisplaySection(Section):
     """Height of an absorber in y, m; less than the pitch of several rows."""
     pixel_map: Annotated[str, Field(min_length=1)] | None = None
     """File with the measured gain, offset and state of every pixel, relative to the configuration's folder."""
+    sensitivity_map: Annotated[str, Field(min_length=1)] | None = None
+    """File with a person's sensitivity at every pixel, by which an intensity is equalised; in the same folder."""
 
     @model_validator(mode="after")
     def _check_missing_places(self) -> Self:

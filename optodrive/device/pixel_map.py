@@ -40,7 +40,9 @@ class _Pixel(Section):
     offset_y_sigma_m: Annotated[Offset, Item(ge=0)] | None = None
 
 
-class _Display(Section):
+class MappedDisplay(Section):
+    """The display that a map of pixels belongs to."""
+
     name: str
     rows: int
     columns: int
@@ -60,7 +62,7 @@ class _PixelMapFile(Section):
     format: str
     version: int
     about: dict[str, str | float | int] = Item(default_factory=dict)
-    display: _Display
+    display: MappedDisplay
     model: _Model
     map: _Map
 
@@ -127,14 +129,8 @@ def load_pixel_map(config: Config) -> PixelMap | None:
     if config.display.pixel_map is None:
         return None
     path = Path(config.display.pixel_map)
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:  # ValueError: a null character in the path
-        raise InputError(
-            str(path), Unquoted(getattr(error, "strerror", None) or str(error)), "a readable file"
-        ) from None
-    content = _read_file(path, status.st_mtime_ns, status.st_size)
-    _check_display(path, content.display, config)
+    content = _read_file(path, *read_change(path))
+    check_mapped_display(path, content.display, config)
     return _build_map(path, content, config)
 
 
@@ -157,16 +153,21 @@ def write_pixel_map(path: Path, pixel_map: PixelMap, config: Config, about: dict
 
     about: informative entries, text without quotes or backslashes
     """
-    display = config.display
-    lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
-    lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]
-    lines += ["", "[display] # of the map", f'name = "{config.name}"', f"rows = {display.rows}"]
-    lines += [f"columns = {display.columns}", f"pitch_m = {display.pitch_m!r}"]
-    lines += [f"missing = {[list(place) for place in display.missing]}"]
+    lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", *format_map_head(config, about)]
     lines += ["", "[model] # the parameter set that the gains refer to", f'parameters = "{pixel_map.model}"']
     lines += ["", "[map]", "pixels = ["]
     lines += [f"  {{ {_format_entry(pixel_map, index)} }}," for index in range(len(pixel_map))]
     write_text(path, "\n".join([*lines, "]"]) + "\n")
+
+
+def format_map_head(config: Config, about: dict[str, str | float | int]) -> list[str]:
+    """Return the lines of the tables [about] and [display] of a map of pixels."""
+    display = config.display
+    lines = ["[about]"]
+    lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]
+    lines += ["", "[display] # of the map", f'name = "{config.name}"', f"rows = {display.rows}"]
+    lines += [f"columns = {display.columns}", f"pitch_m = {display.pitch_m!r}"]
+    return [*lines, f"missing = {[list(place) for place in display.missing]}"]
 
 
 def _format_entry(pixel_map: PixelMap, index: int) -> str:
@@ -178,6 +179,17 @@ def _format_entry(pixel_map: PixelMap, index: int) -> str:
     return ", ".join(parts)
 
 
+def read_change(path: Path) -> tuple[int, int]:
+    """Return a file's time of change, ns, and its size, which tell whether it was changed. Raise InputError."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise InputError(
+            str(path), Unquoted(getattr(error, "strerror", None) or str(error)), "a readable file"
+        ) from None
+    return status.st_mtime_ns, status.st_size
+
+
 @lru_cache(maxsize=8)
 def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
     table = read_toml(path, BYTES_MAX)
@@ -185,7 +197,8 @@ def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
     return parse_table(path, table, _PixelMapFile)
 
 
-def _check_display(path: Path, mapped: _Display, config: Config) -> None:
+def check_mapped_display(path: Path, mapped: MappedDisplay, config: Config) -> None:
+    """Raise InputError unless a map belongs to the configured display."""
     display: DisplaySection = config.display
     for key in ("rows", "columns", "pitch_m"):
         given, expected = getattr(mapped, key), getattr(display, key)

@@ -13,7 +13,7 @@ then hardly falls between them; the table ends at the maximum. So every intensit
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import floor
 
 import numpy as np
@@ -24,6 +24,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import HeightTrain
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
+from optodrive.device.sensitivity_map import load_sensitivity_map, replace_sensitivity_map
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.sensation import compute_intensity, compute_pulse_excitations
@@ -77,12 +78,75 @@ class ExcitationTable:
         return float(self.height_m[first - 1] + share * (self.height_m[first] - self.height_m[first - 1]))
 
 
+@dataclass(frozen=True, eq=False)
+class NominalDrive:
+    """The nominal pixel, cold, and the laser's pulses by which its tables are made."""
+
+    cold: ThermalState
+    drive: DriveRange
+    pulse_gap_s: float
+
+    @cached_property
+    def frame_table(self) -> ExcitationTable:
+        """Table of single pulses."""
+        cold, drive = self.cold, self.drive
+
+        def excite(height_m: float) -> tuple[float, float]:
+            periods, duty = cold.solve_pulse(0, 0.0, height_m, drive) or (0, 0.0)
+            pulse = np.array([[0.0, periods * drive.period_s, duty * drive.max_power_w, 0.0]])
+            return compute_pulse_excitations(cold, pulse, 0)
+
+        return ExcitationTable.tabulate(BELOW_MAX * float(cold.max_displacement_m(drive)[0]), excite)
+
+    def tabulate_train(self, period_s: float, duration_s: float) -> ExcitationTable:
+        """Tabulate a train by height."""
+        drive = limit_pulse_width(self.drive, round(1e6 * (period_s - self.pulse_gap_s)))
+        longest = HeightTrain(0, 0.0, duration_s, period_s, 1.0)
+        max_m = BELOW_MAX * compute_steady_state(longest, self.cold, drive, drive.max_periods, 1.0).peak_m
+        return ExcitationTable.tabulate(
+            max_m,
+            lambda height_m: self._excite_by_train(HeightTrain(0, 0.0, duration_s, period_s, height_m), drive),
+        )
+
+    def _excite_by_train(self, train: HeightTrain, drive: DriveRange) -> tuple[float, float]:
+        """Return the excitations by the pulses that a train alone gets on a cold display."""
+        recipe, heat, pulses = build_pulse_recipe(train, self.cold, drive, "train"), self.cold.copy(), []
+        for start_s in train.pulse_starts_s().tolist():
+            shape = compute_next_pulse(train, recipe, heat, start_s, drive)
+            if shape is not None:
+                pulses.append((start_s, shape[0] * drive.period_s, shape[1] * drive.max_power_w, train.pixel))
+                start, width, power = (np.array([each]) for each in pulses[-1][:3])
+                heat.apply_pulses(np.array([train.pixel]), start, width, power)
+        return compute_pulse_excitations(self.cold, np.array(pulses, dtype=np.float64), train.pixel)
+
+
+@lru_cache(maxsize=8)
+def _build_nominal(config: Config, _parameters: str) -> NominalDrive:
+    """Build the nominal pixel and the pulses of a configuration without maps.
+
+    _parameters: content of the parameter set, by which a changed file is told
+    """
+    # A pixel may get any stage that reaches it, also the one with the least power.
+    weakest = min(config.list_stage_configs(), key=lambda stage: stage.laser.max_power_w).laser
+    drive = DriveRange.from_laser(weakest.max_power_w, weakest.pwm_hz, config.limits.pulse_width_max_s)
+    cold = build_cold_state(config, load_parameters(config.pixel_model.parameters))
+    return NominalDrive(cold, drive, config.limits.pulse_gap_min_s)
+
+
+@lru_cache(maxsize=4 * TRAIN_TABLES_MAX)
+def _tabulate_train(nominal: NominalDrive, period_s: float, duration_s: float) -> ExcitationTable:
+    return nominal.tabulate_train(period_s, duration_s)
+
+
 class IntensityModel:
-    """Converts intensities to heights for a configured display. Nothing is computed before the first conversion."""
+    """Converts intensities to heights for a configured display and the person of its sensitivity map, if it names one.
+
+    Nothing is computed before the first conversion, and tables of earlier models of the same display are used.
+    """
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._train_tables: dict[tuple[float, float], ExcitationTable] = {}
+        self._trains: set[tuple[float, float]] = set()
 
     def solve_targets_m(self, intensity: FloatArray, where: str) -> FloatArray:
         """Return the peak heights of single pulses, m, [p], for intensities [p], 0 where that is 0.
@@ -90,15 +154,14 @@ class IntensityModel:
         Raises InputError (target_unreachable) for an intensity beyond the longest pulse at full power.
         """
         target_m = np.zeros(len(intensity))
+        drive = self._nominal.drive
+        reach = (
+            f"the intensity of the longest pulse ({format_quantity(self._config.limits.pulse_width_max_s, 's')} "
+            f"at {format_quantity(drive.max_power_w, 'W')})"
+        )
         for pixel in np.flatnonzero(intensity).tolist():
-            limits, drive = self._config.limits, self._drive
-            reach = (
-                f"the intensity of the longest pulse ({format_quantity(limits.pulse_width_max_s, 's')} "
-                f"at {format_quantity(drive.max_power_w, 'W')})"
-            )
-            target_m[pixel] = self._solve_m(
-                self._frame_table, pixel, float(intensity[pixel]), f"{where}.{pixel}", reach
-            )
+            place = f"{where}.{pixel}"
+            target_m[pixel] = self._solve_m(self._nominal.frame_table, pixel, float(intensity[pixel]), place, reach)
         return target_m
 
     def solve_train_m(self, pixel: int, period_s: float, duration_s: float, intensity: float, where: str) -> float:
@@ -107,69 +170,34 @@ class IntensityModel:
         Raises InputError (target_unreachable, too_many).
         """
         key = (period_s, min(duration_s, TRAIN_FELT_S))
-        table = self._train_tables.get(key)
-        if table is None:
-            if len(self._train_tables) == TRAIN_TABLES_MAX:
-                expected = f"at most {TRAIN_TABLES_MAX} different periods and durations of trains with an intensity"
-                raise InputError(where, intensity, expected, code="too_many")
-            table = self._train_tables[key] = self._tabulate_train(*key)
+        self._trains.add(key)
+        if len(self._trains) > TRAIN_TABLES_MAX:
+            expected = f"at most {TRAIN_TABLES_MAX} different periods and durations of trains with an intensity"
+            raise InputError(where, intensity, expected, code="too_many")
         reach = f"the largest of pulses every {format_quantity(period_s, 's', 4)}"
-        return self._solve_m(table, pixel, intensity, where, reach)
+        return self._solve_m(_tabulate_train(self._nominal, *key), pixel, intensity, where, reach)
 
     def _solve_m(self, table: ExcitationTable, pixel: int, intensity: float, where: str, reach: str) -> float:
-        gain = float(self._gain[pixel])
-        max_intensity = table.compute_max(gain)
+        factor = float(self._gain[pixel] * self._sensitivity[pixel])
+        max_intensity = table.compute_max(factor)
         if intensity > max_intensity:
             expected = f"at most {floor(100.0 * max_intensity) / 100.0:g}, {reach}"
             raise InputError(where, intensity, expected, code="target_unreachable")
-        return gain * table.solve_m(intensity, gain)
+        return float(self._gain[pixel]) * table.solve_m(intensity, factor)
 
     @cached_property
-    def _cold(self) -> ThermalState:
-        return build_cold_state(remove_pixel_map(self._config), load_parameters(self._config.pixel_model.parameters))
-
-    @cached_property
-    def _drive(self) -> DriveRange:
-        """Return the drive of the stage with the least power: a pixel may get any stage that reaches it."""
-        weakest = min(self._config.list_stage_configs(), key=lambda stage: stage.laser.max_power_w)
-        return DriveRange.from_laser(
-            weakest.laser.max_power_w, weakest.laser.pwm_hz, self._config.limits.pulse_width_max_s
-        )
+    def _nominal(self) -> NominalDrive:
+        bare = replace_sensitivity_map(remove_pixel_map(self._config), None)
+        return _build_nominal(bare, load_parameters(bare.pixel_model.parameters).model_dump_json())
 
     @cached_property
     def _gain(self) -> FloatArray:
-        """Return the displacement of each pixel over the nominal pixel's, [p]. A dead pixel has a gain, too."""
+        """Displacement of each pixel over the nominal pixel's, [p]. A dead pixel has a gain, too."""
         known = load_pixel_map(self._config)
         return np.ones(len(build_pixel_layout(self._config.display))) if known is None else known.gain
 
     @cached_property
-    def _frame_table(self) -> ExcitationTable:
-        drive, cold = self._drive, self._cold
-        max_m = BELOW_MAX * float(cold.max_displacement_m(drive)[0])
-
-        def excite(height_m: float) -> tuple[float, float]:
-            periods, duty = cold.solve_pulse(0, 0.0, height_m, drive) or (0, 0.0)
-            pulse = np.array([[0.0, periods * drive.period_s, duty * drive.max_power_w, 0.0]])
-            return compute_pulse_excitations(cold, pulse, 0)
-
-        return ExcitationTable.tabulate(max_m, excite)
-
-    def _tabulate_train(self, period_s: float, duration_s: float) -> ExcitationTable:
-        drive = limit_pulse_width(self._drive, round(1e6 * (period_s - self._config.limits.pulse_gap_min_s)))
-        longest = HeightTrain(0, 0.0, duration_s, period_s, 1.0)
-        max_m = BELOW_MAX * compute_steady_state(longest, self._cold, drive, drive.max_periods, 1.0).peak_m
-        return ExcitationTable.tabulate(
-            max_m,
-            lambda height_m: self._excite_by_train(HeightTrain(0, 0.0, duration_s, period_s, height_m), drive),
-        )
-
-    def _excite_by_train(self, train: HeightTrain, drive: DriveRange) -> tuple[float, float]:
-        """Return the excitations by the pulses that a train alone gets on a cold display."""
-        recipe, heat, pulses = build_pulse_recipe(train, self._cold, drive, "train"), self._cold.copy(), []
-        for start_s in train.pulse_starts_s().tolist():
-            shape = compute_next_pulse(train, recipe, heat, start_s, drive)
-            if shape is not None:
-                pulses.append((start_s, shape[0] * drive.period_s, shape[1] * drive.max_power_w, train.pixel))
-                start, width, power = (np.array([each]) for each in pulses[-1][:3])
-                heat.apply_pulses(np.array([train.pixel]), start, width, power)
-        return compute_pulse_excitations(self._cold, np.array(pulses, dtype=np.float64), train.pixel)
+    def _sensitivity(self) -> FloatArray:
+        """Felt amplitude of each pixel over the channel model's, [p]."""
+        known = load_sensitivity_map(self._config)
+        return np.ones(len(self._gain)) if known is None else known.sensitivity

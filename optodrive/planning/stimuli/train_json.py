@@ -20,7 +20,8 @@ from optodrive.planning.stimuli.json_values import require_number, require_objec
 PULSE_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", "power_w")
 HEIGHT_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "period_s")
 """Required keys of a height train, beside one of `TARGET_KEYS`."""
-HEIGHT_ONLY_KEYS = frozenset({"period_s", *TARGET_KEYS, "peak_to_peak_um"})
+HEIGHT_TRAIN_TARGETS = (*TARGET_KEYS, "peak_to_peak_um")
+HEIGHT_ONLY_KEYS = frozenset({"period_s", *HEIGHT_TRAIN_TARGETS})
 """Keys that only a height train has."""
 PLAUSIBLE = FRAMES
 LONG_INTERVAL_S = 1.0
@@ -64,7 +65,7 @@ def _parse_pixel_and_time(table: Mapping[str, object], where: str, pixel_count: 
 def _parse_height_train(
     value: object, where: str, config: Config, pixel_count: int, intensity_model: IntensityModel
 ) -> HeightTrain:
-    known = (*HEIGHT_TRAIN_KEYS, *TARGET_KEYS, "peak_to_peak_um", "priority")
+    known = (*HEIGHT_TRAIN_KEYS, *HEIGHT_TRAIN_TARGETS, "priority")
     table = require_object(value, where, known, HEIGHT_TRAIN_KEYS)
     pixel, start_s, duration_s = _parse_pixel_and_time(table, where, pixel_count)
     period_s = require_time(table["period_s"], f"{where}.period_s", "a period > 0 in s", "bad_train", positive=True)

@@ -20,9 +20,9 @@ from optodrive.lab.diagnosis.plausible_units import LENGTHS
 from optodrive.lab.recording.storage import SAMPLE_COLUMNS, SIGNALS, TABLE_COLUMNS
 from optodrive.physics.parameters import PARAMETER_UNITS, Bridge, ParameterSet
 from optodrive.physics.terms import discover_terms
-from optodrive.planning.stimuli.frame_json import FRAME_QUANTITIES
+from optodrive.planning.stimuli.frame_json import FRAME_TIMES, TARGET_KEYS
 from optodrive.planning.stimuli.pattern_registry import describe_patterns
-from optodrive.planning.stimuli.train_json import HEIGHT_TRAIN_KEYS, PULSE_TRAIN_KEYS
+from optodrive.planning.stimuli.train_json import HEIGHT_TRAIN_KEYS, HEIGHT_TRAIN_TARGETS, PULSE_TRAIN_KEYS
 
 UNITS = {
     "_per_code": "rad",
@@ -104,8 +104,8 @@ def test_what_is_no_model_has_ranges_too():
     names = (*columns, *SIGNALS, *LENGTHS, "ambient_K")
     units = {name: find_unit(f"_{name.rpartition('.')[2]}") for name in names}
     assert list_stated(RECORDING) == {name: unit for name, unit in units.items() if unit}
-    trains = {f"trains.{name}" for name in (*PULSE_TRAIN_KEYS, *HEIGHT_TRAIN_KEYS)}
-    keys = {f"frames.{name}" for name in FRAME_QUANTITIES} | trains
+    trains = {f"trains.{name}" for name in (*PULSE_TRAIN_KEYS, *HEIGHT_TRAIN_KEYS, *HEIGHT_TRAIN_TARGETS)}
+    keys = {f"frames.{name}" for name in (*FRAME_TIMES, *TARGET_KEYS)} | trains
     assert list_stated(FRAMES) == {key: find_unit(key) for key in keys if find_unit(key)}
 
 
