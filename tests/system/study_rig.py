@@ -91,3 +91,16 @@ def is_as_requested(record, presentation):
         and np.allclose(executed["width_s"], widths_s, rtol=0, atol=2e-6)
         and np.allclose(executed["start_s"], starts_s, rtol=0, atol=2e-4)  # the PWM's period
     )
+
+
+def assert_on_the_board(presentation, logged):
+    """Assert that the board's own log has a presentation's pulses, one after the other, with their widths and times."""
+    executed = presentation["executed"]
+    starts_us = [round(1e6 * start_s) for start_s in executed["start_s"]]
+    widths_us = [round(1e6 * width_s) for width_s in executed["width_s"]]
+    count = len(starts_us)
+    assert any(
+        [off - on for on, off in logged[k : k + count]] == widths_us
+        and all(abs(on - logged[k][0] - at) <= 2 for (on, _), at in zip(logged[k : k + count], starts_us, strict=True))
+        for k in range(len(logged) - count + 1)
+    )

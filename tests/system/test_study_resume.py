@@ -13,7 +13,7 @@ import pytest
 
 from forked_process import OPTODRIVE, start_process
 from rig import TOKEN, wait_for
-from study_rig import TRIALS, find_defects, read_records, write_study
+from study_rig import TRIALS, assert_on_the_board, find_defects, read_records, write_study
 
 KILLS_MAX = 3
 SESSIONS = [*range(8), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 100))]
@@ -161,16 +161,3 @@ def test_a_persons_session_goes_on_after_a_kill(tmp_path, board, make_daemon, vi
     for record in records:
         if record["record"] == "trial":
             assert_on_the_board(record["presentations"][-1], logged)
-
-
-def assert_on_the_board(presentation, logged):
-    """Assert that the board's own log has a presentation's pulses, one after the other, with their widths and times."""
-    executed = presentation["executed"]
-    starts_us = [round(1e6 * start_s) for start_s in executed["start_s"]]
-    widths_us = [round(1e6 * width_s) for width_s in executed["width_s"]]
-    count = len(starts_us)
-    assert any(
-        [off - on for on, off in logged[k : k + count]] == widths_us
-        and all(abs(on - logged[k][0] - at) <= 2 for (on, _), at in zip(logged[k : k + count], starts_us, strict=True))
-        for k in range(len(logged) - count + 1)
-    )
