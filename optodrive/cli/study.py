@@ -15,11 +15,13 @@ from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
+    from optodrive.core.types.arrays import FloatArray
+    from optodrive.device.config import Config, PixelLayout
     from optodrive.study.page_respondent import PageRespondent
     from optodrive.study.page_server import PageAddress
     from optodrive.study.presenter import Presenter
     from optodrive.study.session import Respondent
-    from optodrive.study.study_file import Study
+    from optodrive.study.study_file import MatchingSection, Study
     from optodrive.study.trial_log import TrialLog
 
 PARTICIPANTS_MAX = 1000
@@ -75,32 +77,49 @@ def study(
         raise InputError("--page", page, "--participant: a simulated participant needs no page")
     if participant is None and lsl:
         raise InputError("--lsl", True, "--participant: a simulated board has no time of this computer")
+    display_config = _load_display_config(design, participant, url, config)
     if participant is None:
-        sessions = _simulate(design, out, participants, config)
+        sessions = _simulate(design, out, participants, display_config)
     else:
         check_participant("--participant", participant)
         if participant.startswith(SIMULATED_PREFIX):
             raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
-        sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page)}
+        sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page, display_config)}
     write_dataset(out)
     report = _build_report(design, sessions, out)
+    if design.matching is not None and display_config is not None:
+        report["sensitivity"] = _write_sensitivity(design, design.matching, sessions, out, display_config)
     print_answer(report, _format_report(report), json)
 
 
-def _simulate(design: "Study", out: Path, participants: int, config: str | None) -> dict[str, list[dict[str, Any]]]:
-    """Run the sessions of simulated participants and return the records of their trials."""
+def _load_display_config(design: "Study", participant: str | None, url: str, config: str | None) -> "Config | None":
+    """Return the configuration of the display, from the daemon only if the study needs it."""
     from optodrive.device.config_file import load_config
+
+    if participant is None:
+        return load_config(config)
+    if design.matching is None:
+        return None
+    from optodrive.client.display import Display
+
+    with Display(url) as display:
+        return display.config()
+
+
+def _simulate(
+    design: "Study", out: Path, participants: int, config: "Config | None"
+) -> dict[str, list[dict[str, Any]]]:
+    """Run the sessions of simulated participants and return the records of their trials."""
     from optodrive.planning.display_model import DisplayModel
     from optodrive.study.dataset import SIMULATED_PREFIX, build_log_path
     from optodrive.study.observers import Observer, Participant
     from optodrive.study.presenter import VirtualPresenter
-    from optodrive.study.session import SimulatedRespondent, draw_order, run_session
+    from optodrive.study.session import SimulatedRespondent, build_matching_model, draw_order, run_session
     from optodrive.study.trial_log import TrialLog
 
-    if design.simulation is None:
+    if design.simulation is None or config is None:
         raise InputError(f"study {design.name}: simulation", None, "an observer, to simulate a participant")
-    display = DisplayModel.from_config(load_config(config))
-    observer, sessions = Observer(design, display, Participant()), {}
+    display, sessions = DisplayModel.from_config(config), {}
     announce_compilation()
     with show_progress("simulating") as on_progress:
         for number in range(1, participants + 1):
@@ -109,24 +128,75 @@ def _simulate(design: "Study", out: Path, participants: int, config: str | None)
                 if log.next_trial is not None:
                     log.begin_run("simulated board in virtual time")
                     presenter = VirtualPresenter(display)
+                    sensitivity = _draw_sensitivity(design, number, display.layout)
+                    observer = Observer(design, display, Participant(), sensitivity)
                     respondent = SimulatedRespondent(observer, design.seed, number, presenter)
-                    run_session(design, log, presenter, respondent)
+                    section = design.matching
+                    matched = None if section is None else build_matching_model(section, display.layout)
+                    run_session(design, log, presenter, respondent, matching=matched)
                     presenter.close()
                 sessions[name] = list(log.trials.values())
             on_progress(number / participants)
     return sessions
 
 
+def _draw_sensitivity(design: "Study", number: int, layout: "PixelLayout") -> "FloatArray":
+    """Return the sensitivity of a simulated participant at each pixel, [p]."""
+    import numpy as np
+
+    from optodrive.study.observers import draw_sensitivity
+
+    sensitivity_range = 1.0 if design.simulation is None else design.simulation.sensitivity_range
+    return draw_sensitivity(layout, sensitivity_range, np.random.default_rng((design.seed, number)))
+
+
+def _write_sensitivity(
+    design: "Study",
+    matching: "MatchingSection",
+    sessions: dict[str, list[dict[str, Any]]],
+    out: Path,
+    config: "Config",
+) -> dict[str, dict[str, Any]]:
+    """Write the sensitivity map of each participant and return its figures."""
+    from optodrive.device.config import build_pixel_layout
+    from optodrive.study.dataset import SIMULATED_PREFIX
+    from optodrive.study.sensitivity_results import compute_variation, write_sensitivity
+
+    found: dict[str, dict[str, Any]] = {}
+    for name, records in sessions.items():
+        path, known = write_sensitivity(out, design, matching, name, records, config)
+        found[name] = {
+            "low": float(known.sensitivity.min()),
+            "high": float(known.sensitivity.max()),
+            "uncertainty": float((known.sigma / known.sensitivity).mean()),
+            "written": str(path),
+        }
+        if name.startswith(SIMULATED_PREFIX):
+            number = int(name.removeprefix(SIMULATED_PREFIX))
+            truth = _draw_sensitivity(design, number, build_pixel_layout(config.display))
+            found[name]["variation"] = compute_variation(truth, 1.0, matching.intensity)
+            found[name]["residual_variation"] = compute_variation(truth, known.sensitivity, matching.intensity)
+    return found
+
+
 def _run_person(
-    design: "Study", out: Path, participant: str, url: str, hold: bool, lsl: bool, page: str | None
+    design: "Study",
+    out: Path,
+    participant: str,
+    url: str,
+    hold: bool,
+    lsl: bool,
+    page: str | None,
+    config: "Config | None",
 ) -> list[dict[str, Any]]:
     """Run a person's session and return the records of the trials."""
     from optodrive.client.display import Display
+    from optodrive.device.config import build_pixel_layout
     from optodrive.study.daemon_presenter import DaemonPresenter
     from optodrive.study.dataset import build_log_path
     from optodrive.study.lab_streams import LabStreams, PublishingPresenter
     from optodrive.study.page_server import parse_page_address
-    from optodrive.study.session import draw_order, run_session
+    from optodrive.study.session import build_matching_model, draw_order, run_session
     from optodrive.study.terminal import TerminalRespondent
     from optodrive.study.trial_log import TrialLog
 
@@ -154,7 +224,10 @@ def _run_person(
             on_trial.append(pages.record_trial)
         log.begin_run(url)
         try:
-            run_session(design, log, presenter, respondent, partial(_call_all, on_trial))
+            matched = None
+            if design.matching is not None and config is not None:
+                matched = build_matching_model(design.matching, build_pixel_layout(config.display))
+            run_session(design, log, presenter, respondent, partial(_call_all, on_trial), matched)
             if streams is not None:
                 streams.finish()
         except EOFError:
@@ -241,6 +314,14 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
     for name, found in report.get("thresholds", {}).items():
         interval = f"95 % interval {found['low']:.3g} to {found['high']:.3g}"
         yield f"threshold        {name}: {report['threshold_of']} {found['threshold']:.3g} ({interval})"
+    for name, found in report.get("sensitivity", {}).items():
+        yield (
+            f"sensitivity      {name}: {found['low']:.2f} to {found['high']:.2f}, "
+            f"uncertainty {100 * found['uncertainty']:.1f} %, {found['written']}"
+        )
+        if "residual_variation" in found:
+            before, after = found["variation"], found["residual_variation"]
+            yield f"variation        {name}: felt {100 * before:.1f} % over the display, {100 * after:.1f} % equalised"
     yield from _format_published(report.get("published"))
     yield f"written          {report['written']}"
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import create_folder, lock_folder, write_text
-from optodrive.study.study_file import Study
+from optodrive.study.study_file import MATCHED_PARAMETERS, Study
 from optodrive.study.trial_log import read_log
 
 BIDS_VERSION = "1.10.0"
@@ -127,8 +127,7 @@ def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
     for factor, values in _list_varied(study).items():
         columns[factor] = {
             "Description": f"Parameter `{factor}` of the stimulus `{study['stimulus']['pattern']}`",
-            "Levels": {str(value): str(value) for value in values},
-        }
+        } | ({"Levels": {str(value): str(value) for value in values}} if values else {})
     return {
         "TaskName": study["name"].replace("-", ""),
         "TaskDescription": f"{study['title']}: {_describe_procedure(study)}",
@@ -140,15 +139,18 @@ def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _list_varied(study: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Return the values of each parameter that varies between trials."""
+    """Return the values of each parameter that varies between trials, none of one that is chosen freely."""
     procedure = study.get("procedure")
-    return {**study["factors"], **({procedure["parameter"]: procedure["levels"]} if procedure else {})}
+    matched: dict[str, list[Any]] = {name: [] for name in MATCHED_PARAMETERS} if study.get("matching") else {}
+    return {**study["factors"], **({procedure["parameter"]: procedure["levels"]} if procedure else {}), **matched}
 
 
 def _describe_procedure(study: Mapping[str, Any]) -> str:
     procedure = study.get("procedure")
     if procedure:
         return f"threshold of {procedure['parameter']} by {procedure['kind']}, {procedure['trials']} trials"
+    if matching := study.get("matching"):
+        return f"comparisons of {matching['places']} places, chosen by the answers, {matching['trials']} trials"
     return f"{study['repetitions']} trials per condition in random order"
 
 

@@ -11,7 +11,8 @@ the paper's accuracies; everything else is from the literature or from the geome
 Linear motion is the mean step from the first to the last place. Rotation is the sign of the area that the perceived
 path encloses. A localisation is the nearest of the places. The odd one of three is the one whose channel signals
 (`sensation`) differ most from those of the others, with a Weber fraction of 0.2 (Craig 1972; Forta et al. 2012 find
-0.2 to 0.6). A magnitude is the perceived intensity with noise of the same kind. Fingers are not confused.
+0.2 to 0.6). A magnitude is the perceived intensity with noise of the same kind, and so are the two that are compared.
+Fingers are not confused.
 """
 
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.device.config import PixelLayout
 from optodrive.physics.sensation import PERSISTENCE_S, ChannelSignals, compute_pulse_excitations, compute_signals
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.stimuli.experiments import compute_finger_places
@@ -47,6 +49,20 @@ class Participant:
     lapse: float = 0.025
 
 
+def draw_sensitivity(layout: PixelLayout, sensitivity_range: float, rng: np.random.Generator) -> FloatArray:
+    """Draw the sensitivity of a participant at each pixel, [p]: a slope and a bump, of mean logarithm 0.
+
+    sensitivity_range: largest over smallest sensitivity
+    """
+    position = np.column_stack([layout.x_m, layout.y_m])
+    position = position / np.abs(position).max()
+    angle, bump = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.7, 0.7, 2)
+    height = position @ (np.cos(angle), np.sin(angle))
+    height = height + rng.normal() * 2.0 * np.exp(-2.0 * np.sum((position - bump) ** 2, axis=1))
+    logarithm = np.log(sensitivity_range) * height / np.ptp(height)
+    return np.asarray(np.exp(logarithm - logarithm.mean()), dtype=np.float64)
+
+
 class Visits(NamedTuple):
     """Places in the order of stimulation: pixel [n], position_m [n, 2] in x and y, exposure_s [n]."""
 
@@ -61,11 +77,14 @@ class Observer:
     sensitivity: [p] factor of the felt displacement by pixel, 1 by default
     """
 
-    def __init__(self, study: Study, display: DisplayModel, participant: Participant) -> None:
+    def __init__(
+        self, study: Study, display: DisplayModel, participant: Participant, sensitivity: FloatArray | None = None
+    ) -> None:
         if study.simulation is None:
             raise ValueError(f"study {study.name} states no observer")
         self._study, self._display, self._participant = study, display, participant
         self._layout, self._lattice = display.layout, Lattice.from_config(display.config)
+        self._sensitivity = np.ones(len(display.layout)) if sensitivity is None else sensitivity
         self._pitch_m = display.config.display.pitch_m
         rules: dict[str, Callable[[Presentation, np.random.Generator], str | float]] = {
             "linear-motion": self._judge_linear_motion,
@@ -75,6 +94,7 @@ class Observer:
             "oddball": self._find_odd,
             "digits": self._name_digits,
             "detection": self._detect,
+            "comparison": self._compare,
         }
         self._perceive = rules[study.simulation.observer]
 
@@ -150,6 +170,12 @@ class Observer:
             return "left" if self._layout.x_m[shown.pixel[0]] < 0.0 else "right"
         return self._study.response.answers[int(rng.integers(len(self._study.response.answers)))]
 
+    def _compare(self, shown: Presentation, rng: np.random.Generator) -> str:
+        """Name the stronger of two stimuli, the first or the second of the answers."""
+        felt = np.log1p([signals.intensity for signals in self.feel(shown)])
+        noisy = felt + WEBER_FRACTION * rng.standard_normal(len(felt))
+        return self._study.response.answers[int(noisy.argmax())]
+
     def feel(self, shown: Presentation) -> list[ChannelSignals]:
         """Return the channels' signals of each stimulus on one pixel. Stimuli are separated by pauses."""
         firsts = np.flatnonzero(np.diff(shown.start_s, prepend=-np.inf) > STIMULUS_PAUSE_S)
@@ -169,4 +195,6 @@ class Observer:
         """Return the weighted amplitudes of a stimulus on one cold pixel, in units of the channels' thresholds."""
         start_s = shown.start_s[rows] - shown.start_s[rows[0]]
         pulses = np.column_stack([start_s, shown.width_s[rows], power_w[rows], shown.pixel[rows]])
-        return compute_pulse_excitations(self._display.build_cold_heat(), pulses, int(shown.pixel[rows[0]]))
+        pixel = int(shown.pixel[rows[0]])
+        meissner, pacinian = compute_pulse_excitations(self._display.build_cold_heat(), pulses, pixel)
+        return float(self._sensitivity[pixel] * meissner), float(self._sensitivity[pixel] * pacinian)

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from optodrive.core.errors import RefusedError
+from optodrive.device.config import PixelLayout
+from optodrive.study.matching import Comparison, MatchingModel
 from optodrive.study.observers import Observer
 from optodrive.study.presenter import Presentation, Presenter
-from optodrive.study.study_file import ProcedureSection, Study, Value
+from optodrive.study.study_file import MATCHING_ANSWERS, MatchingSection, ProcedureSection, Study, Value
 from optodrive.study.threshold import ThresholdModel, draw_constant_levels, select_staircase_level
 from optodrive.study.trial_log import TrialLog
 
@@ -109,9 +111,23 @@ def list_answered(procedure: ProcedureSection, records: Sequence[dict[str, Any]]
     ]
 
 
-def choose_condition(study: Study, log: TrialLog, trial: int) -> dict[str, Value]:
-    """Return a trial's condition, with the level that the procedure chooses by the answers so far."""
+def list_comparisons(records: Sequence[dict[str, Any]]) -> list[tuple[Comparison, bool]]:
+    """Return comparisons, and whether the second place was felt more strongly, of trials in order."""
+    return [(Comparison(**record["condition"]), record["answer"] == MATCHING_ANSWERS[1]) for record in records]
+
+
+def build_matching_model(matching: MatchingSection, layout: PixelLayout) -> MatchingModel:
+    """Return the model of a matching on a display."""
+    return MatchingModel(layout.x_m, layout.y_m, matching.places, matching.intensity)
+
+
+def choose_condition(study: Study, log: TrialLog, trial: int, matching: MatchingModel | None) -> dict[str, Value]:
+    """Return a trial's condition, with the choice of a procedure or a matching by the answers so far."""
     procedure, condition = study.procedure, log.order[trial]
+    if matching is not None:
+        answers = list_comparisons([log.trials[index] for index in sorted(log.trials)])
+        is_swapped = random.Random(f"{study.seed} {trial}").random() < 0.5
+        return dict(matching.choose(answers, is_swapped)._asdict())
     if procedure is None or procedure.kind == "constant":
         return condition
     answered = list_answered(procedure, [log.trials[index] for index in sorted(log.trials)])
@@ -138,16 +154,17 @@ def run_session(
     presenter: Presenter,
     respondent: Respondent,
     on_trial: Callable[[dict[str, Any]], None] = lambda record: None,
+    matching: MatchingModel | None = None,
 ) -> None:
     """Run the trials that do not count yet. Every one that does is on the disk before the next begins.
 
-    on_trial: gets the record of each trial. Raise an OptodriveError if the display cannot show a stimulus; the session
-    can go on later.
+    on_trial: gets the record of each trial; matching: of a study that has one, for its display. Raise an
+    OptodriveError if the display cannot show a stimulus; the session can go on later.
     """
     if study.familiarisation and not log.is_familiarised:
         log.record_familiarisation(_familiarise(study, presenter, respondent))
     while (trial := log.next_trial) is not None:
-        on_trial(_run_trial(study, log, presenter, respondent, trial))
+        on_trial(_run_trial(study, log, presenter, respondent, trial, matching))
         presenter.wait(study.pause_s)
 
 
@@ -166,9 +183,16 @@ def _familiarise(study: Study, presenter: Presenter, respondent: Respondent) -> 
     return records
 
 
-def _run_trial(study: Study, log: TrialLog, presenter: Presenter, respondent: Respondent, trial: int) -> dict[str, Any]:
+def _run_trial(
+    study: Study,
+    log: TrialLog,
+    presenter: Presenter,
+    respondent: Respondent,
+    trial: int,
+    matching: MatchingModel | None,
+) -> dict[str, Any]:
     """Run one trial until it counts and return its record."""
-    condition = choose_condition(study, log, trial)
+    condition = choose_condition(study, log, trial, matching)
     parameters = {**study.stimulus.parameters, **condition}
     for _ in range(ATTEMPTS_MAX):
         respondent.wait_until_ready()  # before the trial is begun: it is not interrupted while nobody is there

@@ -17,6 +17,9 @@ FORMAT, VERSION = "optodrive-study", 1
 EXPERIMENTS = Path(__file__).with_name("experiments")
 TRIALS_MAX = 10_000
 CHANCE_TOLERANCE = 1e-3
+MATCHING_ANSWERS = ("first", "second")
+MATCHED_PARAMETERS = ("first", "second", "first_intensity", "second_intensity")
+"""Parameters of the stimulus of a matching, which vary between trials."""
 
 Value = str | int | float
 Condition = Mapping[str, Value]
@@ -78,11 +81,25 @@ class ProcedureSection(Section):
         return self
 
 
+class MatchingSection(Section):
+    """Comparisons of places, chosen by the answers so far, by which the sensitivity over the display is found."""
+
+    trials: Annotated[int, Field(ge=1, le=5000)]
+    places: Annotated[int, Field(ge=2, le=200)] = 60
+    """Number of compared pixels, spread over the display."""
+    intensity: Annotated[float, Field(gt=0.0, le=100.0)]
+    """Perceived intensity at which they are compared, in thresholds."""
+
+
 class SimulationSection(Section):
     """The simulated participant."""
 
-    observer: Literal["linear-motion", "rotation", "localisation", "intensity", "oddball", "digits", "detection"]
+    observer: Literal[
+        "linear-motion", "rotation", "localisation", "intensity", "oddball", "digits", "detection", "comparison"
+    ]
     """The rule by which it answers."""
+    sensitivity_range: Annotated[float, Field(ge=1.0, le=10.0)] = 1.0
+    """Largest over smallest sensitivity over the display, which varies smoothly and differs between participants."""
 
 
 class PublishedSection(Section):
@@ -120,16 +137,19 @@ class Study(Section):
     familiarisation: bool = False
     """Whether each stimulus is shown once, without a response, before the first trial."""
     stimulus: StimulusSection
-    factors: dict[str, Annotated[tuple[Value, ...], Field(min_length=1)]]
+    factors: dict[str, Annotated[tuple[Value, ...], Field(min_length=1)]] = Field(default_factory=dict)
     """Values of each factor; the conditions are their combinations."""
     response: ResponseSection
     procedure: ProcedureSection | None = None
+    matching: MatchingSection | None = None
     simulation: SimulationSection | None = None
     published: PublishedSection | None = None
 
     @model_validator(mode="after")
     def _check_factors(self) -> "Study":
-        if not self.factors:
+        if self.matching is not None:
+            self._check_matching()
+        elif not self.factors:
             raise ConflictError("factors", self.factors, "at least one factor")
         for name, values in self.factors.items():
             if len(set(map(repr, values))) != len(values):
@@ -154,6 +174,19 @@ class Study(Section):
             raise ConflictError("repetitions", self.repetitions, f"at most {TRIALS_MAX} trials in all")
         return self
 
+    def _check_matching(self) -> None:
+        if self.factors:
+            raise ConflictError("factors", self.factors, "none: the answers choose the comparisons")
+        if self.stimulus.pattern != "comparison" or self.stimulus.parameters:
+            raise ConflictError("stimulus", self.stimulus.pattern, "the pattern comparison without parameters")
+        if self.response.answers != MATCHING_ANSWERS or self.response.correct_factor is not None:
+            expected = f"{', '.join(MATCHING_ANSWERS)}, without a correct_factor"
+            raise ConflictError("response.answers", self.response.answers, expected)
+        if self.procedure is not None:
+            raise ConflictError("procedure", self.procedure.kind, "none beside [matching]")
+        if self.repetitions != 1:
+            raise ConflictError("repetitions", self.repetitions, "none: [matching] states the number of trials")
+
     @property
     def conditions(self) -> tuple[dict[str, Value], ...]:
         """All combinations of the factors' values, the last factor fastest."""
@@ -164,12 +197,15 @@ class Study(Section):
         """Number of trials of one participant."""
         if self.procedure is not None:
             return self.procedure.trials
+        if self.matching is not None:
+            return self.matching.trials
         return len(self.conditions) * self.repetitions
 
     @property
     def varied(self) -> tuple[str, ...]:
         """Names of the stimulus' parameters that vary between trials."""
-        return (*self.factors, *(() if self.procedure is None else (self.procedure.parameter,)))
+        matched = () if self.matching is None else MATCHED_PARAMETERS
+        return (*self.factors, *(() if self.procedure is None else (self.procedure.parameter,)), *matched)
 
     @property
     def task(self) -> str:

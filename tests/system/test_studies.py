@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.study.study_file import load_study
+from optodrive.device.config_file import load_config
+from optodrive.device.sensitivity_map import load_sensitivity_map, replace_sensitivity_map
+from optodrive.study.study_file import EXPERIMENTS, load_study
 from optodrive.study.trial_log import read_log
 
 VALIDATOR = Path(sys.executable).with_name("bids-validator-deno")
@@ -76,6 +78,25 @@ def test_the_validator_finds_a_broken_dataset(dataset, path, old, new):
         assert validate(dataset)[0] != 0
     finally:
         (dataset / path).write_text(text)
+
+
+def test_a_matching_writes_the_sensitivity_map_of_each_participant(tmp_path, capsys):
+    path, data = tmp_path / "short.toml", tmp_path / "data"
+    path.write_text((EXPERIMENTS / "equalisation.toml").read_text().replace("trials = 700", "trials = 30"))
+    report = run_study(capsys, str(path), data, "--participants", "2")
+    assert report["participants"] == {"sim01": 30, "sim02": 30}
+    for name, found in report["sensitivity"].items():
+        known = load_sensitivity_map(replace_sensitivity_map(load_config(), Path(found["written"])))
+        assert (known.participant, known.trials) == (name, 30)
+        assert found["low"] == pytest.approx(known.sensitivity.min(), rel=1e-3)
+        assert 0.15 < found["variation"] < 0.35
+    first, second = (found["variation"] for found in report["sensitivity"].values())
+    assert first != second
+    table = (data / "sub-sim01/beh/sub-sim01_task-equalisation_beh.tsv").read_text().splitlines()
+    assert len(table) == 31
+    assert table[0].split("\t")[3:7] == ["first", "second", "first_intensity", "second_intensity"]
+    assert validate(data)[0] == 0
+    assert run_study(capsys, str(path), data, "--participants", "2") == report
 
 
 @pytest.mark.slow

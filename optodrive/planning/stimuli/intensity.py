@@ -22,6 +22,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import HeightTrain
+from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
 from optodrive.device.sensitivity_map import load_sensitivity_map, replace_sensitivity_map
@@ -42,6 +43,8 @@ PROPORTIONAL_SPAN, INTERPOLATED = 1000.0, 2048
 """Factor by which a table goes on below the simulated heights, and number of its heights."""
 BELOW_MAX = 1.0 - 1e-9
 """Factor of the largest height, which rounding then does not exceed."""
+HEIGHT_DECIMALS = 9
+"""Decimals of a height in µm, with which FRAMES.json is written."""
 TRAIN_FELT_S = 1.0
 """Time from the start of a train that counts, s."""
 TRAIN_TABLES_MAX = 64
@@ -183,7 +186,8 @@ class IntensityModel:
         if intensity > max_intensity:
             expected = f"at most {floor(100.0 * max_intensity) / 100.0:g}, {reach}"
             raise InputError(where, intensity, expected, code="target_unreachable")
-        return float(self._gain[pixel]) * table.solve_m(intensity, factor)
+        target_m = float(self._gain[pixel]) * table.solve_m(intensity, factor)
+        return um_to_m(round(m_to_um(target_m), HEIGHT_DECIMALS))
 
     @cached_property
     def _nominal(self) -> NominalDrive:

@@ -5,6 +5,7 @@ from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import bring_up, experiments, images, shapes
 from optodrive.planning.stimuli.braille_files import build_braille_file
+from optodrive.planning.stimuli.comparison import build_comparison
 from optodrive.planning.stimuli.drawings import build_drawing
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
 from optodrive.planning.stimuli.sequence_file import validate_sequence
@@ -24,6 +25,10 @@ _DIRECTION_PARAMETER = PatternParameter(
 
 def _height_parameter(default_um: float, description: str = "peak height of a raised pixel") -> PatternParameter:
     return PatternParameter("height_um", "number", default_um, description, "µm", min=1.0, max=1000.0)
+
+
+def _intensity_parameter(name: str) -> PatternParameter:
+    return PatternParameter(name, "number", 6.0, "perceived intensity in thresholds", min=0.01, max=1000.0)
 
 
 def _size_parameter(name: str, description: str) -> PatternParameter:
@@ -121,6 +126,19 @@ _PATTERN_LIST = (
         ),
         experiments.build_detection,
         "500 ms at 25 ms on, 25 ms off, three pitches from the centre. A power above the laser's plays at the laser's.",
+        policy="refuse",
+    ),
+    Pattern(
+        "comparison",
+        "two places one after the other, whose intensities are compared",
+        (
+            PatternParameter("first", "pixel", None, "pixel that vibrates first; the middle by default"),
+            PatternParameter("second", "pixel", None, "pixel that vibrates second; the middle by default"),
+            _intensity_parameter("first_intensity"),
+            _intensity_parameter("second_intensity"),
+        ),
+        build_comparison,
+        "400 ms each at 25 Hz, 400 ms between. Intensities are those of a person of sensitivity 1 everywhere.",
         policy="refuse",
     ),
     Pattern("showcase", "a moving dot, a ring, braille, two pairs of fingers", (), build_showcase),

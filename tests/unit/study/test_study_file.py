@@ -18,7 +18,7 @@ CHANCE_PERCENT = {1: 25.0, 2: 50.0, 3: 11.1, 5: 33.3, 6: 16.7}
 
 
 def test_the_six_experiments_are_shipped():
-    assert list_shipped_studies() == ["detection", *(f"experiment-{number}" for number in range(1, 7))]
+    assert list_shipped_studies() == ["detection", "equalisation", *(f"experiment-{number}" for number in range(1, 7))]
 
 
 @pytest.mark.parametrize("number", range(1, 7))

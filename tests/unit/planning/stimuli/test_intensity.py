@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from felt_intensity import STEP_S, feel
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import HeightTrain
 from optodrive.device.config_file import load_config
@@ -15,24 +16,9 @@ from optodrive.planning.stimuli.intensity import TRAIN_TABLES_MAX
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
 CONFIG = load_config("display-437")
-STEP_S = 2e-4
 TOLERANCE = 0.02
 FRAME = {"show_at_s": 0.0, "duration_s": 2.0}
 TRAIN = {"pixel": 200, "start_s": 0.0, "duration_s": 1.0, "period_s": 0.04}
-
-
-def feel(displacement_m):
-    """Return the intensity of a displacement at STEP_S, by the line spectrum up to 500 Hz."""
-    count = len(displacement_m)
-    order = np.arange(1, int(500.0 * count * STEP_S) + 1)
-    hz = order / (count * STEP_S)
-    order, hz = order[hz >= 2.0], hz[hz >= 2.0]
-    phase = np.exp(-2j * np.pi * np.outer(order, np.arange(count)) / count)
-    amplitude_um = 2e6 / count * np.abs(phase @ displacement_m)
-    meissner_um = 3.2 * 10 ** (5 * np.log2(np.maximum(30.0 / hz, 1.0)) / 20)
-    pacinian_um = 0.63 * 10 ** (12 * np.abs(np.log2(hz / 250.0)) / 20)
-    signals = sorted(max(0.0, np.sqrt(np.sum((amplitude_um / um) ** 2)) - 1) for um in (meissner_um, pacinian_um))
-    return signals[1] + 0.5 * signals[0]
 
 
 def feel_plan(config, body):

@@ -62,6 +62,7 @@ def test_the_six_experiments_are_there():
 
 def test_only_stimuli_of_experiments_are_refused_rather_than_trimmed():
     assert {item.name for item in describe_patterns() if item.policy == "refuse"} == {
+        "comparison",
         "detection",
         *(f"experiment-{k}" for k in range(1, 7)),
     }
