@@ -245,6 +245,9 @@ def _serve_pages(
 
     respondent = PageRespondent(design, participant, log.trials)
     with StudyPages(respondent, address, partial(_stop_display, url)) as pages:
+        if not address.is_local:
+            warning = "other computers can reach the pages, and answers and secrets travel unencrypted"
+            print(f"warning: listening on {address.host}: {warning}", file=sys.stderr)
         print(f"participant      {pages.participant_url}", file=sys.stderr)
         print(f"operator         {pages.operator_url}", file=sys.stderr, flush=True)
         yield respondent

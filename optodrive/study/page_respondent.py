@@ -108,7 +108,8 @@ class PageRespondent(Respondent):
     def withdraw(self, fault: str) -> None:
         """Drop the announced stimulus and its answers."""
         with self._changed:
-            self._announced, self._notice = None, f"trial {self._answered + 1} is repeated: {fault}"
+            self._notice = f"trial {self._find_trial_number()} is repeated: {fault}"
+            self._announced = None
             self._notify()
 
     def respond(self, shown: Presentation, trial: int, attempt: int) -> Response | RepeatReason:

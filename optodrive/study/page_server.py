@@ -12,7 +12,9 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from importlib.resources import files
+from ipaddress import ip_address
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
@@ -60,12 +62,20 @@ class PageAddress(NamedTuple):
     host: str
     port: int
 
+    @property
+    def is_local(self) -> bool:
+        """Whether only programs of this computer reach it, which may also call it by another name."""
+        return self.host in LOOPBACK_NAMES
+
 
 def parse_page_address(option: str, text: str) -> PageAddress:
     """Parse `PORT`, on loopback, or `HOST:PORT`. Raise InputError."""
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdigit() and int(port) <= 65535) or ":" in host:
         raise InputError(option, text, "PORT or HOST:PORT, a port from 0 to 65535")
+    with suppress(ValueError):
+        if ip_address(host).is_unspecified:
+            raise InputError(option, text, "the address by which the participant's device reaches this computer")
     return PageAddress(host or LOOPBACK, int(port))
 
 
@@ -89,7 +99,7 @@ class StudyPages:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._wakes: set[asyncio.Event] = set()
         self._is_empty = threading.Condition()
-        hosts = {address.host.lower(), *(LOOPBACK_NAMES if address.host in LOOPBACK_NAMES else ())}
+        hosts = {address.host.lower(), *(LOOPBACK_NAMES if address.is_local else ())}
         self._server = uvicorn.Server(
             uvicorn.Config(
                 _HostCheck(self._build_app(), hosts),

@@ -5,6 +5,7 @@ import pytest
 from playwright.sync_api import expect
 from websockets.exceptions import InvalidStatus
 
+from optodrive.link.session.clock_sync import CLOCK_SPAN_S, DRIFT_MAX
 from study_page_rig import PageStudy, open_wire
 from study_rig import find_defects, read_records, write_study
 from study_visit import StudyVisit
@@ -290,15 +291,20 @@ def test_a_page_that_is_lost_or_replaced_pauses_the_session(study, open_page, re
     assert {len(trial["presentations"]) for trial in others} == {1}
 
 
+def wait_for_question(wire, before):
+    """Wait for the question about another presentation than the one before, and return its key."""
+    while (announced := wire.wait_for("question")["announced"]) == before:
+        pass
+    return announced
+
+
 def test_an_answer_counts_only_for_the_presentation_that_it_names(study, records):
     expected = []
     with open_wire(study.urls["participant"]) as wire:
         wire.send("ready")
         announced = None
         for number in range(TRIALS):
-            while (newer := wire.wait_for("question")["announced"]) == announced:
-                pass
-            announced = newer
+            announced = wait_for_question(wire, announced)
             right = {"handled_s": 0.0, **announced}
             for name in ("trial", "attempt", "presentation"):
                 for step in (-1, 1):
@@ -311,6 +317,33 @@ def test_an_answer_counts_only_for_the_presentation_that_it_names(study, records
         wire.wait_for("done")
     assert study.end() == 0
     assert [trial["answer"] for trial in list_trials(records())] == expected
+
+
+def find_clock_error_us(daemon):
+    """Return the uncertainty of the board's clock by the round trip that the link states."""
+    return 0.5 * (1e3 * daemon.state()["link"]["round_trip_ms"] + 1e6 * DRIFT_MAX * CLOCK_SPAN_S)
+
+
+def test_the_response_time_is_that_between_the_boards_last_gate_off_and_the_answer(study, records, bench):
+    bounds_us, announced, errors_us = [], None, [find_clock_error_us(bench.daemon)]
+    with open_wire(study.urls["participant"]) as wire:
+        wire.send("ready")
+        for _ in range(TRIALS):
+            announced = wait_for_question(wire, announced)
+            before_us = bench.board.now_us()
+            wire.send("answer", answer="2-3", handled_s=0.0, **announced)
+            is_last = len(bounds_us) == TRIALS - 1
+            wire.wait_for("done" if is_last else "stimulus")
+            bounds_us.append((before_us, bench.board.now_us()))
+            errors_us.append(find_clock_error_us(bench.daemon))
+    assert study.end() == 0
+    ends_us = sorted(event["off_us"] for event in bench.board.of("pulse"))
+    trials = list_trials(records())
+    pulses = len(trials[0]["presentations"][0]["executed"]["pixel"])
+    assert len(ends_us) == TRIALS * pulses
+    for number, (trial, (before_us, after_us)) in enumerate(zip(trials, bounds_us, strict=True), start=1):
+        answered_us = ends_us[number * pulses - 1] + 1e6 * trial["response_time_s"]
+        assert before_us - max(errors_us) <= answered_us <= after_us + max(errors_us)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +401,7 @@ def test_host_origin_paths_and_headers(study):
     assert httpx.get(url, headers={"Host": f"localhost:{port}"}).status_code == 200
 
 
-@pytest.mark.parametrize("page", ["x", "1:2:3", "70000", "127.0.0.1:"])
+@pytest.mark.parametrize("page", ["x", "1:2:3", "70000", "127.0.0.1:", "0.0.0.0:0"])
 def test_a_wrong_port_is_told_in_one_line(bench, tmp_path, page):
     study = PageStudy(tmp_path, bench.daemon, write_study(tmp_path), port=page)
     assert not study.read_urls()

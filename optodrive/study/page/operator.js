@@ -83,6 +83,7 @@ function say(text) {
 
 function showPage() {
   const pill = find("page");
+  pill.hidden = !isLive();
   pill.textContent = view.is_ready ? "Participant ready" : view.is_present ? "Participant’s page open" : "No participant’s page";
   pill.dataset.kind = view.is_ready ? "good" : view.is_present ? "none" : "bad";
 }
@@ -94,7 +95,7 @@ function showNow() {
     ["Executed", executed ? describeExecuted(executed) : announced ? "being shown" : ""],
     ["Attempt", announced ? `${announced.attempt}, presentation ${announced.presentation}` : ""],
   ];
-  find("now").replaceChildren(...lines.flatMap(([name, text]) => [build("dt", name), build("dd", text)]));
+  find("now").replaceChildren(...lines.flatMap(([name, text]) => [build("dt", name), build("dd", text || "—")]));
 }
 
 function describe(values) {

@@ -169,9 +169,6 @@ def test_an_answer_that_arrived_before_its_page_was_lost_counts(respondent):
 def test_a_page_that_is_lost_between_readiness_and_stimulus_interrupts_it(respondent):
     respondent.leave(respondent.page)
     respondent.announce(0, 1, 2, CONDITION)
-    page = respondent.join()
-    respondent.receive(page, READY, END_S, None)
-    respondent.receive(page, say("left", presentation=2), END_S + 1.0, None)
     assert respondent.respond(present(), 0, 1) is RepeatReason.INTERRUPTED
 
 
@@ -219,10 +216,23 @@ def test_stop_ends_the_run(respondent, is_open):
     assert errors == ["stopped by hand"]
 
 
+def test_a_stimulus_that_was_not_as_requested_has_no_question_and_the_operator_reads_why(respondent):
+    respondent.receive(respondent.page, say("left"), END_S + 1.0, None)
+    respondent.withdraw("3 of 4 pulses executed")
+    assert respondent.build_participant_view(respondent.page).phase == "rest"
+    assert respondent.build_operator_view().notice == "trial 1 is repeated: 3 of 4 pulses executed"
+    respondent.announce(0, 2, 1, CONDITION)
+    respondent.receive(respondent.page, say("up", attempt=2), END_S + 1.0, None)
+    assert respondent.respond(present(), 0, 2).answer == "up"
+
+
 def test_the_participant_is_never_shown_a_condition(respondent):
-    view = respondent.build_participant_view(respondent.page)
-    assert "condition" not in view.model_dump_json()
-    assert respondent.build_operator_view().condition == CONDITION
+    condition = {"direction": "a direction that no answer names"}
+    respondent.announce(0, 1, 1, condition)
+    view = respondent.build_participant_view(respondent.page).model_dump_json()
+    assert "condition" not in view
+    assert condition["direction"] not in view
+    assert respondent.build_operator_view().condition == condition
 
 
 def test_every_phase_has_its_views():
