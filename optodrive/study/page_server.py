@@ -46,8 +46,8 @@ from optodrive.study.page_respondent import PageRespondent
 
 LOOPBACK = "127.0.0.1"
 CONNECTIONS_MAX = 64
-PING_INTERVAL_S = PING_TIMEOUT_S = 2.0
-"""A page that does not answer a ping for this long is lost; its session waits until it is back."""
+PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 20.0
+"""A page that does not answer a ping for this long is lost. One that comes back before that replaces itself."""
 CLOSE_WAIT_S = 2.0
 """Limit for the last view to reach the pages."""
 NORMAL, INVALID, UNAUTHORISED, REPLACED = 1000, 1008, 4401, 4409

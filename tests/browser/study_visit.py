@@ -32,7 +32,7 @@ class StudyVisit:
 
     def take(self, answer):
         """Take the study to its end: begin by the button, and call `answer` at each question. Return the last phase."""
-        while (phase := self.wait_for("start", "question", "done", "stopped", "lost")) in ("start", "question"):
+        while (phase := self.wait_for("start", "question", "done", "stopped")) in ("start", "question"):
             if phase == "start":
                 self.page.locator("#begin").click()
             else:

@@ -373,6 +373,26 @@ def test_a_page_shows_nothing_to_the_other_ones_token_or_none(study, role, secre
             assert wire.read_close() == (4401, 0)
 
 
+BROKEN = """(() => {
+    const add = WebSocket.prototype.addEventListener;
+    WebSocket.prototype.addEventListener = function (type, listener) {
+        const seeBroken = () => (document.body.dataset.closed = listener({ code: 1006 }));
+        add.call(this, type, type === "close" ? seeBroken : listener);
+    };
+})()"""
+"""Lets a page see every end of a connection as a broken one."""
+
+
+def test_the_end_stays_on_the_page_when_the_connection_breaks_with_it(study, open_page):
+    visit = open_page(study)
+    visit.context.add_init_script(BROKEN)
+    visit.page.reload()
+    assert visit.take(lambda: visit.page.keyboard.press("2")) == "done"
+    assert study.end() == 0
+    visit.page.locator("body[data-closed]").wait_for()
+    assert visit.read_state()[0] == "Finished"
+
+
 def test_a_wrong_address_is_said(study, browser):
     visit = StudyVisit(browser, study.urls["participant"][:-1])
     visit.wait_for("lost")

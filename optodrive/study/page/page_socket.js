@@ -2,7 +2,8 @@
 
 export const NORMAL = 1000, INVALID = 1008, UNAUTHORISED = 4401, REPLACED = 4409; // codes of the server
 const RETRY_MS = 500;
-const FINAL = [NORMAL, INVALID, UNAUTHORISED, REPLACED];
+const FINAL_CODES = [NORMAL, INVALID, UNAUTHORISED, REPLACED];
+const FINAL_PHASES = ["done", "stopped"];
 
 export class PageSocket {
   // path: of the WebSocket; onView: gets each view; onLost: gets the code of a close, and whether it is tried again
@@ -25,11 +26,18 @@ export class PageSocket {
     const scheme = location.protocol.replace("http", "ws");
     const socket = new WebSocket(`${scheme}//${location.host}${this.path}`, ["optodrive", `bearer.${encodeBase64url(token)}`]);
     this.socket = socket;
-    socket.addEventListener("message", ({ data }) => this.onView(JSON.parse(data)));
+    let isOver = false; // after the last view the connection may end in any way
+    socket.addEventListener("message", ({ data }) => {
+      const view = JSON.parse(data);
+      isOver = FINAL_PHASES.includes(view.phase);
+      this.onView(view);
+    });
     socket.addEventListener("close", ({ code }) => {
-      const isFinal = FINAL.includes(code);
-      this.onLost(code, !isFinal);
-      if (!isFinal) {
+      const isTriedAgain = !isOver && !FINAL_CODES.includes(code);
+      if (!isOver) {
+        this.onLost(code, isTriedAgain);
+      }
+      if (isTriedAgain) {
         setTimeout(() => this.#open(), RETRY_MS);
       }
     });
