@@ -15,7 +15,7 @@ function brightness(bytes, invert) {
 }
 
 export class Drawing extends EventTarget {
-  // heights: target per pixel in µm; editing: whether strokes draw or only select
+  // heights: target per pixel, a height in µm or an intensity; editing: whether strokes draw or only select
   constructor(view) {
     super();
     this.view = view;
@@ -71,7 +71,7 @@ export class Drawing extends EventTarget {
     for (let pixel = 0; pixel < grid.pixels; pixel++) {
       const [x, y] = [grid.column(pixel) * SAMPLES, (grid.rows - 1 - grid.row(pixel)) * SAMPLES];
       const mean = brightness(context.getImageData(x, y, SAMPLES, SAMPLES).data, invert);
-      this.heights[pixel] = mean > BRIGHTNESS_MIN ? Math.round(mean * this.height * 10) / 10 : 0;
+      this.heights[pixel] = mean > BRIGHTNESS_MIN ? Math.round(mean * this.height * 100) / 100 : 0;
     }
     this.#notifyChange();
   }

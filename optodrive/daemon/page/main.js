@@ -18,7 +18,7 @@ import { HoldControl } from "./hold.js";
 import { PatternLibrary } from "./patterns.js";
 import { PauseControl } from "./pause.js";
 import { Permissions } from "./permissions.js";
-import { buildFrames, PlanControl } from "./plans.js";
+import { buildFrames, PlanControl, TARGETS } from "./plans.js";
 import { QueueView } from "./queue.js";
 import { Status } from "./status.js";
 import { StopControl } from "./stop.js";
@@ -101,6 +101,7 @@ find("display-name").textContent = `${config.name}, ${grid.pixels} px`;
 // --- controls -------------------------------------------------------------------------------------------------------
 
 const readChoice = (name) => document.querySelector(`input[name="${name}"]:checked`).value;
+const readTarget = () => (find("by-intensity").checked ? "intensity" : "target_um");
 const readNumber = (id) => Number(find(id).value) || 0;
 
 async function buildRequest() {
@@ -110,7 +111,7 @@ async function buildRequest() {
   if (!drawing.count) {
     throw new Error("Nothing is drawn yet: raise pixels on the display, or place a picture on it.");
   }
-  return { path: "/v1/plans", query: { name: "drawing" }, body: buildFrames(drawing.heights, readNumber("rate"), readNumber("seconds") || 1) };
+  return { path: "/v1/plans", query: { name: "drawing" }, body: buildFrames(readTarget(), drawing.heights, readNumber("rate"), readNumber("seconds") || 1) };
 }
 
 plans = new PlanControl(find, buildRequest, announce);
@@ -140,6 +141,13 @@ drawing.addEventListener("selected", () => {
 });
 find("clear").addEventListener("click", () => drawing.clear());
 find("height").addEventListener("input", () => drawing.rescale(readNumber("height")));
+find("by-intensity").addEventListener("change", () => {
+  const { label, value, min, max } = TARGETS[readTarget()];
+  find("height-label").textContent = label;
+  Object.assign(find("height"), { value, min, max });
+  drawing.rescale(value);
+  onStimulusChange();
+});
 for (const id of ["rate", "seconds"]) {
   find(id).addEventListener("input", onStimulusChange);
 }
@@ -193,7 +201,8 @@ function applyColourMap() {
 function describeSelected() {
   const pixel = view.cursor;
   const [height, absorber] = [view.values.height[pixel], view.values.absorber[pixel]];
-  const drawn = view.drawn[pixel] > 0 ? `, drawn ${view.drawn[pixel].toFixed(0)} µm` : "";
+  const target = TARGETS[readTarget()];
+  const drawn = view.drawn[pixel] > 0 ? `, drawn ${Number(view.drawn[pixel].toFixed(target.decimals))}${target.unit}` : "";
   const predicted = view.values.preview[pixel] > 0 ? `, predicted ${view.values.preview[pixel].toFixed(1)} µm` : "";
   const peak = trace.peakUm > 0 ? `, peak ${trace.peakUm.toFixed(1)} µm` : "";
   find("picked").textContent = `Pixel ${pixel}: ${height.toFixed(1)} µm${peak}, ${absorber.toFixed(1)} °C${drawn}${predicted}`;

@@ -9,17 +9,24 @@ const POLL_MS = 400;
 const FRAMES_MAX = 500;
 const FINAL_STATUSES = ["done", "superseded", "stopped", "failed", "cancelled"];
 
+// Quantities that a drawing may state, by their keys in a frame: name, unit, decimals, default and bounds.
+export const TARGETS = {
+  target_um: { label: "Height, µm", unit: " µm", decimals: 1, value: 100, min: 1, max: 1000 },
+  intensity: { label: "Intensity", unit: " thresholds", decimals: 2, value: 8, min: 0.1, max: 100 },
+};
+
 // Build the frames of a drawing: one, or several at a rate.
-export function buildFrames(heights, rateHz, seconds) {
-  const target_um = {};
-  heights.forEach((height, pixel) => {
-    if (height > 0) {
-      target_um[pixel] = Math.round(height * 10) / 10;
+// key: of TARGETS; values: of each pixel, 0 where nothing is drawn
+export function buildFrames(key, values, rateHz, seconds) {
+  const target = {};
+  values.forEach((value, pixel) => {
+    if (value > 0) {
+      target[pixel] = Number(value.toFixed(TARGETS[key].decimals));
     }
   });
   const count = rateHz > 0 ? Math.max(1, Math.min(FRAMES_MAX, Math.round(rateHz * seconds))) : 1;
   const duration_s = rateHz > 0 ? 1 / rateHz : seconds;
-  const frames = Array.from({ length: count }, (_, k) => ({ id: `drawn-${k}`, show_at_s: k * duration_s, duration_s, target_um }));
+  const frames = Array.from({ length: count }, (_, k) => ({ id: `drawn-${k}`, show_at_s: k * duration_s, duration_s, [key]: target }));
   return { frames };
 }
 
