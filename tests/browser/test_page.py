@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect
 
-from page_bench import Bench
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.sequence_file import parse_sequence
+from page_bench import Bench
 from rig import TOKEN, long_train, wait_for
 from window import PHONE, WIDE, PageVisit, arm, list_violations, play_for
 
