@@ -70,6 +70,8 @@ class Pattern:
     def describe_arguments(self, given: Mapping[str, object], config: Config) -> dict[str, str | float | bool | None]:
         """Return all parameters in their own units, also those by default, and a file by the digest of its bytes.
 
+        An intensity stands in place of the height.
+
         Raises InputError as `resolve_arguments`.
         """
         described: dict[str, str | float | bool | None] = {}
@@ -81,6 +83,8 @@ class Pattern:
             if isinstance(value, bytes):
                 value = f"sha256:{sha256(value).hexdigest()}, {len(value)} bytes"
             described[parameter.name] = value
+        if described.get("intensity") is not None:
+            described["height_um"] = None
         return described
 
     def resolve_arguments(self, given: object, config: Config) -> dict[str, ParameterValue]:

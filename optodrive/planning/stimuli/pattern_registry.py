@@ -1,12 +1,18 @@
 """Registry of the named patterns that `play` and the REST API offer."""
 
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
 from optodrive.core.errors import InputError, suggest_nearest
-from optodrive.core.types.stimuli import FrameSequence
+from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import bring_up, experiments, images, shapes
 from optodrive.planning.stimuli.braille_files import build_braille_file
 from optodrive.planning.stimuli.comparison import build_comparison
 from optodrive.planning.stimuli.drawings import build_drawing
+from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
 from optodrive.planning.stimuli.sequence_file import validate_sequence
 from optodrive.planning.stimuli.showcase import build_showcase
@@ -16,6 +22,9 @@ _CENTRE_PARAMETER = PatternParameter(
     "centre", "pixel", None, "pixel at the centre of the stimulus; the display's middle by default"
 )
 _SECONDS_PARAMETER = PatternParameter("seconds", "number", 1.0, "minimum duration", "s", min=0.0, max=600.0)
+_INTENSITY_PARAMETER = PatternParameter(
+    "intensity", "number", None, "perceived intensity in thresholds, in place of height_um", min=0.01, max=1000.0
+)
 _FILE_PARAMETER = PatternParameter("file", "file", None, "image file: PNG, JPEG or GIF", required=True)
 _INVERT_PARAMETER = PatternParameter("invert", "flag", False, "raise dark areas instead of bright ones")
 _DIRECTION_PARAMETER = PatternParameter(
@@ -148,6 +157,7 @@ _PATTERN_LIST = (
         (
             PatternParameter("pixel", "pixel", None, "index of the pixel; the middle by default"),
             _height_parameter(100.0),
+            _INTENSITY_PARAMETER,
             _SECONDS_PARAMETER,
         ),
         shapes.build_single_pixel,
@@ -158,6 +168,7 @@ _PATTERN_LIST = (
         (
             PatternParameter("pixel", "pixel", None, "index of the pixel; the middle by default"),
             _height_parameter(200.0, "height of every peak"),
+            _INTENSITY_PARAMETER,
             PatternParameter(
                 "peak_to_peak_um",
                 "number",
@@ -173,15 +184,31 @@ _PATTERN_LIST = (
         shapes.build_vibration,
         "The peak-to-peak range for a rate and a height depends on the pixel; the error message states it.",
     ),
-    Pattern("all", "every pixel", (_height_parameter(50.0), _SECONDS_PARAMETER), shapes.build_all_pixels),
-    Pattern("checker", "every other pixel", (_height_parameter(50.0), _SECONDS_PARAMETER), shapes.build_checkerboard),
-    Pattern("circle", "a ring", (_RADIUS_PARAMETER, _height_parameter(100.0), _SECONDS_PARAMETER), shapes.build_ring),
+    Pattern(
+        "all",
+        "every pixel",
+        (_height_parameter(50.0), _INTENSITY_PARAMETER, _SECONDS_PARAMETER),
+        shapes.build_all_pixels,
+    ),
+    Pattern(
+        "checker",
+        "every other pixel",
+        (_height_parameter(50.0), _INTENSITY_PARAMETER, _SECONDS_PARAMETER),
+        shapes.build_checkerboard,
+    ),
+    Pattern(
+        "circle",
+        "a ring",
+        (_RADIUS_PARAMETER, _height_parameter(100.0), _INTENSITY_PARAMETER, _SECONDS_PARAMETER),
+        shapes.build_ring,
+    ),
     Pattern(
         "square",
         "the outline of a square",
         (
             _size_parameter("side_mm", "length of a side; 0.6 of the display by default"),
             _height_parameter(100.0),
+            _INTENSITY_PARAMETER,
             _SECONDS_PARAMETER,
         ),
         shapes.build_square_outline,
@@ -192,6 +219,7 @@ _PATTERN_LIST = (
         (
             _DIRECTION_PARAMETER,
             _height_parameter(50.0),
+            _INTENSITY_PARAMETER,
             _time_parameter("step_s", 0.1, "time per pitch, or the beam time if longer"),
         ),
         shapes.build_moving_edge,
@@ -202,6 +230,7 @@ _PATTERN_LIST = (
         (
             _RADIUS_PARAMETER,
             _height_parameter(200.0),
+            _INTENSITY_PARAMETER,
             _time_parameter("step_s", 0.06, "time per pixel, or the beam time if longer"),
             _integer_parameter("turns", 1, "number of turns", 1, 100),
         ),
@@ -213,6 +242,7 @@ _PATTERN_LIST = (
         (
             PatternParameter("text", "text", None, "text to show", required=True),
             _height_parameter(150.0, "peak height of a dot"),
+            _INTENSITY_PARAMETER,
             PatternParameter("seconds", "number", 2.0, "minimum time per page", "s", min=0.0, max=600.0),
             _integer_parameter("dot_step", 1, "pitches between the dots of a cell", 1, 10),
             _integer_parameter("cell_gap", 1, "empty columns between cells", 0, 20),
@@ -243,6 +273,7 @@ _PATTERN_LIST = (
         (
             PatternParameter("file", "file", None, "BRF or PEF file", required=True),
             _height_parameter(150.0, "peak height of a dot"),
+            _INTENSITY_PARAMETER,
             PatternParameter("seconds", "number", 2.0, "minimum time per page", "s", min=0.0, max=600.0),
         ),
         build_braille_file,
@@ -301,8 +332,35 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
     does_not_fit, bad_text, bad_picture, too_many, bad_train.
     """
     pattern, where = find_pattern(name), f"pattern {name}"
-    sequence = pattern.build(config, where, **pattern.resolve_arguments(given, config))
+    arguments = pattern.resolve_arguments(given, config)
+    if arguments.pop("intensity", None) is None:
+        sequence = pattern.build(config, where, **arguments)
+    else:
+        sequence = _build_by_intensity(pattern, where, given, config)
     return validate_sequence(sequence, where, config)
+
+
+def _build_by_intensity(pattern: Pattern, where: str, given: object, config: Config) -> FrameSequence:
+    """Build a pattern all of whose raised pixels have one height, with the heights of one intensity."""
+    arguments, place = pattern.resolve_arguments(given, config), f"{where}: intensity"
+    intensity = float(str(arguments.pop("intensity")))
+    for name in ("height_um", "peak_to_peak_um"):
+        if isinstance(given, Mapping) and name in given:
+            raise InputError(f"{where}: {name}", given[name], "none beside an intensity", code="bad_parameter")
+    model, sequence = IntensityModel(config), pattern.build(config, where, **arguments)
+    if sequence.trains:
+        trains = [
+            replace(each, target_m=model.solve_train_m(each.pixel, each.period_s, each.duration_s, intensity, place))
+            for each in sequence.trains
+            if isinstance(each, HeightTrain)
+        ]
+        return FrameSequence(trains=tuple(trains))
+    is_raised = np.any([frame.target_m > 0.0 for frame in sequence.frames], axis=0)
+    target_m = model.solve_targets_m(np.where(is_raised, intensity, 0.0), place)
+    # Frames last as long as the beam needs for the highest pixel at every place.
+    sequence = pattern.build(config, where, **{**arguments, "height_m": float(target_m.max())})
+    frames = [replace(frame, target_m=np.where(frame.target_m > 0.0, target_m, 0.0)) for frame in sequence.frames]
+    return FrameSequence(tuple(frames))
 
 
 def describe_patterns() -> list[PatternDescription]:

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.device.config_file import load_config
+from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.stimuli.pattern_registry import PATTERNS, build_pattern, describe_patterns, find_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
@@ -209,6 +211,68 @@ def test_the_documented_example_is_read():
     example = DOC.partition("```json")[2].partition("```")[0]
     sequence = parse_sequence(example, CONFIG, "docs")
     assert (len(sequence.frames), len(sequence.trains)) == (2, 2)
+
+
+BY_INTENSITY = [
+    ("pixel", {"pixel": 30}),
+    ("all", {}),
+    ("checker", {"seconds": 0.2}),
+    ("circle", {}),
+    ("square", {}),
+    ("edge", {}),
+    ("dot", {}),
+    ("text", {"text": "hello"}),
+    ("braille-file", {"file": b",HELLO"}),
+]
+
+
+@pytest.mark.parametrize(("name", "given"), BY_INTENSITY)
+def test_a_pattern_by_intensity_raises_the_same_pixels_to_the_heights_of_a_frame_by_intensity(name, given):
+    by_height = build_pattern(name, {**given, "height_um": 60}, CONFIG)
+    sequence = build_pattern(name, {**given, "intensity": 4}, CONFIG)
+    frame = {"show_at_s": 0.0, "duration_s": 60.0, "intensity": [4.0] * 437}
+    target_m = parse_sequence({"frames": [frame]}, CONFIG, "f").frames[0].target_m
+    pictures = {frame.target_m.tobytes() for frame in sequence.frames}
+    assert pictures == {np.where(frame.target_m > 0, target_m, 0.0).tobytes() for frame in by_height.frames}
+    model = DISPLAYS["display-437"]
+    assert check_feasibility(model, sequence, *model.build_cold_state())[1].fits
+
+
+def test_a_vibration_by_intensity_is_a_train_by_intensity():
+    (train,) = build_pattern("vibration", {"pixel": 30, "intensity": "8", "rate_hz": 40, "seconds": 0.5}, CONFIG).trains
+    entry = {"pixel": 30, "start_s": 0.0, "duration_s": 0.5, "period_s": 0.025, "intensity": 8}
+    assert parse_sequence({"trains": [entry]}, CONFIG, "f").trains == (train,)
+
+
+def test_every_pattern_of_one_height_takes_an_intensity():
+    taking = {item.name for item in describe_patterns() if any(each.name == "intensity" for each in item.parameters)}
+    assert taking == {"vibration", *(name for name, _ in BY_INTENSITY)}
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "code", "says"),
+    [
+        ("all", {"intensity": 90}, "target_unreachable", "pattern all: intensity.0: got 90.0, expected at most 24."),
+        ("all", {"intensity": 0}, "bad_parameter", "pattern all: intensity: got 0, expected a number from 0.01"),
+        ("all", {"intensity": 4, "height_um": 50}, "bad_parameter", "height_um: got 50, expected none beside"),
+        ("vibration", {"intensity": 4, "peak_to_peak_um": 9}, "bad_parameter", "peak_to_peak_um: got 9, expected none"),
+        ("vibration", {"intensity": 90}, "target_unreachable", "pattern vibration: intensity: got 90.0"),
+        ("image", {"intensity": 4, "file": b""}, "unknown_parameter", "got 'intensity'"),
+    ],
+)
+def test_a_wrong_intensity_of_a_pattern_is_refused(name, given, code, says):
+    with pytest.raises(InputError) as refused:
+        build_pattern(name, given, CONFIG)
+    assert refused.value.code == code
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_what_is_recorded_of_a_pattern_by_intensity_has_no_height():
+    recorded = PATTERNS["all"].describe_arguments({"intensity": 4}, CONFIG)
+    assert (recorded["intensity"], recorded["height_um"]) == (4, None)
+    recorded = PATTERNS["all"].describe_arguments({}, CONFIG)
+    assert (recorded["intensity"], recorded["height_um"]) == (None, 50.0)
 
 
 def test_the_document_names_every_pattern_and_its_parameters():
