@@ -13,6 +13,7 @@ from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.pixel_map import build_aim_layout, load_pixel_map
+from optodrive.device.sensitivity_map import load_sensitivity_map
 from optodrive.physics.parameters import ParameterSet, PixelArray, build_display_pixels, load_parameters
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState, build_cold_state
@@ -54,6 +55,7 @@ class DisplayModel:
         pixels = build_display_pixels(config, parameters)
         stages = config.list_stage_configs()
         scan_heads, reach = tuple(map(build_scan_head, stages)), np.stack([stage.reach for stage in stages])
+        load_sensitivity_map(config)  # a damaged one is told at the start, not at the first request by intensity
         dead = np.zeros(len(layout), dtype=np.bool_) if pixel_map is None else pixel_map.dead
         if len(stages) > 1 and parameters.planner_terms:
             expected = "a parameter set without planner terms: they are planned with one stage"

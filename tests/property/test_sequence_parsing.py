@@ -9,15 +9,17 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
+from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.stimuli.braille import DIGITS, PUNCTUATION
 from optodrive.planning.stimuli.frame_json import HEIGHT, HEIGHT_MIN_UM
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 from optodrive.planning.stimuli.train_json import LONG_INTERVAL_S
 
-CONFIG = load_config("display-16")
+CONFIG, DISPLAY = load_config("display-16"), DISPLAYS["display-16"]
 HEIGHTS = st.just(0.0) | st.floats(HEIGHT_MIN_UM, 2000)
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
@@ -35,6 +37,14 @@ def is_accepted(value):
     except InputError as error:
         return not _is_one_line(error)
     return True
+
+
+def parse_or_refuse(value):
+    """Return a sequence, or the code of a one-line refusal."""
+    try:
+        return parse_sequence(value, CONFIG, "frames.json")
+    except InputError as error:
+        return error.code if _is_one_line(error) else None
 
 
 def _is_one_line(error):
@@ -84,6 +94,35 @@ def test_sequences_round_trip(frames, periods, gap_s, power_w):
         target = entry["target_um"]
         expected_um = [target.get(str(k), 0.0) for k in range(16)] if isinstance(target, dict) else target
         assert np.allclose(one.target_m, np.array(expected_um) * 1e-6, rtol=1e-12, atol=0)
+
+
+@given(
+    st.dictionaries(st.integers(0, 15), st.floats(0, 40)),
+    st.floats(0, 40, exclude_min=True),
+    st.floats(1e-3, 0.5),
+    st.floats(1e-2, 2.0),
+)
+def test_intensities_are_reachable_heights_or_refused(intensities, train_intensity, period_s, duration_s):
+    frame = {"show_at_s": 0.0, "duration_s": 0.5, "intensity": {str(key): value for key, value in intensities.items()}}
+    train = {"pixel": 3, "start_s": 0.5, "duration_s": duration_s, "period_s": period_s, "intensity": train_intensity}
+    for body in ({"frames": [frame]}, {"trains": [train]}):
+        sequence = parse_or_refuse(body)
+        if isinstance(sequence, str):
+            assert sequence in ("target_unreachable", "bad_train")
+            continue
+        for each in sequence.frames:
+            assert (each.target_m <= DISPLAY.max_displacement_m).all()
+            assert np.flatnonzero(each.target_m).tolist() == sorted(key for key in intensities if intensities[key] > 0)
+        cold, budget = DISPLAY.build_cold_state()
+        check_feasibility(DISPLAY, sequence, cold, budget)  # refuses no height of a train
+        assert sequence_to_json(parse_sequence(sequence_to_json(sequence), CONFIG, "f")) == sequence_to_json(sequence)
+
+
+@given(st.sampled_from(["show_at_s", "duration_s", "intensity"]), JSON)
+def test_any_value_in_a_frame_by_intensity_is_parsed_or_refused(key, value):
+    frame = {"show_at_s": 0.0, "duration_s": 0.5, "intensity": {"3": 5}}
+    if is_accepted({"frames": [{**frame, key: value}]}):
+        assert type(value) in ((dict, list) if key == "intensity" else (int, float))
 
 
 @given(JSON)

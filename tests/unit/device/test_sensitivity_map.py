@@ -14,6 +14,7 @@ from optodrive.device.sensitivity_map import (
     replace_sensitivity_map,
     write_sensitivity_map,
 )
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.stimuli.sequence_file import parse_sequence
 
 CONFIG, COUNT = DISPLAYS["display-16"].config, len(DISPLAYS["display-16"].layout)
@@ -83,6 +84,8 @@ def test_a_damaged_map_is_refused_in_one_line(equalised, old, new, says):
     with pytest.raises(InputError) as refused:
         load_sensitivity_map(equalised)
     assert says in str(refused.value), str(refused.value)
+    with pytest.raises(InputError, match=r"sensitivity\.toml"):
+        DisplayModel.from_config(equalised)
     assert "\n" not in str(refused.value)
 
 
