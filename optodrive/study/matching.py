@@ -2,9 +2,10 @@
 
 Theory of operation. The logarithm f of the sensitivity is a Gaussian process over the display: smooth, with an unknown
 correlation length and standard deviation. A trial shows one place after the other, and the participant names the
-stronger. With nominal intensities a and b (those of a person of sensitivity 1), a place of sensitivity s is felt with
-the excitation (1 + a) s; the answer is "second" with the probability of a logistic function of the difference of the
-logarithms, whose scale is the participant's Weber fraction, and is a guess in a share of the trials.
+stronger. Intensity is the stronger channel's excitation less 1 plus half the weaker one's less 1, and a sensitivity s
+multiplies both. So a nominal intensity a (that of a person of sensitivity 1) at which both channels feel something is
+felt as s (a + 1.5) - 1.5. The answer is "second" with the probability of a logistic function of the difference of the
+logarithms of s (a + 1.5), whose scale is the participant's Weber fraction, and is a guess in a share of the trials.
 
 The posterior of f at the compared places is Gaussian at its maximum (Laplace's approximation), and the process carries
 it to the other pixels. Correlation length, standard deviation and scale are weighed by their evidence over a grid. Only
@@ -24,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.physics.sensation import WEAKER_SHARE
 
 LENGTHS = (0.25, 0.4, 0.65, 1.0)
 """Correlation lengths, in the display's longer side."""
@@ -31,6 +33,8 @@ DEVIATIONS = (0.1, 0.2, 0.4)
 """Standard deviations of the logarithm of the sensitivity."""
 SCALES = (0.11, 0.16, 0.24, 0.36)
 """Scales of the logistic function: 0.16 for two stimuli with a Weber fraction of 0.2 each."""
+BOTH_THRESHOLDS = 1.0 + WEAKER_SHARE
+"""Sum of the channels' thresholds as intensity weighs them."""
 GUESSES = 0.05
 """Share of guesses that the model allows for."""
 NUGGET = 1e-4
@@ -118,7 +122,7 @@ class MatchingModel:
         pair = np.unravel_index(int(np.triu(reduction, 1).argmax()), reduction.shape)
         first, second = (int(index) for index in (pair[::-1] if is_swapped else pair))
         centred = np.clip((prior.to_pixels @ posterior.mean)[self.places], -PRESENTED_MAX, PRESENTED_MAX)
-        shown = np.round((1.0 + self._intensity) * np.exp(-centred) - 1.0, 4)
+        shown = np.round((self._intensity + BOTH_THRESHOLDS) * np.exp(-centred) - BOTH_THRESHOLDS, 4)
         return Comparison(int(self.places[first]), int(self.places[second]), float(shown[first]), float(shown[second]))
 
     def estimate(self, answers: Answers) -> Sensitivity:
@@ -195,7 +199,8 @@ class MatchingModel:
         for row, (comparison, answer) in enumerate(answers):
             design[row, self._index[comparison.second]] += 1.0
             design[row, self._index[comparison.first]] -= 1.0
-            offset[row] = np.log1p(comparison.second_intensity) - np.log1p(comparison.first_intensity)
+            second, first = comparison.second_intensity, comparison.first_intensity
+            offset[row] = np.log(second + BOTH_THRESHOLDS) - np.log(first + BOTH_THRESHOLDS)
             is_second[row] = answer
         return design, offset, np.asarray(is_second > 0.0)
 

@@ -10,6 +10,7 @@ from optodrive.core.files import create_folder
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.sensitivity_map import SensitivityMap, write_sensitivity_map
+from optodrive.study.matching import BOTH_THRESHOLDS
 from optodrive.study.session import build_matching_model, list_comparisons
 from optodrive.study.study_file import MatchingSection, Study
 
@@ -35,7 +36,7 @@ def write_sensitivity(
 def compute_variation(sensitivity: FloatArray, equalised_by: FloatArray | float, intensity: float) -> float:
     """Return the standard deviation over the mean of the intensities felt at all pixels, where one is requested.
 
-    equalised_by: sensitivity by which heights are equalised
+    equalised_by: sensitivity by which heights are equalised. Both channels are taken to feel something.
     """
-    felt = np.maximum((1.0 + intensity) * sensitivity / equalised_by - 1.0, 0.0)
+    felt = np.maximum((intensity + BOTH_THRESHOLDS) * sensitivity / equalised_by - BOTH_THRESHOLDS, 0.0)
     return float(felt.std() / felt.mean())

@@ -82,7 +82,7 @@ def test_the_validator_finds_a_broken_dataset(dataset, path, old, new):
 
 def test_a_matching_writes_the_sensitivity_map_of_each_participant(tmp_path, capsys):
     path, data = tmp_path / "short.toml", tmp_path / "data"
-    path.write_text((EXPERIMENTS / "equalisation.toml").read_text().replace("trials = 700", "trials = 30"))
+    path.write_text((EXPERIMENTS / "equalisation.toml").read_text().replace("trials = 1000", "trials = 30"))
     report = run_study(capsys, str(path), data, "--participants", "2")
     assert report["participants"] == {"sim01": 30, "sim02": 30}
     for name, found in report["sensitivity"].items():

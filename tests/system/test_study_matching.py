@@ -16,7 +16,7 @@ TRIALS = 6
 
 def test_a_persons_answers_make_a_map(board, daemon, tmp_path):
     path = tmp_path / "short.toml"
-    path.write_text((EXPERIMENTS / "equalisation.toml").read_text().replace("trials = 700", f"trials = {TRIALS}"))
+    path.write_text((EXPERIMENTS / "equalisation.toml").read_text().replace("trials = 1000", f"trials = {TRIALS}"))
     process = start_process(
         [OPTODRIVE, "study", path, "--out", tmp_path / "data", "--participant", "07", "--hold", "--url", daemon.url],
         stdin=subprocess.PIPE,

@@ -142,6 +142,13 @@ def _parse_by_pixel(
 
 
 def _parse_intensities(values: list[object], pixels: list[int] | range, where: str) -> FloatArray:
+    if set(map(type, values)) <= {int, float}:
+        try:
+            intensities = np.array(values, dtype=np.float64)
+            if bool(np.all((intensities >= 0.0) & np.isfinite(intensities))):
+                return intensities
+        except OverflowError:
+            pass
     return np.array(
         [
             parse_intensity(value, f"{where}.{pixel}", is_zero_allowed=True)

@@ -11,7 +11,7 @@ with the height of a single pulse. That of a train falls again where its pulses 
 then hardly falls between them; the table ends at the maximum. So every intensity below it has one height.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import floor
@@ -20,7 +20,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import HeightTrain
 from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config, build_pixel_layout
@@ -28,7 +28,7 @@ from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
 from optodrive.device.sensitivity_map import load_sensitivity_map, replace_sensitivity_map
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pulse_for_height import DriveRange
-from optodrive.physics.sensation import compute_intensity, compute_pulse_excitations
+from optodrive.physics.sensation import FELT_MAX_HZ, compute_intensity, compute_pulse_excitations
 from optodrive.physics.thermal_state import ThermalState, build_cold_state
 from optodrive.planning.scheduler.periodic_pulses import (
     build_pulse_recipe,
@@ -37,8 +37,8 @@ from optodrive.planning.scheduler.periodic_pulses import (
     limit_pulse_width,
 )
 
-HEIGHT_SPAN, SAMPLES = 300.0, 48
-"""Largest over smallest simulated height of a table, and their number."""
+HEIGHT_SPAN, FRAME_SAMPLES, TRAIN_SAMPLES = 300.0, 48, 32
+"""Largest over smallest simulated height of a table, and their number for frames and for trains."""
 PROPORTIONAL_SPAN, INTERPOLATED = 1000.0, 2048
 """Factor by which a table goes on below the simulated heights, and number of its heights."""
 BELOW_MAX = 1.0 - 1e-9
@@ -47,7 +47,9 @@ HEIGHT_DECIMALS = 9
 """Decimals of a height in µm, with which FRAMES.json is written."""
 TRAIN_FELT_S = 1.0
 """Time from the start of a train that counts, s."""
-TRAIN_TABLES_MAX = 64
+PERIOD_MIN_S = 1.0 / FELT_MAX_HZ
+"""Smallest period of a train by intensity: a faster vibration is not felt."""
+TRAIN_TABLES_MAX = 16
 """Largest number of different periods and durations of trains with an intensity in a sequence."""
 
 
@@ -59,26 +61,35 @@ class ExcitationTable:
     excitations: FloatArray
 
     @classmethod
-    def tabulate(cls, max_m: float, excite: Callable[[float], tuple[float, float]]) -> "ExcitationTable":
-        """Interpolate excitations between some heights up to max_m. Below those they are proportional to the height."""
-        height_m = np.geomspace(max_m / HEIGHT_SPAN, max_m, SAMPLES)
+    def tabulate(cls, max_m: float, samples: int, excite: Callable[[float], tuple[float, float]]) -> "ExcitationTable":
+        """Interpolate excitations between heights up to max_m, and end at their maximum.
+
+        Below the smallest of these heights they are proportional to the height.
+        """
+        height_m = np.geomspace(max_m / HEIGHT_SPAN, max_m, samples)
         excitations = np.array([excite(each_m) for each_m in height_m.tolist()])
         height_m = np.append(height_m[0] / PROPORTIONAL_SPAN, height_m)
         excitations = np.vstack([excitations[0] / PROPORTIONAL_SPAN, excitations])
         fine_m = np.geomspace(height_m[0], max_m, INTERPOLATED)
         columns = [np.exp(np.interp(np.log(fine_m), np.log(height_m), np.log(each))) for each in excitations.T]
-        return cls(fine_m, np.column_stack(columns))
+        fine = np.column_stack(columns)
+        end = int(np.argmax(fine.max(axis=1))) + 1
+        return cls(fine_m[:end], fine[:end])
 
-    def compute_max(self, factor: float) -> float:
-        """Return the largest intensity of a pixel whose excitation is `factor` times the nominal one."""
-        return float(compute_intensity(factor * self.excitations).max())
+    def compute_max(self, factor: FloatArray) -> FloatArray:
+        """Return the largest intensities of pixels whose excitations are `factor` [n] times the nominal one, [n]."""
+        return compute_intensity(factor[:, None] * self.excitations[-1])
 
-    def solve_m(self, intensity: float, factor: float) -> float:
-        """Return the smallest nominal height of an intensity above 0, at most that of `compute_max`."""
-        felt = compute_intensity(factor * self.excitations)
-        first = int(np.argmax(felt >= intensity))
-        share = (intensity - felt[first - 1]) / (felt[first] - felt[first - 1])
-        return float(self.height_m[first - 1] + share * (self.height_m[first] - self.height_m[first - 1]))
+    def solve_m(self, intensity: FloatArray, factor: FloatArray) -> FloatArray:
+        """Return the nominal heights of intensities [n] above 0, at most those of `compute_max`, by bisection."""
+        low, high = np.zeros(len(intensity), dtype=np.int64), np.full(len(intensity), len(self.height_m) - 1)
+        while (high - low > 1).any():
+            middle = (low + high) // 2
+            is_reached = compute_intensity(factor[:, None] * self.excitations[middle]) >= intensity
+            low, high = np.where(is_reached, low, middle), np.where(is_reached, middle, high)
+        felt_low, felt_high = (compute_intensity(factor[:, None] * self.excitations[row]) for row in (low, high))
+        share = (intensity - felt_low) / (felt_high - felt_low)
+        return np.asarray(self.height_m[low] + share * (self.height_m[high] - self.height_m[low]), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +110,7 @@ class NominalDrive:
             pulse = np.array([[0.0, periods * drive.period_s, duty * drive.max_power_w, 0.0]])
             return compute_pulse_excitations(cold, pulse, 0)
 
-        return ExcitationTable.tabulate(BELOW_MAX * float(cold.max_displacement_m(drive)[0]), excite)
+        return ExcitationTable.tabulate(BELOW_MAX * float(cold.max_displacement_m(drive)[0]), FRAME_SAMPLES, excite)
 
     def tabulate_train(self, period_s: float, duration_s: float) -> ExcitationTable:
         """Tabulate a train by height."""
@@ -108,6 +119,7 @@ class NominalDrive:
         max_m = BELOW_MAX * compute_steady_state(longest, self.cold, drive, drive.max_periods, 1.0).peak_m
         return ExcitationTable.tabulate(
             max_m,
+            TRAIN_SAMPLES,
             lambda height_m: self._excite_by_train(HeightTrain(0, 0.0, duration_s, period_s, height_m), drive),
         )
 
@@ -156,15 +168,13 @@ class IntensityModel:
 
         Raises InputError (target_unreachable) for an intensity beyond the longest pulse at full power.
         """
-        target_m = np.zeros(len(intensity))
-        drive = self._nominal.drive
         reach = (
             f"the intensity of the longest pulse ({format_quantity(self._config.limits.pulse_width_max_s, 's')} "
-            f"at {format_quantity(drive.max_power_w, 'W')})"
+            f"at {format_quantity(self._nominal.drive.max_power_w, 'W')})"
         )
-        for pixel in np.flatnonzero(intensity).tolist():
-            place = f"{where}.{pixel}"
-            target_m[pixel] = self._solve_m(self._nominal.frame_table, pixel, float(intensity[pixel]), place, reach)
+        pixels, target_m = np.flatnonzero(intensity), np.zeros(len(intensity))
+        places = (f"{where}.{pixel}" for pixel in pixels.tolist())
+        target_m[pixels] = self._solve_m(self._nominal.frame_table, pixels, intensity[pixels], places, reach)
         return target_m
 
     def solve_train_m(self, pixel: int, period_s: float, duration_s: float, intensity: float, where: str) -> float:
@@ -172,22 +182,32 @@ class IntensityModel:
 
         Raises InputError (target_unreachable, too_many).
         """
+        if period_s < PERIOD_MIN_S:
+            expected = f"a period of at least {format_quantity(PERIOD_MIN_S, 's')}: a faster vibration is not felt"
+            raise InputError(where, intensity, expected, code="target_unreachable")
         key = (period_s, min(duration_s, TRAIN_FELT_S))
         self._trains.add(key)
         if len(self._trains) > TRAIN_TABLES_MAX:
             expected = f"at most {TRAIN_TABLES_MAX} different periods and durations of trains with an intensity"
             raise InputError(where, intensity, expected, code="too_many")
         reach = f"the largest of pulses every {format_quantity(period_s, 's', 4)}"
-        return self._solve_m(_tabulate_train(self._nominal, *key), pixel, intensity, where, reach)
+        table = _tabulate_train(self._nominal, *key)
+        return float(self._solve_m(table, np.array([pixel]), np.array([intensity]), [where], reach)[0])
 
-    def _solve_m(self, table: ExcitationTable, pixel: int, intensity: float, where: str, reach: str) -> float:
-        factor = float(self._gain[pixel] * self._sensitivity[pixel])
+    def _solve_m(
+        self, table: ExcitationTable, pixels: IntArray, intensity: FloatArray, places: Iterable[str], reach: str
+    ) -> FloatArray:
+        """Return the heights of intensities at pixels [n], m. Raise InputError for the first that is unreachable."""
+        gain = self._gain[pixels]
+        factor = gain * self._sensitivity[pixels]
         max_intensity = table.compute_max(factor)
-        if intensity > max_intensity:
-            expected = f"at most {floor(100.0 * max_intensity) / 100.0:g}, {reach}"
-            raise InputError(where, intensity, expected, code="target_unreachable")
-        target_m = float(self._gain[pixel]) * table.solve_m(intensity, factor)
-        return um_to_m(round(m_to_um(target_m), HEIGHT_DECIMALS))
+        beyond = np.flatnonzero(intensity > max_intensity)
+        if len(beyond):
+            first = int(beyond[0])
+            expected = f"at most {floor(100.0 * max_intensity[first]) / 100.0:g}, {reach}"
+            raise InputError(list(places)[first], float(intensity[first]), expected, code="target_unreachable")
+        height_um = np.round(m_to_um(gain * table.solve_m(intensity, factor)), HEIGHT_DECIMALS)
+        return np.asarray(um_to_m(height_um), dtype=np.float64)
 
     @cached_property
     def _nominal(self) -> NominalDrive:

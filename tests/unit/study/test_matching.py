@@ -23,16 +23,16 @@ def build_model():
     return MatchingModel(LAYOUT.x_m, LAYOUT.y_m, 60, 6.0)
 
 
-def answer_by(truth, model, trials, answers=()):
-    """Continue a matching with a participant who errs never."""
-    answers = list(answers)
+def answer_by(truth, model, trials, names_weaker=False):
+    """Run a matching with a participant who errs never, or always."""
+    answers = []
     for trial in range(trials):
         shown = model.choose(answers, bool(trial % 2))
         first, second = (
-            truth[pixel] * (1.0 + intensity)
+            truth[pixel] * (1.5 + intensity)
             for pixel, intensity in ((shown.first, shown.first_intensity), (shown.second, shown.second_intensity))
         )
-        answers.append((shown, bool(second > first)))
+        answers.append((shown, bool(second > first) != names_weaker))
     return answers
 
 
@@ -60,8 +60,8 @@ def test_a_sensitivity_follows_the_answers_and_without_them_nothing_is_claimed()
     assert compute_variation(truth, found.sensitivity, 8.0) < 0.5 * before
     assert np.log(found.sensitivity).mean() == pytest.approx(0.0, abs=1e-9)
     assert found.sigma.mean() < 0.5 * nothing.sigma.mean()
-    reversed_answers = [(shown, not answer) for shown, answer in answer_by(truth, build_model(), 150)]
-    assert compute_variation(truth, model.estimate(reversed_answers).sensitivity, 8.0) > before
+    reversed_map = model.estimate(answer_by(truth, build_model(), 150, names_weaker=True))
+    assert compute_variation(truth, reversed_map.sensitivity, 8.0) > before
 
 
 def test_a_comparison_shows_what_is_predicted_to_be_felt_alike():
@@ -69,7 +69,7 @@ def test_a_comparison_shows_what_is_predicted_to_be_felt_alike():
     first = model.choose([], False)
     assert first.first_intensity == first.second_intensity == 6.0
     later = model.choose(answer_by(truth, model, 150), False)
-    ratio = truth[later.first] * (1.0 + later.first_intensity) / truth[later.second] / (1.0 + later.second_intensity)
+    ratio = truth[later.first] * (1.5 + later.first_intensity) / truth[later.second] / (1.5 + later.second_intensity)
     assert abs(np.log(ratio)) < 0.1
     swapped = model.choose(answer_by(truth, build_model(), 150), True)
     assert (swapped.first, swapped.second) == (later.second, later.first)
@@ -96,7 +96,7 @@ class EndingPresenter(VirtualPresenter):
 def write_study(folder, trials=TRIALS):
     text = (EXPERIMENTS / "equalisation.toml").read_text()
     path = folder / "short.toml"
-    path.write_text(text.replace("trials = 700", f"trials = {trials}"))
+    path.write_text(text.replace("trials = 1000", f"trials = {trials}"))
     return load_study(str(path))
 
 
@@ -154,7 +154,7 @@ def test_the_map_of_a_session_is_one_that_a_configuration_may_name(tmp_path):
             "procedure: got 'staircase'",
         ),
         ("pause_s = 0.3", "pause_s = 0.3\nrepetitions = 2", "repetitions: got 2"),
-        ("trials = 700", "trials = 0", "matching.trials: got 0"),
+        ("trials = 1000", "trials = 0", "matching.trials: got 0"),
         ("places = 60", "places = 1", "matching.places: got 1"),
         ("sensitivity_range = 2.0", "sensitivity_range = 0.5", "sensitivity_range: got 0.5"),
     ],

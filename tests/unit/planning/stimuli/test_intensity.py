@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from executed_lines import count_lines
 from felt_intensity import STEP_S, feel
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import HeightTrain
@@ -135,12 +136,27 @@ def test_an_intensity_is_written_back_as_the_heights_it_stands_for():
         ({"trains": [TRAIN | {"intensity": 0}]}, "bad_target", "got 0, expected an intensity > 0"),
         ({"trains": [TRAIN | {"intensity": 5, "target_um": 90}]}, "bad_target", "expected one of them"),
         ({"trains": [TRAIN | {"intensity": 5, "peak_to_peak_um": 9}]}, "bad_train", "peak_to_peak_um: got 9"),
+        (
+            {"trains": [TRAIN | {"intensity": 5, "period_s": 0.0015}]},
+            "target_unreachable",
+            "got 5.0, expected a period of at least 2 ms: a faster vibration is not felt",
+        ),
         ({"trains": [TRAIN | {"intensity": 5, "period_s": 1e-5}]}, "bad_train", "period_s: got 1e-05"),
     ],
 )
 def test_a_wrong_intensity_is_refused_in_one_line(body, code, says):
     refused_code, message = refusal(body)
     assert (refused_code, says in message) == (code, True), message
+
+
+def test_the_work_for_a_frame_does_not_grow_with_its_intensities(mapped):
+    few, many = (
+        {"frames": [FRAME | {"intensity": np.linspace(1.0, 5.0, count).tolist() + [0.0] * (437 - count)}]}
+        for count in (2, 437)
+    )
+    parse_sequence(few, mapped, "f")  # fills the tables
+    lines = [count_lines(lambda: parse_sequence(body, mapped, "f")) for body in (few, many)]  # noqa: B023
+    assert lines[1] < 1.1 * lines[0]
 
 
 def test_the_number_of_different_trains_by_intensity_is_bounded():
