@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optodrive.core.errors import RefusedError
+from optodrive.core.errors import InputError, RefusedError
 from optodrive.device.config import PixelLayout
 from optodrive.study.matching import Comparison, MatchingModel
 from optodrive.study.observers import Observer
@@ -117,7 +117,9 @@ def list_comparisons(records: Sequence[dict[str, Any]]) -> list[tuple[Comparison
 
 
 def build_matching_model(matching: MatchingSection, layout: PixelLayout) -> MatchingModel:
-    """Return the model of a matching on a display."""
+    """Return the model of a matching on a display. Raise InputError for a display of one pixel."""
+    if len(layout) < 2:
+        raise InputError("matching", f"a display of {len(layout)} pixel", "at least two pixels to compare")
     return MatchingModel(layout.x_m, layout.y_m, matching.places, matching.intensity)
 
 

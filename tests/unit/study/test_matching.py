@@ -81,6 +81,11 @@ def test_the_choice_follows_from_the_answers_alone():
     assert continued.choose(answers, False) == build_model().choose(answers, False)
 
 
+def test_a_display_of_one_pixel_has_nothing_to_compare():
+    with pytest.raises(InputError, match="got 'a display of 1 pixel', expected at least two pixels"):
+        build_matching_model(load_study("equalisation").matching, DISPLAYS["display-1"].layout)
+
+
 class EndingPresenter(VirtualPresenter):
     """Ends the run before a presentation, as a crash does."""
 
