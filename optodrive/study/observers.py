@@ -54,6 +54,8 @@ def draw_sensitivity(layout: PixelLayout, sensitivity_range: float, rng: np.rand
 
     sensitivity_range: largest over smallest sensitivity
     """
+    if sensitivity_range == 1.0 or len(layout) < 2:
+        return np.ones(len(layout))
     position = np.column_stack([layout.x_m, layout.y_m])
     position = position / np.abs(position).max()
     angle, bump = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.7, 0.7, 2)

@@ -81,6 +81,13 @@ def test_the_choice_follows_from_the_answers_alone():
     assert continued.choose(answers, False) == build_model().choose(answers, False)
 
 
+def test_a_sensitivity_that_does_not_vary_is_1_also_on_one_pixel():
+    for name, sensitivity_range in (("display-437", 1.0), ("display-1", 1.0), ("display-1", 2.0)):
+        layout = DISPLAYS[name].layout
+        drawn = draw_sensitivity(layout, sensitivity_range, np.random.default_rng(1))
+        np.testing.assert_array_equal(drawn, np.ones(len(layout)))
+
+
 def test_a_display_of_one_pixel_has_nothing_to_compare():
     with pytest.raises(InputError, match="got 'a display of 1 pixel', expected at least two pixels"):
         build_matching_model(load_study("equalisation").matching, DISPLAYS["display-1"].layout)
