@@ -7,6 +7,7 @@ from pydantic.json_schema import models_json_schema
 
 from optodrive.core.types.push_options import Policy
 from optodrive.daemon.api.openapi_bodies import LIVE_FRAME_SCHEMA
+from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal
 from optodrive.daemon.responses.hold import HoldReport
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.responses.telemetry import EVENTS
@@ -16,11 +17,11 @@ BINARY_FRAME = "ODF1, a u32 frame number, and one u16 height per pixel in 0.1 µ
 HEAD = """# Streams
 
 Generated from the daemon's models by `scripts/reference`, like the [AsyncAPI 3.0 document](asyncapi.json) with the
-JSON Schema of every message. The daemon's two WebSockets and its server-sent events need `Authorization: Bearer TOKEN`;
+JSON Schema of every message. The daemon's WebSockets and its server-sent events need `Authorization: Bearer TOKEN`;
 a browser's WebSocket, which cannot send it, offers the subprotocols `optodrive` and `bearer.` with the token in
-base64url. [Streaming](../how-to/stream-frames.md), [hold-to-run](../how-to/secure-access.md#hold-to-run) and
-[telemetry](../how-to/operate-the-page.md#telemetry) describe their use; the models are those of the
-[REST reference](rest.md#models).
+base64url. [Streaming](../how-to/stream-frames.md), [fingers](../how-to/read-by-fingers.md),
+[hold-to-run](../how-to/secure-access.md#hold-to-run) and [telemetry](../how-to/operate-the-page.md#telemetry) describe
+their use; the models are those of the [REST reference](rest.md#models).
 """
 
 
@@ -35,7 +36,10 @@ CHANNELS = {
         "bindings": {
             "ws": {
                 "method": "GET",
-                "query": {"type": "object", "properties": {"policy": {"enum": list(get_args(Policy))}}},
+                "query": {
+                    "type": "object",
+                    "properties": {"policy": {"enum": list(get_args(Policy))}, "standing": {"type": "boolean"}},
+                },
             }
         },
         "messages": {
@@ -46,6 +50,15 @@ CHANNELS = {
                 "payload": {"type": "string", "format": "binary"},
             },
             "result": {"summary": "what became of a frame", "payload": _refer(FrameResult)},
+        },
+    },
+    "fingers": {
+        "address": "/v1/fingers",
+        "description": "Places of fingertips, for which standing frames are refreshed first. Role: operator.",
+        "bindings": {"ws": {"method": "GET"}},
+        "messages": {
+            "places": {"summary": "all fingertips at a time", "payload": _refer(FingersMessage)},
+            "refusal": {"summary": "why a message was not understood", "payload": _refer(FingersRefusal)},
         },
     },
     "hold": {
@@ -64,13 +77,13 @@ CHANNELS = {
         "messages": {event: {"summary": f"event {event}", "payload": _refer(model)} for event, model in EVENTS.items()},
     },
 }
-FROM_CLIENT = {"stream": ("frame", "binaryFrame"), "hold": ("beat",), "telemetry": ()}
+FROM_CLIENT = {"stream": ("frame", "binaryFrame"), "fingers": ("places",), "hold": ("beat",), "telemetry": ()}
 """The messages that the daemon receives; it sends all others."""
 
 
 def build_document():
     """Build the AsyncAPI document."""
-    models = [FrameResult, HoldReport, *EVENTS.values()]
+    models = [FrameResult, FingersMessage, FingersRefusal, HoldReport, *EVENTS.values()]
     _, schemas = models_json_schema([(model, "serialization") for model in models], ref_template=REF_TEMPLATE)
     operations = {}
     for name, channel in CHANNELS.items():

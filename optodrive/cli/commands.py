@@ -24,6 +24,7 @@ MODULES = {
     "control": ("status", "arm", "disarm", "dim", "pause", "resume", "reload", "stop"),
     "play": ("push", "play"),
     "braille": ("braille",),
+    "fingers": ("fingers",),
     "patterns": ("patterns",),
     "plan": ("plan",),
     "simulate": ("simulate",),

@@ -58,9 +58,11 @@ class AsyncDisplay(DisplayOperations):
         self._hold = held
         return await self.state()
 
-    def stream(self, policy: Policy = "trim") -> AsyncStream:
+    def stream(self, policy: Policy = "trim", *, standing: bool = False) -> AsyncStream:
         """Open a stream as `Display.stream` does: `async with display.stream() as stream: await stream.send(…)`."""
-        return AsyncStream(self._client.endpoint, self.layout, policy, self._reconnect_timeout_s, self._record_emission)
+        return AsyncStream(
+            self._client.endpoint, self.layout, policy, standing, self._reconnect_timeout_s, self._record_emission
+        )
 
     def _record_emission(self) -> None:
         self._client.require_open()

@@ -37,12 +37,13 @@ class AsyncStream:
         endpoint: Endpoint,
         read_layout: Callable[[], Awaitable[PixelLayout]],
         policy: Policy,
+        standing: bool,
         reconnect_timeout_s: float,
         on_send: Callable[[], None],
     ) -> None:
         self._endpoint = endpoint
         self._read_layout = read_layout
-        self._path = build_stream_path(policy)
+        self._path = build_stream_path(policy, standing)
         self._on_send = on_send
         self._next_frame = 0
         self._results = ResultBuffer()

@@ -11,6 +11,7 @@ import numpy as np
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import run_blocking
+from optodrive.client.fingers import Fingers
 from optodrive.client.hold import Hold
 from optodrive.client.http import BlockingHttp
 from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations
@@ -106,11 +107,18 @@ class Display:
     cancel = _block(DisplayOperations.cancel)
     wait = _block(DisplayOperations.wait)
 
-    def stream(self, policy: Policy = "trim") -> Stream:
-        """Open a stream of frames, of which the newest wins: `with display.stream() as stream: stream.send(…)`."""
+    def stream(self, policy: Policy = "trim", *, standing: bool = False) -> Stream:
+        """Open a stream of frames, of which the newest wins: `with display.stream() as stream: stream.send(…)`.
+
+        standing: refresh the newest frame until the next one, under fingers first
+        """
         self._client.require_open()
         endpoint, layout = self._client.endpoint, self.layout
-        return Stream(endpoint, layout, policy, self._reconnect_timeout_s, self._record_emission)
+        return Stream(endpoint, layout, policy, standing, self._reconnect_timeout_s, self._record_emission)
+
+    def fingers(self) -> Fingers:
+        """Open a connection for the places of fingertips, for which frames that stand are refreshed first."""
+        return Fingers(self._client.endpoint)
 
     def _record_emission(self) -> None:
         self._client.require_open()

@@ -55,9 +55,9 @@ class ResultBuffer:
         return frame >= self._lost_before and frame not in self._final
 
 
-def build_stream_path(policy: Policy) -> str:
+def build_stream_path(policy: Policy, standing: bool) -> str:
     """Build the path of the stream's WebSocket."""
-    return f"/v1/stream?policy={policy}"
+    return f"/v1/stream?policy={policy}&standing={str(standing).lower()}"
 
 
 def build_closed_error() -> NotReadyError:

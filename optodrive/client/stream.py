@@ -21,13 +21,14 @@ class Stream:
         endpoint: Endpoint,
         layout: PixelLayout,
         policy: Policy,
+        standing: bool,
         reconnect_timeout_s: float,
         on_send: Callable[[], None],
     ) -> None:
         async def get_layout() -> PixelLayout:
             return layout
 
-        self._stream = AsyncStream(endpoint, get_layout, policy, reconnect_timeout_s, on_send)
+        self._stream = AsyncStream(endpoint, get_layout, policy, standing, reconnect_timeout_s, on_send)
         self._loop = LoopThread("stream")
         try:
             self._loop.run(self._stream.__aenter__())

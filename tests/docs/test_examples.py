@@ -32,6 +32,7 @@ ELSEWHERE = {
     "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",
     "openssl req -x509": "tests/system/test_tls_proxy.py makes its certificate so",
     "optodrive braille": "tests/system/test_braille_command.py",
+    "optodrive fingers": "tests/system/test_standing_frames.py",
     "optodrive study my-study.toml --out data --participant 07 --hold": "tests/browser/test_study_participant.py",
     "optodrive study my-study.toml --out data --participant 07 --lsl": "tests/system/test_study_streams.py",
     "optodrive dac": "tests/dac plays on the DACs' own protocols; no device is here",
@@ -69,6 +70,7 @@ SCENARIOS = {
     "quickstart": (write_checkout, ["docs/tutorials/quickstart.md:Quickstart"]),
     "configuration": (write_checkout, ["docs/how-to/write-a-configuration.md:A new one"]),
     "client": (write_checkout, ["docs/how-to/use-the-python-client.md:Python client"]),
+    "standing": (write_checkout, ["docs/how-to/read-by-fingers.md:A frame that stands"]),
     "diagnosis": (
         write_recordings,
         ["docs/explanation/diagnosis.md:Diagnosis", "docs/explanation/diagnosis.md:Planning with a diagnosed model"],

@@ -45,6 +45,17 @@ def test_frames_and_their_results_follow_the_schemas(disarmed):
     assert not result.is_valid({"frame": 1, "status": "lost"})
 
 
+def test_places_of_fingers_and_refusals_follow_the_schemas(disarmed):
+    places, refusal = build_validator("fingers", "places"), build_validator("fingers", "refusal")
+    finger = {"number": 1, "x_m": 0.01, "y_m": 0.0, "radius_m": 0.004, "confidence": 1.0}
+    assert places.is_valid({"fingers": [finger], "age_s": 0.01})
+    for wrong in ({}, {"fingers": [finger | {"x_m": 2.0}], "age_s": 0.0}, {"fingers": [{"number": 1}], "age_s": 0.0}):
+        assert not places.is_valid(wrong)
+        with open_socket(disarmed[1], "/v1/fingers") as fingers:
+            fingers.send(json.dumps(wrong))
+            refusal.validate(json.loads(fingers.recv()))
+
+
 def test_reports_of_a_hold_follow_the_schema(disarmed):
     _, daemon = disarmed
     report = build_validator("hold", "report")
@@ -82,6 +93,7 @@ def test_every_message_of_the_document_is_judged_here():
     messages = {(channel, message) for channel, each in DOCUMENT["channels"].items() for message in each["messages"]}
     untyped = {("stream", "binaryFrame"), ("hold", "beat")}
     judged = {("stream", "frame"), ("stream", "result"), ("hold", "report")}
+    judged |= {("fingers", "places"), ("fingers", "refusal")}
     assert messages - untyped - judged == {
         ("telemetry", event) for event in DOCUMENT["channels"]["telemetry"]["messages"]
     }

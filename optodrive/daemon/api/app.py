@@ -20,6 +20,7 @@ from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.daemon_client import NO_EPOCH, DaemonClient
 from optodrive.daemon.api.dim_request import DIM_EXAMPLE, DIM_SCHEMA, parse_dim_request
 from optodrive.daemon.api.error_handlers import add_error_handlers
+from optodrive.daemon.api.fingers_socket import FingersSocket
 from optodrive.daemon.api.hold_socket import HoldSocket
 from optodrive.daemon.api.live_stream import LiveStream
 from optodrive.daemon.api.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
@@ -34,6 +35,7 @@ from optodrive.daemon.api.push_options_query import PushOptionsQuery
 from optodrive.daemon.api.roles import is_role_sufficient
 from optodrive.daemon.api.route_table import RoleRoutes, RouteTable
 from optodrive.daemon.api.scope_keys import ARRIVED_S, CALLER
+from optodrive.daemon.api.standing_stream import StandingStream
 from optodrive.daemon.api.static_files import add_page_routes
 from optodrive.daemon.api.stop_priority import StopPriorityMiddleware
 from optodrive.daemon.api.telemetry_hub import DEFAULT_RATE_HZ, EventStream
@@ -58,6 +60,7 @@ NameQuery = Annotated[
     Query(min_length=1, max_length=40, pattern=r"^[\w.-]+( [\w.-]+)*$", description="what the plan is called in lists"),
 ]
 PolicyQuery = Annotated[Policy, Query(description="treatment of a frame that exceeds a cap")]
+StandingQuery = Annotated[bool, Query(description="keep the newest frame up until the next one")]
 PulsesQuery = Annotated[bool, Query(description="list every pulse")]
 DRY_RUN_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"model": PlanReport, "description": "A dry run: the plan is not stored"}
@@ -184,9 +187,15 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         return await _plan_body(daemon, request, "sequence", name, options, newest, dry_run)
 
     @routes.websocket("/v1/stream", "operator")
-    async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
+    async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim", standing: StandingQuery = False) -> None:
         """Show streamed frames, of which the newest wins, and send the result of each."""
-        await LiveStream(daemon, socket, policy, socket.scope[CALLER].name).run()
+        stream = StandingStream if standing else LiveStream
+        await stream(daemon, socket, policy, socket.scope[CALLER].name).run()
+
+    @routes.websocket("/v1/fingers", "operator")
+    async def track_fingers(socket: WebSocket) -> None:
+        """Take the places of fingertips, for which standing frames are refreshed first."""
+        await FingersSocket(daemon, socket).run()
 
     @routes("GET /v1/telemetry", "viewer", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
     async def stream_telemetry(rate_hz: RateQuery = DEFAULT_RATE_HZ) -> EventStream:

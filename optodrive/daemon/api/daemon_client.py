@@ -7,10 +7,11 @@ import asyncio
 import time
 from bisect import bisect_right
 from collections import OrderedDict, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from optodrive.core.ipc import Message
+from optodrive.core.types.fingers import FingerPlace
 from optodrive.daemon.api.peer import Peer
 from optodrive.daemon.api.reload_requests import ReloadRequests
 from optodrive.daemon.api.state_merge import merge_state
@@ -186,7 +187,10 @@ class PlannerClient:
 
 
 class DaemonClient:
-    """The three processes, the state of the daemon, and the reloads that its supervisor carries out."""
+    """The three processes, the state of the daemon, and the reloads that its supervisor carries out.
+
+    fingers_callbacks: called with the time of arrival of new places of fingers
+    """
 
     def __init__(self, display: DisplayModel, folder: RuntimeFolder) -> None:
         self.display = display
@@ -195,6 +199,7 @@ class DaemonClient:
         self.preview = Peer("preview", folder.preview_socket)
         self.reloads = ReloadRequests()
         self.hub = TelemetryHub()
+        self.fingers_callbacks: set[Callable[[float], None]] = set()
         self._state: StateReport | None = None
         self._state_json = b""
         link, planner = self.link.peer, self.planner.peer
@@ -257,6 +262,12 @@ class DaemonClient:
         if built.fields["status"] != 200:
             return built
         return await self.planner.submit(built.payload, push, built.fields["labels"], built.fields["parameters"])
+
+    def send_fingers(self, places: Sequence[FingerPlace], at_s: float, arrived_s: float) -> None:
+        """Report the fingers that a tracker saw at a monotonic time, to the planner and to the standing pages."""
+        self.planner.peer.send(Message("fingers", {"at_s": at_s, "places": [list(place) for place in places]}))
+        for callback in self.fingers_callbacks:
+            callback(arrived_s)
 
     def revoke(self, caller: str) -> None:
         """End the plans of a caller whose token is no longer valid, and the arming if it has armed the board."""

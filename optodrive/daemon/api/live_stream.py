@@ -6,7 +6,6 @@ from typing import NamedTuple
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from optodrive.core.errors import BusyError, OptodriveError
-from optodrive.core.ipc import Message
 from optodrive.core.types.push_options import Policy
 from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
@@ -27,7 +26,9 @@ FRAME_AGE_MAX_S = 2.0
 """Longest time for which a frame may have waited in the socket: a backlog would light after its client has stopped."""
 
 
-class _Frame(NamedTuple):
+class Frame(NamedTuple):
+    """A frame that has arrived, with its encoded sequence."""
+
     number: int
     sequence: bytes
     arrived_s: float
@@ -47,7 +48,7 @@ class LiveStream:
         self._caller = caller
         self._pixels = len(daemon.display.layout)
         self._next_number = 0
-        self._pending: _Frame | None = None
+        self._pending: Frame | None = None
         self._arrived = asyncio.Event()
         self._outbox: asyncio.Queue[FrameResult] = asyncio.Queue(OUTBOX_MAX)
         self._watchers: set[asyncio.Task[None]] = set()
@@ -61,12 +62,16 @@ class LiveStream:
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            if self._last_watcher is not None and not self._last_watcher.done():
+            if self._may_emit():
                 # First, because this coroutine may be cancelled at its next await.
                 self._daemon.planner.end_stream(self._last_epoch, self._caller)
             for task in (*tasks, *self._watchers):
                 task.cancel()
             await asyncio.gather(*tasks, *self._watchers, return_exceptions=True)
+
+    def _may_emit(self) -> bool:
+        """Whether pulses of this stream may not have left yet."""
+        return self._last_watcher is not None and not self._last_watcher.done()
 
     async def _read(self) -> None:
         while True:
@@ -78,7 +83,7 @@ class LiveStream:
                 self._require_recent(message[EARLIEST_S])
                 epoch = self._daemon.link.require_epoch_at(message[EARLIEST_S])
                 number, sequence = parse_live_frame(data, self._next_number, self._pixels)
-                frame = _Frame(number, encode_sequence(sequence), message[ARRIVED_S], epoch)
+                frame = Frame(number, encode_sequence(sequence), message[ARRIVED_S], epoch)
             except OptodriveError as error:
                 self._publish(FrameResult(frame=None, status="refused", problem=build_error_problem(error)))
                 continue
@@ -97,36 +102,42 @@ class LiveStream:
 
     async def _plan(self) -> None:
         while True:
-            await self._arrived.wait()
-            self._arrived.clear()
-            assert self._pending is not None  # noqa: S101 - set before the event
-            frame, self._pending = self._pending, None
-            push = Push(
-                name=f"frame {frame.number}",
-                options={"policy": self._policy},
-                arrived_s=frame.arrived_s,
-                epoch=frame.epoch,
-                caller=self._caller,
-                streamed=True,
-                lists_pulses=False,
-            )
+            frame = await self._take_frame()
             try:
-                result = await self._daemon.planner.submit(frame.sequence, push)
+                result = await self._daemon.planner.submit(frame.sequence, self._build_push(frame))
             except OptodriveError as error:
                 self._refuse(frame.number, build_error_problem(error))
                 continue
             if result.fields["status"] >= 400:
                 self._refuse(frame.number, Problem.model_validate_json(result.payload))
                 continue
-            self._follow(frame, result)
+            self._follow(frame, PlanReport.model_validate_json(result.payload))
+
+    async def _take_frame(self) -> Frame:
+        """Wait for the next frame to plan."""
+        await self._arrived.wait()
+        self._arrived.clear()
+        assert self._pending is not None  # noqa: S101 - set before the event
+        frame, self._pending = self._pending, None
+        return frame
+
+    def _build_push(self, frame: Frame) -> Push:
+        return Push(
+            name=f"frame {frame.number}",
+            options={"policy": self._policy},
+            arrived_s=frame.arrived_s,
+            epoch=frame.epoch,
+            caller=self._caller,
+            streamed=True,
+            lists_pulses=False,
+        )
 
     def _refuse(self, number: int, problem: Problem) -> None:
         self._publish(FrameResult(frame=number, status="refused", problem=problem))
 
-    def _follow(self, frame: _Frame, result: Message) -> None:
+    def _follow(self, frame: Frame, report: PlanReport) -> None:
         """Publish that a frame is planned, and its end when that comes."""
-        report = PlanReport.model_validate_json(result.payload)
-        self._publish(_report_planned(frame.number, report))
+        self._publish(report_planned(frame.number, report))
         watcher = asyncio.create_task(self._watch(frame.number, report.plan))
         self._last_watcher, self._last_epoch = watcher, frame.epoch
         self._watchers.add(watcher)
@@ -152,7 +163,8 @@ class LiveStream:
             await self._socket.send_text((await self._outbox.get()).to_json())
 
 
-def _report_planned(number: int, report: PlanReport) -> FrameResult:
+def report_planned(number: int, report: PlanReport) -> FrameResult:
+    """Return the result of a frame that is planned."""
     return FrameResult(
         frame=number,
         status=PlanStatus.PLANNED,

@@ -7,6 +7,7 @@ from pydantic.json_schema import models_json_schema
 
 from optodrive.core.json_model import JsonModel
 from optodrive.daemon.api.route_table import RouteTable
+from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal
 from optodrive.daemon.responses.hold import HoldReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.stream import FrameResult
@@ -89,7 +90,14 @@ def extend_openapi(app: FastAPI, table: RouteTable) -> None:
 
 
 def _list_extra_schemas() -> dict[str, Any]:
-    models: list[type[JsonModel]] = [Problem, FrameResult, HoldReport, *EVENTS.values()]
+    models: list[type[JsonModel]] = [
+        Problem,
+        FrameResult,
+        FingersMessage,
+        FingersRefusal,
+        HoldReport,
+        *EVENTS.values(),
+    ]
     _, document = models_json_schema([(model, "serialization") for model in models], ref_template=REF_TEMPLATE)
     schemas: dict[str, Any] = document["$defs"]
     return schemas

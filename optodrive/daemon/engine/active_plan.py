@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,22 @@ from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.planned_sequence import PlannedSequence
 
 
+class RefreshCycle(NamedTuple):
+    """When a stream has drawn each pixel last.
+
+    drawn_s: [p] board time of the start of the last pulse, −infinity without one; begun_s: the pixels drawn since then
+    have had their turn
+    """
+
+    drawn_s: FloatArray
+    begun_s: float
+
+    @property
+    def refreshed(self) -> BoolArray:
+        """Pixels that have had their turn, [p]."""
+        return np.asarray(self.drawn_s >= self.begun_s, dtype=np.bool_)
+
+
 @dataclass(eq=False)
 class ActivePlan:
     """A plan with its thermal states and points, a megabyte for a frame of 1,500 pixels. Only its record outlives it.
@@ -24,7 +41,7 @@ class ActivePlan:
     epoch: in which the request arrived; the board executes nothing of an older one
     crc: CRC-32 of the verified bytes of the points
     growth: plans the rest once it is due, None for a whole plan
-    refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
+    cycle: refresh cycle of the stream before this plan, None for the first one
     first_row: first row that was not executed when the plan was interrupted last
     zero_s: time of the plan at which its points begin; origin_s: the same, or when the light went off meanwhile
     is_interrupted: whether the rows from first_row on were dropped, and are not yet planned again
@@ -41,7 +58,7 @@ class ActivePlan:
     epoch: int
     crc: int
     growth: SequencePlanner | None = None
-    refreshed: BoolArray | None = None
+    cycle: RefreshCycle | None = None
     first_row: int = 0
     zero_s: float = 0.0
     origin_s: float = 0.0

@@ -20,6 +20,7 @@ from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
+from optodrive.daemon.engine.page_refresh import PageRefresh
 from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
@@ -58,6 +59,7 @@ class Engine:
     on_loop: called in every loop iteration; must return quickly
     on_beat: called in every loop iteration, and during long computations in the loop's thread
     on_warning: called with one line for the log when the link fails
+    page: selects what is drawn next of a standing page
     memory: shared with earlier and later planner processes, None without any
     """
 
@@ -82,6 +84,7 @@ class Engine:
         self._simulation_executor = ThreadPoolExecutor(1, "simulation", use_usual_priority)
         self._planning_executor = ThreadPoolExecutor(1, "planner", use_usual_priority)
         self._plan_queue = PlanQueue(display, session, self._plan_store, self._simulation_executor)
+        self.page = PageRefresh(display.layout, clock, self.board_s, lambda: self._plan_queue.stream.lead_s)
         self._memory = ThermalMemory() if memory is None else memory
         self._dimmer = Dimmer(display, self._memory)
         self._planner = Planner(
@@ -201,7 +204,8 @@ class Engine:
             if name != "policy" and value != "as_is":
                 raise InputError(name, value, "no such option: a stream has no time for more than a policy")
         arrived_s = self.board_s() - (self._clock.now_s() - push.arrived_s)
-        return self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left))
+        select = self.page.select if push.standing else None
+        return self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left, select))
 
     def _require_armed(self) -> None:
         """Raise LinkError or NotReadyError if the board accepts no plans."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from math import inf
 from typing import NamedTuple
 
+from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_growth import may_grow
@@ -21,6 +22,7 @@ from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
+from optodrive.planning.stimuli.standing_page import Refresh
 from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
 
 NEVER = threading.Event()
@@ -32,12 +34,14 @@ class PlanningRequest(NamedTuple):
 
     build: returns the sequence, with labels and parameters for report and recording
     arrived_s: board time of the push's arrival; caller_left: set when the caller no longer waits
+    select: returns what is drawn next of a sequence that is a standing page, None for any other sequence
     """
 
     build: Callable[[], BuiltRequest]
     push: Push
     arrived_s: float = 0.0
     caller_left: threading.Event = NEVER
+    select: Callable[[DisplayModel, FrameSequence, PlanningSnapshot], Refresh] | None = None
 
 
 def make_plan(
@@ -58,8 +62,9 @@ def make_plan(
     push = request.push
     growth, feasibility = None, None
     if push.streamed:
-        growth = _begin_streamed(display, push, built.sequence, snapshot, on_progress)
-        planned = growth.plan_until(horizon_s if may_grow(push, built.sequence, len(scales)) else inf)
+        growth = _begin_streamed(display, request, built.sequence, snapshot, on_progress)
+        is_page = request.select is not None
+        planned = growth.plan_until(horizon_s if not is_page and may_grow(push, built.sequence, len(scales)) else inf)
     else:
         heat, budget = snapshot.heat, snapshot.budget
         planned, feasibility = check_feasibility(display, built.sequence, heat, budget, on_progress, **push.options)
@@ -99,20 +104,23 @@ def make_plan(
         epoch=push.epoch,
         crc=zlib.crc32(payload),
         growth=None if growth is None or growth.is_complete else growth,
-        refreshed=snapshot.refreshed,
+        cycle=snapshot.cycle,
     )
 
 
 def _begin_streamed(
     display: DisplayModel,
-    push: Push,
+    request: PlanningRequest,
     sequence: FrameSequence,
     snapshot: PlanningSnapshot,
     on_progress: Callable[[float], None],
 ) -> SequencePlanner:
     """Begin to plan a streamed sequence."""
-    if snapshot.refreshed is not None and can_split(sequence):
-        sequence = stale_pixels_first(sequence, snapshot.refreshed)
-    policy, pixels = push.options.get("policy", "trim"), snapshot.initial_pixels
+    orders: dict[int, IntArray] = {}
+    if request.select is not None:
+        sequence, orders = request.select(display, sequence, snapshot)
+    elif snapshot.cycle is not None and can_split(sequence):
+        sequence = stale_pixels_first(sequence, snapshot.cycle.refreshed)
+    policy, pixels = request.push.options.get("policy", "trim"), snapshot.initial_pixels
     heat, budget = snapshot.heat, snapshot.budget
-    return SequencePlanner(display, sequence, heat, budget, policy, on_progress, initial_pixels=pixels)
+    return SequencePlanner(display, sequence, heat, budget, policy, on_progress, pixels, orders)

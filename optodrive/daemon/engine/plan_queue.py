@@ -78,8 +78,8 @@ class PlanQueue(QueuedPlans):
         snapshot = None if last is None else self.stream.build_cut_snapshot(last, thermal, planning_time_s)
         if snapshot is not None:
             return snapshot
-        refreshed = self.stream.find_refreshed(thermal) if streamed else None
-        return PlanningSnapshot(thermal, start_s, *thermal.shift_to_plan(start_s), refreshed=refreshed)
+        cycle = self.stream.find_cycle() if streamed else None
+        return PlanningSnapshot(thermal, start_s, *thermal.shift_to_plan(start_s), cycle=cycle)
 
     def _earliest_start_s(self, streamed: bool, planning_time_s: float = 0.0) -> float:
         lead_s = STREAM_START_LEAD_S if streamed else START_LEAD_S
@@ -113,6 +113,7 @@ class PlanQueue(QueuedPlans):
             elif snapshot.cut is None or not self.stream.splice(plan, snapshot.predecessor, snapshot.cut):
                 return False
             self.thermal.append(plan)
+            self.stream.record_accepted(plan)
             self.accounts.totals["planned"] += record.pulse_count
             record.change_status(PlanStatus.QUEUED if snapshot.predecessor is None else PlanStatus.RUNNING)
             record.planned_after_s = self._session.board_s() - record.arrived_s
@@ -199,11 +200,13 @@ class PlanQueue(QueuedPlans):
         reason: what ended it; clock_shift_s: as for end_all
         """
         status = PlanStatus.STOPPED if reason in (STOP, DISARM) else PlanStatus.FAILED
+        self.stream.forget_cycle()
         self.end_all(status, reason, clock_shift_s)
 
     def on_board_restarted(self, delay_s: float) -> None:
         """Shift heat and budget to the restarted clock of the board."""
         self.accounts.events.append(ClockShift(delay_s))
+        self.stream.forget_cycle()
         with self.lock:
             self.thermal.shift_clock(delay_s)
 

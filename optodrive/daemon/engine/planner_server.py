@@ -14,6 +14,7 @@ from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.json_model import iterate_json
 from optodrive.core.scheduling import use_usual_priority
+from optodrive.core.types.fingers import FingerPlace
 from optodrive.daemon.engine.dry_run import build_dry_run_start
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.plan_record import PlanRecord
@@ -87,6 +88,9 @@ class PlannerServer:
             "cancel": lambda: self._cancel(connection, fields["id"], fields["plan"]),
             "metrics": lambda: self._reply(connection, fields["id"], 200, self._engine.render_metrics().encode()),
             "snapshot": lambda: self._reply(connection, fields["id"], 200, build_dry_run_start(self._engine)),
+            "fingers": lambda: self._engine.page.update_fingers(
+                fields["at_s"], [FingerPlace(*place) for place in fields["places"]]
+            ),
             "end_stream": lambda: self._engine.end_stream(fields["epoch"], fields["caller"]),
             "telemetry": lambda: self._set_readers(connection, client, fields["readers"], fields["rate_hz"]),
         }

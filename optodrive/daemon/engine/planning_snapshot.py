@@ -1,13 +1,12 @@
 """State from which a plan is made: the plan's zero, and heat and budget at that time."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from math import inf
 
 import numpy as np
 
-from optodrive.core.types.arrays import BoolArray
 from optodrive.core.types.plans import BudgetState
-from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.active_plan import ActivePlan, RefreshCycle
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.link.protocol.point_cut import PointCut
 from optodrive.physics.thermal_state import ThermalState
@@ -24,7 +23,7 @@ class PlanningSnapshot:
     heat, budget: state at that time, on the plan's own time line
     predecessor, cut: running plan that the new one truncates, and where
     initial_pixels: pixel at which the mirrors of each stage point at the plan's zero; None if one is unknown
-    refreshed: [p] pixels that the current refresh cycle of a stream has drawn
+    cycle: when the stream has drawn each pixel last, None if no stream was before
     """
 
     thermal: ThermalEstimate
@@ -34,17 +33,7 @@ class PlanningSnapshot:
     predecessor: ActivePlan | None = None
     cut: PointCut | None = None
     initial_pixels: tuple[int, ...] | None = None
-    refreshed: BoolArray | None = None
-
-
-class RefreshCycle(NamedTuple):
-    """Progress of a stream's refresh cycle when the stream was truncated.
-
-    The cycle continues only if `thermal` is still the queue's estimate, that is, if no other plan came in between.
-    """
-
-    thermal: ThermalEstimate
-    refreshed: BoolArray
+    cycle: RefreshCycle | None = None
 
 
 def build_cut_snapshot(
@@ -73,20 +62,22 @@ def build_cut_snapshot(
         predecessor=running,
         cut=cut,
         initial_pixels=None if is_aim_unknown else tuple(plan.pixel[cut.aim_rows].tolist()),
-        refreshed=mark_refreshed(running, cut.row),
+        cycle=continue_cycle(running, cut.row),
     )
 
 
-def mark_refreshed(truncated: ActivePlan, cut_row: int) -> BoolArray:
-    """Return the pixels that a refresh cycle has drawn when its plan is truncated, [p].
+def continue_cycle(streamed: ActivePlan, row: int) -> RefreshCycle:
+    """Return the refresh cycle after the first `row` pulses of a plan.
 
-    All pixels are unmarked if what is left contains no pixel that is still to be drawn: a new cycle starts.
+    If what is left contains no pixel that is still to be drawn, a new cycle begins.
     """
-    pixel = truncated.planned.plan.pixel
-    if truncated.refreshed is None:
-        refreshed = np.zeros(len(truncated.heat_before.pixels), dtype=np.bool_)
+    plan, zero_s = streamed.planned.plan, streamed.record.start_s
+    if streamed.cycle is None:
+        drawn_s, begun_s = np.full(len(streamed.heat_before.pixels), -inf), zero_s
     else:
-        refreshed = truncated.refreshed.copy()
-    refreshed[pixel[:cut_row]] = True
-    left = np.concatenate([pixel[cut_row:], truncated.unplanned_pixels])
-    return refreshed if not refreshed[left].all() else np.zeros_like(refreshed)
+        drawn_s, begun_s = streamed.cycle.drawn_s.copy(), streamed.cycle.begun_s
+    drawn_s[[pulse.pixel for pulse in streamed.planned.skipped]] = zero_s  # their heat holds them up
+    drawn_s[plan.pixel[:row]] = zero_s + plan.start_s[:row]
+    left = np.concatenate([plan.pixel[row:], streamed.unplanned_pixels])
+    end_s = zero_s + float((plan.start_s + plan.width_s)[:row].max(initial=0.0))
+    return RefreshCycle(drawn_s, end_s if (drawn_s[left] >= begun_s).all() else begun_s)

@@ -13,15 +13,9 @@ If that is too late, because the computer stalled, the rest becomes a frame of i
 
 from math import inf
 
-from optodrive.core.types.arrays import BoolArray
-from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.active_plan import ActivePlan, RefreshCycle
 from optodrive.daemon.engine.plan_growth import GrownPlan
-from optodrive.daemon.engine.planning_snapshot import (
-    PlanningSnapshot,
-    RefreshCycle,
-    build_cut_snapshot,
-    mark_refreshed,
-)
+from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot, continue_cycle
 from optodrive.daemon.engine.progress import PlanRun
 from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
@@ -44,7 +38,7 @@ class QueueStream:
         self._plans = plans
         self._display = display
         self._session = session
-        self._refresh_cycle: RefreshCycle | None = None
+        self._last: ActivePlan | None = None
         self._unfinished: tuple[ActivePlan, ThermalEstimate] | None = None
 
     @property
@@ -115,7 +109,6 @@ class QueueStream:
             last.record.dropped = last.record.pulse_count - snapshot.cut.row
             estimate = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
             self._plans.thermal.set(estimate, snapshot.start_s)
-            self._refresh_cycle = RefreshCycle(estimate, mark_refreshed(last, snapshot.cut.row))
 
     # --- growing plans ------------------------------------------------------------------------------------------
 
@@ -186,7 +179,15 @@ class QueueStream:
 
     # --- refresh cycle ------------------------------------------------------------------------------------------
 
-    def find_refreshed(self, thermal: ThermalEstimate) -> BoolArray | None:
-        """Return the pixels that the current refresh cycle has drawn, [p], None if another plan has come in between."""
-        cycle = self._refresh_cycle
-        return cycle.refreshed if cycle is not None and cycle.thermal is thermal else None
+    def record_accepted(self, plan: ActivePlan) -> None:
+        """Record the plan that was accepted last. One that is not streamed ends the refresh cycle."""
+        self._last = plan if plan.record.streamed else None
+
+    def forget_cycle(self) -> None:
+        """Begin a new refresh cycle, because the board's clock has jumped or accepted plans were not drawn."""
+        self._last = None
+
+    def find_cycle(self) -> RefreshCycle | None:
+        """Return the refresh cycle after the plan accepted last, None if another plan has come in between."""
+        last = self._last
+        return None if last is None else continue_cycle(last, last.record.pulse_count - last.record.dropped)

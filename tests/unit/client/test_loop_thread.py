@@ -49,7 +49,7 @@ def stream(certificate, monkeypatch):
     server = loop.run(start())
     port = server.sockets[0].getsockname()[1]
     layout = PixelLayout(PIXEL, PIXEL, PIXEL.astype(int), PIXEL.astype(int))
-    with Stream(Endpoint(f"https://localhost:{port}", "token"), layout, "trim", 0.0, lambda: None) as stream:
+    with Stream(Endpoint(f"https://localhost:{port}", "token"), layout, "trim", False, 0.0, lambda: None) as stream:
         yield stream
 
     async def stop():

@@ -1,0 +1,70 @@
+"""Places of fingertips over a WebSocket: the newest ones go to the planner process and wake the standing pages."""
+
+import asyncio
+import time
+
+from pydantic import ValidationError
+from starlette.websockets import WebSocket
+
+from optodrive.core.errors import InputError
+from optodrive.daemon.api.daemon_client import DaemonClient
+from optodrive.daemon.api.scope_keys import ARRIVED_S
+from optodrive.daemon.api.socket_token import select_subprotocol
+from optodrive.daemon.responses.error_problem import build_error_problem
+from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal
+from optodrive.planning.stimuli.json_values import decode_json
+
+FORWARD_PERIOD_S = 0.005
+"""Least time between two messages to the planner; of those in between the newest counts."""
+EXPECTED = '{"fingers": [{"number": 1, "x_m": 0.0, "y_m": 0.0, "radius_m": 0.004}], "age_s": 0.0}'
+
+
+class FingersSocket:
+    """One tracker."""
+
+    def __init__(self, daemon: DaemonClient, socket: WebSocket) -> None:
+        self._daemon, self._socket = daemon, socket
+        self._newest: tuple[FingersMessage, float] | None = None
+        self._arrived = asyncio.Event()
+
+    async def run(self) -> None:
+        """Serve until the tracker disconnects."""
+        await self._socket.accept(select_subprotocol(self._socket.scope))
+        tasks = [asyncio.create_task(work) for work in (self._read(), self._forward())]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _read(self) -> None:
+        while (message := await self._socket.receive())["type"] != "websocket.disconnect":
+            try:
+                fingers = parse_fingers(message.get("text") or message.get("bytes") or b"")
+            except InputError as error:
+                await self._socket.send_text(FingersRefusal(problem=build_error_problem(error)).model_dump_json())
+                continue
+            self._newest = fingers, message.get(ARRIVED_S) or time.monotonic()
+            self._arrived.set()
+
+    async def _forward(self) -> None:
+        while True:
+            await self._arrived.wait()
+            self._arrived.clear()
+            assert self._newest is not None  # noqa: S101 - set before the event
+            fingers, arrived_s = self._newest
+            self._daemon.send_fingers(fingers.places, arrived_s - fingers.age_s, arrived_s)
+            await asyncio.sleep(FORWARD_PERIOD_S)
+
+
+def parse_fingers(message: str | bytes) -> FingersMessage:
+    """Parse a message. Raise InputError, also for invalid JSON and for a repeated key."""
+    decoded = decode_json(message, "message")
+    try:
+        return FingersMessage.model_validate(decoded)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(["message", *map(str, first["loc"])])
+        expected = first["msg"].removeprefix("Input should be ")
+        raise InputError(where, first["input"], f"{expected}, as in {EXPECTED}") from None

@@ -1,0 +1,89 @@
+"""Streamed frames that stand: the newest one is refreshed until the next, first where fingers are.
+
+Each refresh is a streamed plan of the pixels whose turn it is, which the planner process selects. One is made whenever
+new places of fingers have arrived, but not sooner than REFRESH_MIN_S after the last, and else every REFRESH_MAX_S,
+before the light that is planned ends. A refresh that is refused, as after STOP, ends the frame: it does not come back
+by itself.
+"""
+
+import asyncio
+import time
+from typing import Any
+
+from optodrive.daemon.api.live_stream import Frame, LiveStream, report_planned
+from optodrive.daemon.push import Push
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.problem import Problem
+from optodrive.daemon.responses.stream import FrameResult
+
+REFRESH_MIN_S, REFRESH_MAX_S = 0.005, 0.03
+
+
+class StandingStream(LiveStream):
+    """Stream of one client whose newest frame stands."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._shown: Frame | None = None
+        self._fingers_arrived_s: float | None = None
+        self._fingers_moved = asyncio.Event()
+
+    async def run(self) -> None:
+        """Serve until the client disconnects. Then the frame ends."""
+        self._daemon.fingers_callbacks.add(self._on_fingers)
+        try:
+            await super().run()
+        finally:
+            self._daemon.fingers_callbacks.discard(self._on_fingers)
+
+    def _on_fingers(self, arrived_s: float) -> None:
+        if self._fingers_arrived_s is None:
+            self._fingers_arrived_s = arrived_s
+        self._fingers_moved.set()
+
+    def _may_emit(self) -> bool:
+        return self._shown is not None
+
+    async def _take_frame(self) -> Frame:
+        """Wait for a frame, or for the time to refresh the one that stands."""
+        if self._shown is not None:
+            await _wait_for_any(REFRESH_MIN_S, self._arrived)
+            if not self._arrived.is_set():
+                await _wait_for_any(REFRESH_MAX_S - REFRESH_MIN_S, self._arrived, self._fingers_moved)
+            if not self._arrived.is_set():
+                return self._shown
+        return await super()._take_frame()
+
+    def _build_push(self, frame: Frame) -> Push:
+        """Build the push of a refresh, whose latency counts from the arrival of the first fingers that it follows."""
+        push = super()._build_push(frame)._replace(standing=True)
+        arrived_s, self._fingers_arrived_s = self._fingers_arrived_s, None
+        self._fingers_moved.clear()
+        if frame is not self._shown:
+            return push
+        return push._replace(arrived_s=time.monotonic() if arrived_s is None else arrived_s)
+
+    def _follow(self, frame: Frame, report: PlanReport) -> None:
+        if frame is self._shown:
+            return
+        if self._shown is not None:
+            superseded = FrameResult(frame=self._shown.number, status=PlanStatus.SUPERSEDED, superseded_by=frame.number)
+            self._publish(superseded)
+        self._shown, self._last_epoch = frame, frame.epoch
+        self._publish(report_planned(frame.number, report))
+
+    def _refuse(self, number: int, problem: Problem) -> None:
+        super()._refuse(number, problem)
+        if self._shown is not None and self._shown.number == number:
+            self._shown = None
+
+
+async def _wait_for_any(timeout_s: float, *events: asyncio.Event) -> None:
+    """Wait until one of some events is set, but no longer than this time."""
+    waits = [asyncio.ensure_future(event.wait()) for event in events]
+    try:
+        await asyncio.wait(waits, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for wait in waits:
+            wait.cancel()
