@@ -52,7 +52,7 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
         np.testing.assert_allclose(plans["p1/target_um"][0, [17, 18]], [90, 60])
         assert [json.loads(plans[f"p{k}/labels"][()]) for k in (1, 2, 3)] == [LABELS, LABELS, {}]
         parameters = [json.loads(plans[f"p{k}/parameters"][()]) for k in (1, 2, 3)]
-        assert parameters == [{}, {"pixel": 17, "height_um": 100.0, "seconds": 1.0}, {}]
+        assert parameters == [{}, {"pixel": 17, "height_um": 100.0, "intensity": None, "seconds": 1.0}, {}]
         for answer in answers:
             kept, columns = plans[answer["plan"]], answer["executed_pulses"]
             np.testing.assert_allclose(1e6 * kept["simulated_m"][:], columns["simulated_um"])
