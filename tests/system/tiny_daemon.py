@@ -31,7 +31,7 @@ STATUS = {"connected": True, "port": "tty", "board": {"state": "DISARMED"}}
 
 MUTANTS = {
     "no STOP before the end": lambda: setattr(LinkView, "stop_and_wait", lambda self, timeout_s: None),
-    "no death of a hung child": lambda: setattr(Child, "find_hang", lambda self: None),
+    "no death of a hung child": lambda: setattr(Child, "find_hang", lambda self, now_s: None),
     "no death with the supervisor": lambda: setattr(forking, "PR_SET_PDEATHSIG", 0),
 }
 

@@ -163,11 +163,13 @@ class Child:
             self._started_s = self._clock.now_s()
         self._beaten_s = self._clock.now_s()
 
-    def find_hang(self) -> str | None:
-        """Return why the process counts as hung, None if it does not. Call it after receive()."""
+    def find_hang(self, now_s: float) -> str | None:
+        """Return why the process counts as hung, None if it does not. Call it after receive().
+
+        now_s: time before receive(). If the supervisor is suspended after it, the beats of the meantime are unread.
+        """
         if not self.is_running or self.killed_because:
             return None
-        now_s = self._clock.now_s()
         if not self.is_ready:
             waited_s = now_s - self._started_s
             return f"not ready after {START_TIMEOUT_S:g} s" if waited_s > START_TIMEOUT_S else None

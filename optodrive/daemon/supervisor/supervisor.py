@@ -195,7 +195,7 @@ class Supervisor:
             self.on_reload()
 
     def _watch(self, child: Child) -> None:
-        reason = child.find_hang()
+        reason = child.find_hang(self._stepped_s)
         if reason is not None:
             child.kill(f"killed: {reason}")
         ended = child.collect()
