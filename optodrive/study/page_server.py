@@ -11,7 +11,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from importlib.resources import files
 from ipaddress import ip_address
@@ -26,7 +26,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from optodrive.core.errors import InputError, OptodriveError
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES, check_host_and_origin
@@ -66,6 +66,13 @@ class PageAddress(NamedTuple):
     def is_local(self) -> bool:
         """Whether only programs of this computer reach it, which may also call it by another name."""
         return self.host in LOOPBACK_NAMES
+
+
+class Closure(NamedTuple):
+    """Why the server closes a page's WebSocket."""
+
+    code: int
+    reason: str
 
 
 def parse_page_address(option: str, text: str) -> PageAddress:
@@ -159,50 +166,39 @@ class StudyPages:
         connection = self._respondent.join()
         views = _SentViews()
         try:
-            await self._run(
-                self._send_participant_views(page, connection, views),
-                self._receive_participant(page, connection, views),
-            )
+            with _Wake(self) as wake:
+                await _run(
+                    page,
+                    self._send_participant_views(page, connection, views, wake),
+                    self._receive_participant(page, connection, views),
+                )
         finally:
             self._respondent.leave(connection)
 
     async def _serve_operator(self, page: WebSocket) -> None:
         if await _accept(page, self._operator_token):
-            await self._run(self._send_operator_views(page), self._receive_operator(page))
+            with _Wake(self) as wake:
+                await _run(page, self._send_operator_views(page, wake), self._receive_operator(page))
 
-    async def _run(self, *work: Any) -> None:
-        """Send and receive until one of them ends."""
-        tasks = [asyncio.ensure_future(each) for each in work]
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+    async def _send_participant_views(
+        self, page: WebSocket, connection: int, views: "_SentViews", wake: asyncio.Event
+    ) -> Closure:
+        while True:
+            wake.clear()
+            view = self._respondent.build_participant_view(connection)
+            if view is None:
+                return Closure(REPLACED, "opened in another window")
+            await page.send_json({"view": views.count(time.monotonic()), **view.model_dump(mode="json")})
+            if view.phase in ("done", "stopped"):
+                return Closure(NORMAL, "")
+            await wake.wait()
 
-    async def _send_participant_views(self, page: WebSocket, connection: int, views: "_SentViews") -> None:
-        with _Wake(self) as wake:
-            while True:
-                wake.clear()
-                view = self._respondent.build_participant_view(connection)
-                if view is None:
-                    await page.close(REPLACED, "opened in another window")
-                    return
-                await page.send_json({"view": views.count(time.monotonic()), **view.model_dump(mode="json")})
-                if view.phase in ("done", "stopped"):
-                    await page.close(NORMAL)
-                    return
-                await wake.wait()
-
-    async def _receive_participant(self, page: WebSocket, connection: int, views: "_SentViews") -> None:
+    async def _receive_participant(self, page: WebSocket, connection: int, views: "_SentViews") -> Closure | None:
         async for text, arrived_s in _iterate_messages(page):
             try:
                 message = PARTICIPANT_MESSAGES.validate_json(text)
             except ValidationError as error:
-                await page.close(INVALID, _describe(error))
-                return
+                return Closure(INVALID, _describe(error))
             if isinstance(message, SeenMessage):
                 views.take_seen(message.view, arrived_s)
                 continue
@@ -210,29 +206,28 @@ class StudyPages:
             if isinstance(message, AnswerMessage) and views.round_trip_s is not None:
                 latency_s = message.handled_s + views.round_trip_s
             self._respondent.receive(connection, message, arrived_s, latency_s)
+        return None
 
-    async def _send_operator_views(self, page: WebSocket) -> None:
-        with _Wake(self) as wake:
-            while True:
-                wake.clear()
-                view = self._respondent.build_operator_view()
-                await page.send_json({**view.model_dump(mode="json"), "participant_url": self.participant_url})
-                if view.phase in ("done", "stopped"):
-                    await page.close(NORMAL)
-                    return
-                await wake.wait()
+    async def _send_operator_views(self, page: WebSocket, wake: asyncio.Event) -> Closure:
+        while True:
+            wake.clear()
+            view = self._respondent.build_operator_view()
+            await page.send_json({**view.model_dump(mode="json"), "participant_url": self.participant_url})
+            if view.phase in ("done", "stopped"):
+                return Closure(NORMAL, "")
+            await wake.wait()
 
-    async def _receive_operator(self, page: WebSocket) -> None:
+    async def _receive_operator(self, page: WebSocket) -> Closure | None:
         async for text, _ in _iterate_messages(page):
             try:
                 command = OPERATOR_MESSAGES.validate_json(text).kind
             except ValidationError as error:
-                await page.close(INVALID, _describe(error))
-                return
+                return Closure(INVALID, _describe(error))
             if command == "stop":
                 await run_in_threadpool(self._stop_display)
             else:
                 self._respondent.set_paused(command == "pause")
+        return None
 
     def _stop_display(self) -> None:
         try:
@@ -308,7 +303,8 @@ class _HostCheck:
         headers = join_headers((name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"])
         problem = check_host_and_origin(headers, self._hosts)
         if problem is None:
-            await self._app(scope, receive, send)
+            with suppress(WebSocketDisconnect):  # a page that left while something was sent to it
+                await self._app(scope, receive, send)
         else:
             await send_problem(send, problem, "websocket.http" if scope["type"] == "websocket" else "http")
 
@@ -321,6 +317,26 @@ async def _accept(page: WebSocket, token: str) -> bool:
         return True
     await page.close(UNAUTHORISED, "not the token of this page")
     return False
+
+
+async def _run(page: WebSocket, *work: Coroutine[Any, Any, Closure | None]) -> None:
+    """Send and receive until one of them ends, and close the page as that one says.
+
+    Neither closes by itself, so that nothing is sent after a close. Raise WebSocketDisconnect if the page has left.
+    """
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+    for result in results:
+        if isinstance(result, Exception):
+            raise result
+        if isinstance(result, Closure):
+            await page.close(*result)
+            return
 
 
 async def _iterate_messages(page: WebSocket) -> Any:

@@ -8,7 +8,7 @@ import random
 import time
 
 import pytest
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Error, sync_playwright
 
 from killable_browser import KillableBrowser
 from page_bench import Bench
@@ -96,9 +96,18 @@ class Session:
                 is_new = self.browser is None
             if self.browser is None:
                 self.browser = KillableBrowser(self.playwright, PARTICIPANT)
-            if is_new:
-                self.browser.open(self.study.urls["participant"])
+            if is_new and not self.load(lambda: self.browser.open(self.study.urls["participant"])):
+                continue
             return
+
+    def load(self, action):
+        """Let the browser load the page. Return False if the run had ended before."""
+        try:
+            action()
+        except Error:
+            wait_for(lambda: not self.is_running, "the end of the run")
+            return False
+        return True
 
     def disturb(self, event):
         if event == "study":
@@ -111,9 +120,9 @@ class Session:
             self.browser.kill()
             self.browser = None
         elif event == "reload":
-            self.browser.reload()
+            self.load(self.browser.reload)
         else:
-            self.browser.open(self.study.urls["participant"])
+            self.load(lambda: self.browser.open(self.study.urls["participant"]))
 
     def run(self, rng, events):
         """Take the session to its end with some events, each at a random moment of some later attempt."""
