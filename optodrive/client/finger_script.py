@@ -2,26 +2,18 @@
 
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.numeric_tables import read_columns
-from optodrive.core.types.fingers import FingerPlace
+from optodrive.core.types.fingers import FingerPlace, FingerReport
 from optodrive.daemon.responses.fingers import FINGERS_MAX, FingerMessage
 
 COLUMNS = ("time_s", "number", "x_m", "y_m", "radius_m")
 LIFTED_S = 0.05
 """Time after its last row at which a script that ends with fingers on the display lifts them."""
-
-
-class FingerReport(NamedTuple):
-    """All fingertips at a time of a script."""
-
-    at_s: float
-    places: tuple[FingerPlace, ...]
 
 
 def read_finger_script(path: Path) -> list[FingerReport]:

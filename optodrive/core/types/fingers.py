@@ -15,3 +15,13 @@ class FingerPlace(NamedTuple):
     y_m: float
     radius_m: float
     confidence: float = 1.0
+
+
+class FingerReport(NamedTuple):
+    """All fingertips on the display at a time.
+
+    at_s: of their measurement, on a clock that its source states
+    """
+
+    at_s: float
+    places: tuple[FingerPlace, ...]

@@ -1,0 +1,1 @@
+"""Trackers of fingertips: a multitouch film and a camera."""
