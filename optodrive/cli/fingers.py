@@ -1,4 +1,4 @@
-"""`optodrive fingers`: report fingertips to the daemon, from a film, or from a file as a tracker would."""
+"""`optodrive fingers`: report fingertips to the daemon, from a film, a camera, or a file as a tracker would."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -24,9 +24,17 @@ def fingers(
         Path | None,
         typer.Option("--film", metavar="PATH", help="A multitouch film, /dev/input/event…, or a recording of one."),
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option("--camera", metavar="N|PATH", help="A camera that sees the display's marks, or a video of one."),
+    ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option("--calibration", metavar="film.toml", help="Of the film, an output of `calibrate film`."),
+    ] = None,
+    marks: Annotated[
+        Path | None,
+        typer.Option("--marks", metavar="marks.toml", help="Where the marks for the camera are on the display."),
     ] = None,
     record: RecordOption = None,
     repeat: Annotated[bool, typer.Option("--repeat", help="Begin again at the end, until Ctrl-C.")] = False,
@@ -36,17 +44,26 @@ def fingers(
     from optodrive.cli.signals import end_as_interrupted
     from optodrive.client.finger_script import read_finger_script
 
-    if (script is None) == (film is None):
-        found = MISSING if film is None else Unquoted("both")
-        raise InputError("FILE.csv or --film", found, "one source of fingertips")
-    for option, path in (("--calibration", calibration), ("--record", record)):
-        if film is None and path is not None:
-            raise InputError(option, str(path), "--film with it")
+    sources = [
+        name for name, given in (("FILE.csv", script), ("--film", film), ("--camera", camera)) if given is not None
+    ]
+    if len(sources) != 1:
+        found = Unquoted(" and ".join(sources)) if sources else MISSING
+        raise InputError("FILE.csv, --film or --camera", found, "one source of fingertips")
+    for option, path, source in (
+        ("--calibration", calibration, "--film"),
+        ("--record", record, "--film"),
+        ("--marks", marks, "--camera"),
+    ):
+        if path is not None and source not in sources:
+            raise InputError(option, str(path), f"{source} with it")
     with end_as_interrupted():
         if script is not None:
             _send(_pace(read_finger_script(script), repeat), url)
         if film is not None:
             _report_film(film, calibration, record, repeat, url)
+        if camera is not None:
+            _report_camera(camera, marks, repeat, url)
 
 
 def _report_film(path: Path, calibration: Path | None, record: Path | None, repeat: bool, url: str) -> None:
@@ -57,24 +74,46 @@ def _report_film(path: Path, calibration: Path | None, record: Path | None, repe
     if calibration is None:
         raise InputError("--calibration", MISSING, "film.toml, an output of `optodrive calibrate film`")
     is_live = is_device(path)
-    if is_live and repeat:
-        raise InputError("--repeat", Unquoted("a device"), "a recording to repeat")
+    _check_repeat(repeat, is_live)
     with open_film(path, record) as (axes, contacts):
         reports = locate_contacts(contacts, load_film_calibration(calibration, axes))
-        _send(reports if is_live else _pace(list(reports), repeat), url)
+        _send(reports if is_live else _pace(reports, repeat), url)
 
 
-def _pace(reports: list["FingerReport"], repeat: bool) -> Iterator["FingerReport"]:
+def _report_camera(source: str, marks: Path | None, repeat: bool, url: str) -> None:
+    from optodrive.tracking.camera import Camera, follow_fingertips
+    from optodrive.tracking.marks import load_marks
+
+    if marks is None:
+        raise InputError("--marks", MISSING, "marks.toml, which states where the marks are")
+    content = load_marks(marks)
+    with Camera(source) as camera:
+        _check_repeat(repeat, camera.is_live)
+        reports = follow_fingertips(camera, content)
+        _send(reports if camera.is_live else _pace(reports, repeat), url)
+
+
+def _check_repeat(repeat: bool, is_live: bool) -> None:
+    if repeat and is_live:
+        raise InputError("--repeat", Unquoted("a device"), "a recording to repeat")
+
+
+def _pace(reports: Iterable["FingerReport"], repeat: bool) -> Iterator["FingerReport"]:
     """Yield each report at its time since the begin, with this time as the monotonic clock shows it."""
-    begin_s = time.monotonic()
-    while True:
-        for report in reports:
-            due_s = begin_s + report.at_s
-            time.sleep(max(0.0, due_s - time.monotonic()))
-            yield report._replace(at_s=due_s)
-        if not repeat:
-            return
-        begin_s += reports[-1].at_s
+    begin_s, played = time.monotonic(), []
+    for report in reports:
+        played.append(report)
+        yield _wait_for(report, begin_s)
+    while repeat:
+        begin_s += played[-1].at_s
+        for report in played:
+            yield _wait_for(report, begin_s)
+
+
+def _wait_for(report: "FingerReport", begin_s: float) -> "FingerReport":
+    due_s = begin_s + report.at_s
+    time.sleep(max(0.0, due_s - time.monotonic()))
+    return report._replace(at_s=due_s)
 
 
 def _send(reports: Iterable["FingerReport"], url: str) -> None:

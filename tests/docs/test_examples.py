@@ -45,6 +45,7 @@ ELSEWHERE = {
     "optodrive diagnose --live": "a synopsis; tests/system/test_diagnose_live.py",
     "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
     "optodrive calibrate film": "tests/system/test_finger_trackers.py",
+    "optodrive fingers --camera": "tests/system/test_finger_trackers.py",
     "optodrive fingers --film": "tests/system/test_finger_trackers.py",
     "optodrive calibrate pixels": "tests/accuracy/test_calibrate_pixels.py records its sweep, which takes minutes",
     "optodrive calibrate servo recording.h5 --stage": "tests/accuracy/test_calibrate_servo.py",

@@ -9,12 +9,22 @@ import numpy as np
 import pytest
 
 from forked_process import OPTODRIVE, start_process
+from optodrive.tracking.camera import BACKGROUND_PICTURES
+from rendered_hand import ABOVE, SIZE, Finger, render, write_marks, write_video
 from rig import TOKEN, running, wait_for
 from test_standing_frames import LEAD, PLACES, compute_lead, count_pulses, send_page, show
 from touch_film import SimulatedFilm
 
 PAGE = tuple(range(50, 400))
 CORNERS = (0, 18, 417, 397)
+
+
+FINGERS = (120, 325)
+FAR = [
+    pixel
+    for pixel in PAGE
+    if pixel in FINGERS or min(np.hypot(*np.subtract(PLACES[pixel], PLACES[finger])) for finger in FINGERS) > 0.015
+]
 
 
 @pytest.fixture(scope="module")
@@ -54,27 +64,20 @@ def test_a_recorded_film_brings_light_under_the_fingers_and_under_no_others(rig,
     end_s = film.move(end_s, 0.1, fingers)
     film.events[lost : len(film.events) - 2] = [(end_s - 0.1, 0, 3, 0)]  # the kernel's buffer overflows
     film.restate(end_s)
-    film.move(end_s, 1.0, {"middle": fingers["middle"]})
+    film.move(end_s, 0.2, {"middle": fingers["middle"]})
     recording = film.write(tmp_path / "hand.evemu")
     environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": daemon.url}
     with show(daemon) as stream:
         send_page(stream, PAGE)
         arguments = [OPTODRIVE, "fingers", "--film", recording, "--calibration", calibration, "--repeat"]
         with start_process(arguments, env=environment) as command:
-            for pixel in (120, 325):
-                wait_for(lambda pixel=pixel: compute_lead_of_hand(board, pixel) >= LEAD, "more light under a finger")
+            for finger, other in (FINGERS, FINGERS[::-1]):
+                far = [pixel for pixel in FAR if pixel != other]
+                wait_for(lambda f=finger, far=far: compute_lead(board, f, far) >= LEAD, "more light under a finger")
             command.send_signal(signal.SIGINT)
             assert command.wait() == 130
         since = len(board.of("pulse"))
         wait_for(lambda: min(count_pulses(board, since)[pixel] for pixel in PAGE) >= 1, "the whole page")
-
-
-def compute_lead_of_hand(board, pixel):
-    """Return how many more pulses a dot has than any that is far from both fingers."""
-    near = [
-        other for other in PAGE if min(np.hypot(*np.subtract(PLACES[other], PLACES[f])) for f in (120, 325)) < 0.015
-    ]
-    return compute_lead(board, pixel, sorted(set(PAGE) - set(near)))
 
 
 def test_a_recording_that_ends_says_so(rig, calibration, tmp_path):
@@ -85,15 +88,47 @@ def test_a_recording_that_ends_says_so(rig, calibration, tmp_path):
     assert int(done.stdout.split()[0]) > 40
 
 
+def test_a_video_of_a_hand_brings_light_under_its_fingers(rig, tmp_path):
+    board, daemon = rig
+    daemon.call("POST", "/v1/disarm")
+    daemon.arm()
+    board.forget()
+    random = np.random.default_rng(6)
+    pictures = [render(ABOVE, [], random) for _ in range(BACKGROUND_PICTURES)]
+    pictures += [render(ABOVE, [Finger(PLACES[120]), Finger(PLACES[325])], random) for _ in range(4)] * 10
+    video, marks = write_video(tmp_path / "hand.avi", pictures), write_marks(tmp_path / "marks.toml")
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": daemon.url}
+    with show(daemon) as stream:
+        send_page(stream, PAGE)
+        arguments = [OPTODRIVE, "fingers", "--camera", video, "--marks", marks, "--repeat"]
+        with start_process(arguments, env=environment) as command:
+            for finger, other in (FINGERS, FINGERS[::-1]):
+                far = [pixel for pixel in FAR if pixel != other]
+                wait_for(lambda f=finger, far=far: compute_lead(board, f, far) >= LEAD, "more light under a finger")
+            command.send_signal(signal.SIGTERM)
+            assert command.wait() == 130
+
+
+def test_a_video_without_marks_gets_one_line(rig, tmp_path):
+    video = write_video(tmp_path / "blank.avi", [np.full(SIZE[::-1], 90, dtype=np.uint8)] * 16)
+    arguments = ["--camera", video, "--marks", write_marks(tmp_path / "marks.toml")]
+    error = run("fingers", *arguments, url=rig[1].url, status=2).stderr
+    assert error == f"optodrive: {video}: marks: got none, expected 4 of the marks 7, 3, 11, 0 in a picture\n"
+
+
 REFUSALS = {
-    "no source": ([], "FILE.csv or --film: missing, expected one source of fingertips"),
-    "two sources": (["hand.csv", "--film", "x"], "FILE.csv or --film: got both"),
+    "no source": ([], "FILE.csv, --film or --camera: missing, expected one source of fingertips"),
+    "two sources": (["hand.csv", "--film", "x"], "FILE.csv, --film or --camera: got FILE.csv and --film"),
     "no film": (["--film", "/dev/input/event99", "--calibration", "film.toml"], "No such file or directory"),
     "another device": (["--film", "/dev/null", "--calibration", "film.toml"], "expected a multitouch film"),
     "no calibration": (["--film", "x"], "--calibration: missing, expected film.toml, an output of"),
     "lost calibration": (["--film", "hand.evemu", "--calibration", "none.toml"], "none.toml: got 'No such file"),
     "recorded twice": (["--film", "hand.evemu", "--calibration", "film.toml", "--record", "y"], "--record: got 'y'"),
     "no film to calibrate": (["hand.csv", "--calibration", "film.toml"], "--calibration: got 'film.toml'"),
+    "no camera": (["--camera", "9", "--marks", "marks.toml"], "/dev/video9: got no such file, expected a camera"),
+    "no marks": (["--camera", "9"], "--marks: missing, expected marks.toml"),
+    "marks for a film": (["hand.csv", "--marks", "marks.toml"], "--marks: got 'marks.toml', expected --camera with it"),
+    "no video": (["--camera", "hand.evemu", "--marks", "marks.toml"], "hand.evemu: got no pictures"),
     "device repeated": (["--film", "/dev/null", "--calibration", "film.toml", "--repeat"], "--repeat: got a device"),
 }
 
@@ -104,6 +139,7 @@ def test_wrong_options_get_one_line(case, tmp_path, monkeypatch):
     film = SimulatedFilm()
     film.touch(0.0, PLACES[120])
     film.write(tmp_path / "hand.evemu")
+    write_marks(tmp_path / "marks.toml")
     arguments, message = REFUSALS[case]
     error = run("fingers", *arguments, status=2).stderr
     assert message in error

@@ -1,0 +1,103 @@
+"""Fingertips from a camera, or from a video of one, that sees the marks of a display."""
+
+import os
+import time
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from optodrive.core.errors import InputError, LinkError, Unquoted
+from optodrive.core.types.fingers import FingerPlace, FingerReport
+from optodrive.tracking.finger_numbers import FingerNumbers
+from optodrive.tracking.fingertips import FingertipDetector
+from optodrive.tracking.marks import MarksFile, find_view, import_opencv
+
+BACKGROUND_PICTURES = 15
+"""Pictures at the begin, without hands, in which the marks are found and whose median is the background."""
+PAD_RADIUS_M = 0.005
+"""Radius of a contact, which a camera does not see."""
+STAMP_AGE_MAX_S = 0.5
+"""Age up to which a driver's stamp is one of CLOCK_MONOTONIC."""
+LIFTED_S = 0.05
+"""Time after its last picture at which a video that ends with fingers on the display lifts them."""
+
+
+class Picture(NamedTuple):
+    """A grey picture, [rows, columns], and the time at which it was taken."""
+
+    at_s: float
+    grey: Any
+
+
+class Camera:
+    """An opened camera or video.
+
+    source: number of a camera, path of its device, or of a video; is_live: whether it is a camera, whose times are
+    those of CLOCK_MONOTONIC; those of a video count from its begin. Raises InputError for a source that is none
+    """
+
+    def __init__(self, source: str) -> None:
+        cv2 = import_opencv()
+        self._path = Path(f"/dev/video{source}" if source.isdecimal() else source)
+        self.is_live = self._path.is_char_device()
+        if not (self.is_live or self._path.is_file()):
+            raise InputError(str(self._path), Unquoted("no such file"), "a camera or a video")
+        if not os.access(self._path, os.R_OK):
+            expected = "a file that may be read, as members of the group `video` may read cameras"
+            raise InputError(str(self._path), Unquoted("no permission"), expected)
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        self._stamp = cv2.CAP_PROP_POS_MSEC
+        self._grey = cv2.COLOR_BGR2GRAY
+        self._cv2 = cv2
+        self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_V4L2 if self.is_live else cv2.CAP_ANY)
+        if not self._capture.isOpened():
+            raise InputError(str(self._path), Unquoted("no pictures"), "a camera or a video that OpenCV reads")
+        if self.is_live:
+            self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        self._capture.release()
+
+    @property
+    def name(self) -> str:
+        """Path of the camera or the video."""
+        return str(self._path)
+
+    def read_pictures(self) -> Iterator[Picture]:
+        """Yield pictures until the video ends. Raise LinkError if the camera gives no more."""
+        while True:
+            is_read, picture = self._capture.read()
+            if not is_read:
+                break
+            stamp_s, now_s = 1e-3 * float(self._capture.get(self._stamp)), time.monotonic()
+            if self.is_live and not 0.0 <= now_s - stamp_s <= STAMP_AGE_MAX_S:
+                stamp_s = now_s
+            yield Picture(stamp_s, picture if picture.ndim == 2 else self._cv2.cvtColor(picture, self._grey))
+        if self.is_live:
+            raise LinkError(f"{self._path}: the camera is gone")
+
+
+def follow_fingertips(camera: Camera, marks: MarksFile) -> Iterator[FingerReport]:
+    """Yield the fingertips of every picture after the first ones, which show the display without hands.
+
+    Raises InputError for too few pictures, and for pictures without the marks.
+    """
+    pictures = camera.read_pictures()
+    first = [picture.grey for picture in islice(pictures, BACKGROUND_PICTURES)]
+    if len(first) < BACKGROUND_PICTURES:
+        expected = f"at least {BACKGROUND_PICTURES} of the display without hands at its begin"
+        raise InputError(camera.name, Unquoted(f"{len(first)} pictures"), expected)
+    view = find_view(np.median(first, axis=0).astype(np.uint8), marks, camera.name)
+    detector, numbers, at_s = FingertipDetector(view, first), FingerNumbers(), 0.0
+    for at_s, grey in pictures:
+        places_m = detector.find(grey)
+        numbered = zip(numbers.assign(at_s, places_m), places_m.tolist(), strict=True)
+        yield FingerReport(at_s, tuple(FingerPlace(number, x_m, y_m, PAD_RADIUS_M) for number, (x_m, y_m) in numbered))
+    yield FingerReport(at_s + LIFTED_S, ())
