@@ -33,6 +33,8 @@ from optodrive.device.config_sections import (
 
 FORMAT = "optodrive-config"
 VERSION = 4
+DAMPING_MAX = 0.995
+"""Largest damping ratio of a servo with two poles that ring."""
 
 
 class Config(Section):
@@ -147,6 +149,7 @@ class Config(Section):
             raise ConflictError("limits.pulse_width_max_s", self.limits.pulse_width_max_s, expected)
         self._check_scan_range()
         self._check_focus()
+        self._check_damping()
         self._check_converter_codes()
 
     def _check_reach(self) -> None:
@@ -177,6 +180,12 @@ class Config(Section):
                     f"to fit, with scanner.aim_error_m {self.scanner.aim_error_m} on either side and two steps of the "
                     f"converter to spare, on display.absorber_{side}_m {getattr(display, f'absorber_{side}_m')}",
                 )
+
+    def _check_damping(self) -> None:
+        scanner = self.scanner
+        if scanner.damping * (1.0 + scanner.damping_uncertainty) > DAMPING_MAX:
+            expected = f"a half-width that leaves scanner.damping {scanner.damping} at most {DAMPING_MAX}"
+            raise ConflictError("scanner.damping_uncertainty", scanner.damping_uncertainty, expected)
 
     def _check_converter_codes(self) -> None:
         steps = DAC_HALF_RANGE_CODES if self.board.is_dac else HALF_RANGE_CODES

@@ -30,6 +30,7 @@ DAC_POINT_EXCESS_S = {"helios": 1e-8, "ether_dream": 5e-8, "idn": 1e-6}
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 HalfWidth = Annotated[float, Field(ge=0, le=0.5), PlausibleRange(0.0, 0.5, "1")]
+ServoHalfWidth = Annotated[float, Field(ge=0, le=0.3), PlausibleRange(0.0, 0.3, "1")]
 Pitch = Annotated[Positive, PlausibleRange(1e-4, 0.1, "m")]
 BridgeWidth = Annotated[Positive, PlausibleRange(1e-5, 5e-3, "m")]
 FocalLength = Annotated[Positive, PlausibleRange(5e-3, 3.0, "m")]
@@ -131,6 +132,14 @@ class ServoSection(Section):
     """Time from a command to the first movement of the servo's target, s."""
     slew_rad_per_s: Annotated[float, Field(ge=1, le=100_000), PlausibleRange(1.0, 1500.0, "rad/s")]
     """Speed at which the servo's target moves to the command, rad/s."""
+    bandwidth_uncertainty: ServoHalfWidth = 0.1
+    """Half-width of bandwidth_hz, relative. The gate opens when every servo within these half-widths has settled."""
+    damping_uncertainty: ServoHalfWidth = 0.1
+    """Half-width of damping, relative."""
+    slew_uncertainty: ServoHalfWidth = 0.1
+    """Half-width of slew_rad_per_s, relative."""
+    delay_uncertainty_s: Annotated[float, Field(ge=0, le=0.01), PlausibleRange(0.0, 2e-3, "s")] = 1e-5
+    """Half-width of delay_s, s."""
 
 
 class ScannerSection(ServoSection):

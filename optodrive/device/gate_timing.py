@@ -8,15 +8,29 @@ from cmath import exp as cexp
 from cmath import phase
 from math import asin, cos, exp, pi, sqrt
 
+from optodrive.core.kernels import kernel
 from optodrive.device.config_sections import ScannerSection
-from optodrive.device.servo import Servo
+from optodrive.device.servo import Servo, ServoRange
 
 BISECTION_STEPS = 50
+CROSSING_STEPS = 30
+"""Bisections of a crossing, to a billionth of half a period of the ringing."""
 
 
 def build_servo(scanner: ScannerSection) -> Servo:
     """Return the configured servo of both mirrors."""
     return Servo(scanner.bandwidth_hz, scanner.damping, scanner.delay_s, scanner.slew_rad_per_s)
+
+
+def build_servo_range(scanner: ScannerSection) -> ServoRange:
+    """Return the configured servo with its declared uncertainty."""
+    return ServoRange(
+        build_servo(scanner),
+        scanner.bandwidth_uncertainty,
+        scanner.damping_uncertainty,
+        scanner.slew_uncertainty,
+        scanner.delay_uncertainty_s,
+    )
 
 
 def pole_per_s(servo: Servo) -> complex:
@@ -30,26 +44,30 @@ def settling_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
 
     move_rad and tolerance_rad are positive.
     """
-    pole, ramp_s = pole_per_s(servo), move_rad / servo.slew
-    amplitude = -1j * servo.slew * pole.conjugate() / (pole * pole.imag) * (1.0 - cexp(pole * ramp_s))
+    ramp_s = move_rad / servo.slew
+    return servo.delay + ramp_s + ringing_s(2.0 * pi * servo.frequency, servo.damping, servo.slew, ramp_s, tolerance_rad)
 
-    def is_outside(at_s: float) -> bool:
-        return abs((amplitude * cexp(pole * at_s)).real) > tolerance_rad
 
+@kernel
+def ringing_s(omega: float, damping: float, slew: float, ramp_s: float, tolerance_rad: float) -> float:
+    """Return the time from the end of a ramp until the error stays within tolerance_rad, s. omega: rad/s"""
+    pole = complex(-damping * omega, omega * sqrt(1.0 - damping**2))
+    amplitude = -1j * slew * pole.conjugate() / (pole * pole.imag) * (1.0 - cexp(pole * ramp_s))
+    size_rad, start_rad = abs(amplitude), phase(amplitude)
     # Between two extrema of the ringing the error is monotone, so bisection finds the last crossing.
     outside_s, extremum_s = 0.0, ((0.5 * pi - phase(pole * amplitude)) % pi) / pole.imag
-    while is_outside(extremum_s):
+    while size_rad * exp(pole.real * extremum_s) * abs(cos(pole.imag * extremum_s + start_rad)) > tolerance_rad:
         outside_s, extremum_s = extremum_s, extremum_s + pi / pole.imag
     inside_s = extremum_s
-    if not is_outside(outside_s):
-        return servo.delay + ramp_s
-    for _ in range(BISECTION_STEPS):
+    if size_rad * exp(pole.real * outside_s) * abs(cos(pole.imag * outside_s + start_rad)) <= tolerance_rad:
+        return 0.0
+    for _ in range(CROSSING_STEPS):
         middle_s = 0.5 * (outside_s + inside_s)
-        if is_outside(middle_s):
+        if size_rad * exp(pole.real * middle_s) * abs(cos(pole.imag * middle_s + start_rad)) > tolerance_rad:
             outside_s = middle_s
         else:
             inside_s = middle_s
-    return servo.delay + ramp_s + inside_s
+    return inside_s
 
 
 def envelope_factor(servo: Servo) -> float:

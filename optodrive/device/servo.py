@@ -1,6 +1,6 @@
 """Simulation of a mirror that follows its command as a second-order servo with a delay and a slew limit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 
 import numpy as np
@@ -24,6 +24,31 @@ class Servo:
     damping: float
     delay: float
     slew: float
+
+
+@dataclass(frozen=True)
+class ServoRange:
+    """A servo and the half-widths of its uncertainty.
+
+    frequency, damping, slew: relative; delay_s: s
+    """
+
+    servo: Servo
+    frequency: float
+    damping: float
+    slew: float
+    delay_s: float
+
+    def servo_at(self, frequency: float, damping: float, slew: float, delay: float) -> Servo:
+        """Return the servo at a place within the uncertainty, from −1 to 1 in each half-width."""
+        servo = self.servo
+        return replace(
+            servo,
+            frequency=servo.frequency * (1.0 + frequency * self.frequency),
+            damping=servo.damping * (1.0 + damping * self.damping),
+            slew=servo.slew * (1.0 + slew * self.slew),
+            delay=servo.delay + delay * self.delay_s,
+        )
 
 
 def simulate_servo(at_s: FloatArray, command_rad: FloatArray, t_s: FloatArray, servo: Servo | None) -> FloatArray:

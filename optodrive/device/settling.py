@@ -1,29 +1,29 @@
 """Settling times of the mirrors: how long a move keeps the gate closed until the whole focus stays on the absorber.
 
 Both axes move at once, and the slower one decides. Residual ringing of earlier moves takes a share of the tolerance,
-see docs/decisions/0013-gate-by-trajectory.md.
+see docs/decisions/0013-gate-by-trajectory.md. The times hold for every servo within the declared uncertainty, see
+docs/decisions/0074-servos-within-their-uncertainty.md.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from math import ceil, exp, log, sqrt
+from math import ceil, exp, log, pi
 from typing import Self
 
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config
-from optodrive.device.gate_timing import build_servo, envelope_factor, pole_per_s, settling_s
+from optodrive.device.gate_timing import build_servo_range, envelope_factor, settling_s
 from optodrive.device.pixel_map import build_aim_layout
 from optodrive.device.scan_field import ScanField, max_neighbour_step_rad, tolerance_ratio
-from optodrive.device.servo import Servo
+from optodrive.device.servo import ServoRange
+from optodrive.device.settling_bound import bound_settling_s
 
 LONG_DWELL_SHARE = 0.01
 """Share of the tolerance for residual ringing of earlier moves after a long dwell."""
 BISECTION_STEPS = 40
-INTERVAL_SHARE = 0.03
-"""Largest share of the tolerance that is given up so that a few moves bound all moves between them."""
 CEIL_OFFSET = 1.0 - 1e-6
 """Offset that turns truncation into rounding up, except for rounding errors of whole numbers."""
 
@@ -67,7 +67,7 @@ class SettlingTable:
         spans = [int(span_rad / moves.pitch_rad + CEIL_OFFSET) for span_rad in spans_rad]
         farthest = max(1, *spans)
         after_long, after_short = (
-            (moves.build_interval_table(0, farthest, share), moves.build_interval_table(1, farthest, share))
+            (moves.build_table(0, farthest, share, 1), moves.build_table(1, farthest, share, 1))
             for share in (LONG_DWELL_SHARE, short_dwell_share)
         )
         lead_in_us = max(after_short[0][spans[0]], after_short[1][spans[1]])
@@ -85,7 +85,7 @@ class SettlingTable:
         )
         # Only a first move, from the centre of an even lattice, spans half pitches.
         halves = [
-            1e6 * moves.settling_s(axis, 0.5 * odd, short_dwell_share)
+            1e6 * moves.settling_s(axis, 0.5 * odd, 0.5 * odd, short_dwell_share)
             for axis, count in enumerate((display.columns, display.rows))
             for odd in range(1, count if count % 2 == 0 else 0, 2)
         ]
@@ -116,12 +116,12 @@ class SettlingTable:
 
 @dataclass(frozen=True)
 class _ServoMoves:
-    """Moves of one servo on one lattice.
+    """Moves of any servo of a range on one lattice.
 
     tolerance_rad: angle tolerance in x and y, less half a code of rounding; min_pulse_s: width of the shortest pulse
     """
 
-    servo: Servo
+    servos: ServoRange
     pitch_rad: float
     code_rad: float
     tolerance_rad: tuple[float, float]
@@ -135,47 +135,47 @@ class _ServoMoves:
         )
         pitch_rad = config.display.pitch_m / (2.0 * scanner.focal_length_m)
         min_pulse_s = int(1e6 / config.laser.pwm_hz) * 1e-6
-        return cls(build_servo(scanner), pitch_rad, scanner.rad_per_code, (x_rad, y_rad), min_pulse_s)
+        return cls(build_servo_range(scanner), pitch_rad, scanner.rad_per_code, (x_rad, y_rad), min_pulse_s)
 
-    def settling_s(self, axis: int, pitches: float, share: float) -> float:
-        """Return the settling time of a move, s, lengthened by up to one code of rounding.
+    def settling_s(self, axis: int, min_pitches: float, max_pitches: float, share: float) -> float:
+        """Return a bound of the settling times of moves between two distances, lengthened by a code of rounding, s.
 
         share: share of the tolerance that residual ringing of earlier moves takes
         """
-        tolerance_rad = (1.0 - share) * self.tolerance_rad[axis] - self.code_rad
-        return settling_s(self.servo, pitches * self.pitch_rad, tolerance_rad)
+        return bound_settling_s(
+            self.servos, min_pitches * self.pitch_rad, max_pitches * self.pitch_rad, self._remaining_rad(axis, share)
+        )
 
-    def interval_settling_s(self, axis: int, pitches: int, share: float) -> float:
-        """Return an upper bound of the settling times of all moves of more than pitches − 1 and up to `pitches`, s.
+    def _remaining_rad(self, axis: int, share: float) -> float:
+        return (1.0 - share) * self.tolerance_rad[axis] - self.code_rad
 
-        The complex amplitude of the ringing changes by at most 1/√(1 − ζ²) per change of the move, less after a long
-        ramp. If the ringing of a move stays within a tolerance that is narrower by that amount, the ringing of all
-        moves up to one step shorter stays within the full tolerance, and none of them has a longer ramp.
+    def build_table(self, axis: int, farthest: int, share: float, below: int = 0) -> TimesUs:
+        """Return the times of 0 to `farthest` pitches, µs.
+
+        below: 1 if the time of n pitches bounds all moves of more than n − 1, else 0
         """
-        before_rad = (pitches - 1) * self.pitch_rad
-        slope = exp(pole_per_s(self.servo).real * before_rad / self.servo.slew) / sqrt(1.0 - self.servo.damping**2)
-        tolerance_rad = (1.0 - share) * self.tolerance_rad[axis] - self.code_rad
-        steps = ceil(self.pitch_rad * slope / (INTERVAL_SHARE * tolerance_rad))
-        narrower_rad = tolerance_rad - slope * self.pitch_rad / steps
-        ends_rad = (before_rad + self.pitch_rad * (1 + np.arange(steps)) / steps).tolist()
-        return max(settling_s(self.servo, end_rad, narrower_rad) for end_rad in ends_rad)
+        times_s = (self.settling_s(axis, way - below, way, share) for way in range(1, farthest + 1))
+        return _enforce_subadditivity([0, *(ceil(1e6 * each_s) for each_s in times_s)])
 
-    def build_interval_table(self, axis: int, farthest: int, share: float) -> TimesUs:
-        return _enforce_subadditivity(
-            [0, *(ceil(1e6 * self.interval_settling_s(axis, way, share)) for way in range(1, farthest + 1))]
-        )
+    def _min_pitch_settling_s(self, share: float) -> float:
+        """Return a time that every planned move of a pitch takes at least: that of one slow servo, s."""
+        slow = self.servos.servo_at(-1.0, 1.0, -1.0, 1.0)
+        return min(settling_s(slow, self.pitch_rad, self._remaining_rad(axis, share)) for axis in range(2))
 
-    def build_table(self, axis: int, farthest: int, share: float) -> TimesUs:
-        return _enforce_subadditivity(
-            [0, *(ceil(1e6 * self.settling_s(axis, pitches, share)) for pitches in range(1, farthest + 1))]
-        )
+    @property
+    def _min_rate_per_s(self) -> float:
+        """Rate at which ringing decays at least, 1/s."""
+        slow = self.servos.servo_at(-1.0, -1.0, 0.0, 0.0)
+        return 2.0 * pi * slow.frequency * slow.damping
 
-    def _pitch_settling_s(self, share: float) -> float:
-        return min(self.settling_s(axis, 1, share) for axis in range(2))
+    @property
+    def _max_envelope_factor(self) -> float:
+        """Envelope factor of any servo: it rises with the damping ratio."""
+        return envelope_factor(self.servos.servo_at(0.0, 1.0, 0.0, 0.0))
 
     def _residual_factor(self, share: float) -> float:
         """Return the decay of ringing from one gate to the next, over the shortest pulse and the shortest move."""
-        return exp(pole_per_s(self.servo).real * (self.min_pulse_s + self._pitch_settling_s(share)))
+        return exp(-self._min_rate_per_s * (self.min_pulse_s + self._min_pitch_settling_s(share)))
 
     def short_dwell_share(self) -> float:
         """Return the share of the tolerance for the residual ringing of all earlier moves after the shortest pulses.
@@ -185,7 +185,7 @@ class _ServoMoves:
 
         def residual_share(share: float) -> float:
             factor = self._residual_factor(share)
-            return envelope_factor(self.servo) * factor / (1.0 - factor)
+            return self._max_envelope_factor * factor / (1.0 - factor)
 
         return max(
             LONG_DWELL_SHARE, _bisect_fixed_point(residual_share, 1.0 - 1.01 * self.code_rad / min(self.tolerance_rad))
@@ -193,9 +193,8 @@ class _ServoMoves:
 
     def long_dwell_us(self, short_dwell_share: float) -> int:
         """Return the dwell after which all earlier moves leave LONG_DWELL_SHARE at the next gate opening, µs."""
-        rate_per_s = -pole_per_s(self.servo).real
-        decay = envelope_factor(self.servo) / (LONG_DWELL_SHARE * (1.0 - self._residual_factor(short_dwell_share)))
-        return max(0, ceil(1e6 * (log(decay) / rate_per_s - self._pitch_settling_s(LONG_DWELL_SHARE))))
+        decay = self._max_envelope_factor / (LONG_DWELL_SHARE * (1.0 - self._residual_factor(short_dwell_share)))
+        return max(0, ceil(1e6 * (log(decay) / self._min_rate_per_s - self._min_pitch_settling_s(LONG_DWELL_SHARE))))
 
 
 def _bisect_fixed_point(function: Callable[[float], float], high_limit: float) -> float:

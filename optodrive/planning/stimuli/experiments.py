@@ -12,7 +12,8 @@ import numpy as np
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.device.config import Config, PixelLayout
-from optodrive.device.gate_timing import build_servo, settling_s
+from optodrive.device.gate_timing import build_servo_range
+from optodrive.device.settling_bound import bound_settling_s
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 DIRECTIONS = {"left": (0, -1), "right": (0, 1), "up": (1, 0), "down": (-1, 0)}
@@ -145,7 +146,8 @@ def _longest_settling_s(config: Config, layout: PixelLayout, path: Sequence[int]
     moves_m = np.maximum(*(np.abs(np.diff(at_m[order])) for at_m in (layout.x_m, layout.y_m)))
     scanner = config.scanner
     move_rad = float(moves_m.max()) / (2.0 * scanner.focal_length_m)
-    return ceil(1e6 * settling_s(build_servo(scanner), move_rad, min(config.tolerance_rad))) / 1e6
+    longest_s = bound_settling_s(build_servo_range(scanner), move_rad, move_rad, min(config.tolerance_rad))
+    return ceil(1e6 * longest_s) / 1e6
 
 
 def compute_finger_places(digit: int, pitch_m: float) -> list[tuple[int, int]]:

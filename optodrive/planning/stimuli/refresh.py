@@ -7,8 +7,9 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, TactileFrame
 from optodrive.device.config import Config
-from optodrive.device.gate_timing import build_servo, settling_s
+from optodrive.device.gate_timing import build_servo_range
 from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
+from optodrive.device.settling_bound import bound_settling_s
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import build_cold_state
@@ -34,7 +35,7 @@ class BeamTimeEstimator:
 
     def __init__(self, config: Config) -> None:
         self.lattice = Lattice.from_config(config)
-        self._scanner, self._servo = config.scanner, build_servo(config.scanner)
+        self._scanner, self._servos = config.scanner, build_servo_range(config.scanner)
         self._tolerance_rad, self._pitch_m = min(config.tolerance_rad), config.display.pitch_m
         laser = config.laser
         self._drive = DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
@@ -53,7 +54,8 @@ class BeamTimeEstimator:
 
     def settling_s(self, distance_m: float) -> float:
         """Return the settling time of a move between two absorbers, s."""
-        return settling_s(self._servo, distance_m / (2.0 * self._scanner.focal_length_m), self._tolerance_rad)
+        move_rad = distance_m / (2.0 * self._scanner.focal_length_m)
+        return bound_settling_s(self._servos, move_rad, move_rad, self._tolerance_rad)
 
     def beam_time_s(self, target_m: FloatArray) -> float:
         """Return the beam time of a picture with its margin, in whole milliseconds, s.

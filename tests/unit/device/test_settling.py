@@ -19,6 +19,8 @@ def modify(config, **sections):
     return Config.model_validate(table)
 
 
+EXACT = {"bandwidth_uncertainty": 0.0, "damping_uncertainty": 0.0, "slew_uncertainty": 0.0, "delay_uncertainty_s": 0.0}
+
 RINGING = modify(
     CONFIG,
     scanner={"damping": 0.3, "bandwidth_hz": 400.0, "slew_rad_per_s": 300.0},
@@ -47,9 +49,9 @@ def test_axes_with_unlike_room_have_times_of_their_own():
 
 
 @pytest.mark.parametrize(("name", "pitch_us"), [("display-1511", 327), ("display-437", 317)])
-def test_a_pitch_takes_as_long_as_the_focus_needs_to_be_on_the_absorber(name, pitch_us):
-    config = DISPLAYS[name].config
-    moves, servo = DISPLAYS[name].scan_head.settling, build_servo(config.scanner)
+def test_a_pitch_takes_as_long_as_the_focus_of_an_exact_servo_needs_to_be_on_the_absorber(name, pitch_us):
+    config = modify(DISPLAYS[name].config, scanner=EXACT)
+    moves, servo = SettlingTable.from_config(config), build_servo(config.scanner)
     exact_us = 1e6 * settling_s(servo, moves.pitch_rad, 0.99 * config.tolerance_rad[0])
     assert moves.settling_us(moves.pitch_rad, 0.0, LONG_US) == pitch_us
     assert exact_us <= pitch_us <= exact_us + 2
@@ -70,6 +72,21 @@ def test_times_rise_and_no_detour_is_quicker(moves):
     for long_us, short_us in zip(moves.after_long_dwell, moves.after_short_dwell, strict=True):
         assert np.all(np.array(short_us) >= np.array(long_us))
     assert moves.lead_in_us >= moves.after_short_dwell[0][-1]
+
+
+@pytest.mark.parametrize(
+    ("uncertainty", "pitch_us"),
+    [
+        ({"bandwidth_uncertainty": 0.1}, 355),
+        ({"damping_uncertainty": 0.1}, 350),
+        ({"slew_uncertainty": 0.1}, 333),
+        ({"delay_uncertainty_s": 1e-5}, 337),
+        (dict.fromkeys(EXACT, 0.1) | {"delay_uncertainty_s": 1e-5}, 397),
+    ],
+)
+def test_each_uncertainty_of_the_servo_takes_time(uncertainty, pitch_us):
+    moves = SettlingTable.from_config(modify(CONFIG, scanner=EXACT | uncertainty))
+    assert moves.settling_us(moves.pitch_rad, 0.0, LONG_US) == pytest.approx(pitch_us, abs=2)
 
 
 def test_without_care_a_detour_would_be_quicker():

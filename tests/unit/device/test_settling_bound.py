@@ -1,0 +1,73 @@
+"""The bound of settling times holds for every servo within the declared uncertainty, and wastes little."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from optodrive.device.gate_timing import settling_s
+from optodrive.device.servo import Servo, ServoRange
+from optodrive.device.settling_bound import bound_settling_s
+
+PITCH_RAD, TOLERANCE_RAD = 4e-3 / 0.44, 8.8e-4
+SHIPPED = ServoRange(Servo(1700.0, 0.7, 3e-5, 100.0), 0.1, 0.1, 0.1, 1e-5)
+RINGING = ServoRange(Servo(400.0, 0.3, 3e-5, 300.0), 0.1, 0.1, 0.1, 1e-5)
+RESONANT = ServoRange(Servo(400.0, 0.3, 3e-5, 30.0), 0.1, 0.1, 0.1, 1e-5)
+places = st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1.0, 1.0))
+
+
+@settings(max_examples=20 * settings.default.max_examples)
+@given(
+    servo=st.builds(
+        Servo,
+        frequency=st.floats(200, 5000),
+        damping=st.floats(0.3, 0.9),
+        delay=st.floats(1e-5, 1e-4),
+        slew=st.floats(20, 1000),
+    ),
+    half_widths=st.tuples(*[st.sampled_from([0.0, 0.02, 0.1])] * 3),
+    distances_rad=st.tuples(st.floats(2e-3, 0.3), st.floats(2e-3, 0.3)).map(sorted),
+    share=st.floats(0.01, 0.45),
+    place=st.tuples(*[places] * 5),
+)
+def test_no_servo_within_the_range_takes_longer(servo, half_widths, distances_rad, share, place):
+    servos = ServoRange(servo, *half_widths, 1e-5)
+    tolerance_rad = share * min(distances_rad[0], 0.02)
+    bound_s = bound_settling_s(servos, *distances_rad, tolerance_rad)
+    move_rad = distances_rad[0] + 0.5 * (1.0 + place[4]) * (distances_rad[1] - distances_rad[0])
+    assert settling_s(servos.servo_at(*place[:4]), move_rad, tolerance_rad) <= bound_s * (1.0 + 1e-9)
+
+
+def sample_times_s(servos, move_rad, count, tolerance_rad=TOLERANCE_RAD):
+    random = np.random.default_rng(3)
+    return [settling_s(servos.servo_at(*each), move_rad, tolerance_rad) for each in random.uniform(-1, 1, (count, 4))]
+
+
+def corner_times_s(servos, move_rad, tolerance_rad=TOLERANCE_RAD):
+    return [settling_s(servos.servo_at(*each), move_rad, tolerance_rad) for each in product((-1.0, 1.0), repeat=4)]
+
+
+@pytest.mark.parametrize("pitches", [1, 2, 5, 38])
+@pytest.mark.parametrize(
+    ("servos", "excess"), [(SHIPPED, 0.01), (RINGING, 0.02), (RESONANT, 0.15)], ids=["shipped", "ringing", "resonant"]
+)
+def test_the_bound_is_near_the_slowest_servo(servos, excess, pitches):
+    move_rad = pitches * PITCH_RAD
+    slowest_s = max(*corner_times_s(servos, move_rad), *sample_times_s(servos, move_rad, 3000))
+    assert slowest_s <= bound_settling_s(servos, move_rad, move_rad, TOLERANCE_RAD) <= (1.0 + excess) * slowest_s
+
+
+def test_of_a_servo_that_is_known_exactly_it_is_the_settling_time():
+    exact = ServoRange(SHIPPED.servo, 0.0, 0.0, 0.0, 0.0)
+    bound_s = bound_settling_s(exact, PITCH_RAD, PITCH_RAD, TOLERANCE_RAD)
+    assert bound_s == pytest.approx(settling_s(exact.servo, PITCH_RAD, TOLERANCE_RAD), abs=1e-9)
+
+
+def test_corners_alone_would_open_the_gate_early():
+    """Mutant: the slowest of the sixteen corners, for a servo whose ringing just exceeds the tolerance between them."""
+    servos, move_rad = ServoRange(Servo(1713.0, 0.387, 3e-5, 79.5), 0.1, 0.1, 0.1, 0.0), 0.0854
+    slowest_s = max(sample_times_s(servos, move_rad, 3000, tolerance_rad=3.85e-3))
+    assert slowest_s > 1.03 * max(corner_times_s(servos, move_rad, tolerance_rad=3.85e-3))
+    assert slowest_s <= bound_settling_s(servos, move_rad, move_rad, 3.85e-3)
