@@ -45,12 +45,17 @@ def settling_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
     move_rad and tolerance_rad are positive.
     """
     ramp_s = move_rad / servo.slew
-    return servo.delay + ramp_s + ringing_s(2.0 * pi * servo.frequency, servo.damping, servo.slew, ramp_s, tolerance_rad)
+    return (
+        servo.delay + ramp_s + ringing_s(2.0 * pi * servo.frequency, servo.damping, servo.slew, ramp_s, tolerance_rad)
+    )
 
 
 @kernel
 def ringing_s(omega: float, damping: float, slew: float, ramp_s: float, tolerance_rad: float) -> float:
-    """Return the time from the end of a ramp until the error stays within tolerance_rad, s. omega: rad/s"""
+    """Return the time from the end of a ramp until the error stays within tolerance_rad, s.
+
+    omega: natural frequency, rad/s
+    """
     pole = complex(-damping * omega, omega * sqrt(1.0 - damping**2))
     amplitude = -1j * slew * pole.conjugate() / (pole * pole.imag) * (1.0 - cexp(pole * ramp_s))
     size_rad, start_rad = abs(amplitude), phase(amplitude)

@@ -1,10 +1,10 @@
 """Upper bound of the settling time of a move, for every servo within its declared uncertainty.
 
-Theory of operation. At a time τ after the end of its ramp, the mirror's error is the slew times the integral of h(ωt; ζ)
+Theory of operation. At a time τ after the end of its ramp, the mirror's error is the slew times the integral of h(ωt)
 from τ to τ plus the ramp, where h is the error after a unit step. Its last crossing of the tolerance jumps where an
-extremum just exceeds it, so neither corners nor a grid of servos bound it. The error itself changes slowly: h is at most
-exp(−ζωt)/β with β = √(1 − ζ²), and so are its derivatives with polynomials of t, whose integrals from τ on bound how
-much the error changes over a cell of parameters. If the ringing of the servo in the middle of a cell stays within a
+extremum just exceeds it, so neither corners nor a grid of servos bound it. The error itself changes slowly: h is at
+most exp(−ζωt)/β with β = √(1 − ζ²), and so are its derivatives with polynomials of t, whose integrals from τ on bound
+how much the error changes over a cell of parameters. If the ringing of the servo in the middle of a cell stays within a
 tolerance that is narrower by that change, the ringing of every servo of the cell stays within the tolerance. Cells are
 halved, that with the largest bound first, until the largest bound is near the longest settling time that was met. The
 distance is a fourth parameter of the cells, so that one bound covers all moves between two distances.
@@ -45,7 +45,8 @@ def bound_settling_s(servos: ServoRange, min_move_rad: float, max_move_rad: floa
 def _bound_s(cells: FloatArray, bounds_s: FloatArray, widths_s: FloatArray, tolerance_rad: float) -> float:
     """Return the bound over the first of the cells, without the delay, s. All arrays are overwritten.
 
-    cells: [n, 2, 4] from low to high parameters; bounds_s: [n], of each cell; widths_s: [n, 4], what each parameter adds to it
+    cells: [n, 2, 4] from low to high parameters; bounds_s: [n], of each cell
+    widths_s: [n, 4], what each parameter adds to it
     """
     longest_s = 0.0
     for corner in range(16):
@@ -58,7 +59,7 @@ def _bound_s(cells: FloatArray, bounds_s: FloatArray, widths_s: FloatArray, tole
         largest = int(np.argmax(bounds_s[:count]))
         is_close = bounds_s[largest] <= (1.0 + PRECISION) * longest_s
         if is_close or count == len(bounds_s):
-            return max(longest_s, bounds_s[largest])
+            return float(max(longest_s, bounds_s[largest]))
         widest = int(np.argmax(widths_s[largest]))
         middle = 0.5 * (cells[largest, 0, widest] + cells[largest, 1, widest])
         for each in range(4):
@@ -94,10 +95,13 @@ def _bound_cell_s(low: FloatArray, high: FloatArray, tolerance_rad: float, width
 
 
 @kernel
-def _bound_changes_rad(low: FloatArray, high: FloatArray, tolerance_rad: float, from_s: float, out: FloatArray) -> float:
+def _bound_changes_rad(
+    low: FloatArray, high: FloatArray, tolerance_rad: float, from_s: float, out: FloatArray
+) -> float:
     """Return how much the error changes at most from the middle of a cell to any place in it, rad.
 
-    tolerance_rad: bound of the error in the middle from from_s on, the time after the ramp from which on it holds; out: [4], receives the part of each parameter
+    from_s: time after the ramp from which on the error in the middle is within tolerance_rad, and the bound holds
+    out: [4], receives the part of each parameter
     """
     damping, beta = low[DAMPING], sqrt(1.0 - high[DAMPING] ** 2)
     from_rad, ramp_rad = low[OMEGA] * from_s, high[OMEGA] * high[MOVE] / low[SLEW]

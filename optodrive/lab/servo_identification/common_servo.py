@@ -7,18 +7,24 @@ from math import cos, exp, pi, sin, sqrt
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.config import Config
+from optodrive.device.config import DAMPING_MAX, Config
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 
-DAMPING_MIN, DAMPING_MAX = 0.3, 0.9
+DAMPING_MIN, COMMON_DAMPING_MAX = 0.3, 0.9
 """Range of the configuration."""
 FREQUENCY_MIN_HZ = 100.0
 TOLERANCE_SHARES = (1.0, 0.75, 0.5)
 """Shares of the gate's tolerance at which settling is compared; former moves may use the rest."""
 MOVE_SIZE_COUNT = 8
 FREQUENCY_STEP = 0.995
+SIGMAS = 3.0
+"""Half-width of an identified parameter, in its standard deviations."""
+HALF_WIDTH_MIN, HALF_WIDTH_MAX = 0.02, 0.3
+"""Range of relative half-widths."""
+UNMEASURED_HALF_WIDTH = 0.1
+DELAY_HALF_WIDTH_MIN_S = 1e-5
 SETTLING_SLACK = 1.001
 """Permitted ratio of required to actual settling time."""
 
@@ -70,6 +76,21 @@ def find_common_servo(
     return CommonServo(servo, min(1.0, 1.0 / sqrt(ratio)), _settling_excess(mirrors, servo, moves))
 
 
+def find_half_widths(
+    mirrors: tuple[IdentifiedServo, IdentifiedServo], servo: Servo
+) -> tuple[float, float, float, float]:
+    """Return the half-widths of frequency, damping, slew (relative) and delay (s) within which plans take the servo.
+
+    They are three standard deviations, and at least what temperature may change; the delay's at least a sample of the
+    servo's driver. A slew that the recording does not show keeps the half-width of one that was never measured.
+    """
+    frequency, damping, delay_s, inverse_slew = SIGMAS * np.max([each.sigma for each in mirrors], axis=0)
+    slew = servo.slew * inverse_slew if all(each.slew_identified for each in mirrors) else UNMEASURED_HALF_WIDTH
+    relative = np.clip([frequency, damping / servo.damping, slew], HALF_WIDTH_MIN, HALF_WIDTH_MAX).tolist()
+    relative[1] = min(relative[1], DAMPING_MAX / servo.damping - 1.0)
+    return *relative, max(float(delay_s), DELAY_HALF_WIDTH_MIN_S)
+
+
 def move_sizes_rad(config: Config, axis: int) -> list[float]:
     """Return sizes of moves along one axis from one pitch to the whole display, rad."""
     display = config.display
@@ -86,7 +107,7 @@ def _slow_to_required(
     required_s: FloatArray,
 ) -> Servo:
     """Lower the frequency of a servo, with the longer delay and the lower slew, until it settles as required."""
-    damping = min(max(start.damping, DAMPING_MIN), DAMPING_MAX)
+    damping = min(max(start.damping, DAMPING_MIN), COMMON_DAMPING_MAX)
     delay_s, slew = max(each.servo.delay for each in mirrors), min(each.servo.slew for each in mirrors)
     frequency = start.frequency
     while True:

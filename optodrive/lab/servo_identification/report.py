@@ -12,7 +12,7 @@ from optodrive.device.config import Config
 from optodrive.device.config_file import MIRRORS_FORMAT, MIRRORS_VERSION
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.common_servo import CommonServo, move_sizes_rad
+from optodrive.lab.servo_identification.common_servo import CommonServo, find_half_widths, move_sizes_rad
 from optodrive.lab.servo_identification.effect_fit import LINEAR, Linearity
 from optodrive.lab.servo_identification.gate_effect import MirrorEffect
 from optodrive.lab.servo_identification.identify import IdentifiedServo
@@ -29,6 +29,8 @@ BANDWIDTH_TOLERANCE, DELAY_TOLERANCE_S, SETTLING_TOLERANCE = 0.03, 1e-5, 0.05
 MISFIT_MAX = 1.5
 """A residual above this multiple of the noise shows an unmodelled response."""
 CRITICAL_DAMPING = 0.99
+HALF_WIDTHS = ("bandwidth_uncertainty", "damping_uncertainty", "slew_uncertainty", "delay_uncertainty_s")
+"""Keys of the half-widths in the configuration's [scanner]."""
 
 
 def build_report(
@@ -39,7 +41,8 @@ def build_report(
 ) -> dict[str, Any]:
     """Build the report in SI units. Intervals are 95 %."""
     return {
-        "scanner": scanner_table(common.servo),
+        "scanner": scanner_table(common.servo)
+        | dict(zip(HALF_WIDTHS, find_half_widths(mirrors, common.servo), strict=True)),
         "galvo": {"share": common.galvo_share},
         "settling_excess": dict(zip(AXES, common.settling_excess, strict=True)),
         "effect": {
