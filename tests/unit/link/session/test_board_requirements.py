@@ -50,10 +50,13 @@ def test_a_single_off_centre_pixel_includes_the_move_from_the_centre():
     assert np.all(board_us(build_board_requirements(display.config).limits, codes) <= planned_us)
 
 
+UNCERTAINTIES = ("bandwidth_uncertainty", "damping_uncertainty", "slew_uncertainty", "delay_uncertainty_s")
+
+
 @pytest.mark.parametrize("servo", [{"slew_rad_per_s": 3.0, "bandwidth_hz": 2000.0}, {"slew_rad_per_s": 1.0}])
 def test_a_slew_that_decides_alone_leaves_the_board_no_time_to_start_with(servo):
     table = DISPLAYS["display-16"].config.model_dump()
-    table["scanner"] |= {"delay_s": 0.0, **servo}
+    table["scanner"] |= {"delay_s": 0.0, **servo} | dict.fromkeys(UNCERTAINTIES, 0.0)
     display = type(DISPLAYS["display-16"]).from_config(Config.model_validate(table))
     limits = build_board_requirements(display.config).limits
     codes, planned_us = list_moves(display, np.random.default_rng(1))

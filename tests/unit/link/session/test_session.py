@@ -163,7 +163,7 @@ def changed(section, **values):
     ("settings", "config", "says"),
     [
         (BoardSettings(uid="00" * 12), changed("board", uid="11" * 12), "board.uid: got '0000"),
-        (BoardSettings(replace(DEFAULT_LIMITS, settle_us=228)), CONFIG, "scanner.bandwidth_hz: got 1700.0"),
+        (BoardSettings(replace(DEFAULT_LIMITS, settle_us=310)), CONFIG, "scanner.bandwidth_hz: got 1700.0"),
         (BoardSettings(replace(DEFAULT_LIMITS, settle_ns_per_code=500)), CONFIG, "scanner.slew_rad_per_s: got 100.0"),
         (BoardSettings(replace(DEFAULT_LIMITS, max_on_us=49_999)), CONFIG, "limits.pulse_width_max_s: got 0.05"),
         (BoardSettings(replace(DEFAULT_LIMITS, full_power_uw=2_000_000)), CONFIG, "laser.max_power_w: got 2.45"),

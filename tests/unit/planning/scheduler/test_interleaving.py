@@ -119,7 +119,7 @@ def test_a_frame_of_one_pixel_is_not_split():
 
 
 def test_the_last_round_compensates_for_trimmed_sub_pulses():
-    caps = DISPLAY.budget.caps._replace(pulse_energy_j=0.002)
+    caps = DISPLAY.budget.caps._replace(pulse_energy_j=0.0018)
     cold = replace(DISPLAY, budget=DISPLAY.budget._replace(caps=caps))
     result = plan_frames(frame(FOUR), display=cold)
     heat, plan = DISPLAY.build_cold_heat(), result.plan

@@ -111,7 +111,7 @@ def test_a_height_beyond_one_cycle_builds_up_over_several_cycles():
 
 def test_four_interleaved_trains_keep_their_times_and_heights():
     trains = [
-        HeightTrain(200 + 3 * k, 0.01 * k, 0.6, 0.04, (150 + 5 * k) * 1e-6, 0.67 * (150 + 5 * k) * 1e-6)
+        HeightTrain(200 + 3 * k, 0.01 * k, 0.6, 0.04, (150 + 5 * k) * 1e-6, 0.675 * (150 + 5 * k) * 1e-6)
         for k in range(4)
     ]
     result = plan_trains(*trains)
@@ -119,7 +119,7 @@ def test_four_interleaved_trains_keep_their_times_and_heights():
     for train in trains:
         peaks_um, troughs_um = simulate_cycles(result, train)
         assert peaks_um[1:] == pytest.approx(np.full(14, train.target_m * 1e6), rel=0.02)
-        assert (peaks_um - troughs_um)[2:] == pytest.approx(np.full(13, 0.67e6 * train.target_m), rel=0.03)
+        assert (peaks_um - troughs_um)[2:] == pytest.approx(np.full(13, 0.675e6 * train.target_m), rel=0.03)
 
 
 def test_a_pulse_never_exceeds_its_slot():

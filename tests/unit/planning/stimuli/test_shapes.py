@@ -33,7 +33,7 @@ from optodrive.planning.stimuli.showcase import build_showcase, concatenate_sequ
 CONFIG = load_config("display-437")
 LAYOUT = Lattice.from_config(CONFIG).layout
 PITCH_M = 3.6e-3
-PITCH_MOVE_S = 317e-6
+PITCH_MOVE_S = 383e-6
 
 
 def raised(frame):
