@@ -104,12 +104,17 @@ class EvdevFilm:
         if not select.select([self._device.fd], [], [], timeout_s)[0]:
             return []
         try:
-            return [
+            events = [
                 InputEvent(event.sec + 1e-6 * event.usec, event.type, event.code, event.value)
                 for event in self._device.read()
             ]
+        except BlockingIOError:  # woken for nothing
+            return []
         except OSError as error:
             raise LinkError(f"{self._path}: the film is gone: {error.strerror}") from None
+        if not events:
+            raise LinkError(f"{self._path}: the film is gone: end of its events")
+        return events
 
     def _read_state(self, at_s: float) -> tuple[InputEvent, ...]:
         """Return events that state all slots at a time, and then the slot that is current."""
