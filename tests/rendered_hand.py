@@ -138,11 +138,11 @@ def shade_plane(x, y, spheres):
     grid_m = 2e-3
     grid_x, grid_y = np.meshgrid(np.arange(-0.2, 0.2, grid_m), np.arange(-0.2, 0.2, grid_m))
     shadow = np.zeros(grid_x.shape)
-    points = np.stack([grid_x, grid_y, np.zeros(grid_x.shape)], axis=-1)
+    light = LIGHT / np.linalg.norm(LIGHT)
     for *centre, radius in spheres[::3]:
-        to = np.array(centre) - points
-        across = np.linalg.norm(to - (to @ LIGHT)[..., None] * LIGHT, axis=-1)
-        shadow[across < radius] = 1.0
+        to_x, to_y, to_z = centre[0] - grid_x, centre[1] - grid_y, centre[2]
+        along = light[0] * to_x + light[1] * to_y + light[2] * to_z
+        shadow[to_x**2 + to_y**2 + to_z**2 - along**2 < radius**2] = 1.0
     shadow = cv2.GaussianBlur(shadow, (0, 0), 1.5)
     return 1.0 - 0.22 * cv2.remap(
         shadow.astype(np.float32),

@@ -1,8 +1,12 @@
 """A film at the Linux input layer: paths that are none."""
 
+import sys
+from pathlib import Path
+
 import pytest
 
 from optodrive.core.errors import InputError
+from optodrive.tracking.camera import Camera
 from optodrive.tracking.evdev_film import EvdevFilm, is_device
 
 
@@ -19,3 +23,14 @@ def test_a_device_is_told_from_a_recording(tmp_path):
     assert is_device(tmp_path / "/dev/null")
     assert not is_device(tmp_path)
     assert not is_device(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "open_source"),
+    [("evdev", "evdev", lambda: EvdevFilm(Path("/dev/null"))), ("cv2", "OpenCV", lambda: Camera("0"))],
+)
+def test_without_its_library_a_tracker_says_how_to_install_it(module, name, open_source, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError) as refused:
+        open_source()
+    assert str(refused.value) == f"{name}: missing, expected the extra: pip install 'optodrive[tracking]'"
