@@ -16,6 +16,7 @@ LATE_LISTED_MAX = 5
 
 def format_plan_summary(summary: "PlanSummary") -> list[str]:
     """Format a plan's summary, one line per item."""
+    early = f", steps sent {format_quantity(summary.early_step_s, 's')} early" if summary.early_step_s else ""
     galvo_pause = f", and {summary.galvo_pause_s:.1f} s of galvo pauses" if summary.galvo_pause_s else ""
     target = f", {summary.predicted_max_target_um:.1f} µm requested" if summary.predicted_max_target_um else ""
     pixel = "" if summary.predicted_max_pixel is None else f", at pixel {summary.predicted_max_pixel}"
@@ -24,7 +25,7 @@ def format_plan_summary(summary: "PlanSummary") -> list[str]:
         f"pulses           {summary.pulses}",
         f"duration         {summary.duration_s:.4f} s",
         f"beam on          {summary.beam_on_s:.4f} s, {100 * summary.beam_on_fraction:.1f} % of it",
-        f"settling         {summary.settling_s:.4f} s{galvo_pause}",
+        f"settling         {summary.settling_s:.4f} s{early}{galvo_pause}",
         f"energy           {summary.energy_j:.4f} J incident",
         f"highest          {summary.predicted_max_um:.1f} µm predicted{target}{pixel}",
         f"min headroom     {summary.headroom_min_k:.1f} K below the absorber cap",

@@ -15,6 +15,7 @@ from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import ConflictError, Name, Section
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.device.config_sections import (
+    CLOCKED_DACS,
     DAC_HALF_RANGE_CODES,
     DAC_POWER_STEPS,
     HALF_RANGE_CODES,
@@ -150,6 +151,7 @@ class Config(Section):
         self._check_scan_range()
         self._check_focus()
         self._check_damping()
+        self._check_trajectories()
         self._check_converter_codes()
 
     def _check_reach(self) -> None:
@@ -186,6 +188,14 @@ class Config(Section):
         if scanner.damping * (1.0 + scanner.damping_uncertainty) > DAMPING_MAX:
             expected = f"a half-width that leaves scanner.damping {scanner.damping} at most {DAMPING_MAX}"
             raise ConflictError("scanner.damping_uncertainty", scanner.damping_uncertainty, expected)
+
+    def _check_trajectories(self) -> None:
+        if self.scanner.trajectories == "early_steps" and self.board.transport not in CLOCKED_DACS:
+            expected = (
+                f"steps with board.transport '{self.board.transport}': only on {' and '.join(CLOCKED_DACS)} "
+                "do mirrors and light follow one clock"
+            )
+            raise ConflictError("scanner.trajectories", self.scanner.trajectories, expected)
 
     def _check_converter_codes(self) -> None:
         steps = DAC_HALF_RANGE_CODES if self.board.is_dac else HALF_RANGE_CODES

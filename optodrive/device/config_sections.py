@@ -24,6 +24,8 @@ NETWORK_DACS = ("ether_dream", "idn")
 DAC_TIMING_SLACK_POINTS = {"helios": 5, "ether_dream": 5, "idn": 6}
 """On a laser DAC a pulse starts up to two points late (rounding; the end of a chunk) and ends up to three points early
 (the same, and the dark point before an immediately following pulse); on IDN one more dark point precedes a pulse."""
+CLOCKED_DACS = ("helios", "ether_dream")
+"""Laser DACs that play positions and light by one clock at the rate that they are asked for."""
 DAC_POINT_EXCESS_S = {"helios": 1e-8, "ether_dream": 5e-8, "idn": 1e-6}
 """A point lasts up to one tick of the DAC's clock longer than requested, s."""
 
@@ -155,6 +157,8 @@ class ScannerSection(ServoSection):
     """File of a calibrated scan field that replaces the ideal lens, relative to the configuration's folder."""
     mirrors: Annotated[str, Field(min_length=1)] | None = None
     """File of measured servos that replace the stated one, relative to the configuration's folder."""
+    trajectories: Literal["steps", "early_steps"] = "steps"
+    """When a step to the next pixel is sent: as the light ends, or as early as the focus stays on the absorber."""
     half_range_codes: int = HALF_RANGE_CODES
     """Codes of the converter from the centre to the end of the range: 32767, for a laser DAC 2047."""
 
@@ -281,7 +285,12 @@ class BoardSection(Section):
         """Largest reduction of the interval between two planned times on this board, s, and zero for ticks."""
         if not self.is_dac:
             return 0.0
-        return DAC_TIMING_SLACK_POINTS[self.transport] * (1.0 / self.points_per_s + DAC_POINT_EXCESS_S[self.transport])
+        return DAC_TIMING_SLACK_POINTS[self.transport] * self.point_max_s
+
+    @property
+    def point_max_s(self) -> float:
+        """Longest duration of a point of the laser DAC, s."""
+        return 1.0 / self.points_per_s + DAC_POINT_EXCESS_S[self.transport]
 
     @property
     def is_dac(self) -> bool:

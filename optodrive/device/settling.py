@@ -19,11 +19,15 @@ from optodrive.device.gate_timing import build_servo_range, envelope_factor, set
 from optodrive.device.pixel_map import build_aim_layout
 from optodrive.device.scan_field import ScanField, max_neighbour_step_rad, tolerance_ratio
 from optodrive.device.servo import ServoRange
-from optodrive.device.settling_bound import bound_settling_s
+from optodrive.device.settling_bound import bound_departure_s, bound_settling_s
 
 LONG_DWELL_SHARE = 0.01
 """Share of the tolerance for residual ringing of earlier moves after a long dwell."""
 BISECTION_STEPS = 40
+EARLY_SHARE = 0.05
+"""Share of the tolerance for residual ringing when a step is sent early."""
+EARLY_SLACK_POINTS = 3
+"""Points by which a pulse on a laser DAC may end earlier than planned."""
 CEIL_OFFSET = 1.0 - 1e-6
 """Offset that turns truncation into rounding up, except for rounding errors of whole numbers."""
 
@@ -45,6 +49,9 @@ class SettlingTable:
     after_long_dwell: tuple[TimesUs, TimesUs]
     after_short_dwell: tuple[TimesUs, TimesUs]
     lead_in_us: int
+    early_points: int = 0
+    early_us: int = 0
+    early_dwell_us: int = 0
 
     @classmethod
     def from_config(cls, config: Config, field: ScanField | None = None) -> Self:
@@ -52,7 +59,26 @@ class SettlingTable:
 
         field: the calibrated field, None for the ideal one
         """
-        return cls._for_whole_pitches(config) if field is None else cls._for_any_distance(config, field)
+        table = cls._for_whole_pitches(config) if field is None else cls._for_any_distance(config, field)
+        if config.scanner.trajectories == "steps":
+            return table
+        ratio = 1.0 if field is None else tolerance_ratio(field, build_aim_layout(config), config)
+        return table._with_early_steps(_ServoMoves.from_config(config, ratio), config)
+
+    def _with_early_steps(self, moves: "_ServoMoves", config: Config) -> Self:
+        """Return the table with the largest lead in whole points for which the focus stays on the absorber.
+
+        A step is never sent before the light on its pixel begins. The slowest device's points are the longest.
+        """
+        departures_s = (bound_departure_s(moves.servos, moves.remaining_rad(axis, EARLY_SHARE)) for axis in range(2))
+        point_s = config.board.point_max_s
+        points = int(min(*departures_s, moves.min_pulse_s) / point_s)
+        early_us = int(1e6 * points / config.board.points_per_s) - 1
+        if early_us < 1:
+            return self
+        rest_us = max(self.long_dwell_us, moves.rest_us(EARLY_SHARE))
+        dwell_us = rest_us + early_us + ceil(1e6 * EARLY_SLACK_POINTS * point_s)
+        return replace(self, early_points=points, early_us=early_us, early_dwell_us=dwell_us)
 
     @classmethod
     def _for_any_distance(cls, config: Config, field: ScanField) -> Self:
@@ -71,7 +97,7 @@ class SettlingTable:
             for share in (LONG_DWELL_SHARE, short_dwell_share)
         )
         lead_in_us = max(after_short[0][spans[0]], after_short[1][spans[1]])
-        long_dwell_us = moves.long_dwell_us(short_dwell_share)
+        long_dwell_us = moves.long_dwell_us()
         return cls(moves.pitch_rad, long_dwell_us, after_long, after_short, lead_in_us)
 
     @classmethod
@@ -92,7 +118,7 @@ class SettlingTable:
         lead_in_us = max(
             after_short[0][display.columns - 1], after_short[1][display.rows - 1], *(ceil(each) for each in halves)
         )
-        long_dwell_us = moves.long_dwell_us(short_dwell_share)
+        long_dwell_us = moves.long_dwell_us()
         return cls(moves.pitch_rad, long_dwell_us, after_long, after_short, lead_in_us)
 
     def settling_us(self, dx_rad: float, dy_rad: float, dwell_us: int = 0) -> int:
@@ -103,7 +129,8 @@ class SettlingTable:
         tables = self.after_long_dwell if dwell_us >= self.long_dwell_us else self.after_short_dwell
         x_us = tables[0][int(abs(dx_rad) / self.pitch_rad + CEIL_OFFSET)]
         y_us = tables[1][int(abs(dy_rad) / self.pitch_rad + CEIL_OFFSET)]
-        return x_us if x_us > y_us else y_us
+        early_us = self.early_us if dwell_us >= self.early_dwell_us else 0
+        return max(0, max(x_us, y_us) - early_us)
 
     def min_settling_us(self, dx_rad: FloatArray, dy_rad: FloatArray) -> int:
         """Return the smallest settling time, after a long dwell, of several moves [k], µs."""
@@ -111,7 +138,7 @@ class SettlingTable:
             np.array(table)[(np.abs(way_rad) / self.pitch_rad + CEIL_OFFSET).astype(np.int64)]
             for table, way_rad in zip(self.after_long_dwell, (dx_rad, dy_rad), strict=True)
         )
-        return int(np.maximum(x_us, y_us).min())
+        return max(0, int(np.maximum(x_us, y_us).min()) - self.early_us)
 
 
 @dataclass(frozen=True)
@@ -143,10 +170,10 @@ class _ServoMoves:
         share: share of the tolerance that residual ringing of earlier moves takes
         """
         return bound_settling_s(
-            self.servos, min_pitches * self.pitch_rad, max_pitches * self.pitch_rad, self._remaining_rad(axis, share)
+            self.servos, min_pitches * self.pitch_rad, max_pitches * self.pitch_rad, self.remaining_rad(axis, share)
         )
 
-    def _remaining_rad(self, axis: int, share: float) -> float:
+    def remaining_rad(self, axis: int, share: float) -> float:
         return (1.0 - share) * self.tolerance_rad[axis] - self.code_rad
 
     def build_table(self, axis: int, farthest: int, share: float, below: int = 0) -> TimesUs:
@@ -160,7 +187,7 @@ class _ServoMoves:
     def _min_pitch_settling_s(self, share: float) -> float:
         """Return a time that every planned move of a pitch takes at least: that of one slow servo, s."""
         slow = self.servos.servo_at(-1.0, 1.0, -1.0, 1.0)
-        return min(settling_s(slow, self.pitch_rad, self._remaining_rad(axis, share)) for axis in range(2))
+        return min(settling_s(slow, self.pitch_rad, self.remaining_rad(axis, share)) for axis in range(2))
 
     @property
     def _min_rate_per_s(self) -> float:
@@ -191,10 +218,14 @@ class _ServoMoves:
             LONG_DWELL_SHARE, _bisect_fixed_point(residual_share, 1.0 - 1.01 * self.code_rad / min(self.tolerance_rad))
         )
 
-    def long_dwell_us(self, short_dwell_share: float) -> int:
+    def rest_us(self, share: float) -> int:
+        """Return the time from the opening of a gate until all earlier moves leave this share of the tolerance, µs."""
+        decay = self._max_envelope_factor / (share * (1.0 - self._residual_factor(self.short_dwell_share())))
+        return ceil(1e6 * log(decay) / self._min_rate_per_s)
+
+    def long_dwell_us(self) -> int:
         """Return the dwell after which all earlier moves leave LONG_DWELL_SHARE at the next gate opening, µs."""
-        decay = self._max_envelope_factor / (LONG_DWELL_SHARE * (1.0 - self._residual_factor(short_dwell_share)))
-        return max(0, ceil(1e6 * (log(decay) / self._min_rate_per_s - self._min_pitch_settling_s(LONG_DWELL_SHARE))))
+        return max(0, self.rest_us(LONG_DWELL_SHARE) - int(1e6 * self._min_pitch_settling_s(LONG_DWELL_SHARE)))
 
 
 def _bisect_fixed_point(function: Callable[[float], float], high_limit: float) -> float:

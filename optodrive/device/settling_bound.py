@@ -10,6 +10,7 @@ halved, that with the largest bound first, until the largest bound is near the l
 distance is a fourth parameter of the cells, so that one bound covers all moves between two distances.
 """
 
+from cmath import exp as cexp
 from functools import lru_cache
 from math import exp, log, pi, sqrt
 
@@ -17,13 +18,14 @@ import numpy as np
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.gate_timing import ringing_s
+from optodrive.device.gate_timing import pole_per_s, ringing_s
 from optodrive.device.servo import ServoRange
 
 PRECISION = 0.002
 """Excess of the bound over the longest settling time that was met at which the search ends, relative."""
 CELLS_MAX = 2000
 """Number of cells at which it ends in any case, with the bound that it has."""
+DEPARTURE_STEPS = 40
 OMEGA, DAMPING, SLEW, MOVE = range(4)
 """Parameters of a cell."""
 
@@ -39,6 +41,25 @@ def bound_settling_s(servos: ServoRange, min_move_rad: float, max_move_rad: floa
     cells[0, 0] = 2.0 * pi * low.frequency, low.damping, low.slew, min_move_rad
     cells[0, 1] = 2.0 * pi * high.frequency, high.damping, high.slew, max_move_rad
     return high.delay + _bound_s(cells, np.empty(CELLS_MAX), np.empty((CELLS_MAX, 4)), tolerance_rad)
+
+
+def bound_departure_s(servos: ServoRange, tolerance_rad: float) -> float:
+    """Return a lower bound of the time from a command until a mirror at rest has left a tolerance, s.
+
+    While the error of a unit step falls, the fastest servo of the range leaves first: a higher frequency, a lower
+    damping, and a ramp that is steeper, longer and earlier each move the mirror farther.
+    """
+    fast = servos.servo_at(1.0, -1.0, 1.0, -1.0)
+    pole, rate = pole_per_s(fast), fast.damping / sqrt(1.0 - fast.damping**2)
+    low_s, high_s = 0.0, pi / pole.imag
+    for _ in range(DEPARTURE_STEPS):
+        middle_s = 0.5 * (low_s + high_s)
+        lag_s = ((1.0 - 1.0j * rate) * (cexp(pole * middle_s) - 1.0) / pole).real
+        if fast.slew * (middle_s - lag_s) > tolerance_rad:
+            high_s = middle_s
+        else:
+            low_s = middle_s
+    return max(0.0, fast.delay) + low_s
 
 
 @kernel

@@ -109,16 +109,17 @@ def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelA
 
 def build_galvo_model(config: Config) -> GalvoModel:
     """Build the model of the servos of the only stage, with the lead-in that its plans keep."""
-    scanner = config.scanner
+    scanner, settling = config.scanner, build_settling_table(config)
     return GalvoModel(
         omega_rad_per_s=2.0 * np.pi * scanner.bandwidth_hz,
         damping=scanner.damping,
         delay_s=scanner.delay_s,
         slew_rad_per_s=scanner.slew_rad_per_s,
-        lead_in_s=build_settling_table(config).lead_in_us * 1e-6,
+        lead_in_s=settling.lead_in_us * 1e-6,
         averaging_s=config.limits.galvo_mean_s,
         rad_per_code=scanner.rad_per_code,
         timing_slack_s=config.board.timing_slack_s,
+        early_s=settling.early_points * config.board.point_max_s if settling.early_points else 0.0,
     )
 
 

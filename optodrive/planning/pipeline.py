@@ -163,6 +163,7 @@ class SequencePlanner:
             shortfall=self._limiter.build_shortfall(),
             delays=_merge_delays(self._limiter.delays),
             galvo_pause_s=self._limiter.galvo_pause_s,
+            early_step_s=1e-6 * self.display.scan_head.settling.early_us,
             heat=heat,
             budget=self._limiter.state,
             dead_pixels=self._dead_pixels,

@@ -42,6 +42,7 @@ def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | No
         settling_s=float(plan.settling_s.sum()),
         lead_in_s=planned.lead_in_s,
         galvo_pause_s=planned.galvo_pause_s,
+        early_step_s=planned.early_step_s,
         energy_j=float(plan.energy_j.sum()),
         predicted_max_pixel=None if max_row is None else int(plan.pixel[max_row]),
         predicted_max_um=0.0 if max_row is None else m_to_um(float(planned.predicted_m[max_row])),

@@ -69,6 +69,7 @@ class PlannedSequence:
     simultaneous: frames split into interleaved rounds
     shortfall: under policy "trim", None if no pulse was trimmed; delays: under policy "delay"
     galvo_pause_s: total of the pauses in which the mirrors' coils cool
+    early_step_s: time by which steps precede the end of the light on a pixel where the mirrors have come to rest
     dead_pixels: dead pixels that frames requested and that were omitted
     """
 
@@ -82,6 +83,7 @@ class PlannedSequence:
     shortfall: Shortfall | None
     delays: tuple[Delay, ...]
     galvo_pause_s: float
+    early_step_s: float
     heat: ThermalState
     budget: BudgetState
     dead_pixels: tuple[int, ...] = ()

@@ -92,6 +92,7 @@ class PlanSummary(JsonModel):
     predicted_max_pixel, predicted_max_um, predicted_max_target_um: the pulse with the largest predicted displacement
     target_max_um: the largest target
     beam_on_s: of all stages together; beam_on_fraction: of the time of all stages
+    early_step_s: time by which steps precede the end of the light, 0 if they follow it
     """
 
     feasibility: FeasibilityReport | None
@@ -102,6 +103,7 @@ class PlanSummary(JsonModel):
     settling_s: float
     lead_in_s: float
     galvo_pause_s: float
+    early_step_s: float
     energy_j: float
     predicted_max_pixel: int | None
     predicted_max_um: float

@@ -16,11 +16,11 @@ from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 
 
-def build_config(name="display-16", **board):
+def build_config(name="display-16", trajectories="steps", **board):
     """Return a shipped configuration with a Helios DAC."""
     table = load_config(name).model_dump()
     table["board"] |= {"transport": "helios", "interlock_watched": True} | board
-    table["scanner"]["half_range_codes"] = 2047
+    table["scanner"] |= {"half_range_codes": 2047, "trajectories": trajectories}
     return Config.model_validate(table)
 
 
@@ -30,8 +30,8 @@ def build_display(name="display-16", points_per_s=40_000):
 
 
 @cache
-def build_network_display(transport, name="display-16", points_per_s=40_000):
-    config = build_config(name, transport=transport, points_per_s=points_per_s, port="dac")
+def build_network_display(transport, name="display-16", points_per_s=40_000, trajectories="steps"):
+    config = build_config(name, trajectories, transport=transport, points_per_s=points_per_s, port="dac")
     return DisplayModel.from_config(config)
 
 

@@ -43,6 +43,12 @@ def read_light(table, display, sample_s, first_sample=0):
     x_rad, y_rad = (x - CENTRE_CODE) * rad_per_code, (y - CENTRE_CODE) * rad_per_code
     moved = np.append(True, (np.diff(table[:, 3:5], axis=0) != 0).any(axis=1))
     is_on = level > 0
+    # Light that goes on while the mirrors are told to leave still falls where it was: one stretch.
+    goes_on = np.append(False, is_on[1:] & is_on[:-1] & moved[1:] & (from_s[1:] - until_s[:-1] < 1e-9))
+    until_s = until_s.copy()
+    for row in np.flatnonzero(goes_on)[::-1]:
+        until_s[row - 1] = until_s[row]
+    is_on &= ~goes_on
     at_m = np.column_stack(ideal_position_m(display, x_rad[is_on], y_rad[is_on]))
     places_m = np.column_stack([display.layout.x_m, display.layout.y_m])
     pixel = np.array([int(np.argmin(((places_m - at) ** 2).sum(axis=1))) for at in at_m], dtype=np.int64)

@@ -20,7 +20,7 @@ from reference_models.thermal_display import NO_CAPS, TOUCHED, build_plan, build
 FULL_W = 2.45
 SECTION = DisplaySection(rows=2, columns=2, pitch_m=4e-3, bridge_width_m=4e-4)
 NEIGHBOURS = Neighbours.from_display(SECTION)
-MIRRORS = GalvoModels.from_models(GalvoModel(1e4, 0.7, 0.0, 1e3, 1e-3, 1.0, 0.0, 0.0))
+MIRRORS = GalvoModels.from_models(GalvoModel(1e4, 0.7, 0.0, 1e3, 1e-3, 1.0, 0.0, 0.0, 0.0))
 WEAK = ("gas_lag", "side_resistance")
 """Uncertainties with less effect than the bound's own margin: they reduce what is granted, which is all that shows."""
 HALF_WIDTHS = dict.fromkeys(Uncertainty.__dataclass_fields__, 0.4) | {"exponent": 0.1}

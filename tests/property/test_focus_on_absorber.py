@@ -11,19 +11,21 @@ from pydantic import ValidationError
 from displays import DISPLAYS
 from focus_judge import compute_overhang_m, ideal_position_m
 from hidden_field import calibrate_hidden_field
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, LocalProtocolError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
 from optodrive.device.gate_timing import build_servo_range
 from optodrive.device.settling import SettlingTable
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.dac.encoding import PointScale, decode, encode
+from optodrive.link.dac.verification import encode_verified, verify_chunks
 from optodrive.link.protocol.quantisation import CENTRE_CODE, quantise
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 ROUNDING_M = 1e-9
+POINT_RATES = (20_000, 40_000, 50_000)
 EXACT = {"bandwidth_uncertainty": 0.0, "damping_uncertainty": 0.0, "slew_uncertainty": 0.0, "delay_uncertainty_s": 0.0}
 SLOWEST = (-1.0, 1.0, -1.0, 1.0)
 """Place of the servo that enters the tolerance last."""
@@ -169,11 +171,11 @@ def test_an_uncertainty_that_is_forgotten_is_caught(name):
         assert (max_overhang_m(display, plan, places=(SLOWEST,)) > ROUNDING_M) == is_caught
 
 
-def helios_display(display, points_per_s):
+def helios_display(display, points_per_s, trajectories="steps"):
     """Return the same display behind a Helios."""
     table = display.config.model_dump()
     table["board"] |= {"transport": "helios", "points_per_s": points_per_s}
-    table["scanner"]["half_range_codes"] = 2047
+    table["scanner"] |= {"half_range_codes": 2047, "trajectories": trajectories}
     return DisplayModel.from_config(Config.model_validate(table))
 
 
@@ -181,7 +183,8 @@ def helios_display(display, points_per_s):
 @given(data=st.data())
 def test_on_a_helios_whose_steps_are_coarse(data):
     try:
-        display = helios_display(data.draw(displays()), data.draw(st.sampled_from([20_000, 40_000, 50_000])))
+        rate, trajectories = (data.draw(st.sampled_from(each)) for each in (POINT_RATES, ("steps", "early_steps")))
+        display = helios_display(data.draw(displays()), rate, trajectories)
     except InputError:
         reject()
     except ValidationError:  # two coarse steps and the focus do not fit on the absorber
@@ -191,14 +194,57 @@ def test_on_a_helios_whose_steps_are_coarse(data):
     assert helios_overhang_m(servo, plan_pulses(display, sequence)) <= ROUNDING_M
 
 
+@pytest.mark.parametrize("trajectories", ["steps", "early_steps"])
 @pytest.mark.parametrize(("name", "height_m"), [("display-437", 10e-6), ("display-16", 50e-6)])
-def test_on_a_helios_in_a_full_frame(name, height_m):
-    display = helios_display(DISPLAYS[name], 40_000)
+def test_on_a_helios_in_a_full_frame(name, height_m, trajectories):
+    display = helios_display(DISPLAYS[name], 40_000, trajectories)
     plan = plan_pulses(display, full_frame(display, height_m))
-    assert max_overhang_m(display, plan, helios_overhang_m, (SLOWEST,)) <= ROUNDING_M
-    early = shorten_settling(display)
+    assert max_overhang_m(display, plan, helios_overhang_m) <= ROUNDING_M
+    early = shorten_settling(display, 0.75)  # whole points are up to 8 % longer
     plan = plan_pulses(early, full_frame(early, 50e-6))
     assert max_overhang_m(early, plan, helios_overhang_m, (SLOWEST,)) > 2e-5
+
+
+def test_early_steps_save_their_time():
+    plain, early = (helios_display(DISPLAYS["display-16"], 50_000, each) for each in ("steps", "early_steps"))
+    ends_s = [plan_pulses(each, full_frame(each, 50e-6)).end_s for each in (plain, early)]
+    assert early.scan_head.settling.early_points == 4
+    assert ends_s[0] - ends_s[1] == pytest.approx(15 * 79e-6, abs=1e-9)
+
+
+def hurry_steps(display, monkeypatch, **changes):
+    """Return the display with other early steps, in the plan and in its points."""
+    scale = replace(PointScale.from_config(display.config), **changes)
+    monkeypatch.setattr(PointScale, "from_config", lambda _config: scale)
+    return with_settling(display, replace(display.scan_head.settling, long_dwell_us=0, **changes))
+
+
+def test_a_step_that_leaves_too_early_is_caught(monkeypatch):
+    """Mutant: two points more."""
+    display = helios_display(DISPLAYS["display-16"], 50_000, "early_steps")
+    early = hurry_steps(display, monkeypatch, early_points=6)
+    assert max_overhang_m(display, plan_pulses(early, full_frame(early, 50e-6)), helios_overhang_m) > 1e-5
+
+
+def test_a_step_that_leaves_before_the_mirrors_rest_is_caught(monkeypatch):
+    """Mutant: early steps also after the shortest pulses."""
+    servo = EXACT | {"damping": 0.3, "bandwidth_hz": 400.0, "slew_rad_per_s": 300.0}
+    display = helios_display(change_display("display-16", scanner=servo), 50_000, "early_steps")
+    assert max_overhang_m(display, plan_pulses(display, shortest_pulses(display)), helios_overhang_m) <= ROUNDING_M
+    early = hurry_steps(display, monkeypatch, early_dwell_us=0)
+    assert max_overhang_m(display, plan_pulses(early, shortest_pulses(early)), helios_overhang_m) > 1e-5
+
+
+def test_bytes_with_a_step_in_the_midst_of_light_are_refused():
+    display = helios_display(DISPLAYS["display-16"], 40_000, "early_steps")
+    (_, state), scale = display.build_cold_state(), PointScale.from_config(display.config)
+    plan = plan_pulses(display, full_frame(display, 50e-6))
+    encode_verified(plan, scale, state, display.budget)
+    for early in (replace(scale, early_points=4), replace(scale, early_dwell_us=0)):
+        sequence = full_frame(display, 50e-6) if early.early_dwell_us else shortest_pulses(display)
+        chunks = [each.data for each in encode(plan_pulses(display, sequence), early)]
+        with pytest.raises(LocalProtocolError, match="exceeds the plan's pulses"):
+            verify_chunks(chunks, plan_pulses(display, sequence), scale, state, display.budget)
 
 
 @pytest.mark.parametrize("number", range(1, 7))
@@ -212,11 +258,11 @@ def with_settling(display, settling):
     return replace(display, scan_heads=(replace(display.scan_head, settling=settling),))
 
 
-def shorten_settling(display):
-    """Return a display whose settling times open the gate 15 % early."""
+def shorten_settling(display, share=0.85):
+    """Return a display whose settling times open the gate early, by default by 15 %."""
     settling = display.scan_head.settling
     after_long_dwell, after_short_dwell = (
-        tuple(tuple(int(0.85 * time_us) for time_us in times_us) for times_us in tables)
+        tuple(tuple(int(share * time_us) for time_us in times_us) for times_us in tables)
         for tables in (settling.after_long_dwell, settling.after_short_dwell)
     )
     early = replace(settling, after_long_dwell=after_long_dwell, after_short_dwell=after_short_dwell)

@@ -56,6 +56,7 @@ def random_mirrors(rng):
         averaging_s=rng.choice([0.1, 1.0, 3.0]),
         rad_per_code=0.0,
         timing_slack_s=0.0,
+        early_s=0.0,
     )
 
 

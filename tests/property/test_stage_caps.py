@@ -21,7 +21,7 @@ FULL_W = 2.45
 SECTION = DisplaySection(rows=2, columns=2, pitch_m=4e-3, bridge_width_m=4e-4)
 NEIGHBOURS = Neighbours.from_display(SECTION)
 CERTAIN = Uncertainty(**dict.fromkeys(Uncertainty.__dataclass_fields__, 0.0))
-FAST_MIRRORS = GalvoModel(1e4, 0.7, 0.0, 1e3, 1e-3, 1.0, 0.0, 0.0)
+FAST_MIRRORS = GalvoModel(1e4, 0.7, 0.0, 1e3, 1e-3, 1.0, 0.0, 0.0, 0.0)
 STAGES = 4
 
 

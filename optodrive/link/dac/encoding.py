@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.device.config import Config
 from optodrive.device.config_sections import DAC_HALF_RANGE_CODES
+from optodrive.device.field_loader import build_settling_table
 from optodrive.link.dac.formats.base import CHUNK_MAX_S, Chunk, DacFormat, PointTable
 from optodrive.link.dac.formats.registry import find_format
 from optodrive.link.protocol.dac_codes import DacScale
@@ -26,17 +27,23 @@ TRAILING_POINTS = 2
 
 @dataclass(frozen=True)
 class PointScale(DacScale, bits=12):
-    """Scale factors between SI units and codes, levels and points of one kind of DAC."""
+    """Scale factors between SI units and codes, levels and points of one kind of DAC.
+
+    early_points: points by which the mirrors leave before the end of a pulse, after early_dwell_us on its pixel
+    """
 
     full_power_w: float
     format: DacFormat
+    early_points: int = 0
+    early_dwell_us: int = 0
 
     @classmethod
     def from_config(cls, config: Config) -> "PointScale":
         """Derive the scale. The codes span the scanner's whole range, the largest level is the laser's full power."""
         rad_per_code = config.scanner.range_rad / DAC_HALF_RANGE_CODES
         dac_format = find_format(config.board.transport)(config.board.points_per_s)
-        return cls(rad_per_code, config.laser.max_power_w, dac_format)
+        settling = build_settling_table(config)
+        return cls(rad_per_code, config.laser.max_power_w, dac_format, settling.early_points, settling.early_dwell_us)
 
     @property
     def point_s(self) -> float:
@@ -98,7 +105,9 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     last[:-1] -= last[:-1] == first[1:]  # a blank point separates adjacent pulses
     emitting = (level > 0) & (last > first)  # the mirrors skip pulses without emission
     first, last, level = first[emitting], last[emitting], level[emitting]
-    x, y = scale.to_codes(plan.x_rad[emitting]), scale.to_codes(plan.y_rad[emitting])
+    x, y = scale.to_codes(plan.x_rad), scale.to_codes(plan.y_rad)
+    early = np.where(_find_early_steps(plan, scale), scale.early_points, 0)[emitting]
+    x, y = x[emitting], y[emitting]
     before = np.concatenate([[0], last[:-1]])[: len(last)]
     run_lengths = np.column_stack([first - before, last - first]).ravel()
     count = int(last[-1]) if len(last) else 0
@@ -106,12 +115,25 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     levels = np.repeat(
         np.append(np.column_stack([np.zeros_like(level), level]).ravel(), 0), np.append(run_lengths, tail)
     )
-    dwell_points = np.append(last - before, tail)
+    early[-1:] = 0  # the mirrors stay on the last pixel
+    dwell_points = np.append(np.diff(last - early, prepend=0), tail)
     x, y = (
         np.repeat(np.append(codes, codes[-1:] if len(codes) else PointScale.CENTRE_CODE), dwell_points)
         for codes in (x, y)
     )
     return np.column_stack([x, y, levels])
+
+
+def _find_early_steps(plan: LimitedPlan, scale: PointScale) -> BoolArray:
+    """Return for every pulse whether the step behind it is sent early, [n]: the mirrors have rested on its pixel.
+
+    They have been there since the first of the consecutive pulses on it, also if that one emits nothing.
+    """
+    start_us, width_us = (np.rint(1e6 * times_s).astype(np.int64) for times_s in (plan.start_s, plan.width_s))
+    is_first = np.append(True, np.diff(plan.pixel) != 0)[: len(plan)]
+    arrival_us = start_us[is_first][np.cumsum(is_first) - 1]
+    dwell_us: IntArray = start_us + width_us - arrival_us
+    return (dwell_us >= scale.early_dwell_us) & (scale.early_points > 0)
 
 
 def _split_chunks(points: PointTable, scale: PointScale) -> Iterator[tuple[int, int]]:
@@ -123,8 +145,17 @@ def _split_chunks(points: PointTable, scale: PointScale) -> Iterator[tuple[int, 
         if last is None:
             last = longest if scale.format.accepts_length(longest - first) else longest - 1
             points[last - 1, 2] = 0
+            _blank_early_step(points, last, scale)
         yield first, last
         first = last
+
+
+def _blank_early_step(points: PointTable, last: int, scale: PointScale) -> None:
+    """Blank the light of an early step that follows the end of a chunk."""
+    before = points[max(0, last - scale.early_points) : last + 1, :2]
+    if (before != before[-1:]).any():
+        level = points[last : last + scale.early_points, 2]
+        level[np.logical_and.accumulate(level > 0)] = 0
 
 
 def _find_gate_off_end(points: PointTable, first: int, longest: int, dac_format: DacFormat) -> int | None:
@@ -140,7 +171,8 @@ def decode(chunks: Sequence[bytes], scale: PointScale) -> PointPulses:
     """Decode the bytes of consecutive chunks. The brightest channel counts.
 
     Power is that of the level times the stretch, as if the energy of a longer point had been emitted in the nominal
-    time. Raise LocalProtocolError for invalid chunks.
+    time. The light of an early step, whose mirrors have rested before it, belongs to the pulse before it. Raise
+    LocalProtocolError for invalid chunks.
     """
     tables, ticks = [], []
     for data in chunks:
@@ -154,6 +186,9 @@ def decode(chunks: Sequence[bytes], scale: PointScale) -> PointPulses:
     run_ends = np.append(changes, len(points) - 1)
     emitting = points[run_starts, 2] > 0
     run_starts, run_ends = run_starts[emitting], run_ends[emitting]
+    is_early = _match_early_steps(points, run_starts, run_ends, begin_ticks / scale.format.clock_hz, scale)
+    run_ends = np.where(np.append(is_early[1:], False), np.append(run_ends[1:], 0), run_ends)[~is_early]
+    run_starts = run_starts[~is_early]
     x, y, level = points[run_starts].T
     return PointPulses(
         start_s=begin_ticks[run_starts] / scale.format.clock_hz,
@@ -162,3 +197,23 @@ def decode(chunks: Sequence[bytes], scale: PointScale) -> PointPulses:
         y_rad=scale.to_angles_rad(y),
         power_w=level / scale.format.level_max * scale.full_power_w * scale.format.stretch,
     )
+
+
+def _match_early_steps(
+    points: PointTable, run_starts: IntArray, run_ends: IntArray, begin_s: FloatArray, scale: PointScale
+) -> BoolArray:
+    """Return which emitting runs [k] continue the light of the run before while the mirrors leave, [k].
+
+    begin_s: [n] of each point
+    """
+    moved = np.flatnonzero(np.append(True, (np.diff(points[:, :2], axis=0) != 0).any(axis=1)))
+    arrived = moved[np.searchsorted(moved, run_starts, side="right") - 1]
+    held_us = 1e6 * (begin_s[run_ends] - begin_s[arrived])
+    is_early = np.zeros(len(run_starts), dtype=np.bool)
+    is_early[1:] = (
+        (run_starts[1:] == run_ends[:-1])
+        & (points[run_starts[1:], 2] == points[run_starts[:-1], 2])
+        & (run_ends[1:] - run_starts[1:] <= scale.early_points)
+        & (held_us[:-1] >= scale.early_dwell_us)
+    )
+    return is_early

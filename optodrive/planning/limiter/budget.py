@@ -97,6 +97,7 @@ class GalvoModel(NamedTuple):
     averaging_s: time constant of the mean-square acceleration
     rad_per_code: one converter step, by which a move can be longer
     timing_slack_s: largest reduction of an interval between two planned times by quantisation
+    early_s: largest time by which a step is sent before the pulse before it ends
     """
 
     omega_rad_per_s: float
@@ -107,6 +108,7 @@ class GalvoModel(NamedTuple):
     averaging_s: float
     rad_per_code: float
     timing_slack_s: float
+    early_s: float
 
 
 class GalvoModels(NamedTuple):
@@ -120,6 +122,7 @@ class GalvoModels(NamedTuple):
     averaging_s: FloatArray
     rad_per_code: FloatArray
     timing_slack_s: FloatArray
+    early_s: FloatArray
 
     @classmethod
     def from_models(cls, *models: GalvoModel) -> "GalvoModels":
@@ -139,6 +142,7 @@ def select_galvo(galvos: GalvoModels, stage: int) -> GalvoModel:
         galvos.averaging_s[stage],
         galvos.rad_per_code[stage],
         galvos.timing_slack_s[stage],
+        galvos.early_s[stage],
     )
 
 

@@ -71,11 +71,12 @@ def apply_move(
     dx_rad, dy_rad = abs(dx_rad) + galvo.rad_per_code, abs(dy_rad) + galvo.rad_per_code
     # The mirrors leave when a pulse ends; for the first pulse of a plan, at the start of its lead-in at the latest.
     at_s = max(previous_end_s, start_s - galvo.lead_in_s) + max(dx_rad, dy_rad) / galvo.slew_rad_per_s
-    envelope = ringing_envelope_factor(galvo, previous_end_s - galvo.timing_slack_s - state.at_s)
+    envelope = ringing_envelope_factor(galvo, previous_end_s - galvo.early_s - galvo.timing_slack_s - state.at_s)
     x_ringing = sqrt(move_energy(galvo, dx_rad)) + envelope * state.x_ringing
     y_ringing = sqrt(move_energy(galvo, dy_rad)) + envelope * state.y_ringing
-    # Either end of the move may be off by one converter step.
-    decay = exp(-(at_s - state.at_s - 2.0 * galvo.rad_per_code / galvo.slew_rad_per_s) / galvo.averaging_s)
+    # Either end of the move may be off by one converter step, and it may begin early.
+    shorter_s = galvo.early_s + 2.0 * galvo.rad_per_code / galvo.slew_rad_per_s
+    decay = exp(-(at_s - state.at_s - shorter_s) / galvo.averaging_s)
     return GalvoState(
         state.x_mean_square * decay + x_ringing**2 / galvo.averaging_s,
         state.y_mean_square * decay + y_ringing**2 / galvo.averaging_s,
@@ -93,7 +94,7 @@ def mean_square_bound(galvo: GalvoModel, state: GalvoState, end_s: float) -> flo
     the largest possible move is always counted.
     """
     # Planned times telescope from move to move, so their slack counts once, here.
-    elapsed_s = end_s - galvo.timing_slack_s - state.at_s
+    elapsed_s = end_s - galvo.early_s - galvo.timing_slack_s - state.at_s
     decay = exp(-(elapsed_s - effective_delay_s(galvo)) / galvo.averaging_s)
     envelope = ringing_envelope_factor(galvo, elapsed_s)
     max_move_root = sqrt(move_energy(galvo, 1e9))

@@ -160,6 +160,7 @@ def _compute_settling_us(moves: MoveTimes, origin: int, pixel: int, dwell_us: in
         return moves.lead_in_us
     x = int(abs(moves.x_rad[pixel] - moves.x_rad[origin]) / moves.pitch_rad + CEIL_OFFSET)
     y = int(abs(moves.y_rad[pixel] - moves.y_rad[origin]) / moves.pitch_rad + CEIL_OFFSET)
+    early_us = moves.early_us if dwell_us >= moves.early_dwell_us else 0
     if dwell_us >= moves.long_dwell_us:
-        return int(max(moves.long_x_us[x], moves.long_y_us[y]))
+        return max(0, int(max(moves.long_x_us[x], moves.long_y_us[y])) - early_us)
     return int(max(moves.short_x_us[x], moves.short_y_us[y]))

@@ -51,6 +51,8 @@ class MoveTimes(NamedTuple):
     short_x_us: IntArray
     short_y_us: IntArray
     lead_in_us: int
+    early_us: int
+    early_dwell_us: int
 
     @classmethod
     def from_table(cls, table: SettlingTable, x_rad: FloatArray, y_rad: FloatArray, lead_in_us: int) -> "MoveTimes":
@@ -60,8 +62,19 @@ class MoveTimes(NamedTuple):
         """
         long_x_us, long_y_us = (np.array(times_us, dtype=np.int64) for times_us in table.after_long_dwell)
         short_x_us, short_y_us = (np.array(times_us, dtype=np.int64) for times_us in table.after_short_dwell)
-        dwell_us = table.long_dwell_us
-        return cls(x_rad, y_rad, table.pitch_rad, dwell_us, long_x_us, long_y_us, short_x_us, short_y_us, lead_in_us)
+        return cls(
+            x_rad,
+            y_rad,
+            table.pitch_rad,
+            table.long_dwell_us,
+            long_x_us,
+            long_y_us,
+            short_x_us,
+            short_y_us,
+            lead_in_us,
+            table.early_us,
+            table.early_dwell_us,
+        )
 
 
 class BeamPath:

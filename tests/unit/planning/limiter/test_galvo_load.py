@@ -25,6 +25,7 @@ SERVO = GalvoModel(
     averaging_s=1.0,
     rad_per_code=0.0,
     timing_slack_s=0.0,
+    early_s=0.0,
 )
 STANDING_STILL = GalvoState(0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -77,8 +78,10 @@ def compute_bound(galvo, rows, mutate=lambda state: state):
 
 
 def simulate_peak(galvo, rows):
-    """Simulate the same for a servo that leaves when a pulse ends."""
+    """Simulate the same for a servo that leaves when a pulse ends, or early where it is longer than that."""
+    early_s = [galvo.early_s if width_s > galvo.early_s else 0.0 for _, width_s, _ in rows]
     ends_s = np.array([0.0] + [start_s + width_s for start_s, width_s, _ in rows])
+    ends_s[1:-1] -= early_s[:-1]
     numbers = (galvo.omega_rad_per_s, galvo.damping, galvo.delay_s, galvo.slew_rad_per_s, galvo.averaging_s)
     return _coil(ends_s[:-1].copy(), np.array([x_rad for *_, x_rad in rows]), ends_s[-1] + 0.1, *numbers)
 
@@ -94,6 +97,7 @@ def move_sequences(draw):
         averaging_s=draw(st.sampled_from([0.05, 0.3, 1.0])),
         rad_per_code=0.0,
         timing_slack_s=0.0,
+        early_s=draw(st.sampled_from([0.0, 0.0, 8e-5])),
     )
     now_s, at_rad, rows = 0.0, 0.0, []
     for _ in range(draw(st.integers(1, 30))):

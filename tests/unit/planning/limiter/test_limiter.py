@@ -47,6 +47,7 @@ SERVO = GalvoModel(
     averaging_s=1.0,
     rad_per_code=0.0,
     timing_slack_s=0.0,
+    early_s=0.0,
 )
 
 
