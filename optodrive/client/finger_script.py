@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.numeric_tables import read_columns
+from optodrive.core.toml_model import build_input_error
 from optodrive.core.types.fingers import FingerPlace, FingerReport
 from optodrive.daemon.responses.fingers import FINGERS_MAX, FingerMessage
 
@@ -48,7 +49,5 @@ def _check_place(path: Path, row: int, values: list[float]) -> FingerPlace:
     try:
         FingerMessage.model_validate({"number": int(number), **members})
     except ValidationError as error:
-        first = error.errors()[0]
-        expected = first["msg"].removeprefix("Input should be ")
-        raise InputError(f"{path}: row {row}: {first['loc'][0]}", first["input"], expected) from None
+        raise build_input_error(error, f"{path}: row {row}") from None
     return FingerPlace(int(number), *place)

@@ -12,7 +12,7 @@ from optodrive.client.loop_thread import LoopThread
 from optodrive.client.socket_connection import open_connection
 from optodrive.core.errors import LinkError
 from optodrive.core.types.fingers import FingerPlace
-from optodrive.daemon.responses.fingers import FingerMessage, FingersMessage
+from optodrive.daemon.responses.fingers import validate_fingers
 
 PATH = "/v1/fingers"
 
@@ -43,10 +43,10 @@ class Fingers:
     def send(self, places: Sequence[FingerPlace], age_s: float = 0.0) -> None:
         """Report all fingertips, none if there is none. age_s: time since they were there.
 
-        Raise LinkError without a connection, and ValidationError for a place that the display cannot have.
+        Raise LinkError without a connection, and InputError for a place that the display cannot have.
         """
-        fingers = tuple(FingerMessage(**place._asdict()) for place in places)
-        self._loop.run(self._send(FingersMessage(fingers=fingers, age_s=age_s).model_dump_json()))
+        message = validate_fingers({"fingers": [place._asdict() for place in places], "age_s": age_s})
+        self._loop.run(self._send(message.model_dump_json()))
 
     async def _send(self, text: str) -> None:
         try:

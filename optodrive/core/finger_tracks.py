@@ -28,15 +28,12 @@ MARGIN_SIGMAS, MARGIN_MAX_M = 2.0, 3e-3
 class PredictedFinger(NamedTuple):
     """A fingertip at a later time.
 
-    vx_m_per_s, vy_m_per_s: its velocity; radius_m: of its contact; margin_m: by which its place may differ, two
-    standard deviations or MARGIN_MAX_M
+    radius_m: of its contact; margin_m: by which its place may differ, two standard deviations or MARGIN_MAX_M
     """
 
     number: int
     x_m: float
     y_m: float
-    vx_m_per_s: float
-    vy_m_per_s: float
     radius_m: float
     margin_m: float
 
@@ -86,8 +83,8 @@ class FingerTracks:
         for number, track in self._tracks.items():
             state, covariance = _extrapolate(track, at_s)
             margin_m = min(MARGIN_MAX_M, MARGIN_SIGMAS * sqrt(covariance[0, 0]))
-            (x_m, y_m), (vx_m_per_s, vy_m_per_s) = state.tolist()
-            predicted.append(PredictedFinger(number, x_m, y_m, vx_m_per_s, vy_m_per_s, track.radius_m, margin_m))
+            x_m, y_m = state[0].tolist()
+            predicted.append(PredictedFinger(number, x_m, y_m, track.radius_m, margin_m))
         return tuple(predicted)
 
 

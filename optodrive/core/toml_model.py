@@ -15,7 +15,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from optodrive.core.errors import MISSING, InputError, suggest_nearest
+from optodrive.core.errors import MISSING, InputError, Unquoted, suggest_nearest
 from optodrive.core.field_docstrings import read_field_docstrings
 from optodrive.core.plausibility import check_table, collect_ranges
 
@@ -108,6 +108,10 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if first["type"] == "model_type":
         message = "a table with keys, as in { value = … }" if isinstance(first["input"], int | float) else "a table"
+    if first["type"] == "too_long":
+        return InputError(
+            label, Unquoted(f"{first['ctx']['actual_length']} of them"), f"at most {first['ctx']['max_length']}"
+        )
     if first["type"] == "missing":
         return InputError(label, MISSING, "this key")
     if first["type"] == "value_error" and not isinstance(first["input"], str):

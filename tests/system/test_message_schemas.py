@@ -47,7 +47,7 @@ def test_frames_and_their_results_follow_the_schemas(disarmed):
 
 def test_places_of_fingers_and_refusals_follow_the_schemas(disarmed):
     places, refusal = build_validator("fingers", "places"), build_validator("fingers", "refusal")
-    finger = {"number": 1, "x_m": 0.01, "y_m": 0.0, "radius_m": 0.004, "confidence": 1.0}
+    finger = {"number": 1, "x_m": 0.01, "y_m": 0.0, "radius_m": 0.004}
     assert places.is_valid({"fingers": [finger], "age_s": 0.01})
     for wrong in ({}, {"fingers": [finger | {"x_m": 2.0}], "age_s": 0.0}, {"fingers": [{"number": 1}], "age_s": 0.0}):
         assert not places.is_valid(wrong)

@@ -7,14 +7,13 @@ class FingerPlace(NamedTuple):
     """A fingertip.
 
     number: the same for one fingertip as long as it is tracked; x_m, y_m: centre of its contact in the coordinates of
-    the display's layout; radius_m: of the contact; confidence: 0 to 1, of the tracker
+    the display's layout; radius_m: of the contact
     """
 
     number: int
     x_m: float
     y_m: float
     radius_m: float
-    confidence: float = 1.0
 
 
 class FingerReport(NamedTuple):

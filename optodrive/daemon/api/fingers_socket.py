@@ -3,7 +3,6 @@
 import asyncio
 import time
 
-from pydantic import ValidationError
 from starlette.websockets import WebSocket
 
 from optodrive.core.errors import InputError
@@ -11,12 +10,11 @@ from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.scope_keys import ARRIVED_S
 from optodrive.daemon.api.socket_token import select_subprotocol
 from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal
+from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal, validate_fingers
 from optodrive.planning.stimuli.json_values import decode_json
 
 FORWARD_PERIOD_S = 0.005
 """Least time between two messages to the planner; of those in between the newest counts."""
-EXPECTED = '{"fingers": [{"number": 1, "x_m": 0.0, "y_m": 0.0, "radius_m": 0.004}], "age_s": 0.0}'
 
 
 class FingersSocket:
@@ -60,11 +58,4 @@ class FingersSocket:
 
 def parse_fingers(message: str | bytes) -> FingersMessage:
     """Parse a message. Raise InputError, also for invalid JSON and for a repeated key."""
-    decoded = decode_json(message, "message")
-    try:
-        return FingersMessage.model_validate(decoded)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(["message", *map(str, first["loc"])])
-        expected = first["msg"].removeprefix("Input should be ")
-        raise InputError(where, first["input"], f"{expected}, as in {EXPECTED}") from None
+    return validate_fingers(decode_json(message, "message"))

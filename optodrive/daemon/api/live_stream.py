@@ -106,10 +106,10 @@ class LiveStream:
             try:
                 result = await self._daemon.planner.submit(frame.sequence, self._build_push(frame))
             except OptodriveError as error:
-                self._refuse(frame.number, build_error_problem(error))
+                self._refuse(frame, build_error_problem(error))
                 continue
             if result.fields["status"] >= 400:
-                self._refuse(frame.number, Problem.model_validate_json(result.payload))
+                self._refuse(frame, Problem.model_validate_json(result.payload))
                 continue
             self._follow(frame, PlanReport.model_validate_json(result.payload))
 
@@ -132,8 +132,8 @@ class LiveStream:
             lists_pulses=False,
         )
 
-    def _refuse(self, number: int, problem: Problem) -> None:
-        self._publish(FrameResult(frame=number, status="refused", problem=problem))
+    def _refuse(self, frame: Frame, problem: Problem) -> None:
+        self._publish(FrameResult(frame=frame.number, status="refused", problem=problem))
 
     def _follow(self, frame: Frame, report: PlanReport) -> None:
         """Publish that a frame is planned, and its end when that comes."""

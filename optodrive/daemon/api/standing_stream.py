@@ -3,13 +3,14 @@
 Each refresh is a streamed plan of the pixels whose turn it is, which the planner process selects. One is made whenever
 new places of fingers have arrived, but not sooner than REFRESH_MIN_S after the last, and else every REFRESH_MAX_S,
 before the light that is planned ends. A refresh that is refused, as after STOP, ends the frame: it does not come back
-by itself.
+by itself. One that found too many requests waiting is tried again.
 """
 
 import asyncio
 import time
 from typing import Any
 
+from optodrive.core.errors import BusyError
 from optodrive.daemon.api.live_stream import Frame, LiveStream, report_planned
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
@@ -18,6 +19,8 @@ from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.stream import FrameResult
 
 REFRESH_MIN_S, REFRESH_MAX_S = 0.005, 0.03
+TRIED_AGAIN = (BusyError.code,)
+"""Codes of the problems after which a frame still stands."""
 
 
 class StandingStream(LiveStream):
@@ -73,10 +76,12 @@ class StandingStream(LiveStream):
         self._shown, self._last_epoch = frame, frame.epoch
         self._publish(report_planned(frame.number, report))
 
-    def _refuse(self, number: int, problem: Problem) -> None:
-        super()._refuse(number, problem)
-        if self._shown is not None and self._shown.number == number:
+    def _refuse(self, frame: Frame, problem: Problem) -> None:
+        if frame is self._shown:
+            if problem.code in TRIED_AGAIN:
+                return
             self._shown = None
+        super()._refuse(frame, problem)
 
 
 async def _wait_for_any(timeout_s: float, *events: asyncio.Event) -> None:

@@ -2,9 +2,10 @@
 
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, ValidationError
 
 from optodrive.core.json_model import JsonModel
+from optodrive.core.toml_model import build_input_error
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.daemon.responses.problem import Problem
 
@@ -20,14 +21,13 @@ class FingerMessage(JsonModel):
     """A fingertip on the display.
 
     number: the same for one fingertip as long as it is tracked; x_m, y_m: centre of its contact, in the coordinates of
-    the display's pixels; radius_m: of the contact; confidence: of the tracker, 0 to 1
+    the display's pixels; radius_m: of the contact
     """
 
     number: Annotated[int, Field(ge=0, le=NUMBER_MAX, strict=True)]
     x_m: Place
     y_m: Place
     radius_m: Annotated[float, Field(gt=0, le=RADIUS_MAX_M, allow_inf_nan=False, strict=True)]
-    confidence: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False, strict=True)] = 1.0
 
 
 class FingersMessage(JsonModel):
@@ -43,6 +43,14 @@ class FingersMessage(JsonModel):
     def places(self) -> tuple[FingerPlace, ...]:
         """The fingertips."""
         return tuple(FingerPlace(*dict(finger).values()) for finger in self.fingers)
+
+
+def validate_fingers(message: object) -> FingersMessage:
+    """Return a decoded message as its model. Raise InputError that names the first member that it may not have."""
+    try:
+        return FingersMessage.model_validate(message)
+    except ValidationError as error:
+        raise build_input_error(error, "message", FingersMessage) from None
 
 
 class FingersRefusal(JsonModel):
