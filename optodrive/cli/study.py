@@ -17,8 +17,8 @@ from optodrive.core.errors import InputError
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import FloatArray
     from optodrive.device.config import Config, PixelLayout
+    from optodrive.study.page_address import PageAddress
     from optodrive.study.page_respondent import PageRespondent
-    from optodrive.study.page_server import PageAddress
     from optodrive.study.presenter import Presenter
     from optodrive.study.session import Respondent
     from optodrive.study.study_file import MatchingSection, Study
@@ -195,7 +195,7 @@ def _run_person(
     from optodrive.study.daemon_presenter import DaemonPresenter
     from optodrive.study.dataset import build_log_path
     from optodrive.study.lab_streams import LabStreams, PublishingPresenter
-    from optodrive.study.page_server import parse_page_address
+    from optodrive.study.page_address import parse_page_address
     from optodrive.study.session import build_matching_model, draw_order, run_session
     from optodrive.study.terminal import TerminalRespondent
     from optodrive.study.trial_log import TrialLog

@@ -11,10 +11,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable, Coroutine, Mapping
-from contextlib import suppress
-from importlib.resources import files
-from ipaddress import ip_address
+from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
@@ -22,19 +19,16 @@ import uvicorn
 from pydantic import ValidationError
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from optodrive.core.errors import InputError, OptodriveError
-from optodrive.daemon.api.host_check import LOOPBACK_NAMES, check_host_and_origin
-from optodrive.daemon.api.problem_response import send_problem
-from optodrive.daemon.api.request_limits import App, Receive, Scope, Send
-from optodrive.daemon.api.request_line import join_headers
+from optodrive.daemon.api.host_check import LOOPBACK_NAMES
 from optodrive.daemon.api.socket_token import read_subprotocol_token, select_subprotocol
-from optodrive.daemon.api.static_files import MEDIA_TYPES, SECURITY_HEADERS
+from optodrive.study.page_address import PageAddress
+from optodrive.study.page_http import HostCheck, build_response, read_files
 from optodrive.study.page_messages import (
     MESSAGE_MAX_BYTES,
     OPERATOR_MESSAGES,
@@ -44,7 +38,6 @@ from optodrive.study.page_messages import (
 )
 from optodrive.study.page_respondent import PageRespondent
 
-LOOPBACK = "127.0.0.1"
 CONNECTIONS_MAX = 64
 PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 20.0
 """A page that does not answer a ping for this long is lost. One that comes back before that replaces itself."""
@@ -52,20 +45,6 @@ CLOSE_WAIT_S = 2.0
 """Limit for the last view to reach the pages."""
 NORMAL, INVALID, UNAUTHORISED, REPLACED = 1000, 1008, 4401, 4409
 """Codes with which a page's WebSocket is closed; the pages tell them apart."""
-SHARED_FILES = ("colours.css", "announcer.js")
-"""Files of the daemon's page."""
-
-
-class PageAddress(NamedTuple):
-    """Where the pages are served. port: 0 for any free one."""
-
-    host: str
-    port: int
-
-    @property
-    def is_local(self) -> bool:
-        """Whether only programs of this computer reach it, which may also call it by another name."""
-        return self.host in LOOPBACK_NAMES
 
 
 class Closure(NamedTuple):
@@ -73,17 +52,6 @@ class Closure(NamedTuple):
 
     code: int
     reason: str
-
-
-def parse_page_address(option: str, text: str) -> PageAddress:
-    """Parse `PORT`, on loopback, or `HOST:PORT`. Raise InputError."""
-    host, _, port = text.rpartition(":")
-    if not (port.isascii() and port.isdigit() and int(port) <= 65535) or ":" in host:
-        raise InputError(option, text, "PORT or HOST:PORT, a port from 0 to 65535")
-    with suppress(ValueError):
-        if ip_address(host).is_unspecified:
-            raise InputError(option, text, "the address by which the participant's device reaches this computer")
-    return PageAddress(host or LOOPBACK, int(port))
 
 
 class StudyPages:
@@ -109,7 +77,7 @@ class StudyPages:
         hosts = {address.host.lower(), *(LOOPBACK_NAMES if address.is_local else ())}
         self._server = uvicorn.Server(
             uvicorn.Config(
-                _HostCheck(self._build_app(), hosts),
+                HostCheck(self._build_app(), hosts),
                 ws="websockets-sansio",
                 ws_max_size=MESSAGE_MAX_BYTES,
                 ws_per_message_deflate=False,  # a small frame could need any amount of memory
@@ -142,13 +110,13 @@ class StudyPages:
         self._thread.join()
 
     def _build_app(self) -> Starlette:
-        contents = _read_files()
+        contents = read_files()
 
         async def get_page(request: Request) -> Response:
-            return _build_response(f"{request.url.path.removeprefix('/')}.html", contents)
+            return build_response(f"{request.url.path.removeprefix('/')}.html", contents)
 
         async def get_file(request: Request) -> Response:
-            return _build_response(request.path_params["name"], contents)
+            return build_response(request.path_params["name"], contents)
 
         return Starlette(
             routes=[
@@ -293,22 +261,6 @@ class _SentViews:
             self.round_trip_s = arrived_s - self._sent_s
 
 
-class _HostCheck:
-    """Refuses requests by Host and Origin, in front of the application."""
-
-    def __init__(self, app: App, hosts: set[str]) -> None:
-        self._app, self._hosts = app, hosts
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = join_headers((name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"])
-        problem = check_host_and_origin(headers, self._hosts)
-        if problem is None:
-            with suppress(WebSocketDisconnect):  # a page that left while something was sent to it
-                await self._app(scope, receive, send)
-        else:
-            await send_problem(send, problem, "websocket.http" if scope["type"] == "websocket" else "http")
-
-
 async def _accept(page: WebSocket, token: str) -> bool:
     """Accept a WebSocket. Close it at once if it presents another token: a refused one could not tell its page why."""
     presented = read_subprotocol_token(dict(page.headers))
@@ -348,15 +300,3 @@ async def _iterate_messages(page: WebSocket) -> Any:
 def _describe(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     return f"{'.'.join(map(str, first['loc'])) or 'message'}: {first['msg']}"[:120]
-
-
-def _read_files() -> dict[str, bytes]:
-    contents = {item.name: item.read_bytes() for item in files("optodrive.study").joinpath("page").iterdir()}
-    shared = files("optodrive.daemon").joinpath("page")
-    return contents | {name: shared.joinpath(name).read_bytes() for name in SHARED_FILES}
-
-
-def _build_response(name: str, contents: Mapping[str, bytes]) -> Response:
-    if name not in contents:
-        raise HTTPException(404)
-    return Response(contents[name], media_type=MEDIA_TYPES["." + name.rpartition(".")[2]], headers=SECURITY_HEADERS)
