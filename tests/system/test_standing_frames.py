@@ -1,5 +1,6 @@
 """Frames that stand: refreshed until the next or until their client ends, under fingers first, and dark after STOP."""
 
+import base64
 import json
 import os
 import signal
@@ -21,6 +22,7 @@ from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from rig import TOKEN, running, wait_for
 from test_six_experiments import cell_codes
+from test_telemetry import Reader
 
 PAGE = tuple(range(100, 160))
 PIXEL_OF = {tuple(codes): pixel for pixel, codes in enumerate(cell_codes().tolist())}
@@ -159,6 +161,36 @@ def test_dots_under_fingers_get_more_light_than_others_and_the_whole_page_withou
             wait_for(lambda: find_lead() >= LEAD, "more light under the finger")
         since = len(board.of("pulse"))
         wait_for(lambda: min(count_pulses(board, since)[pixel] for pixel in page) >= 1, "the whole page")
+
+
+def decode_page(event):
+    return np.flatnonzero(np.frombuffer(base64.b64decode(event["height"]), dtype="<u2"))
+
+
+def test_telemetry_says_where_fingers_are_and_what_their_dots_get(armed):
+    _board, daemon = armed
+    finger, page = 120, tuple(range(50, 400))
+    reader = Reader(daemon)
+    touched = json.dumps({"fingers": [place(finger)], "age_s": 0.0})
+    with show(daemon) as stream:
+        send_page(stream, page)
+        with socket(daemon, "/v1/fingers") as fingers:
+
+            def is_seen():
+                fingers.send(touched)
+                event = reader.last("fingers")
+                return event and event["fingers"] and (event["fingers"][0]["height_share"] or 0.0) > 0.9
+
+            wait_for(is_seen, "a dot that is as high as its page")
+            (seen,) = reader.last("fingers")["fingers"]
+            assert (seen["number"], seen["dots"], seen["radius_m"]) == (1, 1, 0.001)
+            assert (seen["x_m"], seen["y_m"]) == pytest.approx(PLACES[finger], abs=1e-4)
+            assert seen["rate_hz"] > 0.0
+            assert decode_page(reader.last("page")).tolist() == list(page)
+        wait_for(lambda: reader.last("fingers")["tracker"] == "lost", "the tracker to be lost")
+        assert reader.last("fingers")["fingers"] == []
+    wait_for(lambda: reader.last("page")["height"] == "", "the page to end")
+    reader.close()
 
 
 @pytest.mark.parametrize(

@@ -66,16 +66,19 @@ class LiveThermalState:
         self._peaks = self._build_no_peaks()
         self.out_of_order = 0
 
-    def apply(self, executed: ExecutedBatch) -> None:
-        """Add pulses, in order of time."""
+    def apply(self, executed: ExecutedBatch) -> FloatArray:
+        """Add pulses, in order of time. Return the displacement to which each raises its pixel, [n], m."""
+        displacement_m = np.zeros(len(executed.row))
         columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
         try:
             peaks = self._heat.apply_pulses(*columns)
+            displacement_m = peaks.displacement_m
             for held, values in zip(self._peaks, peaks, strict=True):
                 np.maximum.at(held, executed.pixel, values)
         except ValueError:
             self.out_of_order += len(executed.row)
         self._budget = commit_executed(executed.pixel, executed.stage, executed, self._budget, self._display.budget)
+        return displacement_m
 
     def shift_clock(self, delay_s: float) -> None:
         """Shift all past pulses by delay_s after a restart of the board's clock."""

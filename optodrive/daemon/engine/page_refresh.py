@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from math import ceil, inf
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from optodrive.planning.stimuli.standing_page import SLOT_S, Refresh, build_refr
 
 TRACKER_LOST_S = 0.1
 """Without the places of fingers for this time, the page is drawn as if there were none."""
+PAGE_GONE_S = 0.5
+"""A page that was not refreshed for this time no longer stands."""
 AHEAD_SLOTS = 2
 """A dot is drawn for a finger that will touch it within this number of slots."""
 MOVE_S = 4e-4
@@ -42,6 +45,7 @@ class PageRefresh:
         self._seen_s = -inf
         self._lock = threading.Lock()
         self._width_s = FIRST_WIDTH_S
+        self._page_m, self._selected_s = np.zeros(len(layout)), -inf
 
     def update_fingers(self, at_s: float, places: Sequence[FingerPlace]) -> None:
         """Take the places of all fingers at a time of the host's clock."""
@@ -55,10 +59,25 @@ class PageRefresh:
             is_lost = self._clock.now_s() - self._seen_s > TRACKER_LOST_S
             return () if is_lost else self._tracks.predict(at_s)
 
+    @property
+    def tracker(self) -> Literal["none", "seen", "lost"]:
+        """Whether the tracker reports, has ceased to, or never did."""
+        with self._lock:
+            if self._seen_s == -inf:
+                return "none"
+            return "lost" if self._clock.now_s() - self._seen_s > TRACKER_LOST_S else "seen"
+
+    @property
+    def page_m(self) -> FloatArray:
+        """Heights of the page that stands, [p], m, 0 without one."""
+        stands = self._clock.now_s() - self._selected_s <= PAGE_GONE_S
+        return self._page_m if stands else np.zeros(len(self._layout))
+
     def select(self, display: DisplayModel, page: FrameSequence, snapshot: PlanningSnapshot) -> Refresh:
         """Return the part of a page whose turn it is. Raise InputError for a height out of reach."""
         (frame,) = remove_dead_pixels(display, page)[0].frames
         check_targets_reachable(display, page)
+        self._page_m, self._selected_s = frame.target_m, self._clock.now_s()
         if snapshot.predecessor is not None:
             self._width_s = float(snapshot.predecessor.planned.plan.width_s.mean())
         pixel_time_s = self._width_s + MOVE_S

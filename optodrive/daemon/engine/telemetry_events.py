@@ -8,7 +8,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PulseBatch
+from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PageEvent, PulseBatch
 from optodrive.device.config_sections import LimitsSection
 from optodrive.physics.nominal_display import DisplayState
 from optodrive.planning.limiter.caps import CAPS_BY_KEY
@@ -30,6 +30,12 @@ def build_display_event(
         absorber=_encode_base64((ambient_c + state.absorber_k) / TEMPERATURE_UNIT_K),
         absorber_peak=_encode_base64((ambient_c + peaks.absorber_k) / TEMPERATURE_UNIT_K),
     )
+
+
+def build_page_event(board_s: float, page_m: FloatArray) -> PageEvent:
+    """Encode the heights of the standing page, [p], m, which are all 0 without one."""
+    height = _encode_base64(page_m / HEIGHT_UNIT_M) if page_m.any() else ""
+    return PageEvent(board_s=round(board_s, 6), height=height)
 
 
 def build_pulse_batch(

@@ -1,4 +1,4 @@
-"""Producer of the telemetry's display, budget and pulses events as text, from executed reports.
+"""Producer of the telemetry's display, budget, fingers, page and pulses events as text, from executed reports.
 
 It runs in a thread of its own. Without readers it only follows the executed pulses.
 """
@@ -17,12 +17,18 @@ from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.progress import ClockShift, merge_events
-from optodrive.daemon.engine.telemetry_events import build_display_event, build_pulse_batch, describe_caps
-from optodrive.daemon.responses.telemetry import BudgetEvent
+from optodrive.daemon.engine.telemetry_events import (
+    build_display_event,
+    build_page_event,
+    build_pulse_batch,
+    describe_caps,
+)
+from optodrive.daemon.engine.touch_report import TouchReport
+from optodrive.daemon.responses.telemetry import BudgetEvent, FingersEvent
 from optodrive.physics.nominal_display import DisplayState
 
 IDLE_RATE_HZ = 20.0
-BUDGET_PERIOD_S, COLD_DISPLAY_PERIOD_S = 0.25, 1.0
+BUDGET_PERIOD_S, COLD_DISPLAY_PERIOD_S, PAGE_PERIOD_S = 0.25, 1.0, 1.0
 DRAIN_PERIOD_S = 1.0
 """Interval between two collections of executed pulses without readers."""
 WARM_DISPLACEMENT_M, WARM_RISE_K = 5e-8, 0.1
@@ -55,6 +61,8 @@ class TelemetryProducer:
         self._publish_message = publish
         self._on_failure = on_failure
         self._executed_state = LiveThermalState(engine.display)
+        self._touch = TouchReport(engine.display.layout)
+        self._tracker, self._page_m = "", np.zeros(0)
         self._batches: deque[Message] = deque(maxlen=BATCHES_MAX)
         self._batch_number = 0
         self._announced_rows: dict[ActivePlan, int] = {}
@@ -117,6 +125,7 @@ class TelemetryProducer:
             self._executed_state.take_peaks()  # they are older than what the next reader has seen
             return
         self._publish_display(now_s, board_s)
+        self._publish_touch(now_s, board_s)
         if self._is_due("budget", now_s, BUDGET_PERIOD_S):
             caps = describe_caps(self._executed_state.compute_usage(board_s), self._config.limits)
             panel_c = round(self._executed_state.compute_panel_c(board_s), 3)
@@ -149,14 +158,26 @@ class TelemetryProducer:
             event = build_display_event(board_s, self._is_warm, pixel_state, peaks, self._config.ambient_c)
             self._publish("display", event)
 
+    def _publish_touch(self, now_s: float, board_s: float) -> None:
+        """Publish fingers while a tracker reports, the page when it changes, and both from time to time."""
+        page, tracker = self._engine.page, self._engine.page.tracker
+        page_m = page.page_m
+        if tracker == "seen" or tracker != self._tracker or self._is_due("fingers", now_s, PAGE_PERIOD_S):
+            touched = self._touch.build(board_s, page.find_fingers(now_s), page_m)
+            self._publish("fingers", FingersEvent(board_s=round(board_s, 6), tracker=tracker, fingers=touched))
+        if not np.array_equal(page_m, self._page_m) or self._is_due("page", now_s, PAGE_PERIOD_S):
+            self._publish("page", build_page_event(board_s, page_m))
+        self._tracker, self._page_m = tracker, page_m
+
     def _collect_executed(self) -> None:
         for event in merge_events(self._engine.drain_events()):
             if isinstance(event, ClockShift):
                 self._executed_state.shift_clock(event.delay_s)
+                self._touch.clear()
                 continue
             executed = ExecutedBatch.from_progress(event, self._engine.scales)
             if len(executed.row):
-                self._executed_state.apply(executed)
+                self._touch.add(executed.pixel, executed.start_s, self._executed_state.apply(executed))
                 columns = (executed.start_s, executed.width_s, executed.power_w)
                 self._add_batch("executed", executed.plan, executed.row, *columns)
 

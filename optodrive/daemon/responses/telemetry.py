@@ -1,6 +1,7 @@
 """The events of GET /v1/telemetry, except `state`, which is a StateReport."""
 
 from collections.abc import Mapping
+from typing import Literal
 
 from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel, TextColumn
 from optodrive.daemon.responses.state import StateReport
@@ -73,11 +74,48 @@ class BudgetEvent(JsonModel):
     panel_c: float
 
 
+class TouchedFinger(JsonModel):
+    """A fingertip, with rate and height of the dots of the standing page under it, null without such dots.
+
+    dots: of the page, under the contact
+    rate_hz: mean number of pulses of a dot in the last 0.2 s, per second
+    height_share: mean height of their newest pulses relative to the page's, at most 1; a dot without one counts as 0
+    """
+
+    number: int
+    x_m: float
+    y_m: float
+    radius_m: float
+    dots: int
+    rate_hz: float | None
+    height_share: float | None
+
+
+class FingersEvent(JsonModel):
+    """Fingertips at a board time.
+
+    tracker: seen, lost (silent for 0.1 s) or none, which has not reported since the daemon started
+    """
+
+    board_s: float
+    tracker: Literal["none", "seen", "lost"]
+    fingers: list[TouchedFinger]
+
+
+class PageEvent(JsonModel):
+    """Heights of the standing page as base64 of little-endian u16 in 0.1 µm, empty without a page."""
+
+    board_s: float
+    height: str
+
+
 EVENTS: Mapping[str, type[JsonModel]] = {
     "state": StateReport,
     "display": DisplayEvent,
     "pulses": PulsesEvent,
     "budget": BudgetEvent,
+    "fingers": FingersEvent,
+    "page": PageEvent,
     "fault": FaultEvent,
 }
 """Every event by its name."""
