@@ -1,4 +1,4 @@
-// The display: one square per pixel, the drawing, and the path of the beam. A picture of the grid is scaled up.
+// The display: one square per pixel, the drawing, the page that stands, fingers, and the path of the beam. A picture of the grid is scaled up.
 
 import { buildColourMap, readThemeColour } from "./colours.js";
 
@@ -12,6 +12,8 @@ export class DisplayView {
     this.quantity = "height";
     this.cursor = grid.centre();
     this.drawn = new Float32Array(grid.pixels);
+    this.page = new Uint16Array(grid.pixels);
+    this.fingers = []; // label, and place and radius in pitches from the first column and row
     this.beamPath = [];
     this.values = { height: new Float32Array(grid.pixels), absorber: new Float32Array(grid.pixels), preview: new Float32Array(grid.pixels) };
     this.ambient = 20;
@@ -85,6 +87,7 @@ export class DisplayView {
     context.drawImage(this.lattice, 0, 0, this.canvas.width, this.canvas.height);
     context.drawImage(this.marks, 0, 0);
     this.#paintBeam();
+    this.#paintFingers();
     this.#paintCursor();
     this.frames++;
     this.canvas.dataset.frames = this.frames;
@@ -121,6 +124,11 @@ export class DisplayView {
         const [x, y] = this.#corner(pixel);
         context.strokeRect(x + line / 2, y + line / 2, this.cell - line, this.cell - line);
       }
+      if (this.page[pixel] > 0) {
+        context.beginPath();
+        context.arc(...this.#centre(pixel), (this.cell - line) / 2, 0, 7);
+        context.stroke();
+      }
     }
     this.requestPaint();
   }
@@ -146,6 +154,29 @@ export class DisplayView {
     context.fill();
     context.strokeStyle = "black";
     context.stroke();
+  }
+
+  // White discs with a dark edge contrast with every colour of the maps; the number tells them apart.
+  #paintFingers() {
+    const { context, cell } = this;
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.font = `700 ${Math.max(14, cell * 0.9)}px system-ui, sans-serif`;
+    for (const { label, column, row, radius } of this.fingers) {
+      const [x, y] = [(column + 0.5) * cell, (this.grid.rows - 0.5 - row) * cell];
+      for (const [width, colour] of [[5, "black"], [2, "white"]]) {
+        context.lineWidth = width;
+        context.strokeStyle = colour;
+        context.beginPath();
+        context.arc(x, y, Math.max(radius, 0.5) * cell, 0, 7);
+        context.stroke();
+      }
+      context.lineWidth = 4;
+      context.strokeStyle = "black";
+      context.strokeText(label, x, y);
+      context.fillStyle = "white";
+      context.fillText(label, x, y);
+    }
   }
 
   #paintCursor() {

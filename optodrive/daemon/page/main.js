@@ -9,6 +9,7 @@ import { buildColourMap } from "./colours.js";
 import { DimControl } from "./dim.js";
 import { DisplayView } from "./display.js";
 import { Drawing } from "./draw.js";
+import { FingersView } from "./fingers.js";
 import { Freshness } from "./freshness.js";
 import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
@@ -69,6 +70,7 @@ const view = new DisplayView(find("display"), grid);
 view.ambient = config.ambient_c;
 view.maxC = config.limits.absorber_max_c;
 const drawing = new Drawing(view);
+const fingersView = new FingersView(find, view, config.display.pitch_m, announce);
 const timeline = new Timeline(find("timeline"), find("timeline-text"), config.laser.max_power_w);
 const trace = new Trace(find("trace"));
 const gauges = new Gauges(find("gauges"));
@@ -327,6 +329,8 @@ telemetry.addEventListener("budget", ({ detail }) => {
     freshness.see("budget"); // without a link nobody knows what the board executes
   }
 });
+telemetry.addEventListener("fingers", ({ detail }) => fingersView.showFingers(detail));
+telemetry.addEventListener("page", ({ detail }) => fingersView.showPage(detail));
 telemetry.addEventListener("pulses", ({ detail }) => timeline.addPulses(detail));
 telemetry.addEventListener("display", ({ detail }) => {
   find("stale").hidden = true;

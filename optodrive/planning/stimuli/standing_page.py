@@ -24,6 +24,8 @@ from optodrive.planning.stimuli.streamed_frame import FRAME_DURATION_S
 REFRESH_PERIOD_S = 0.04
 """Time from one pulse of a pixel to its next turn. Touch tells less than 20 per second from a standing dot."""
 BURST_S = 0.012
+BURST_MAX_S = 0.024
+"""Longest burst under fingers. A newer refresh replaces the end of its path, which would leave one finger dark."""
 REST_MIN = 6
 """Pixels away from the fingers that are worth the mirrors' way."""
 SLOT_S = 0.01
@@ -61,7 +63,8 @@ def select_bursts(
         due_touched_s, due_rest_s = np.where(touched, due_s, inf), np.where(touched, inf, due_s)
         next_s = float(due_touched_s.min(initial=inf))
         if next_s <= now_s:
-            chosen = _take_oldest(due_touched_s, now_s + BURST_S, horizon_s - now_s, pixel_time_s)
+            span_s = min(BURST_MAX_S, horizon_s - now_s)
+            chosen = _take_oldest(due_touched_s, now_s + BURST_S, span_s, pixel_time_s)
         else:
             chosen = _take_oldest(due_rest_s, now_s, min(next_s, horizon_s) - now_s, pixel_time_s)
             if not len(chosen) or len(chosen) < min(REST_MIN, int(np.count_nonzero(~touched))):

@@ -29,8 +29,11 @@ from optodrive.daemon.responses.telemetry import (
     CapUsage,
     DisplayEvent,
     FaultEvent,
+    FingersEvent,
+    PageEvent,
     PulseBatch,
     PulsesEvent,
+    TouchedFinger,
 )
 from optodrive.planning.effective_config import EffectiveConfig
 from optodrive.planning.stimuli.pattern import PatternDescription, PatternParameter
@@ -39,6 +42,7 @@ from optodrive.planning.summary_schema import DelaySummary, PlanSummary, PulseCo
 PAGE = Path(optodrive.daemon.__file__).parent / "page"
 VARIABLES = {
     "api.js": {"problem": Problem},
+    "fingers.js": {"finger": TouchedFinger},
     "gauges.js": {"cap": CapUsage},
     "grid.js": {"config": EffectiveConfig, "display": EffectiveConfig.model_fields["display"].annotation},
     "history.js": {"fault": FaultEvent, "plan": RecentPlan, "queue": QueueReport, "totals": PulseTotals},
@@ -59,6 +63,8 @@ EVENT_DETAILS = {"state": StateReport, "fault": FaultEvent, "budget": BudgetEven
 DESTRUCTURED = {
     ("main.js", r"const \[config, \{([^}]*)\}\]"): PatternList,
     ("arm.js", r"const \{([^}]*)\} = control;"): ControlReport,
+    ("fingers.js", r"showFingers\(\{([^}]*)\}\)"): FingersEvent,
+    ("fingers.js", r"showPage\(\{([^}]*)\}\)"): PageEvent,
     ("header.js", r"showState\(\{([^}]*)\}\)"): StateReport,
     ("pause.js", r"const \{([^}]*)\} = await call"): StateReport,
     ("permissions.js", r"const \{([^}]*)\} = this.caller;"): CallerReport,
