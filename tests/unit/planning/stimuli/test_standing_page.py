@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from optodrive.core.types.stimuli import TactileFrame
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
+from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 from optodrive.planning.stimuli import standing_page
 from optodrive.planning.stimuli.standing_page import (
     REFRESH_PERIOD_S,
@@ -21,20 +22,29 @@ LAYOUT = build_pixel_layout(load_config("display-1511").display)
 COUNT = len(LAYOUT)
 
 
-def draw_for(seconds, target_m, find_touched, cut_s=0.023):
-    """Draw a page as a stream does whose plans are replaced every cut_s. Return pixel and start of every pulse."""
+def draw_for(seconds, target_m, find_touched, cut_s=0.023, along_path=False):
+    """Draw a page as a stream does whose plans are replaced every cut_s. Return pixel and start of every pulse.
+
+    along_path: draw each burst along the path that `build_refresh` gives it
+    """
     drawn_s, pulses, begin_s = np.full(len(target_m), -np.inf), [], 0.0
     while begin_s < seconds:
         is_touched = np.array([find_touched(begin_s + slot * SLOT_S) for slot in range(SLOTS)])
-        end_s = begin_s + cut_s
+        end_s, origin = begin_s + cut_s, None
         for burst in select_bursts(target_m, is_touched, drawn_s, begin_s, PIXEL_S):
-            for number, pixel in enumerate(burst.pixels.tolist()):
+            order = order_along_path(burst.pixels, origin) if along_path else burst.pixels
+            origin = int(order[-1])
+            for number, pixel in enumerate(order.tolist()):
                 start_s = begin_s + burst.begin_s + number * PIXEL_S
                 if start_s < end_s:
                     pulses.append((pixel, start_s))
                     drawn_s[pixel] = start_s
         begin_s = max(end_s, pulses[-1][1] + PIXEL_S if pulses else 0.0)
     return np.array([pixel for pixel, _ in pulses]), np.array([start_s for _, start_s in pulses])
+
+
+def order_along_path(pixels, origin):
+    return compute_visiting_order(pixels, LAYOUT.row, LAYOUT.column, LAYOUT.x_m, LAYOUT.y_m, origin)
 
 
 def starts_of(pixels, starts_s, pixel):
@@ -66,6 +76,22 @@ def test_fingers_on_more_than_the_beam_can_refresh_share_it():
     counts = np.bincount(pixels, minlength=COUNT)
     assert counts[:40].max() - counts[:40].min() <= 2
     assert counts[40:].sum() == 0
+
+
+def count_under_two_fingers():
+    """Return the pulses under either of two fingers on a page that is raised everywhere, in 4 s."""
+    hands = [np.argsort(np.hypot(LAYOUT.x_m - x_m, LAYOUT.y_m))[:13] for x_m in (-0.009, 0.009)]
+    pixels, _ = draw_for(4.0, np.full(COUNT, 50e-6), touch(*np.concatenate(hands)), 0.05, along_path=True)
+    counts = np.bincount(pixels, minlength=COUNT)
+    return sorted(int(counts[hand].sum()) for hand in hands)
+
+
+def test_neither_of_two_fingers_stays_without_light(monkeypatch):
+    fewer, more = count_under_two_fingers()
+    assert fewer >= 0.9 * more
+    monkeypatch.setattr(standing_page, "BURST_MAX_S", 1.0)  # mutant
+    fewer, more = count_under_two_fingers()
+    assert fewer < 0.6 * more
 
 
 def test_without_fingers_every_pixel_gets_its_turn():
