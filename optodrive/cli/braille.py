@@ -34,6 +34,9 @@ def braille(
         Path, typer.Option("--key-file", help="With brlapi: key that a client must be able to read.")
     ] = KEY_FILE,
     height_um: Annotated[float, typer.Option("--height-um", min=0.0, help="Height of a dot, µm.")] = HEIGHT_UM,
+    fingers: Annotated[
+        bool, typer.Option("--fingers", help="Refresh dots under fingers first, whose places a tracker reports.")
+    ] = False,
     url: UrlOption = DEFAULT_URL,
     hold: HoldOption = False,
 ) -> None:
@@ -85,9 +88,9 @@ def braille(
         size = f"{columns} cells" if rows == 1 else f"{rows} lines of {columns} cells"
         pixels = [slot for line in places for slot in line]
         try:
-            with display.stream() as stream:
+            with display.stream(standing=fingers) as stream:
                 print(f"{size} at {place}; Ctrl-C ends it", flush=True)
-                ReaderPort(channel, cells, stream, pixels, height_um, len(layout), _report).run()
+                ReaderPort(channel, cells, stream, pixels, height_um, len(layout), _report, fingers).run()
         finally:
             channel.close()
 

@@ -2,8 +2,9 @@
 
 Theory of operation. A port takes the place of that of a braille display, whose cells are those of the tactile display.
 Dots fall within a second without light, so all cells are streamed again every FRAME_S while any dot is up, and of these
-frames the newest wins. When the reader is gone, the cells are cleared. The end of this process closes the stream, whose
-pulses the daemon drops.
+frames the newest wins. A stream whose frames stand refreshes them itself, first where fingers are: it gets the cells
+when they change, and again as long as they are not shown. When the reader is gone, the cells are cleared. The end of
+this process closes the stream, whose pulses the daemon drops.
 """
 
 import os
@@ -86,6 +87,7 @@ class ReaderPort:
     """The screen reader at the other end of a port, and the keys of standard input.
 
     pixels: of each dot of each cell; report: takes a line on what was not shown or not understood
+    stands: whether the stream's frames stand
     """
 
     def __init__(
@@ -97,12 +99,14 @@ class ReaderPort:
         height_um: float,
         pixel_count: int,
         report: Callable[[str], None],
+        stands: bool = False,
     ) -> None:
         self._channel, self._protocol, self._stream, self._report = channel, protocol, stream, report
         self._pixels, self._height_um, self._pixel_count = pixels, height_um, pixel_count
         self._keys = [sys.stdin.fileno()]
         self._shown = bytes(protocol.count)
         self._problem = ""
+        self._stands = stands
 
     def run(self) -> None:
         """Run until an exception ends it."""
@@ -110,7 +114,9 @@ class ReaderPort:
         while True:
             self._take_input(max(0.0, due_s - time.monotonic()))
             is_due = time.monotonic() >= due_s
-            if self._protocol.cells != self._shown or (is_due and any(self._shown)):
+            self._take_results()
+            is_again = any(self._shown) and (not self._stands or bool(self._problem))
+            if self._protocol.cells != self._shown or (is_due and is_again):
                 self._show(self._protocol.cells)
             if is_due:
                 due_s = time.monotonic() + FRAME_S
@@ -143,13 +149,15 @@ class ReaderPort:
     def _show(self, cells: bytes) -> None:
         self._stream.send(draw_cells(cells, self._pixels, self._height_um, self._pixel_count))
         self._shown = cells
+
+    def _take_results(self) -> None:
         for result in self._stream.results():
             if result.status in NOT_SHOWN:
                 problem = result.error or (result.problem.detail if result.problem else result.status)
                 if problem != self._problem:
                     self._report(f"not shown: {problem}")
                 self._problem = problem
-            elif result.executed:
+            elif result.executed or (self._stands and result.status == "planned"):
                 self._problem = ""
 
 
