@@ -11,14 +11,13 @@ import string
 import struct
 import threading
 import time
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from measuring import Row, build_display, build_frames, running_daemon, to_ms
 from websockets.sync.client import connect
 
-from rig import TOKEN  # of the tests
+from finger_judge import Touch, judge, read_pulses  # of the tests
+from rig import TOKEN
 
 NAME, HEIGHT_UM = "display-1511", 50.0
 SPEEDS_M_PER_S = (0.02, 0.05, 0.1)
@@ -28,9 +27,7 @@ APART_M, RADIUS_M = 0.018, 0.005
 TRACKER_HZ, AGE_S, NOISE_M = 100.0, 0.01, 3e-4
 LIFTED_S = 0.3
 """Time of the way to the next line, in which no finger touches."""
-WINDOW_S, SHARE_MIN = 0.05, 0.9
 LATENCY_S = 0.06
-DUTY_MAX = 65535
 LEAD_S = 0.02
 VIRTUAL_S, REPLACED_S = 60.0, 0.025
 """Time of reading without a daemon, and time after which each refresh is replaced there."""
@@ -40,14 +37,6 @@ OPTIONS = {
     "--virtual-s": {"type": float, "default": VIRTUAL_S, "help": "of reading in virtual time, for the caps"},
     "--seed": {"type": int, "default": 5, "help": "of the text"},
 }
-
-
-class Touch(NamedTuple):
-    """A fingertip that touches the display at a time."""
-
-    number: int
-    x_m: float
-    y_m: float
 
 
 class ReadingHand:
@@ -105,51 +94,6 @@ def track(link, hand, begin_s, seconds):
         link.send(json.dumps({"fingers": fingers, "age_s": AGE_S + time.monotonic() - due_s}))
 
 
-class Pulses(NamedTuple):
-    """Pulses of a board's log, [n].
-
-    pixel; start_s: in the host's time; peak_m: displacement to which the thermal model raises the pixel; energy_j
-    """
-
-    pixel: np.ndarray
-    start_s: np.ndarray
-    peak_m: np.ndarray
-    energy_j: np.ndarray
-
-
-def read_pulses(board, display):
-    from optodrive.link.board_setup import build_board_requirements
-
-    layout, angle = display.layout, 1.0 / (2.0 * display.config.scanner.focal_length_m)
-    scale = build_board_requirements(display.config).scale
-    codes = np.column_stack([scale.to_codes(layout.x_m * angle), scale.to_codes(layout.y_m * angle)])
-    pixel_of = {tuple(code): pixel for pixel, code in enumerate(codes.tolist())}
-    pulses = board.all_of("pulse")
-    pixel = np.array([pixel_of[pulse["x"], pulse["y"]] for pulse in pulses])
-    on_s, off_s = (1e-6 * np.array([pulse[key] for pulse in pulses]) for key in ("on_us", "off_us"))
-    power_w = scale.full_power_w / DUTY_MAX * np.array([pulse["duty"] for pulse in pulses])
-    peaks = display.build_cold_heat().apply_pulses(pixel, on_s, off_s - on_s, power_w)
-    zero_s = float(Path(f"{board.port}.clock").read_text())
-    return Pulses(pixel, zero_s + on_s, peaks.displacement_m, power_w * (off_s - on_s))
-
-
-def judge(pulses, display, target_m, hand, begin_s, seconds):
-    """Return of all dots under pads at all times the share with a high enough pulse in time, and its mean rate, 1/s."""
-    layout = display.layout
-    raised = np.flatnonzero(target_m)
-    is_high = pulses.peak_m >= SHARE_MIN * target_m[pulses.pixel]
-    starts = {pixel: pulses.start_s[(pulses.pixel == pixel) & is_high] for pixel in raised.tolist()}
-    good = seen = 0
-    for at_s in np.arange(1.0, seconds, 0.005):
-        for touch in hand.find_touches(at_s):
-            distance_m = np.hypot(layout.x_m[raised] - touch.x_m, layout.y_m[raised] - touch.y_m)
-            for pixel in raised[distance_m <= RADIUS_M].tolist():
-                row = np.searchsorted(starts[pixel], begin_s + at_s)
-                seen += 1
-                good += row > 0 and starts[pixel][row - 1] > begin_s + at_s - WINDOW_S
-    return good / seen, seen
-
-
 def measure_reading(display, heights_um, lines, speed, seconds, lead_s):
     with running_daemon(NAME, text=f"stream_lead_s = {lead_s}") as (board, daemon):
         daemon.arm()
@@ -167,7 +111,10 @@ def measure_reading(display, heights_um, lines, speed, seconds, lead_s):
             tracker.join()
             underruns = daemon.state()["board"]["underruns"]
         pulses = read_pulses(board, display)
-    share, _ = judge(pulses, display, 1e-6 * heights_um, hand, begin_s, seconds)
+    times_s = begin_s + np.arange(1.0, seconds, 0.005)
+    share, _ = judge(
+        pulses, display, 1e-6 * heights_um, lambda at_s: hand.find_touches(at_s - begin_s), times_s, RADIUS_M
+    )
     name = f"{100 * speed:g} cm/s"
     yield f"{name}: dots under the pads at 0.9 of their height and 20 Hz", share, "1"
     for key, what in (("planned_s", "plan"), ("first_byte_s", "first byte"), ("first_light_s", "first light")):

@@ -22,7 +22,7 @@ from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState
-from optodrive.daemon.responses.telemetry import BudgetEvent, DisplayEvent, PulseBatch
+from optodrive.daemon.responses.telemetry import EVENTS, PulseBatch
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.sequence_codec import encode_sequence
 from rig import Board, config_text, wait_for
@@ -273,8 +273,7 @@ def test_telemetry_is_sent_while_there_are_readers_and_pulses_once(web):
     wait_for(lambda: len(executed_rows(web)) >= 20, "the pulses from before")
     wait_for(lambda: {"display", "budget"} <= {m.fields["event"] for m in web.of_kind("telemetry")}, "one of each")
     for message in web.of_kind("telemetry"):
-        model = {"display": DisplayEvent, "budget": BudgetEvent}[message.fields["event"]]
-        model.model_validate_json(message.payload)
+        EVENTS[message.fields["event"]].model_validate_json(message.payload)
     second = Web(web.socket._connection.getpeername(), web.engine)
     second.send("telemetry", readers=2, rate_hz=30.0)
     wait_for(lambda: len(executed_rows(second)) >= 20, "the same pulses")
