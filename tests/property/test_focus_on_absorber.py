@@ -160,6 +160,45 @@ def test_in_a_full_frame(name, height_m):
     assert max_overhang_m(display, plan_pulses(display, full_frame(display, height_m))) <= ROUNDING_M
 
 
+def draw_sequence(rng, display):
+    """Return a frame of random heights, or pulses of random widths on random pixels."""
+    count, period_s = len(display.layout), 1.0 / display.config.laser.pwm_hz
+    if rng.random() < 0.5:
+        target_m = np.where(rng.random(count) < rng.uniform(0.1, 1.0), rng.uniform(5e-6, 60e-6, count), 0.0)
+        return FrameSequence((TactileFrame("random", 0.0, 60.0, target_m),))
+    widths_s = period_s * rng.choice([1, 1, 2, 5, 20], 400)
+    begins_s = np.cumsum(widths_s) - widths_s
+    pixels = rng.integers(0, count, 400).tolist()
+    rows = zip(pixels, begins_s.tolist(), widths_s.tolist(), strict=True)
+    return FrameSequence(
+        trains=tuple(PulseTrain(pixel, at_s, wide_s, wide_s, 0.0, 1.0) for pixel, at_s, wide_s in rows)
+    )
+
+
+def count_judged(name, count, seed):
+    """Judge random plans with servos at random places of their uncertainty until `count` pulses are judged."""
+    rng, display, pulses = np.random.default_rng(seed), DISPLAYS[name], 0
+    while pulses < count:
+        plan = plan_pulses(display, draw_sequence(rng, display))
+        place = tuple(rng.choice([-1.0, 1.0, rng.uniform(-1.0, 1.0)], 4).tolist())
+        assert overhang_m(with_servo(display, place), plan) <= ROUNDING_M, (name, seed, place)
+        pulses += len(plan)
+    return pulses
+
+
+@pytest.mark.parametrize("name", ["display-16", "display-437"])
+def test_random_plans_of_a_shipped_display(name):
+    assert count_judged(name, 400, seed=1) >= 400
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(0)
+@pytest.mark.parametrize("part", range(5))
+@pytest.mark.parametrize("name", ["display-16", "display-357", "display-437", "display-1511"])
+def test_a_million_pulses_of_random_plans(name, part):
+    assert count_judged(name, 50_000, seed=100 + part) >= 50_000
+
+
 @pytest.mark.parametrize("name", sorted(EXACT))
 def test_an_uncertainty_that_is_forgotten_is_caught(name):
     """Mutants: half of an uncertainty."""
