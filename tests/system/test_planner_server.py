@@ -271,7 +271,8 @@ def test_telemetry_is_sent_while_there_are_readers_and_pulses_once(web):
         return [row for batch in texts if batch.plan == plan for row in batch.row]
 
     wait_for(lambda: len(executed_rows(web)) >= 20, "the pulses from before")
-    wait_for(lambda: {"display", "budget"} <= {m.fields["event"] for m in web.of_kind("telemetry")}, "one of each")
+    made = {"display", "budget", "fingers", "page"}
+    wait_for(lambda: made <= {m.fields["event"] for m in web.of_kind("telemetry")}, "one of each")
     for message in web.of_kind("telemetry"):
         EVENTS[message.fields["event"]].model_validate_json(message.payload)
     second = Web(web.socket._connection.getpeername(), web.engine)
