@@ -78,6 +78,7 @@ def list_judged(reader):
     return [event for event in reader.of("fingers") if all(find_light(event, number) for number in FINGERS)]
 
 
+@pytest.mark.slow  # the windows of telemetry and judge end at times that a stall of the computer moves apart
 def test_the_light_in_the_telemetry_is_that_of_the_board_s_log(rig, display):
     board, daemon = rig
     daemon.arm()
