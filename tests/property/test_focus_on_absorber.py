@@ -14,6 +14,7 @@ from hidden_field import calibrate_hidden_field
 from optodrive.core.errors import InputError, LocalProtocolError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
+from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.gate_timing import build_servo_range
 from optodrive.device.settling import SettlingTable
 from optodrive.link.board_setup import build_board_requirements
@@ -32,13 +33,13 @@ SLOWEST = (-1.0, 1.0, -1.0, 1.0)
 PLACES = (SLOWEST, (1.0, -1.0, 1.0, -1.0), (-1.0, -1.0, -1.0, 1.0), (0.0, 0.0, 0.0, 0.0))
 
 
-def overhang_m(display, plan, position_of=ideal_position_m):
+def overhang_m(display, plan, position_of=ideal_position_m, stage=0):
     """Return how far the focus, with its aim error, extends beyond an absorber's edge while the gate is on, m.
 
     It is negative if the focus never does.
     """
     scale = build_board_requirements(display.config).scale
-    points = quantise(plan, scale)
+    points = quantise(plan, scale, stage)
     x, y, dark, on, _ = points.table.astype(np.int64).T
     begin_s = np.concatenate([[0], np.cumsum(dark + on)[:-1]]) * scale.tick_s
     gate_on = np.flatnonzero(on)
@@ -208,6 +209,24 @@ def test_an_uncertainty_that_is_forgotten_is_caught(name):
     for planned, is_caught in ((display, False), (loose, True)):
         plan = plan_pulses(planned, full_frame(planned, 50e-6))
         assert (max_overhang_m(display, plan, places=(SLOWEST,)) > ROUNDING_M) == is_caught
+
+
+def test_the_beams_of_several_stages(tmp_path):
+    """Each beam has the settling times of its own mirrors; by those of the other, the slower one is caught."""
+    stages = "".join(
+        f'\n[[stages]]\nname = "{name}"\nscanner = {{ bandwidth_hz = {hz} }}\n'
+        for name, hz in (("left", 1700.0), ("right", 1000.0))
+    )
+    path = tmp_path / "stages.toml"
+    path.write_text(locate_shipped("display-437.toml").read_text() + stages)
+    display = DisplayModel.from_config(load_config(path))
+    left, right = (replace(display, config=config) for config in display.config.list_stage_configs())
+    plan = plan_pulses(display, full_frame(display, 20e-6))
+    assert set(plan.stage.tolist()) == {0, 1}
+    for stage, beam in enumerate((left, right)):
+        judges = [with_servo(beam, place) for place in PLACES]
+        assert max(overhang_m(judge, plan, stage=stage) for judge in judges) <= ROUNDING_M
+    assert overhang_m(with_servo(right, SLOWEST), plan, stage=0) > 1e-4
 
 
 def helios_display(display, points_per_s, trajectories="steps"):
