@@ -6,12 +6,18 @@ const TRACKERS = {
   none: "No tracker reports fingers.",
   seen: "A tracker reports the fingers.",
   lost: "The tracker is lost: the whole page is drawn in turn.",
+  unknown: "Unknown where fingers are: no data from the daemon.",
 };
 const TEXT_MS = 500;
+const MEAN_MS = 1000; // the telemetry counts pulses over 0.2 s, in which one more or less is 5 per second
+const STEADY_MS = 1000; // a tracker that comes and goes faster is not announced each time
 
 export class FingersView {
   #tracker = "none";
+  #said = "none";
+  #sayTimer = null;
   #textDueMs = 0;
+  #recent = new Map(); // number of a finger → its figures of the last MEAN_MS
 
   constructor(find, view, pitchM, announce) {
     this.find = find;
@@ -39,32 +45,64 @@ export class FingersView {
       radius: finger.radius_m / this.pitchM,
     }));
     this.view.requestPaint();
-    if (tracker !== this.#tracker) {
-      this.announce(TRACKERS[tracker]); // said once; the figures change all the time and are not
-    }
     const now = performance.now();
-    if (tracker === this.#tracker && now < this.#textDueMs) {
+    this.#remember(fingers, now);
+    if (!this.#follow(tracker) && now < this.#textDueMs) {
       return;
     }
-    this.#tracker = tracker;
     this.#textDueMs = now + TEXT_MS;
     this.#describePage();
     this.find("fingers").replaceChildren(...fingers.map((finger) => this.#buildLine(finger)));
   }
 
+  // Show nothing: where fingers are and what stands is unknown.
+  clear() {
+    const [event, page] = [{ tracker: "unknown", fingers: [] }, { height: "" }];
+    this.showFingers(event);
+    this.showPage(page);
+  }
+
+  // Return whether the tracker's state is another one. It is said once, and the figures, which change all the time, are not.
+  #follow(tracker) {
+    if (tracker === this.#tracker) {
+      return false;
+    }
+    this.#tracker = tracker;
+    clearTimeout(this.#sayTimer);
+    if (tracker !== this.#said && tracker !== "unknown") {
+      this.#sayTimer = setTimeout(() => {
+        this.#said = tracker;
+        this.announce(TRACKERS[tracker]);
+      }, STEADY_MS);
+    }
+    return true;
+  }
+
+  #remember(fingers, now) {
+    const touching = fingers.filter((finger) => finger.dots > 0);
+    const kept = touching.map((finger) => {
+      const before = (this.#recent.get(finger.number) ?? []).filter(({ at }) => at > now - MEAN_MS);
+      return [finger.number, [...before, { at: now, rateHz: finger.rate_hz, share: finger.height_share }]];
+    });
+    this.#recent = new Map(kept);
+  }
+
   #buildLine(finger) {
     const line = document.createElement("li");
     const dots = `${finger.dots} ${finger.dots === 1 ? "dot" : "dots"}`;
+    const recent = this.#recent.get(finger.number) ?? [];
+    const mean = (name) => recent.reduce((sum, each) => sum + each[name], 0) / recent.length;
     line.textContent = finger.dots
-      ? `Finger ${finger.number}: ${dots}, ${finger.rate_hz.toFixed(0)} pulses/s each, ${(100 * finger.height_share).toFixed(0)} % of their height`
+      ? `Finger ${finger.number}: ${dots}, ${mean("rateHz").toFixed(0)} pulses/s each, ${(100 * mean("share")).toFixed(0)} % of the height`
       : `Finger ${finger.number}: no dots of the page`;
     return line;
   }
 
   #describePage() {
-    const isUsed = this.#tracker !== "none" || this.dots > 0;
+    const isUsed = !["none", "unknown"].includes(this.#tracker) || this.dots > 0;
     this.find("fingers-panel").hidden &&= !isUsed; // once shown it stays, so that nothing moves
-    this.find("standing").textContent = this.dots ? `A page of ${this.dots} dots stands.` : "No page stands.";
+    const page = this.dots ? `A page of ${this.dots} dots stands.` : "No page stands.";
+    this.find("standing").textContent = this.#tracker === "unknown" ? "" : page;
     this.find("tracker").textContent = TRACKERS[this.#tracker];
   }
 }

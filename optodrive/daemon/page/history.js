@@ -7,7 +7,7 @@ const PLANS_MAX = 50;
 const LEAVING_MS = 5000; // a page that is left or reloaded ends its own connection
 const STORE = "history";
 const TIME = new Intl.DateTimeFormat(undefined, { timeStyle: "medium", hourCycle: "h23" });
-const FRAME_NAME = /^frame \d+$/; // of a streamed frame, as the daemon names its plan
+export const FRAME_NAME = /^frame \d+$/; // of a streamed frame, as the daemon names its plan
 
 export class History {
   constructor(find) {

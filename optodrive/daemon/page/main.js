@@ -92,8 +92,15 @@ const freshness = new Freshness(
     board: [panelOf("figures")],
     budget: [panelOf("gauges")],
     display: [panelOf("display"), panelOf("timeline"), panelOf("trace")],
+    fingers: [panelOf("fingers")],
   },
-  (source) => source === "state" && showNothingKnown("no data from the daemon"),
+  (source) => {
+    if (source === "state") {
+      showNothingKnown("no data from the daemon");
+    } else if (source === "fingers") {
+      fingersView.clear();
+    }
+  },
 );
 const pastEvents = new History(find);
 const queue = new QueueView(find, announce, showError);
@@ -278,6 +285,7 @@ telemetry.addEventListener("up", () => {
 });
 telemetry.addEventListener("down", () => {
   freshness.lose();
+  fingersView.clear();
   if (telemetry.revocation) {
     showInvalidToken();
   } else if (telemetry.paused) {
@@ -329,7 +337,10 @@ telemetry.addEventListener("budget", ({ detail }) => {
     freshness.see("budget"); // without a link nobody knows what the board executes
   }
 });
-telemetry.addEventListener("fingers", ({ detail }) => fingersView.showFingers(detail));
+telemetry.addEventListener("fingers", ({ detail }) => {
+  fingersView.showFingers(detail);
+  freshness.see("fingers");
+});
 telemetry.addEventListener("page", ({ detail }) => fingersView.showPage(detail));
 telemetry.addEventListener("pulses", ({ detail }) => timeline.addPulses(detail));
 telemetry.addEventListener("display", ({ detail }) => {

@@ -1,6 +1,7 @@
 // What plays, by whom and for how much longer, and what waits for the beam.
 
 import { call } from "./api.js";
+import { FRAME_NAME } from "./history.js";
 
 const TICK_MS = 200;
 
@@ -36,7 +37,8 @@ export class QueueView {
     if (isRunning) {
       this.#showRunning(first);
     }
-    this.#showWaiting(isRunning ? others : queue.active);
+    const waiting = isRunning ? others : queue.active;
+    this.#showWaiting(waiting.filter((plan) => !FRAME_NAME.test(plan.name))); // the next frame replaces one that waits
   }
 
   // Show whether a plan runs; null: none does.
