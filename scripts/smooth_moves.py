@@ -15,7 +15,7 @@ A move is computed for a distance. A shorter one is the same move, scaled: it st
 limit. So one table by whole pitches holds every move, and both axes of a diagonal move have the same dark time.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import sqrt
 from typing import Self
 
@@ -27,7 +27,8 @@ from scipy.sparse import csc_matrix, triu
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config import Config
-from optodrive.device.servo import Servo
+from optodrive.device.servo import Servo, ServoRange
+from optodrive.lab.servo_identification.common_servo import find_half_widths
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.planning.budget_setup import build_galvo_model
 from optodrive.planning.limiter.galvo_load import move_energy
@@ -50,10 +51,6 @@ MIN_DWELL_S = (2 * LEAD_SAMPLES + REST_SAMPLES) * SAMPLE_S
 """Shortest light between two moves, s."""
 GRID = (-1.0, 0.0, 1.0)
 """Places of the grid over the uncertainty, in half-widths."""
-SIGMAS = 3.0
-"""Half-width of an identified parameter, in its standard deviations."""
-HALF_WIDTH_MIN = 0.02
-"""Smallest relative half-width of an identified frequency or damping ratio: they drift with temperature."""
 MISFIT_MAX = 1.1
 """Largest rms residual of an identified servo, times the noise."""
 DARK_SAMPLES_MAX = 100
@@ -61,51 +58,27 @@ RAD_PER_UNIT = 1e-3
 """Unit of angle in the programme, rad: the solver takes numbers near one."""
 
 
-@dataclass(frozen=True)
-class ServoRange:
-    """A servo and the half-widths of its uncertainty.
+def find_range(found: IdentifiedServo, tolerance_rad: float) -> ServoRange | None:
+    """Return the range of a servo that `calibrate servo` identified, None if it does not suffice for smooth moves.
 
-    frequency, damping: relative; delay_samples: samples of a command
+    It does not if the steps were too small to show the slew limit, if the delay is uncertain by more than a sample,
+    if the model leaves a residual beyond the noise, or if the noise of every run could hide one beyond the reserve.
     """
+    noise_rad = min(segment.noise_rad for segment in found.trace.segments)
+    is_noisy = noise_rad * sqrt(MISFIT_MAX**2 - 1.0) > RESERVE * tolerance_rad
+    frequency, damping, _, delay_s = find_half_widths((found, found), found.servo)
+    if is_noisy or delay_s > SAMPLE_S or not found.slew_identified or found.misfit > MISFIT_MAX:
+        return None
+    return ServoRange(found.servo, frequency, damping, 0.0, SAMPLE_S)
 
-    servo: Servo
-    frequency: float
-    damping: float
-    delay_samples: int
 
-    @classmethod
-    def from_identified(cls, found: IdentifiedServo, tolerance_rad: float) -> Self | None:
-        """Return the range of a servo that `calibrate servo` identified, None if it does not suffice for smooth moves.
-
-        It does not if the steps were too small to show the slew limit, if the delay is uncertain by more than a sample,
-        if the model leaves a residual beyond the noise, or if the noise of every run could hide one beyond the reserve.
-        """
-        noise_rad = min(segment.noise_rad for segment in found.trace.segments)
-        is_noisy = noise_rad * sqrt(MISFIT_MAX**2 - 1.0) > RESERVE * tolerance_rad
-        is_uncertain = SIGMAS * found.sigma[2] > SAMPLE_S
-        if is_noisy or is_uncertain or not found.slew_identified or found.misfit > MISFIT_MAX:
-            return None
-        frequency = max(SIGMAS * float(found.sigma[0]), HALF_WIDTH_MIN)
-        damping = max(SIGMAS * float(found.sigma[1]) / found.servo.damping, HALF_WIDTH_MIN)
-        return cls(found.servo, frequency, damping, 1)
-
-    def servo_at(self, frequency: float, damping: float, delay: float) -> Servo:
-        """Return the servo at a place within the uncertainty, from −1 to 1 in each half-width."""
-        servo = self.servo
-        return replace(
-            servo,
-            frequency=servo.frequency * (1.0 + frequency * self.frequency),
-            damping=servo.damping * (1.0 + damping * self.damping),
-            delay=servo.delay + delay * self.delay_samples * SAMPLE_S,
-        )
-
-    def list_grid(self) -> list[Servo]:
-        """Return the servos of the grid over frequency and damping."""
-        return [
-            self.servo_at(frequency, damping, 0.0)
-            for frequency in (GRID if self.frequency else (0.0,))
-            for damping in (GRID if self.damping else (0.0,))
-        ]
+def list_grid(servos: ServoRange) -> list[Servo]:
+    """Return the servos of the grid over frequency and damping."""
+    return [
+        servos.servo_at(frequency, damping, 0.0, 0.0)
+        for frequency in (GRID if servos.frequency else (0.0,))
+        for damping in (GRID if servos.damping else (0.0,))
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,15 +137,16 @@ def compute_move(
     # A command holds its last sample.
     hold = np.eye(command_count)[np.minimum(np.arange(count), command_count - 1)]
     sample = np.arange(count) - LEAD_SAMPLES  # from the gate's closing on
-    is_leaving = sample <= servos.delay_samples
-    is_arriving = sample >= dark_samples - servos.delay_samples
+    delay_samples = round(servos.delay_s / SAMPLE_S)
+    is_leaving = sample <= delay_samples
+    is_arriving = sample >= dark_samples - delay_samples
     is_over = sample >= command_count - 1 - LEAD_SAMPLES + REST_SAMPLES
     reach = (1.0 if is_alone else 1.0 - RESERVE - RINGING) * tolerance_rad
     parts = [(is_leaving, 0.0, reach), (is_arriving, distance_rad, reach)]
     if not is_alone:
         parts.append((is_over, distance_rad, RINGING_OF_ONE * tolerance_rad))
     rows, limits = [], []
-    for servo_of_grid in servos.list_grid():
+    for servo_of_grid in list_grid(servos):
         angle = respond(servo_of_grid, count)[0] @ hold
         for part, target_rad, reach_rad in parts:
             some = angle[part & (sample > sample[0])]

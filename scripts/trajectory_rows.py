@@ -14,16 +14,17 @@ import numpy as np
 from ruckig import InputParameter, Ruckig, Trajectory
 from smooth_moves import (
     SAMPLE_S,
-    ServoRange,
     SmoothTable,
     compute_move,
     find_fastest_move,
+    list_grid,
     respond,
 )
 
 from optodrive.device.gate_timing import build_servo
+from optodrive.device.servo import ServoRange
 
-UNCERTAINTIES = {"exact": (0.0, 0), "±5 %": (0.05, 1), "±10 %": (0.1, 1)}
+UNCERTAINTIES = {"exact": (0.0, 0.0), "±5 %": (0.05, SAMPLE_S), "±10 %": (0.1, SAMPLE_S)}
 SETTLING_SAMPLES = 100
 PLATEAUS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Limits of the acceleration, times the largest one that the jerk alone permits."""
@@ -53,13 +54,14 @@ def judge_command(servos, command_rad, distance_rad, tolerance_rad):
     """Judge a command [n] that ends at distance_rad by all servos."""
     command_rad = np.append(command_rad, np.full(SETTLING_SAMPLES, distance_rad))
     leave, arrive = len(command_rad), 0
-    for servo in servos.list_grid():
+    for servo in list_grid(servos):
         angle_rad = respond(servo, len(command_rad))[0] @ command_rad
         leave = min(leave, int(np.argmax(np.abs(angle_rad) > tolerance_rad)) - 1)
         arrive = max(arrive, int(np.flatnonzero(np.abs(angle_rad - distance_rad) > tolerance_rad)[-1]) + 1)
     acceleration = respond(servos.servo, len(command_rad))[1] @ command_rad
     heat = float((acceleration**2).sum() * SAMPLE_S)
-    return JudgedCommand(leave - servos.delay_samples, arrive + servos.delay_samples, heat)
+    delay_samples = round(servos.delay_s / SAMPLE_S)
+    return JudgedCommand(leave - delay_samples, arrive + delay_samples, heat)
 
 
 def build_step(servo, distance_rad):
@@ -167,8 +169,8 @@ def measure_trajectories(bench):
     floor_s = bench.plan_order(frame, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
     ways_rad = [bench.settling.pitch_rad * pitches for pitches in range(1, FRAME_PITCHES_MAX + 1)]
     yield from measure_frame(bench, floor_s, "steps")
-    for name, (relative, delay_samples) in UNCERTAINTIES.items():
-        servos = ServoRange(servo, relative, relative, delay_samples)
+    for name, (relative, delay_s) in UNCERTAINTIES.items():
+        servos = ServoRange(servo, relative, relative, 0.0, delay_s)
         yield from measure_moves(bench, servos, name)
         steps = [judge_command(servos, build_step(servo, way_rad), way_rad, tolerance_rad) for way_rad in ways_rad]
         early_us = [round(1e6 * SAMPLE_S * step.dark_samples) for step in steps]

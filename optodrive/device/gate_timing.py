@@ -13,8 +13,8 @@ from optodrive.device.config_sections import ScannerSection
 from optodrive.device.servo import Servo, ServoRange
 
 BISECTION_STEPS = 50
-CROSSING_STEPS = 30
-"""Bisections of a crossing, to a billionth of half a period of the ringing."""
+CROSSING_STEPS = 20
+"""Bisections of a crossing, to a millionth of half a period of the ringing."""
 
 
 def build_servo(scanner: ScannerSection) -> Servo:

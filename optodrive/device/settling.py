@@ -7,6 +7,7 @@ docs/decisions/0074-servos-within-their-uncertainty.md.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from math import ceil, exp, log, pi
 from typing import Self
@@ -27,7 +28,7 @@ BISECTION_STEPS = 40
 EARLY_SHARE = 0.05
 """Share of the tolerance for residual ringing when a step is sent early."""
 EARLY_SLACK_POINTS = 3
-"""Points by which a pulse on a laser DAC may end earlier than planned."""
+"""Points by which a pulse on a laser DAC may be shorter than planned."""
 CEIL_OFFSET = 1.0 - 1e-6
 """Offset that turns truncation into rounding up, except for rounding errors of whole numbers."""
 
@@ -42,6 +43,8 @@ class SettlingTable:
     on a pixel that counts as long; after_long_dwell, after_short_dwell: times in x and y, µs, non-decreasing and
     subadditive, so that no detour is faster; lead_in_us: upper bound for the first move of a plan, from the centre or
     from any pixel
+    early_points, early_us: points of a laser DAC, and the time that they last at least, by which a step precedes the
+    end of the light on a pixel after early_dwell_us there; 0 with plain steps
     """
 
     pitch_rad: float
@@ -68,13 +71,13 @@ class SettlingTable:
     def _with_early_steps(self, moves: "_ServoMoves", config: Config) -> Self:
         """Return the table with the largest lead in whole points for which the focus stays on the absorber.
 
-        A step is never sent before the light on its pixel begins. The slowest device's points are the longest.
+        A step is never sent before the light on its pixel begins, also of the shortest pulse.
         """
         departures_s = (bound_departure_s(moves.servos, moves.remaining_rad(axis, EARLY_SHARE)) for axis in range(2))
         point_s = config.board.point_max_s
-        points = int(min(*departures_s, moves.min_pulse_s) / point_s)
+        points = min(int(min(departures_s) / point_s), int(moves.min_pulse_s / point_s) - EARLY_SLACK_POINTS)
         early_us = int(1e6 * points / config.board.points_per_s) - 1
-        if early_us < 1:
+        if points < 1:
             return self
         rest_us = max(self.long_dwell_us, moves.rest_us(EARLY_SHARE))
         dwell_us = rest_us + early_us + ceil(1e6 * EARLY_SLACK_POINTS * point_s)
@@ -87,39 +90,35 @@ class SettlingTable:
         angles_rad = field.angles_rad(layout.x_m, layout.y_m)
         nominal = _ServoMoves.from_config(config, tolerance_ratio(field, layout, config))
         moves = replace(nominal, pitch_rad=max_neighbour_step_rad(layout, *angles_rad) or nominal.pitch_rad)
-        short_dwell_share = moves.short_dwell_share()
         # The first move begins at the centre or on any pixel.
         spans_rad = [max(float(np.ptp(angle_rad)), float(np.abs(angle_rad).max())) for angle_rad in angles_rad]
         spans = [int(span_rad / moves.pitch_rad + CEIL_OFFSET) for span_rad in spans_rad]
         farthest = max(1, *spans)
         after_long, after_short = (
             (moves.build_table(0, farthest, share, 1), moves.build_table(1, farthest, share, 1))
-            for share in (LONG_DWELL_SHARE, short_dwell_share)
+            for share in (LONG_DWELL_SHARE, moves.short_dwell_share)
         )
         lead_in_us = max(after_short[0][spans[0]], after_short[1][spans[1]])
-        long_dwell_us = moves.long_dwell_us()
-        return cls(moves.pitch_rad, long_dwell_us, after_long, after_short, lead_in_us)
+        return cls(moves.pitch_rad, moves.long_dwell_us, after_long, after_short, lead_in_us)
 
     @classmethod
     def _for_whole_pitches(cls, config: Config) -> Self:
         moves, display = _ServoMoves.from_config(config), config.display
-        short_dwell_share = moves.short_dwell_share()
         farthest = max(1, display.rows - 1, display.columns - 1)
         after_long, after_short = (
             (moves.build_table(0, farthest, share), moves.build_table(1, farthest, share))
-            for share in (LONG_DWELL_SHARE, short_dwell_share)
+            for share in (LONG_DWELL_SHARE, moves.short_dwell_share)
         )
         # Only a first move, from the centre of an even lattice, spans half pitches.
         halves = [
-            1e6 * moves.settling_s(axis, 0.5 * odd, 0.5 * odd, short_dwell_share)
+            1e6 * moves.settling_s(axis, 0.5 * odd, 0.5 * odd, moves.short_dwell_share)
             for axis, count in enumerate((display.columns, display.rows))
             for odd in range(1, count if count % 2 == 0 else 0, 2)
         ]
         lead_in_us = max(
             after_short[0][display.columns - 1], after_short[1][display.rows - 1], *(ceil(each) for each in halves)
         )
-        long_dwell_us = moves.long_dwell_us()
-        return cls(moves.pitch_rad, long_dwell_us, after_long, after_short, lead_in_us)
+        return cls(moves.pitch_rad, moves.long_dwell_us, after_long, after_short, lead_in_us)
 
     def settling_us(self, dx_rad: float, dy_rad: float, dwell_us: int = 0) -> int:
         """Return the settling time of a move, rounded up to whole pitches, µs.
@@ -204,6 +203,7 @@ class _ServoMoves:
         """Return the decay of ringing from one gate to the next, over the shortest pulse and the shortest move."""
         return exp(-self._min_rate_per_s * (self.min_pulse_s + self._min_pitch_settling_s(share)))
 
+    @cached_property
     def short_dwell_share(self) -> float:
         """Return the share of the tolerance for the residual ringing of all earlier moves after the shortest pulses.
 
@@ -220,9 +220,10 @@ class _ServoMoves:
 
     def rest_us(self, share: float) -> int:
         """Return the time from the opening of a gate until all earlier moves leave this share of the tolerance, µs."""
-        decay = self._max_envelope_factor / (share * (1.0 - self._residual_factor(self.short_dwell_share())))
+        decay = self._max_envelope_factor / (share * (1.0 - self._residual_factor(self.short_dwell_share)))
         return ceil(1e6 * log(decay) / self._min_rate_per_s)
 
+    @property
     def long_dwell_us(self) -> int:
         """Return the dwell after which all earlier moves leave LONG_DWELL_SHARE at the next gate opening, µs."""
         return max(0, self.rest_us(LONG_DWELL_SHARE) - int(1e6 * self._min_pitch_settling_s(LONG_DWELL_SHARE)))

@@ -8,6 +8,7 @@ import pytest
 
 from hidden_servo import commands
 from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.device.servo import ServoRange
 from optodrive.lab.servo_identification.identify import identify
 from optodrive.lab.servo_identification.step_trace import extract_trace
 from smooth_judge import TrueServo, follow, judge
@@ -15,7 +16,8 @@ from smooth_plans import CODE_RAD, CONFIG, PITCH_RAD, TOLERANCE_RAD, sample_plan
 
 sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 
-from smooth_moves import MIN_DWELL_S, ServoRange, SmoothTable, compute_move
+import smooth_moves
+from smooth_moves import MIN_DWELL_S, SmoothTable, compute_move
 
 SIZES_RAD = (0.005, 0.03, 0.1)
 SAMPLE_S = 2e-5
@@ -60,7 +62,7 @@ def measure_excursion(name, noise):
     """Return the largest distance of light from its pixel's centre, times the tolerance, None without smooth moves."""
     (servo, coupling), random = HIDDEN[name], np.random.default_rng(3)
     trace = extract_trace("recording.h5", record(servo, coupling, random, noise), 0)
-    servos = ServoRange.from_identified(
+    servos = smooth_moves.find_range(
         identify("recording.h5", trace, CONFIG.scanner.slew_rad_per_s), min(CONFIG.tolerance_rad)
     )
     if servos is None:
@@ -92,9 +94,8 @@ def test_a_recording_whose_noise_could_hide_an_effect_has_no_smooth_moves():
 
 
 def test_without_the_check_of_the_noise_light_would_leave_the_absorber(monkeypatch):
-    monkeypatch.setattr(
-        ServoRange, "from_identified", lambda found, _tolerance_rad: ServoRange(found.servo, 0.02, 0.02, 1)
-    )
+    unchecked = lambda found, _tolerance_rad: ServoRange(found.servo, 0.02, 0.02, 0.0, smooth_moves.SAMPLE_S)  # noqa: E731
+    monkeypatch.setattr(smooth_moves, "find_range", unchecked)
     assert measure_excursion("friction", 0.01) > 1.0
 
 

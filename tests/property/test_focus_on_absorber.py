@@ -274,7 +274,9 @@ def hurry_steps(display, monkeypatch, **changes):
     """Return the display with other early steps, in the plan and in its points."""
     scale = replace(PointScale.from_config(display.config), **changes)
     monkeypatch.setattr(PointScale, "from_config", lambda _config: scale)
-    return with_settling(display, replace(display.scan_head.settling, long_dwell_us=0, **changes))
+    early_us = int(1e6 * scale.early_points * scale.point_s) - 1
+    settling = replace(display.scan_head.settling, long_dwell_us=0, early_us=early_us, **changes)
+    return with_settling(display, settling)
 
 
 def test_a_step_that_leaves_too_early_is_caught(monkeypatch):
@@ -285,11 +287,11 @@ def test_a_step_that_leaves_too_early_is_caught(monkeypatch):
 
 
 def test_a_step_that_leaves_before_the_mirrors_rest_is_caught(monkeypatch):
-    """Mutant: early steps also after the shortest pulses."""
+    """Mutant: steps as early as after a long rest also after the shortest pulses."""
     servo = EXACT | {"damping": 0.3, "bandwidth_hz": 400.0, "slew_rad_per_s": 300.0}
     display = helios_display(change_display("display-16", scanner=servo), 50_000, "early_steps")
     assert max_overhang_m(display, plan_pulses(display, shortest_pulses(display)), helios_overhang_m) <= ROUNDING_M
-    early = hurry_steps(display, monkeypatch, early_dwell_us=0)
+    early = hurry_steps(display, monkeypatch, early_dwell_us=0, early_points=8)
     assert max_overhang_m(display, plan_pulses(early, shortest_pulses(early)), helios_overhang_m) > 1e-5
 
 

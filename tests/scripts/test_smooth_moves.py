@@ -11,6 +11,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.device.gate_timing import build_servo
+from optodrive.device.servo import ServoRange
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 from smooth_judge import TrueServo, judge
 from smooth_plans import CODE_RAD, CONFIG, PITCH_RAD, TOLERANCE_RAD, sample_plan
@@ -18,11 +19,11 @@ from smooth_plans import CODE_RAD, CONFIG, PITCH_RAD, TOLERANCE_RAD, sample_plan
 sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 
 import smooth_moves
-from smooth_moves import MIN_DWELL_S, ServoRange, SmoothTable, compute_move
+from smooth_moves import MIN_DWELL_S, SAMPLE_S, SmoothTable, compute_move
 
 SERVO = build_servo(CONFIG.scanner)
-DECLARED = ServoRange(SERVO, 0.1, 0.1, 1)
-IDENTIFIED = ServoRange(SERVO, 0.05, 0.05, 1)
+DECLARED = ServoRange(SERVO, 0.1, 0.1, 0.0, SAMPLE_S)
+IDENTIFIED = ServoRange(SERVO, 0.05, 0.05, 0.0, SAMPLE_S)
 DARK_SAMPLES = {DECLARED: (27, 38), IDENTIFIED: (20, 30)}
 FAST_PULSES, SLOW_PULSES = 10_000, 250_000
 PULSES_OF_A_SERVO = 500
@@ -41,7 +42,7 @@ def build_table(servos, tolerance=1.0):
 def sample_servo(random, servos):
     """Return a servo within the uncertainty, every other one at a corner of it."""
     frequency, damping, delay = random.choice([-1.0, 1.0], 3) if random.random() < 0.5 else random.uniform(-1.0, 1.0, 3)
-    servo = servos.servo_at(frequency, damping, delay)
+    servo = servos.servo_at(frequency, damping, 0.0, delay)
     return TrueServo(servo.frequency, servo.damping, servo.delay, servo.slew)
 
 

@@ -55,9 +55,10 @@ class PageRefresh:
 
     def find_fingers(self, at_s: float) -> tuple[PredictedFinger, ...]:
         """Return where the fingers are at a time of the host's clock. None are known when the tracker is lost."""
+        if self.tracker != "seen":
+            return ()
         with self._lock:
-            is_lost = self._clock.now_s() - self._seen_s > TRACKER_LOST_S
-            return () if is_lost else self._tracks.predict(at_s)
+            return self._tracks.predict(at_s)
 
     @property
     def tracker(self) -> Literal["none", "seen", "lost"]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import DAMPING_MAX, Config
+from optodrive.device.config_sections import ServoSection
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.identify import IdentifiedServo
@@ -23,8 +24,9 @@ SIGMAS = 3.0
 """Half-width of an identified parameter, in its standard deviations."""
 HALF_WIDTH_MIN, HALF_WIDTH_MAX = 0.02, 0.3
 """Range of relative half-widths."""
-UNMEASURED_HALF_WIDTH = 0.1
+UNMEASURED_HALF_WIDTH = float(ServoSection.model_fields["slew_uncertainty"].default)
 DELAY_HALF_WIDTH_MIN_S = 1e-5
+"""A sample of a servo's digital driver, s."""
 SETTLING_SLACK = 1.001
 """Permitted ratio of required to actual settling time."""
 

@@ -105,9 +105,8 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     last[:-1] -= last[:-1] == first[1:]  # a blank point separates adjacent pulses
     emitting = (level > 0) & (last > first)  # the mirrors skip pulses without emission
     first, last, level = first[emitting], last[emitting], level[emitting]
-    x, y = scale.to_codes(plan.x_rad), scale.to_codes(plan.y_rad)
+    x, y = scale.to_codes(plan.x_rad[emitting]), scale.to_codes(plan.y_rad[emitting])
     early = np.where(_find_early_steps(plan, scale), scale.early_points, 0)[emitting]
-    x, y = x[emitting], y[emitting]
     before = np.concatenate([[0], last[:-1]])[: len(last)]
     run_lengths = np.column_stack([first - before, last - first]).ravel()
     count = int(last[-1]) if len(last) else 0

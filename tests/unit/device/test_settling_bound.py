@@ -1,15 +1,17 @@
 """The bound of settling times holds for every servo within the declared uncertainty, and wastes little."""
 
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from focus_judge import ExactServo
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo, ServoRange
-from optodrive.device.settling_bound import bound_settling_s
+from optodrive.device.settling_bound import bound_departure_s, bound_settling_s
 
 PITCH_RAD, TOLERANCE_RAD = 4e-3 / 0.44, 8.8e-4
 SHIPPED = ServoRange(Servo(1700.0, 0.7, 3e-5, 100.0), 0.1, 0.1, 0.1, 1e-5)
@@ -38,6 +40,29 @@ def test_no_servo_within_the_range_takes_longer(servo, half_widths, distances_ra
     bound_s = bound_settling_s(servos, *distances_rad, tolerance_rad)
     move_rad = distances_rad[0] + 0.5 * (1.0 + place[4]) * (distances_rad[1] - distances_rad[0])
     assert settling_s(servos.servo_at(*place[:4]), move_rad, tolerance_rad) <= bound_s * (1.0 + 1e-9)
+
+
+def follow_step(servo, move_rad, t_s):
+    """Return the angle after a step at 0, by the exact servo of the judges."""
+    scanner = SimpleNamespace(
+        bandwidth_hz=servo.frequency, damping=servo.damping, delay_s=servo.delay, slew_rad_per_s=servo.slew
+    )
+    return ExactServo(scanner).angles(np.array([0.0]), np.array([move_rad]), t_s)
+
+
+@settings(max_examples=5 * settings.default.max_examples)
+@given(place=st.tuples(*[places] * 4), move_rad=st.floats(1e-4, 0.3), share=st.floats(0.2, 1.0))
+def test_no_servo_within_the_range_leaves_earlier(place, move_rad, share):
+    tolerance_rad = share * TOLERANCE_RAD
+    servo, leaves_s = SHIPPED.servo_at(*place), bound_departure_s(SHIPPED, tolerance_rad)
+    angle_rad = follow_step(servo, move_rad, np.linspace(0.0, leaves_s, 200))
+    assert np.abs(angle_rad).max() <= tolerance_rad * (1.0 + 1e-9)
+
+
+def test_the_fastest_servo_leaves_then():
+    leaves_s = bound_departure_s(SHIPPED, TOLERANCE_RAD)
+    angle_rad = follow_step(SHIPPED.servo_at(1.0, -1.0, 1.0, -1.0), 0.1, np.array([0.5 * leaves_s, leaves_s]))
+    assert angle_rad[-1] == pytest.approx(TOLERANCE_RAD, rel=1e-6)
 
 
 def sample_times_s(servos, move_rad, count, tolerance_rad=TOLERANCE_RAD):
