@@ -54,6 +54,17 @@ def run(*arguments, url="http://127.0.0.1:9", status=0):
     return done
 
 
+def follow_both(board, daemon, end, *source):
+    """Report fingertips from a source until both fingers have more light, and end that by a signal."""
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": daemon.url}
+    with start_process([OPTODRIVE, "fingers", *source, "--repeat"], env=environment) as command:
+        for finger, other in (FINGERS, FINGERS[::-1]):
+            far = [pixel for pixel in FAR if pixel != other]
+            wait_for(lambda f=finger, far=far: compute_lead(board, f, far) >= LEAD, "more light under a finger")
+        command.send_signal(end)
+        assert command.wait() == 130
+
+
 def test_a_recorded_film_brings_light_under_the_fingers_and_under_no_others(rig, calibration, tmp_path):
     board, daemon = rig
     daemon.arm()
@@ -66,16 +77,9 @@ def test_a_recorded_film_brings_light_under_the_fingers_and_under_no_others(rig,
     film.restate(end_s)
     film.move(end_s, 0.2, {"middle": fingers["middle"]})
     recording = film.write(tmp_path / "hand.evemu")
-    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": daemon.url}
     with show(daemon) as stream:
         send_page(stream, PAGE)
-        arguments = [OPTODRIVE, "fingers", "--film", recording, "--calibration", calibration, "--repeat"]
-        with start_process(arguments, env=environment) as command:
-            for finger, other in (FINGERS, FINGERS[::-1]):
-                far = [pixel for pixel in FAR if pixel != other]
-                wait_for(lambda f=finger, far=far: compute_lead(board, f, far) >= LEAD, "more light under a finger")
-            command.send_signal(signal.SIGINT)
-            assert command.wait() == 130
+        follow_both(board, daemon, signal.SIGINT, "--film", recording, "--calibration", calibration)
         since = len(board.of("pulse"))
         wait_for(lambda: min(count_pulses(board, since)[pixel] for pixel in PAGE) >= 1, "the whole page")
 
@@ -97,16 +101,9 @@ def test_a_video_of_a_hand_brings_light_under_its_fingers(rig, tmp_path):
     pictures = [render(ABOVE, [], random) for _ in range(BACKGROUND_PICTURES)]
     pictures += [render(ABOVE, [Finger(PLACES[120]), Finger(PLACES[324])], random) for _ in range(4)] * 10
     video, marks = write_video(tmp_path / "hand.avi", pictures), write_marks(tmp_path / "marks.toml")
-    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": daemon.url}
     with show(daemon) as stream:
         send_page(stream, PAGE)
-        arguments = [OPTODRIVE, "fingers", "--camera", video, "--marks", marks, "--repeat"]
-        with start_process(arguments, env=environment) as command:
-            for finger, other in (FINGERS, FINGERS[::-1]):
-                far = [pixel for pixel in FAR if pixel != other]
-                wait_for(lambda f=finger, far=far: compute_lead(board, f, far) >= LEAD, "more light under a finger")
-            command.send_signal(signal.SIGTERM)
-            assert command.wait() == 130
+        follow_both(board, daemon, signal.SIGTERM, "--camera", video, "--marks", marks)
 
 
 def test_a_video_without_marks_gets_one_line(rig, tmp_path):
