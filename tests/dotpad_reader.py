@@ -45,7 +45,7 @@ def list_held(data):
 class DotPadReader:
     """A reader that opens the port and writes cells as BRLTTY does: line by line, each after the one before is shown.
 
-    count: of cells
+    board: its description; count: of cells, those of the text display first
     """
 
     def __init__(self, port):
@@ -53,14 +53,16 @@ class DotPadReader:
         tty.setraw(self._port, termios.TCSANOW)
         self._received = b""
         self._send(build(BOARD))
-        _, _, board = self.take(BOARD + 1)
-        self.rows, self.columns = board[4:6]
-        self.count = self.rows * self.columns
+        _, _, self.board = self.take(BOARD + 1)
+        text_rows, text_columns, _, _, graphic_rows, graphic_columns, _, _ = self.board[4:]
+        self._columns = [text_columns] * text_rows + [graphic_columns] * graphic_rows
+        self.count = sum(self._columns)
 
     def write(self, cells):
-        for line in range(self.rows):
-            part = cells[line * self.columns :][: self.columns].ljust(self.columns, b"\0")
-            self._send(build(LINE, b"\0" + encode(part), line))
+        cells = cells.ljust(self.count, b"\0")
+        for line, columns in enumerate(self._columns):
+            self._send(build(LINE, b"\0" + encode(cells[:columns]), line))
+            cells = cells[columns:]
             assert self.take(LINE + 1)[1:] == (line, b"\0")
             assert self.take(LINE + 2)[1:] == (line, b"\0")
 

@@ -19,6 +19,7 @@ class ReaderProtocol(StrEnum):
 
     HUMANWARE = "humanware"
     DOTPAD = "dotpad"
+    DOTPAD_GRAPHIC = "dotpad-graphic"
     BRLAPI = "brlapi"
 
 
@@ -28,7 +29,11 @@ def braille(
     ],
     protocol: Annotated[
         ReaderProtocol,
-        typer.Option("--protocol", help="One line: humanware, brltty -b hw. Several: dotpad, -b dp; brlapi, -b ba."),
+        typer.Option(
+            "--protocol",
+            help="humanware, brltty -b hw: one line. brlapi, -b ba, and dotpad, -b dp: several. "
+            "dotpad-graphic, -b dp: a line above dots.",
+        ),
     ] = ReaderProtocol.HUMANWARE,
     key_file: Annotated[
         Path, typer.Option("--key-file", help="With brlapi: key that a client must be able to read.")
@@ -43,6 +48,14 @@ def braille(
     """Be a braille display for an unmodified screen reader. Keys by name on stdin."""
     from optodrive.cli.signals import end_as_interrupted
     from optodrive.client.brlapi import CellPage
+    from optodrive.client.cell_places import (
+        compute_pitch_m,
+        cut_rectangle,
+        divide_display,
+        find_cell_lines,
+        join_lines,
+        plan_area,
+    )
     from optodrive.client.display import Display
     from optodrive.client.dotpad import CellGrid
     from optodrive.client.humanware import CellLine
@@ -54,14 +67,7 @@ def braille(
         parse_number,
         read_key,
     )
-    from optodrive.client.reader_port import (
-        CellProtocol,
-        ReaderPort,
-        compute_pitch_m,
-        cut_rectangle,
-        find_cell_lines,
-        join_lines,
-    )
+    from optodrive.client.reader_port import CellProtocol, ReaderPort
     from optodrive.link.simulator.pseudo_terminal import check_link_path
 
     is_server = protocol is ReaderProtocol.BRLAPI
@@ -70,23 +76,31 @@ def braille(
     else:
         check_link_path("PORT", Path(port))
     with end_as_interrupted(), Display(url) as display:
-        layout = display.layout
-        places = find_cell_lines(layout, display.state().display)
+        layout, name = display.layout, display.state().display
+        if protocol is ReaderProtocol.DOTPAD_GRAPHIC:
+            text, graphic = divide_display(layout, name)
+        else:
+            lines = find_cell_lines(layout, name)
+            is_line = protocol is ReaderProtocol.HUMANWARE
+            text, graphic = [join_lines(lines)] if is_line else cut_rectangle(lines, layout), []
         if hold:
             display.arm(hold=True)
-        places = [join_lines(places)] if protocol is ReaderProtocol.HUMANWARE else cut_rectangle(places, layout)
-        rows, columns = len(places), len(places[0])
         cells: CellProtocol
         channel: ReaderChannel
         if is_server:
-            page = CellPage(rows, columns, key)
+            page = CellPage(len(text), len(text[0]), key)
             cells, channel, place = page, SocketChannel(number, page), f"{HOST}:{number}"
         else:
-            is_line = protocol is ReaderProtocol.HUMANWARE
-            cells = CellLine(columns) if is_line else CellGrid(rows, columns, compute_pitch_m(layout, places[0][0]))
+            if protocol is ReaderProtocol.HUMANWARE:
+                cells = CellLine(len(text[0]))
+            else:
+                text_area, graphic_area = (plan_area(display, lines, height_um) for lines in (text, graphic))
+                cells = CellGrid(text_area, graphic_area, compute_pitch_m(layout, text[0][0]))
             channel, place = SerialChannel(Path(port)), port
-        size = f"{columns} cells" if rows == 1 else f"{rows} lines of {columns} cells"
-        pixels = [slot for line in places for slot in line]
+        size = f"{len(text[0])} cells" if len(text) == 1 else f"{len(text)} lines of {len(text[0])} cells"
+        if graphic:
+            size += f", {4 * len(graphic)} rows of {2 * len(graphic[0])} dots"
+        pixels = [slot for line in text + graphic for slot in line]
         try:
             with display.stream(standing=fingers) as stream:
                 print(f"{size} at {place}; Ctrl-C ends it", flush=True)

@@ -5,14 +5,16 @@ two bytes, a sequence number, data, and the exclusive or of A5 and the bytes fro
 from 6.6 on) and NVDA ask for the board's description, write the cells of a line, and receive keys. Facts of the
 protocol: their drivers.
 
-The lines are a text display, whose lines both drivers number from 0. They number those of a graphic display apart from
-each other where there is no text display, and BRLTTY writes its status cells over the text display where there is one.
+Lines are numbered from 0: those of the text display, then those of the graphic display, whose cells are 4 × 2 dots
+without gaps. Both drivers agree on that where there is a text display; without one they number graphic lines apart.
+BRLTTY writes its status cells to the text display where it uses the graphic one.
 """
 
 import struct
 from functools import reduce
 from math import ceil
 from operator import xor
+from typing import NamedTuple
 
 SYNC = b"\xaa\x55"
 LENGTH = struct.Struct(">H")
@@ -34,12 +36,12 @@ TEXT_FLAG = 0x80
 """Of the sequence number: bit 0 of a cell is dot 1, as NVDA writes it. Otherwise bits are as in DOTS, as BRLTTY's."""
 LENGTH_ERROR, COMMAND_ERROR, CHECKSUM_ERROR = b"\1", b"\2", b"\3"
 
-HAS_TEXT, HAS_PERKINS_KEYS, HAS_ROUTING_KEYS, HAS_NAVIGATION_KEYS, HAS_PANNING_KEYS = 0x40, 0x20, 0x10, 0x08, 0x04
+HAS_GRAPHIC, HAS_TEXT, HAS_PERKINS_KEYS, HAS_ROUTING_KEYS = 0x80, 0x40, 0x20, 0x10
+HAS_NAVIGATION_KEYS, HAS_PANNING_KEYS = 0x08, 0x04
 EIGHT_DOTS = 1
 """Dots per cell. With six BRLTTY would compute three lines of five, as its internal cells always have four rows."""
-DOTS_PER_S = 110
-"""Rate at which the shipped displays raise dots of 150 µm, one after the other."""
-DOTS_PER_CELL = 6
+REFRESH_STEP_S = 0.1
+REFRESH_MAX_S = 25.5
 PERKINS_BYTES, ROUTING_BYTES = 4, 8
 
 DOT = dict(zip((7, 3, 2, 1, 4, 5, 6, 8), range(8), strict=True))
@@ -61,16 +63,32 @@ DOTS = (1, 2, 3, 7, 4, 5, 6, 8)
 """Dot of each bit of a cell, from bit 0: the left column from the top, then the right one."""
 
 
+class CellArea(NamedTuple):
+    """Lines of cells that are declared together, none where a board has no such display.
+
+    refresh_s: time in which all of its dots rise, of which the protocol can state at most REFRESH_MAX_S
+    """
+
+    rows: int
+    columns: int
+    refresh_s: float
+
+    def describe(self) -> bytes:
+        """Return the descriptor: lines, columns, the cell after which a line is divided (none), the time in 0.1 s."""
+        return bytes([self.rows, self.columns, 0, ceil(min(self.refresh_s, REFRESH_MAX_S) / REFRESH_STEP_S)])
+
+
 class CellGrid:
-    """A display of rows × columns cells.
+    """A text display and, if it has rows, a graphic one.
 
     pitch_m: between dots; count: of cells; routing_count: of cells with a routing key; cells: the dots of each, row
     after row, bit 0 is dot 1, as the reader wrote them last; has_reader: whether one has written anything
     """
 
-    def __init__(self, rows: int, columns: int, pitch_m: float) -> None:
-        self.rows, self.columns, self._pitch_m = rows, columns, pitch_m
-        self.count = rows * columns
+    def __init__(self, text: CellArea, graphic: CellArea, pitch_m: float) -> None:
+        self._text, self._graphic, self._pitch_m = text, graphic, pitch_m
+        self._columns = [area.columns for area in (text, graphic) for _ in range(area.rows)]
+        self.count = sum(self._columns)
         self.routing_count = min(self.count, 8 * ROUTING_BYTES)
         self.clear()
 
@@ -133,22 +151,19 @@ class CellGrid:
         return build_packet(ERROR, COMMAND_ERROR)
 
     def _describe(self) -> bytes:
-        """Return the board's description: keys, dots per cell, pitch in 0.1 mm, and displays.
-
-        That of text has its lines, columns, and the time in which all dots of a line rise, in 0.1 s. There is none of
-        graphics.
-        """
+        """Return the board's description: keys, dots per cell, pitch in 0.1 mm, no function keys, and displays."""
         features = HAS_TEXT | HAS_PERKINS_KEYS | HAS_ROUTING_KEYS | HAS_NAVIGATION_KEYS | HAS_PANNING_KEYS
+        features |= HAS_GRAPHIC if self._graphic.rows else 0
         board = bytes([features, EIGHT_DOTS, round(self._pitch_m * 1e4), 0])
-        refresh_s = DOTS_PER_CELL * self.columns / DOTS_PER_S
-        return board + bytes([self.rows, self.columns, 0, ceil(refresh_s * 10)]) + bytes(4)
+        return board + self._text.describe() + self._graphic.describe()
 
     def _write(self, line: int, data: bytes, is_text: bool) -> bytes:
         """Take cells of a line: the first one's place, and the cells, none in BRLTTY's status of no cells."""
-        begin, cells = (data[0], data[1:]) if data else (self.columns, b"\0")
-        if not (line < self.rows and begin + len(cells) <= self.columns):
+        columns = self._columns[line] if line < len(self._columns) else 0
+        begin, cells = (data[0], data[1:]) if data else (columns, b"\0")
+        if not (columns and begin + len(cells) <= columns):
             return build_packet(DISPLAY_LINE + 1, NOT_ACKNOWLEDGED, line)
-        place = line * self.columns + begin
+        place = sum(self._columns[:line]) + begin
         self.cells = (
             self.cells[:place]
             + (cells if is_text else bytes(map(_to_braille, cells)))

@@ -14,51 +14,16 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-import numpy as np
-
-from optodrive.client.humanware import CELLS_MAX, NAMED_KEYS
+from optodrive.client.cell_places import draw_cells
+from optodrive.client.humanware import NAMED_KEYS
 from optodrive.client.reader_channels import READ_BYTES, ReaderChannel
 from optodrive.client.stream import Stream
 from optodrive.core.errors import InputError
-from optodrive.core.types.arrays import FloatArray
-from optodrive.device.config import PixelLayout
-from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.text import CellSlot, Spacing, find_line_slots
+from optodrive.planning.stimuli.text import CellSlot
 
 FRAME_S = 0.1
 NOT_SHOWN = ("refused", "failed", "stopped")
 """Statuses of frames that were not shown, or not to their end, although no newer one came."""
-SPACING = Spacing(dot_step=1, cell_gap=1, line_gap=1)
-
-
-def find_cell_lines(layout: PixelLayout, name: str) -> list[list[CellSlot]]:
-    """Return the pixel of each dot of each cell, per line. Raise InputError if none fits the display."""
-    lines = find_line_slots(Lattice.from_layout(name, layout), SPACING)
-    if not lines:
-        raise InputError("display", name, "room for a braille cell, 3 rows of 2 pixels", code="does_not_fit")
-    return lines
-
-
-def join_lines(lines: list[list[CellSlot]]) -> list[CellSlot]:
-    """Return the cells of all lines as one line, as many as its protocol states."""
-    return [slot for line in lines for slot in line][:CELLS_MAX]
-
-
-def cut_rectangle(lines: list[list[CellSlot]], layout: PixelLayout) -> list[list[CellSlot]]:
-    """Return the largest rectangle of cells: adjacent lines, of each the cells in columns that all of them have."""
-    places = [{int(layout.column[slot[1]]): slot for slot in line} for line in lines]
-    spans = [places[begin:end] for begin in range(len(places)) for end in range(begin + 1, len(places) + 1)]
-    rectangles = []
-    for span in spans:
-        columns = sorted(set.intersection(*(set(line) for line in span)))
-        rectangles.append([[line[column] for column in columns] for line in span])
-    return max(rectangles, key=lambda rectangle: sum(map(len, rectangle)))
-
-
-def compute_pitch_m(layout: PixelLayout, slot: CellSlot) -> float:
-    """Return the distance between the dots 1 and 2 of a cell."""
-    above, below = slot[1], slot[2]
-    return float(np.hypot(layout.x_m[above] - layout.x_m[below], layout.y_m[above] - layout.y_m[below]))
 
 
 class CellProtocol(Protocol):
@@ -159,14 +124,6 @@ class ReaderPort:
                 self._problem = problem
             elif result.executed or (self._stands and result.status == "planned"):
                 self._problem = ""
-
-
-def draw_cells(cells: bytes, pixels: list[CellSlot], height_um: float, pixel_count: int) -> FloatArray:
-    """Return the height of each pixel, µm, [p]. Dots 7 and 8 have no pixel."""
-    heights_um = np.zeros(pixel_count)
-    for dots, slot in zip(cells, pixels, strict=True):
-        heights_um[[pixel for dot, pixel in slot.items() if dots >> (dot - 1) & 1]] = height_um
-    return heights_um
 
 
 def parse_key(text: str, routing_count: int) -> tuple[str, int | None]:

@@ -12,8 +12,8 @@ import numpy as np
 from braille_reader import BrlttyProcess, Writer, drive_lines, drive_serial
 from dotpad_reader import DotPadReader
 from forked_process import OPTODRIVE, start_process
+from optodrive.client.cell_places import draw_cells, find_cell_lines, join_lines
 from optodrive.client.reader_channels import FIRST_PORT, HOST
-from optodrive.client.reader_port import draw_cells, find_cell_lines, join_lines
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from rig import TOKEN, running, wait_for
@@ -24,8 +24,15 @@ PIXELS = join_lines(find_cell_lines(LAYOUT, "display-437"))
 COUNT = len(PIXELS)
 
 
+def find_raised(cells, pixels=PIXELS):
+    """Return the pixels of the raised dots."""
+    return set(draw_cells(cells, pixels, 1.0, len(LAYOUT)).nonzero()[0].tolist())
+
+
 class SerialLine:
     """One line of cells at a serial port: arguments of the command, what it prints, and its reader."""
+
+    find_raised = staticmethod(find_raised)
 
     def __init__(self, folder):
         self.port = folder / "braille"
@@ -38,7 +45,7 @@ class SerialLine:
         return reader, Writer(reader)
 
 
-class ServedLines:
+class ServedLines(SerialLine):
     """Several lines at a server of BrlAPI, as SerialLine."""
 
     def __init__(self, folder):
@@ -55,7 +62,7 @@ class ServedLines:
         return reader, Writer(reader)
 
 
-class DotGridLines:
+class DotGridLines(SerialLine):
     """Several lines at a serial port by the DotPad's protocol, as SerialLine."""
 
     def __init__(self, folder):
@@ -66,6 +73,38 @@ class DotGridLines:
     def connect(self, folder):
         reader = DotPadReader(self.port)
         return reader, reader
+
+
+class DotGraphic(DotGridLines):
+    """A line of text above a graphic display, by the DotPad's protocol."""
+
+    def __init__(self, folder):
+        super().__init__(folder)
+        self.arguments = [self.port, "--protocol", "dotpad-graphic"]
+        self.opened = f"6 cells, 16 rows of 20 dots at {self.port}"
+
+    @staticmethod
+    def find_raised(cells):
+        """Return the pixels of the raised dots: of 6 cells in rows 0 to 2, and of 4 × 10 without gaps from row 4 on."""
+        raised = set()
+        for number, dots in enumerate(cells):
+            line, column = divmod(number - 6, 10)
+            top, left = (0, 3 * number + 3) if number < 6 else (4 + 4 * line, 2 * column)
+            places = CELL_PLACES if number >= 6 else CELL_PLACES[:6]
+            raised |= {
+                pixel_at(top + down, left + right) for dot, (down, right) in enumerate(places) if dots >> dot & 1
+            }
+        return raised
+
+
+CELL_PLACES = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (3, 0), (3, 1)]
+"""Rows down and columns right of the dots 1 to 8."""
+
+
+def pixel_at(from_top, column):
+    """Return the pixel at a place of the lattice of 21 rows."""
+    (found,) = np.flatnonzero((LAYOUT.row == 20 - from_top) & (LAYOUT.column == column))
+    return int(found)
 
 
 class BrailleCommand:
@@ -122,7 +161,7 @@ class Desk:
 
     def wait_for_light(self, cells):
         """Wait until the board emits a pulse that these cells have."""
-        expected = find_raised(cells)
+        expected = self.command.place.find_raised(cells)
         since = len(self.board.of("pulse"))
         wait_for(lambda: self.find_emitted(since) & expected, "light")
 
@@ -131,7 +170,7 @@ class Desk:
 
         Each dot twice: the rest of a frame before may consist of these dots, too.
         """
-        expected = find_raised(cells)
+        expected = self.command.place.find_raised(cells)
         self.writer.write(cells)
         since = len(self.board.of("pulse"))
 
@@ -143,11 +182,6 @@ class Desk:
 
         wait_for(is_shown, f"{cells.hex()}, after pulse {since}")
         return since, expected
-
-
-def find_raised(cells):
-    """Return the pixels of the raised dots."""
-    return set(draw_cells(cells, PIXELS, 1.0, len(LAYOUT)).nonzero()[0].tolist())
 
 
 def is_dark(desk):

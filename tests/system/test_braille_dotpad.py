@@ -1,10 +1,22 @@
 """Lines of braille by the DotPad's protocol: cells in the executed pulses, keys, and the end of either side."""
 
 import random
+from itertools import pairwise
+from statistics import median
 
 import pytest
 
-from braille_desk import COUNT, DotGridLines, draw_text, is_dark, running_desk
+from braille_desk import (
+    CELL_PLACES,
+    COUNT,
+    LAYOUT,
+    DotGraphic,
+    DotGridLines,
+    draw_text,
+    is_dark,
+    pixel_at,
+    running_desk,
+)
 from braille_reader import ROUTING_KEY, BrlttyProcess, Writer, drive_dots, has_driver
 from dotpad_reader import list_held
 from optodrive.client.dotpad import NAMED_KEYS
@@ -56,6 +68,28 @@ def test_a_side_that_is_killed_is_dark_until_it_is_back(desk):
     assert not desk.board.of("fault")
 
 
+@pytest.fixture(scope="module")
+def graphic_desk(tmp_path_factory):
+    with running_desk(tmp_path_factory.mktemp("graphic"), DotGraphic) as desk:
+        yield desk
+
+
+def test_text_and_graphics_light_their_dots_and_no_other(graphic_desk):
+    rng = random.Random(4)
+    for _ in range(2):
+        since, expected = graphic_desk.show(rng.randbytes(graphic_desk.writer.count))
+        assert graphic_desk.find_emitted(since) == expected
+
+
+def test_the_time_of_each_display_is_that_of_its_pulses(graphic_desk):
+    board = graphic_desk.writer.board
+    assert board[:7] + board[8:11] == bytes([0xFC, 1, 36, 0, 1, 6, 0, 4, 10, 0])
+    since, _ = graphic_desk.show(b"\xff" * graphic_desk.writer.count)
+    ends_us = [pulse["off_us"] for pulse in graphic_desk.board.of("pulse")[since:]]
+    period_s = median(later - end for end, later in pairwise(ends_us)) / 1e6
+    assert [board[7], board[11]] == pytest.approx([36 * period_s / 0.1, 320 * period_s / 0.1], rel=0.1, abs=1)
+
+
 class BrlttyLines(DotGridLines):
     def connect(self, folder):
         reader = BrlttyProcess(folder, *drive_dots(self.port))
@@ -89,3 +123,38 @@ def test_brltty_drives_all_lines(tmp_path):
         desk.start_reader()
         since, expected = desk.show(draw_text(rng))
         assert desk.find_emitted(since) == expected
+
+
+class BrlttyGraphic(DotGraphic):
+    connect = BrlttyLines.connect
+
+
+def find_drawn(desk, since):
+    """Return the pixels of the graphic display emitted twice. BRLTTY writes its status to the line of text."""
+    return {pixel for pixel in desk.find_emitted(since, times=2) if LAYOUT.row[pixel] < 18}
+
+
+@pytest.mark.skipif(not has_driver("dp"), reason="needs a BRLTTY with a driver of the DotPad: 6.6 or later")
+def test_brltty_draws_on_the_graphic_display(tmp_path):
+    """It draws 3 lines of 7 cells, with an empty column between cells and two empty rows between lines."""
+    rng = random.Random(5)
+    with running_desk(tmp_path, BrlttyGraphic) as desk:
+        assert desk.writer.count == 21
+        for _ in range(3):
+            cells = rng.randbytes(21)
+            expected = {
+                pixel_at(4 + 6 * (number // 7) + down, 3 * (number % 7) + right)
+                for number, dots in enumerate(cells)
+                for dot, (down, right) in enumerate(CELL_PLACES)
+                if dots >> dot & 1
+            }
+            desk.writer.write(cells)
+            since = len(desk.board.of("pulse"))
+
+            def is_drawn(expected=expected):
+                nonlocal since
+                if find_drawn(desk, since) - expected:  # the rest of the cells before
+                    since = len(desk.board.of("pulse"))
+                return find_drawn(desk, since) == expected
+
+            wait_for(is_drawn, f"{cells.hex()}, after pulse {since}")

@@ -5,12 +5,12 @@ import random
 import pytest
 
 from dotpad_reader import BOARD, FIRMWARE, LINE, NAME, build, encode, list_held, read
-from optodrive.client.dotpad import NAMED_KEYS, CellGrid
+from optodrive.client.dotpad import NAMED_KEYS, CellArea, CellGrid
 
 
 @pytest.fixture
 def grid():
-    return CellGrid(5, 7, 0.0036)
+    return CellGrid(CellArea(5, 7, 1.82), CellArea(0, 0, 0.0), 0.0036)
 
 
 def test_a_packet_is_that_of_the_drivers():
@@ -20,7 +20,7 @@ def test_a_packet_is_that_of_the_drivers():
 def test_a_reader_learns_the_board_with_lengths_as_its_driver_expects(grid):
     (board, name, firmware) = read(grid.receive(build(BOARD) + build(NAME) + build(FIRMWARE)))
     features = 0x40 | 0x20 | 0x10 | 0x08 | 0x04
-    assert board == (0x0111, 0, bytes([features, 1, 36, 0, 5, 7, 0, 4, 0, 0, 0, 0]))
+    assert board == (0x0111, 0, bytes([features, 1, 36, 0, 5, 7, 0, 19, 0, 0, 0, 0]))
     assert name == (0x0101, 0, b"optodrive ")
     assert firmware[:2] == (0x0001, 0)
     assert len(firmware[2]) == 8
@@ -116,9 +116,39 @@ def test_named_keys_differ():
 
 
 def test_routing_keys_are_as_many_as_the_packet_has_room_for():
-    large = CellGrid(10, 11, 0.004)
+    large = CellGrid(CellArea(10, 11, 5.73), CellArea(0, 0, 0.0), 0.004)
     assert (large.count, large.routing_count) == (110, 64)
     for cell in range(64):
         (held, released) = read(large.build_key_press("routing", cell))
         assert (held[0], len(held[2]), list_held(held[2])) == (0x0322, 8, {cell})
         assert released == (0x0322, 0, bytes(8))
+
+
+@pytest.fixture
+def graphic_grid():
+    return CellGrid(CellArea(1, 6, 0.31), CellArea(4, 10, 100.0), 0.0036)
+
+
+def test_a_graphic_display_is_declared_beside_that_of_text(graphic_grid):
+    ((_, _, board),) = read(graphic_grid.receive(build(BOARD)))
+    features = 0x80 | 0x40 | 0x20 | 0x10 | 0x08 | 0x04
+    assert board == bytes([features, 1, 36, 0, 1, 6, 0, 4, 4, 10, 0, 255])  # 25.5 s is the largest time
+
+
+@pytest.mark.parametrize("graphic_flag", [0, 0x80])
+def test_graphic_lines_follow_those_of_text(graphic_grid, graphic_flag):
+    cells = random.Random(3).randbytes(46)
+    graphic_grid.receive(build(LINE, b"\0" + cells[:6], 0, 0x80))
+    for line in range(4):
+        part = cells[6 + 10 * line :][:10]
+        data = part if graphic_flag else encode(part)
+        answers = graphic_grid.receive(build(LINE, b"\0" + data, 1 + line, graphic_flag))
+        assert read(answers) == [(code, 1 + line, b"\0") for code in (0x0201, 0x0202)]
+    assert graphic_grid.cells == cells
+    graphic_grid.receive(build(LINE, b"\3" + encode(b"\xaa"), 2))  # a changed cell only
+    assert graphic_grid.cells == cells[:19] + b"\xaa" + cells[20:]
+
+
+@pytest.mark.parametrize(("line", "data"), [(0, bytes(8)), (1, bytes(12)), (4, b"\x09\0\0"), (5, bytes(2))])
+def test_cells_outside_of_either_display_are_refused(graphic_grid, line, data):
+    assert read(graphic_grid.receive(build(LINE, data, line))) == [(0x0201, line, b"\1")]

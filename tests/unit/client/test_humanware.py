@@ -5,8 +5,9 @@ from itertools import pairwise
 
 import pytest
 
+from optodrive.client.cell_places import cut_rectangle, draw_cells, find_cell_lines, join_lines
 from optodrive.client.humanware import CELLS_MAX, CellLine
-from optodrive.client.reader_port import cut_rectangle, draw_cells, find_cell_lines, join_lines, parse_key
+from optodrive.client.reader_port import parse_key
 from optodrive.core.errors import InputError
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
