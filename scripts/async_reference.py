@@ -58,7 +58,7 @@ CHANNELS = {
         "bindings": {"ws": {"method": "GET"}},
         "messages": {
             "places": {"summary": "all fingertips at a time", "payload": _refer(FingersMessage)},
-            "refusal": {"summary": "why a message was not understood", "payload": _refer(FingersRefusal)},
+            "refusal": {"summary": "why a message was not taken", "payload": _refer(FingersRefusal)},
         },
     },
     "hold": {

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from socket import create_connection
 
 import numpy as np
@@ -190,6 +190,31 @@ def test_telemetry_says_where_fingers_are_and_what_their_dots_get(armed):
         wait_for(lambda: reader.last("fingers")["tracker"] == "lost", "the tracker to be lost")
         assert reader.last("fingers")["fingers"] == []
     wait_for(lambda: reader.last("page")["height"] == "", "the page to end")
+    reader.close()
+
+
+def test_places_that_have_waited_behind_others_are_refused_until_the_socket_is_empty(armed):
+    """Faster than the caller's rate, places would be seconds old when their turn comes."""
+    _board, daemon = armed
+    reader, touched = Reader(daemon), json.dumps({"fingers": [place(120)], "age_s": 0.0})
+    with socket(daemon, "/v1/fingers") as fingers:
+
+        def send_many():
+            for _ in range(200):
+                fingers.send(touched)
+            with suppress(TimeoutError):
+                return json.loads(fingers.recv(timeout=0))["problem"]
+
+        problem = wait_for(send_many, "the refusal of a backlog")
+        assert problem["code"] == "busy"
+        assert "waited behind others" in problem["detail"]
+
+        def is_seen():
+            fingers.send(touched)
+            return reader.last("fingers")["tracker"] == "seen"
+
+        wait_for(lambda: reader.last("fingers")["tracker"] == "lost", "the tracker to be lost")
+        wait_for(is_seen, "the tracker after the backlog")
     reader.close()
 
 

@@ -5,9 +5,9 @@ import time
 
 from starlette.websockets import WebSocket
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.daemon.api.daemon_client import DaemonClient
-from optodrive.daemon.api.scope_keys import ARRIVED_S
+from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.socket_token import select_subprotocol
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal, validate_fingers
@@ -15,6 +15,8 @@ from optodrive.planning.stimuli.json_values import decode_json
 
 FORWARD_PERIOD_S = 0.005
 """Least time between two messages to the planner; of those in between the newest counts."""
+WAITED_MAX_S = 0.2
+"""Longest time for which places may have waited in the socket: fingers have left those of a backlog."""
 
 
 class FingersSocket:
@@ -24,6 +26,7 @@ class FingersSocket:
         self._daemon, self._socket = daemon, socket
         self._newest: tuple[FingersMessage, float] | None = None
         self._arrived = asyncio.Event()
+        self._is_late = False
 
     async def run(self) -> None:
         """Serve until the tracker disconnects."""
@@ -38,12 +41,17 @@ class FingersSocket:
 
     async def _read(self) -> None:
         while (message := await self._socket.receive())["type"] != "websocket.disconnect":
+            was_late, self._is_late = self._is_late, time.monotonic() - message[EARLIEST_S] > WAITED_MAX_S
+            if was_late and self._is_late:
+                continue
             try:
+                if self._is_late:
+                    raise BusyError("the places have waited behind others: report at most `requests_per_s` per second")
                 fingers = parse_fingers(message.get("text") or message.get("bytes") or b"")
-            except InputError as error:
+            except OptodriveError as error:
                 await self._socket.send_text(FingersRefusal(problem=build_error_problem(error)).model_dump_json())
                 continue
-            self._newest = fingers, message.get(ARRIVED_S) or time.monotonic()
+            self._newest = fingers, message[ARRIVED_S]
             self._arrived.set()
 
     async def _forward(self) -> None:

@@ -54,7 +54,7 @@ def validate_fingers(message: object) -> FingersMessage:
 
 
 class FingersRefusal(JsonModel):
-    """Why a message was not understood. The fingertips before it remain."""
+    """Why a message was not taken. The fingertips before it remain."""
 
     model_config = ConfigDict(json_schema_serialization_defaults_required=False)
 
