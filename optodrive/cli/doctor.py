@@ -121,13 +121,15 @@ def examine_port(port: str, baud: int = BAUD, root: Path = Path("/")) -> list["F
 
 
 def _examine_board(config: "Config", clock: "Clock", root: Path) -> list["Finding"]:
-    """Return the findings on port and board of one stage."""
+    """Return the findings on mirrors, port and board of one stage."""
     from optodrive.cli.doctor_board import check_board
+    from optodrive.cli.doctor_mirrors import check_mirrors
     from optodrive.cli.doctor_port import check_port
 
+    mirrors = check_mirrors(config)
     if config.board.is_dac:
         from optodrive.cli.doctor_dac import check_dac
 
-        return list(check_dac(config, clock))
+        return [mirrors, *check_dac(config, clock)]
     port, free = check_port(config.board, root)
-    return [*port, *(check_board(config, clock) if free else [])]
+    return [mirrors, *port, *(check_board(config, clock) if free else [])]
