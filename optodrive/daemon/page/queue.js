@@ -30,7 +30,7 @@ export class QueueView {
 
   show(queue) {
     const [first, ...others] = queue.active;
-    const isRunning = first?.plan === queue.running && first !== undefined;
+    const isRunning = first !== undefined && (first.plan === queue.running || isFrame(first));
     this.idle.textContent = first ? "The next plan starts." : "Nothing plays.";
     this.#showWhether(isRunning ? first : null);
     this.at = performance.now();
@@ -38,15 +38,16 @@ export class QueueView {
       this.#showRunning(first);
     }
     const waiting = isRunning ? others : queue.active;
-    this.#showWaiting(waiting.filter((plan) => !FRAME_NAME.test(plan.name))); // the next frame replaces one that waits
+    this.#showWaiting(waiting.filter((plan) => !isFrame(plan))); // the next frame replaces one that waits
   }
 
   // Show whether a plan runs; null: none does.
   #showWhether(plan) {
     this.running = plan;
     this.idle.hidden = plan !== null;
-    for (const element of [this.now, this.end]) {
-      element.toggleAttribute("data-empty", plan === null);
+    this.now.toggleAttribute("data-empty", plan === null);
+    for (const element of [this.end, this.now.querySelector("progress")]) {
+      element.toggleAttribute("data-empty", plan === null || isFrame(plan)); // the next frame would follow
     }
   }
 
@@ -63,7 +64,9 @@ export class QueueView {
 
   #showTimeLeft() {
     const plan = this.running;
-    if (plan) {
+    if (plan && isFrame(plan)) {
+      this.now.querySelector(".left").textContent = "STOP ends them.";
+    } else if (plan) {
       const leftS = Math.max(0, plan.ends_in_s - (performance.now() - this.at) / 1000);
       const left = plan.ends_in_s === null ? "paused" : `${leftS.toFixed(1)} s left`;
       this.now.querySelector(".left").textContent = `${plan.executed} of ${plan.planned} pulses, ${left}`;
@@ -110,6 +113,12 @@ export class QueueView {
   }
 }
 
+function isFrame(plan) {
+  return FRAME_NAME.test(plan.name);
+}
+
+// Streamed frames replace each other too fast to be told apart.
 function describe(plan) {
-  return `${plan.plan} ${plan.name}${plan.caller ? ` by ${plan.caller}` : ""}`;
+  const what = isFrame(plan) ? "Streamed frames" : `${plan.plan} ${plan.name}`;
+  return `${what}${plan.caller ? ` by ${plan.caller}` : ""}`;
 }
