@@ -221,7 +221,6 @@ def test_an_answer_before_the_end_of_the_stimulus_does_not_count(make_study, ope
     visit.page.keyboard.press("w")
     visit.wait_for("question")
     assert "before the stimulus had ended" in visit.read_state()[1]
-    visit.page.keyboard.press("s")
     assert visit.take(lambda: visit.page.keyboard.press("s")) == "done"
     assert study.end() == 0
     trials = [record for record in records() if record["record"] == "trial"]
