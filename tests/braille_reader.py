@@ -2,17 +2,17 @@
 
 import ctypes
 import os
+import random
 import shutil
+import socket
 import subprocess
-from itertools import count
 from pathlib import Path
 
 from optodrive.core.forking import die_with_parent
 from rig import wait_for
 
 BRLAPI = "libbrlapi.so.0.8"
-SOCKETS = count(100 + os.getpid() % 10_000 * 6)
-"""Numbers of BrlAPI's sockets, of which no two may be the same on a computer."""
+SOCKET_MIN, SOCKET_MAX = 100, 60_000
 ROUTING_KEY = 0x2001_0000
 """Key code of a routing key, whose lowest bits are the cell from 0."""
 
@@ -32,11 +32,24 @@ def has_driver(name):
     return bool(program) and (Path(program).resolve().parents[1] / f"lib/brltty/libbrlttyb{name}.so").exists()
 
 
+def claim_socket():
+    """Return a number of a socket of BrlAPI that no other test of this computer has, and what keeps it until closed."""
+    while True:
+        number, claim = random.randrange(SOCKET_MIN, SOCKET_MAX), socket.socket(socket.AF_UNIX)
+        try:
+            claim.bind(f"\0optodrive-brlapi-{number}")
+        except OSError:
+            claim.close()
+            continue
+        return number, claim
+
+
 class BrlttyProcess:
     """BRLTTY with the given driver; its home is the folder."""
 
     def __init__(self, folder, *driver):
-        self.host = f":{next(SOCKETS)}"
+        number, self._claim = claim_socket()
+        self.host = f":{number}"
         self._log = (folder / "brltty.log").open("a")
         folders = [option for flag in "WU" for option in (f"-{flag}", str(folder))]
         self.process = subprocess.Popen(
@@ -55,6 +68,7 @@ class BrlttyProcess:
         self.process.kill()
         self.process.wait()
         self._log.close()
+        self._claim.close()
 
 
 def drive_serial(port):

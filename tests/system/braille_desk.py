@@ -180,8 +180,19 @@ class Desk:
                 since = len(self.board.of("pulse"))
             return self.find_emitted(since, times=2) == expected and (expected or is_dark(self))
 
-        wait_for(is_shown, f"{cells.hex()}, after pulse {since}")
+        try:
+            wait_for(is_shown, f"{cells.hex()}, after pulse {since}")
+        except BaseException:
+            self._describe(since, expected)
+            raise
         return since, expected
+
+    def _describe(self, since, expected):
+        """Print what the parts do, for a report of a failure."""
+        found, state = self.find_emitted(since), self.daemon.state()
+        print(f"{len(found & expected)} of {len(expected)} dots, {len(found - expected)} others since pulse {since}")
+        print(f"{len(self.board.of('pulse'))} pulses, command: {self.command.process.poll()}, board: {state['board']}")
+        print(f"queue: {state['queue']}")
 
 
 def is_dark(desk):
