@@ -1,5 +1,6 @@
 """`optodrive fingers`: report fingertips to the daemon, from a film, a camera, or a file as a tracker would."""
 
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -119,6 +120,7 @@ def _wait_for(report: "FingerReport", begin_s: float) -> "FingerReport":
 def _send(reports: Iterable["FingerReport"], url: str) -> None:
     """Send reports with their ages, until there is no other."""
     from optodrive.client.display import Display
+    from optodrive.core.errors import BusyError
     from optodrive.daemon.responses.fingers import AGE_MAX_S, FINGERS_MAX
 
     count, begin_s = 0, time.monotonic()
@@ -126,6 +128,9 @@ def _send(reports: Iterable["FingerReport"], url: str) -> None:
         for report in reports:
             age_s = max(0.0, time.monotonic() - report.at_s)
             if age_s <= AGE_MAX_S:  # older after a pause of this process: the fingers are elsewhere by now
-                connection.send(report.places[:FINGERS_MAX], age_s)
-                count += 1
+                try:
+                    connection.send(report.places[:FINGERS_MAX], age_s)
+                    count += 1
+                except BusyError as error:
+                    print(f"optodrive: {error}", file=sys.stderr)
     print(f"{count} reports of fingertips in {time.monotonic() - begin_s:.3g} s")

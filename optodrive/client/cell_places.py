@@ -1,7 +1,5 @@
 """Places of a screen reader's cells on a display: each cell as the pixels of its dots."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from optodrive.client.display import Display
@@ -20,13 +18,6 @@ GRAPHIC_CELL = np.array([[1, 4], [2, 5], [3, 6], [7, 8]])
 """Dot of each place of a cell of a graphic display, whose cells have no gaps."""
 PLANNED_S = 1.0
 """Duration of the frame whose plan is asked for. A frame that takes longer is planned to its end."""
-
-
-class DividedDisplay(NamedTuple):
-    """A line of text above a graphic display: the cells of each line."""
-
-    text: list[list[CellSlot]]
-    graphic: list[list[CellSlot]]
 
 
 def find_cell_lines(layout: PixelLayout, name: str) -> list[list[CellSlot]]:
@@ -53,7 +44,7 @@ def cut_rectangle(lines: list[list[CellSlot]], layout: PixelLayout) -> list[list
     return max(rectangles, key=lambda rectangle: sum(map(len, rectangle)))
 
 
-def divide_display(layout: PixelLayout, name: str) -> DividedDisplay:
+def divide_display(layout: PixelLayout, name: str) -> tuple[list[list[CellSlot]], list[list[CellSlot]]]:
     """Return the cells of a line of text at the top, and below it those of a graphic display.
 
     Dots of the graphic display have the lattice's pitch in both directions. Raises InputError if it has no room.
@@ -64,7 +55,7 @@ def divide_display(layout: PixelLayout, name: str) -> DividedDisplay:
     graphic = cut_rectangle(lines, layout) if lines else []
     if not (text and graphic and graphic[0]):
         raise InputError("display", name, "room for a braille cell above a graphic one of 4 rows", code="does_not_fit")
-    return DividedDisplay(text, graphic)
+    return text, graphic
 
 
 def _find_graphic_lines(index: IntArray) -> list[list[CellSlot]]:

@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from forked_process import OPTODRIVE, start_process
 from optodrive.client import Display
-from optodrive.core.errors import InputError
+from optodrive.core.errors import BusyError, InputError
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
@@ -245,6 +245,22 @@ def test_the_client_refuses_a_wrong_place_and_sends_the_next_one(rig, monkeypatc
         with pytest.raises(InputError, match=r"^message: fingers\.0\.x_m: got 2\.0, expected less than or equal to 1$"):
             fingers.send([FingerPlace(1, 2.0, 0.0, 0.004)])
         fingers.send([FingerPlace(1, 0.0, 0.0, 0.004)])
+
+
+def test_the_client_says_once_that_places_waited_and_sends_the_next_ones(rig, monkeypatch):
+    monkeypatch.setenv("OPTODRIVE_TOKEN", TOKEN)
+    touched = [FingerPlace(1, 0.0, 0.0, 0.004)]
+    with Display(rig[1].url) as display, display.fingers() as fingers:
+
+        def find_refusal():
+            try:
+                for _ in range(200):
+                    fingers.send(touched)
+            except BusyError as error:
+                return str(error)
+
+        assert "waited behind others" in wait_for(find_refusal, "the refusal of a backlog")
+        fingers.send(touched)
 
 
 def test_a_script_of_fingers_brings_light_under_them(armed, tmp_path):

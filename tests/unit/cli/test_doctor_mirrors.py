@@ -4,8 +4,9 @@ import re
 
 import pytest
 
-from optodrive.cli.doctor_mirrors import check_mirrors
+from optodrive.cli.doctor_mirrors import MEASURED, check_mirrors
 from optodrive.device.config_file import load_config
+from optodrive.lab.servo_identification.common_servo import HALF_WIDTH_MIN
 from optodrive.planning.display_model import DisplayModel
 
 
@@ -25,6 +26,7 @@ def find_times_us(text):
 
 
 def test_a_servo_that_nobody_measured_is_a_warning_with_the_gain_of_measuring_it():
+    assert MEASURED == HALF_WIDTH_MIN
     finding = check_mirrors(CONFIG)
     assert finding.status == "warning"
     assert "1.7 kHz ± 10 %" in finding.observation
@@ -32,7 +34,7 @@ def test_a_servo_that_nobody_measured_is_a_warning_with_the_gain_of_measuring_it
     table = DisplayModel.from_config(CONFIG).scan_heads[0].settling
     assert stated_us == table.settling_us(table.pitch_rad, 0.0, table.long_dwell_us)
     (measured_us,) = find_times_us(finding.remedy)
-    half_widths = dict.fromkeys(("bandwidth_uncertainty", "damping_uncertainty", "slew_uncertainty"), 0.02)
+    half_widths = dict.fromkeys(("bandwidth_uncertainty", "damping_uncertainty", "slew_uncertainty"), HALF_WIDTH_MIN)
     measured = check_mirrors(with_scanner(CONFIG, **half_widths, mirrors="/lab/mirrors.toml"))
     assert measured.status == "ok"
     assert "mirrors.toml: 1.7 kHz ± 2 %" in measured.observation
