@@ -16,7 +16,7 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
-TIMEOUT_MS = 110_000
+TIMEOUT_MS = 500_000
 """Limit of last resort, shorter than that of pytest: its error shows the page."""
 WIDE, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 
