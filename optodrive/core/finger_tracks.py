@@ -7,13 +7,9 @@ has jumped, and its track begins anew.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import NamedTuple
 
-import numpy as np
-
-from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.fingers import FingerPlace
 
 ACCELERATION_M_PER_S2, CHANGE_S = 1.0, 0.1
@@ -38,16 +34,20 @@ class PredictedFinger(NamedTuple):
     margin_m: float
 
 
-@dataclass
-class _Track:
-    """State of a fingertip at a time.
+class _Track(NamedTuple):
+    """State of a fingertip at a time. Numbers, because arrays of two take ten times as long.
 
-    state: [2, 2] place and velocity of x and y; covariance: [2, 2], the same for both axes
+    place_m2, cross_m2_per_s, speed_m2_per_s2: covariance of place and velocity, the same for both axes
     """
 
     at_s: float
-    state: FloatArray
-    covariance: FloatArray
+    x_m: float
+    y_m: float
+    x_m_per_s: float
+    y_m_per_s: float
+    place_m2: float
+    cross_m2_per_s: float
+    speed_m2_per_s2: float
     radius_m: float
 
 
@@ -62,36 +62,46 @@ class FingerTracks:
         self._tracks = {place.number: self._continue(at_s, place) for place in places}
 
     def _continue(self, at_s: float, place: FingerPlace) -> _Track:
-        measured_m = np.array([place.x_m, place.y_m])
-        track = self._tracks.get(place.number)
-        if track is not None:
-            state, covariance = _extrapolate(track, at_s)
-            variance_m2 = covariance[0, 0] + NOISE_M**2
-            rest_m = measured_m - state[0]
-            if hypot(*rest_m) <= GATE * sqrt(variance_m2):
-                gain = covariance[:, 0] / variance_m2
-                state = state + np.outer(gain, rest_m)
-                covariance = covariance - np.outer(gain, covariance[0])
-                return _Track(at_s, state, covariance, place.radius_m)
-        return _Track(
-            at_s, np.array([measured_m, [0.0, 0.0]]), np.diag([NOISE_M**2, FIRST_SPEED_M_PER_S**2]), place.radius_m
-        )
+        earlier = self._tracks.get(place.number)
+        if earlier is not None:
+            track = _extrapolate(earlier, at_s)
+            variance_m2 = track.place_m2 + NOISE_M**2
+            x_m, y_m = place.x_m - track.x_m, place.y_m - track.y_m
+            if hypot(x_m, y_m) <= GATE * sqrt(variance_m2):
+                of_place, of_speed_per_s = track.place_m2 / variance_m2, track.cross_m2_per_s / variance_m2
+                return _Track(
+                    at_s,
+                    track.x_m + of_place * x_m,
+                    track.y_m + of_place * y_m,
+                    track.x_m_per_s + of_speed_per_s * x_m,
+                    track.y_m_per_s + of_speed_per_s * y_m,
+                    track.place_m2 - of_place * track.place_m2,
+                    track.cross_m2_per_s - of_place * track.cross_m2_per_s,
+                    track.speed_m2_per_s2 - of_speed_per_s * track.cross_m2_per_s,
+                    place.radius_m,
+                )
+        return _Track(at_s, place.x_m, place.y_m, 0.0, 0.0, NOISE_M**2, 0.0, FIRST_SPEED_M_PER_S**2, place.radius_m)
 
     def predict(self, at_s: float) -> tuple[PredictedFinger, ...]:
         """Return the fingertips at a later time."""
         predicted = []
-        for number, track in self._tracks.items():
-            state, covariance = _extrapolate(track, at_s)
-            margin_m = min(MARGIN_MAX_M, MARGIN_SIGMAS * sqrt(covariance[0, 0]))
-            x_m, y_m = state[0].tolist()
-            predicted.append(PredictedFinger(number, x_m, y_m, track.radius_m, margin_m))
+        for number, earlier in self._tracks.items():
+            track = _extrapolate(earlier, at_s)
+            margin_m = min(MARGIN_MAX_M, MARGIN_SIGMAS * sqrt(track.place_m2))
+            predicted.append(PredictedFinger(number, track.x_m, track.y_m, track.radius_m, margin_m))
         return tuple(predicted)
 
 
-def _extrapolate(track: _Track, at_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return state and covariance of a track at a later time."""
+def _extrapolate(track: _Track, at_s: float) -> _Track:
+    """Return a track at a later time."""
     time_s = max(0.0, at_s - track.at_s)
-    transition = np.array([[1.0, time_s], [0.0, 1.0]])
     density = ACCELERATION_M_PER_S2**2 * CHANGE_S
-    noise = density * np.array([[time_s**3 / 3.0, time_s**2 / 2.0], [time_s**2 / 2.0, time_s]])
-    return transition @ track.state, transition @ track.covariance @ transition.T + noise
+    place_m2, cross_m2_per_s, speed_m2_per_s2 = track.place_m2, track.cross_m2_per_s, track.speed_m2_per_s2
+    return track._replace(
+        at_s=at_s,
+        x_m=track.x_m + time_s * track.x_m_per_s,
+        y_m=track.y_m + time_s * track.y_m_per_s,
+        place_m2=place_m2 + time_s * (2.0 * cross_m2_per_s + time_s * (speed_m2_per_s2 + density * time_s / 3.0)),
+        cross_m2_per_s=cross_m2_per_s + time_s * (speed_m2_per_s2 + density * time_s / 2.0),
+        speed_m2_per_s2=speed_m2_per_s2 + density * time_s,
+    )

@@ -13,7 +13,7 @@ import pytest
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.daemon.engine import queue_pause
-from optodrive.daemon.engine.thermal_estimate import EndedPlan, rewind_estimate
+from optodrive.daemon.engine.thermal_estimate import EndedPlan, EndedPlans, rewind_estimate
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.session.board_group import BoardGroup
@@ -292,7 +292,8 @@ def forget_heat(plan, budget, on_progress):
     """Mutant: the bound counts only what the lost board has reported."""
     ended, rows = EndedPlan.from_plan(plan), plan.executed_rows
     kept = PulsePlan(**{name: getattr(ended.plan, name)[rows] for name in PulsePlan.__dataclass_fields__})
-    return rewind_estimate([ended._replace(plan=kept, dropped=0)], np.inf, budget, on_progress)
+    rest = EndedPlans.from_plans([plan])._replace(plans=(ended._replace(plan=kept, dropped=0),))
+    return rewind_estimate(rest, np.inf, budget, on_progress)
 
 
 def test_what_the_lost_board_may_have_emitted_counts_as_heat(monkeypatch):

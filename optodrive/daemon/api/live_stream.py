@@ -111,7 +111,7 @@ class LiveStream:
             if result.fields["status"] >= 400:
                 self._refuse(frame, Problem.model_validate_json(result.payload))
                 continue
-            self._follow(frame, PlanReport.model_validate_json(result.payload))
+            self._follow(frame, result.payload)
 
     async def _take_frame(self) -> Frame:
         """Wait for the next frame to plan."""
@@ -135,8 +135,9 @@ class LiveStream:
     def _refuse(self, frame: Frame, problem: Problem) -> None:
         self._publish(FrameResult(frame=frame.number, status="refused", problem=problem))
 
-    def _follow(self, frame: Frame, report: PlanReport) -> None:
+    def _follow(self, frame: Frame, report_json: bytes) -> None:
         """Publish that a frame is planned, and its end when that comes."""
+        report = PlanReport.model_validate_json(report_json)
         self._publish(report_planned(frame.number, report))
         watcher = asyncio.create_task(self._watch(frame.number, report.plan))
         self._last_watcher, self._last_epoch = watcher, frame.epoch

@@ -1,13 +1,14 @@
 """Streamed frames that stand: the newest one is refreshed until the next, first where fingers are.
 
 Each refresh is a streamed plan of the pixels whose turn it is, which the planner process selects. One is made whenever
-new places of fingers have arrived, but not sooner than REFRESH_MIN_S after the last, and else every REFRESH_MAX_S,
-before the light that is planned ends. A refresh that is refused, as after STOP, ends the frame: it does not come back
-by itself. One that found too many requests waiting is tried again.
+new places of fingers have arrived, but not sooner than REFRESH_MIN_S after the last one began, and else every
+REFRESH_MAX_S, before the light that is planned ends. A refresh that is refused, as after STOP, ends the frame: it does
+not come back by itself. One that found too many requests waiting is tried again.
 """
 
 import asyncio
 import time
+from math import inf
 from typing import Any
 
 from optodrive.core.errors import BusyError
@@ -18,7 +19,7 @@ from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.stream import FrameResult
 
-REFRESH_MIN_S, REFRESH_MAX_S = 0.005, 0.03
+REFRESH_MIN_S, REFRESH_MAX_S = 0.008, 0.04
 TRIED_AGAIN = (BusyError.code,)
 """Codes of the problems after which a frame still stands."""
 
@@ -29,6 +30,7 @@ class StandingStream(LiveStream):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._shown: Frame | None = None
+        self._began_s = -inf
         self._fingers_arrived_s: float | None = None
         self._fingers_moved = asyncio.Event()
 
@@ -51,30 +53,30 @@ class StandingStream(LiveStream):
     async def _take_frame(self) -> Frame:
         """Wait for a frame, or for the time to refresh the one that stands."""
         if self._shown is not None:
-            await _wait_for_any(REFRESH_MIN_S, self._arrived)
-            if not self._arrived.is_set():
-                await _wait_for_any(REFRESH_MAX_S - REFRESH_MIN_S, self._arrived, self._fingers_moved)
+            await _wait_for_any(self._began_s + REFRESH_MIN_S, self._arrived)
+            await _wait_for_any(self._began_s + REFRESH_MAX_S, self._arrived, self._fingers_moved)
             if not self._arrived.is_set():
                 return self._shown
         return await super()._take_frame()
 
     def _build_push(self, frame: Frame) -> Push:
         """Build the push of a refresh, whose latency counts from the arrival of the first fingers that it follows."""
+        self._began_s = time.monotonic()
         push = super()._build_push(frame)._replace(standing=True)
         arrived_s, self._fingers_arrived_s = self._fingers_arrived_s, None
         self._fingers_moved.clear()
         if frame is not self._shown:
             return push
-        return push._replace(arrived_s=time.monotonic() if arrived_s is None else arrived_s)
+        return push._replace(refreshes=True, arrived_s=self._began_s if arrived_s is None else arrived_s)
 
-    def _follow(self, frame: Frame, report: PlanReport) -> None:
+    def _follow(self, frame: Frame, report_json: bytes) -> None:
         if frame is self._shown:
             return
         if self._shown is not None:
             superseded = FrameResult(frame=self._shown.number, status=PlanStatus.SUPERSEDED, superseded_by=frame.number)
             self._publish(superseded)
         self._shown, self._last_epoch = frame, frame.epoch
-        self._publish(report_planned(frame.number, report))
+        self._publish(report_planned(frame.number, PlanReport.model_validate_json(report_json)))
 
     def _refuse(self, frame: Frame, problem: Problem) -> None:
         if frame is self._shown:
@@ -84,8 +86,11 @@ class StandingStream(LiveStream):
         super()._refuse(frame, problem)
 
 
-async def _wait_for_any(timeout_s: float, *events: asyncio.Event) -> None:
-    """Wait until one of some events is set, but no longer than this time."""
+async def _wait_for_any(until_s: float, *events: asyncio.Event) -> None:
+    """Wait until one of some events is set, but no longer than until a monotonic time."""
+    timeout_s = until_s - time.monotonic()
+    if timeout_s <= 0.0 or any(event.is_set() for event in events):
+        return
     waits = [asyncio.ensure_future(event.wait()) for event in events]
     try:
         await asyncio.wait(waits, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)

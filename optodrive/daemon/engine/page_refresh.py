@@ -1,6 +1,7 @@
 """The part of a standing page that is drawn next, from the places of fingers and the pulses of the stream so far."""
 
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from math import ceil, inf
 from typing import Literal
@@ -27,8 +28,10 @@ AHEAD_SLOTS = 2
 MOVE_S = 4e-4
 """Typical time of a move between two pixels under the same finger."""
 FIRST_WIDTH_S = 4e-3
-MARGIN_S = 0.07
+MARGIN_MIN_S, MARGIN_MAX_S = 0.04, 0.07
 """Light that is planned beyond the lead of the stream: the next refresh comes meanwhile, and finds some unsent."""
+MARGIN_INTERVALS, INTERVALS_KEPT = 2.0, 8
+"""The same in intervals between refreshes, the longest of the latest ones."""
 
 
 class PageRefresh:
@@ -46,6 +49,7 @@ class PageRefresh:
         self._lock = threading.Lock()
         self._width_s = FIRST_WIDTH_S
         self._page_m, self._selected_s = np.zeros(len(layout)), -inf
+        self._intervals_s = deque([inf], INTERVALS_KEPT)
 
     def update_fingers(self, at_s: float, places: Sequence[FingerPlace]) -> None:
         """Take the places of all fingers at a time of the host's clock."""
@@ -78,14 +82,17 @@ class PageRefresh:
         """Return the part of a page whose turn it is. Raise InputError for a height out of reach."""
         (frame,) = remove_dead_pixels(display, page)[0].frames
         check_targets_reachable(display, page)
-        self._page_m, self._selected_s = frame.target_m, self._clock.now_s()
+        now_s = self._clock.now_s()
+        self._intervals_s.append(now_s - self._selected_s)
+        self._page_m, self._selected_s = frame.target_m, now_s
         if snapshot.predecessor is not None:
             self._width_s = float(snapshot.predecessor.planned.plan.width_s.mean())
         pixel_time_s = self._width_s + MOVE_S
-        begin_s = self._clock.now_s() + snapshot.start_s - self._board_s()
-        slots = ceil((self._lead_s() + MARGIN_S) / SLOT_S)
-        touched = np.array([self._find_touched(begin_s + step * SLOT_S) for step in range(slots + AHEAD_SLOTS)])
-        is_touched = np.array([touched[slot : slot + AHEAD_SLOTS + 1].any(axis=0) for slot in range(slots)])
+        begin_s = now_s + snapshot.start_s - self._board_s()
+        margin_s = min(MARGIN_MAX_S, max(MARGIN_MIN_S, MARGIN_INTERVALS * max(self._intervals_s)))
+        slots = ceil((self._lead_s() + margin_s) / SLOT_S)
+        touched = self._find_touched((begin_s + SLOT_S * np.arange(slots + AHEAD_SLOTS)).tolist())
+        is_touched = np.logical_or.reduce([touched[step : slots + step] for step in range(AHEAD_SLOTS + 1)])
         drawn_s = self._find_drawn_s(snapshot)
         bursts = select_bursts(frame.target_m, is_touched, drawn_s, snapshot.start_s, pixel_time_s)
         return build_refresh(frame, bursts, self._layout, pixel_time_s)
@@ -93,10 +100,14 @@ class PageRefresh:
     def _find_drawn_s(self, snapshot: PlanningSnapshot) -> FloatArray:
         return np.full(len(self._layout), -inf) if snapshot.cycle is None else snapshot.cycle.drawn_s
 
-    def _find_touched(self, at_s: float) -> BoolArray:
-        """Return the pixels under fingers at a time of the host's clock, [p]."""
-        touched = np.zeros(len(self._layout), dtype=np.bool_)
-        for finger in self.find_fingers(at_s):
-            distance_m = np.hypot(self._layout.x_m - finger.x_m, self._layout.y_m - finger.y_m)
-            touched |= distance_m <= finger.radius_m + finger.margin_m
-        return touched
+    def _find_touched(self, times_s: Sequence[float]) -> BoolArray:
+        """Return the pixels under fingers at times of the host's clock, [t, p]."""
+        if self.tracker != "seen":
+            return np.zeros((len(times_s), len(self._layout)), dtype=np.bool_)
+        with self._lock:
+            predicted = [self._tracks.predict(at_s) for at_s in times_s]
+        fingers = np.array(predicted, dtype=np.float64).reshape(len(times_s), -1, len(PredictedFinger._fields))
+        _, x_m, y_m, radius_m, margin_m = np.moveaxis(fingers, -1, 0)[..., np.newaxis]
+        distance_m2 = (self._layout.x_m - x_m) ** 2 + (self._layout.y_m - y_m) ** 2
+        is_under: BoolArray = (distance_m2 <= (radius_m + margin_m) ** 2).any(axis=1)
+        return is_under

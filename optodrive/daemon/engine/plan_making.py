@@ -93,6 +93,7 @@ def make_plan(
         labels=dict(built.labels),
         parameters=dict(built.parameters),
         streamed=push.streamed,
+        refreshes=push.refreshes,
         first_pulse_s=float(decoded.start_s.min()) if len(decoded.start_s) else None,
     )
     return ActivePlan(

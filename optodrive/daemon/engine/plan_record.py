@@ -117,6 +117,7 @@ class PlanRecord:
     caller: name of the token that submitted it
     labels, parameters: of the caller, and of the pattern
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
+    refreshes: whether it refreshes a standing page, and nobody waits for its end
     execution: None until execution has ended
     first_pulse_s: first gate on from the plan's zero, None without a pulse; onset: the executed one
     """
@@ -134,6 +135,7 @@ class PlanRecord:
     labels: dict[str, str | int | float | bool] = field(default_factory=dict)
     parameters: dict[str, str | float | bool | None] = field(default_factory=dict)
     streamed: bool = False
+    refreshes: bool = False
     status: PlanStatus = PlanStatus.PLANNED
     error: str | None = None
     sent: int = 0

@@ -9,12 +9,14 @@ from optodrive.daemon.engine.plan_record import PlanRecord
 
 RECORDS_MAX = 200
 BYTES_MAX = 10_000_000
-"""Beyond these numbers of plans or bytes the oldest ended plans are dropped."""
+"""Beyond this number of plans, or of bytes of ended ones, the oldest ended plans are dropped."""
 RECENT_PLANS = 20
 
 
 class PlanStore:
     """Records of plans by id, thread-safe. Beyond RECORDS_MAX or BYTES_MAX the oldest ended plans are dropped.
+
+    What counts is the size of a record at its plan's end.
 
     end_callbacks: called with every plan that ends, by any thread; must not block
     """
@@ -23,20 +25,29 @@ class PlanStore:
         self.end_callbacks: list[Callable[[ActivePlan], None]] = []
         self._lock = threading.Lock()
         self._records: dict[str, PlanRecord] = {}
+        self._ended_bytes: dict[str, int] = {}
+        self._kept_bytes = 0
 
     def add(self, plan: ActivePlan) -> None:
         """Keep the record of a plan."""
         plan.on_end = self._run_end_callbacks
         with self._lock:
             self._records[plan.record.plan_id] = plan.record
-            kept_bytes = sum(kept.nbytes for kept in self._records.values())
-            for plan_id, oldest in list(self._records.items()):
-                if not oldest.has_ended or (len(self._records) <= RECORDS_MAX and kept_bytes <= BYTES_MAX):
-                    break
-                del self._records[plan_id]
-                kept_bytes -= oldest.nbytes
+            self._make_room()
+
+    def _make_room(self) -> None:
+        while len(self._records) > RECORDS_MAX or self._kept_bytes > BYTES_MAX:
+            oldest = next(iter(self._records))
+            if oldest not in self._ended_bytes:
+                break
+            del self._records[oldest]
+            self._kept_bytes -= self._ended_bytes.pop(oldest)
 
     def _run_end_callbacks(self, plan: ActivePlan) -> None:
+        with self._lock:
+            ended_bytes = self._ended_bytes[plan.record.plan_id] = plan.record.nbytes
+            self._kept_bytes += ended_bytes
+            self._make_room()
         for callback in self.end_callbacks:
             callback(plan)
 

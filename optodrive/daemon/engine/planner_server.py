@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Any
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import OptodriveError
@@ -113,8 +112,8 @@ class PlannerServer:
         def finish(done: "Future[PlanReport]") -> None:
             if done.cancelled():
                 return
-            answer = _encode(done.result, 201)  # in the planner's thread
-            self._engine.commands.post(partial(self._finish, connection, client, request_id, *answer))
+            answer = _encode(done.result, 201, is_read=not push.refreshes)  # in the planner's thread
+            self._engine.commands.post(partial(self._finish, connection, client, request_id, push, *answer))
 
         future.add_done_callback(finish)
 
@@ -125,10 +124,19 @@ class PlannerServer:
         return BuiltRequest(decode_sequence(message.payload), message.fields["labels"], message.fields["parameters"])
 
     def _finish(
-        self, connection: MessageSocket, client: _Client, request_id: int, status: int, payload: bytes, audit: Any
+        self,
+        connection: MessageSocket,
+        client: _Client,
+        request_id: int,
+        push: Push,
+        status: int,
+        payload: bytes,
+        audit: dict[str, object],
     ) -> None:
-        if client.requests.pop(request_id, None) is not None:
-            self._reply(connection, request_id, status, payload, audit)
+        if client.requests.pop(request_id, None) is None:
+            return
+        reply = self._send_result if push.refreshes else self._reply
+        reply(connection, request_id, status, payload, audit)
 
     def _drop(self, client: _Client, request_id: int) -> None:
         """Forget a request: one that waits is not planned, and one that is being planned ends."""
@@ -177,6 +185,16 @@ class PlannerServer:
     ) -> None:
         """Send a result, after the state that explains it."""
         self._publish_state(0.0)
+        self._send_result(connection, request_id, status, payload, audit)
+
+    def _send_result(
+        self,
+        connection: MessageSocket,
+        request_id: int,
+        status: int,
+        payload: bytes,
+        audit: dict[str, object] | None = None,
+    ) -> None:
         fields = {"id": request_id, "status": status, "audit": audit or {}}
         self._engine.message_loop.send(connection, Message("result", fields, payload))
 
@@ -198,7 +216,7 @@ class PlannerServer:
         self._server.broadcast(Message("state", self._engine.build_planner_state().model_dump(mode="json")))
 
     def _report_end(self, record: PlanRecord) -> None:
-        if not record.streamed:
+        if not record.streamed or record.refreshes:
             return
         self._publish_state(0.0)
         report = record.build_report(self._engine.board_s(), False, self._engine.read_clocks())
@@ -241,8 +259,13 @@ def _fail(error: BaseException) -> None:
     raise OptodriveError(f"the telemetry failed: {type(error).__name__}: {error}") from error
 
 
-def _encode(get_report: Callable[[], PlanReport], status: int) -> tuple[int, bytes, dict[str, object]]:
-    """Return status, JSON and audit fields of a report, or of the problem that kept it from being made or encoded."""
+def _encode(
+    get_report: Callable[[], PlanReport], status: int, is_read: bool = True
+) -> tuple[int, bytes, dict[str, object]]:
+    """Return status, JSON and audit fields of a report, or of the problem that kept it from being made or encoded.
+
+    is_read: whether anybody reads the report
+    """
     try:
         report = get_report()
         audit: dict[str, object] = {
@@ -251,7 +274,7 @@ def _encode(get_report: Callable[[], PlanReport], status: int) -> tuple[int, byt
             "pulses": report.planned,
             "plan_status": report.status,
         }
-        return status, b"".join(iterate_json(report)), audit
+        return status, b"".join(iterate_json(report)) if is_read else b"", audit
     except OptodriveError as error:
         problem = build_error_problem(error)
     except Exception as error:

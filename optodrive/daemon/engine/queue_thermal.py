@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.thermal_estimate import (
-    EndedPlan,
+    EndedPlans,
     ThermalEstimate,
     estimate_before_rest,
     rewind_estimate,
@@ -54,8 +54,7 @@ class QueueThermal:
         clock_shift_s: by which the board's clock has jumped since they were queued
         """
         gate_off_s = max(self._session.board_s() - clock_shift_s + self._lease_s, self._session.dark_s)
-        plans = [EndedPlan.from_plan(plan) for plan in ended]
-        estimate = rewind_estimate(plans, gate_off_s, self._budget, self._on_progress)
+        estimate = rewind_estimate(EndedPlans.from_plans(ended), gate_off_s, self._budget, self._on_progress)
         self.set(estimate, max(gate_off_s, estimate.budget.at_s))
 
     def delay(self, delay_s: float) -> None:
@@ -73,8 +72,8 @@ class QueueThermal:
 
         active: plans that run, or the first that waits; host_s: present host time
         """
-        plans = tuple(EndedPlan.from_plan(plan) for plan in active)
-        return SavedThermalState(host_s, self._session.board_s(), self.estimate, plans)
+        ended = EndedPlans.from_plans(active) if active else None
+        return SavedThermalState(host_s, self._session.board_s(), self.estimate, ended)
 
     def build_saved_key(self, active: Sequence[ActivePlan]) -> object:
         """Return a value that changes whenever build_saved_state() would return another state.
@@ -94,6 +93,6 @@ class QueueThermal:
         expected_s = saved.board_s + host_s - saved.host_s
         gate_off_s = expected_s + self._lease_s
         estimate = saved.estimate
-        if saved.plans:
-            estimate = rewind_estimate(saved.plans, gate_off_s, self._budget, self._on_progress)
+        if saved.ended is not None:
+            estimate = rewind_estimate(saved.ended, gate_off_s, self._budget, self._on_progress)
         self.set(estimate.with_delay(board_s - expected_s + HOLD_MAX_S))

@@ -48,14 +48,12 @@ def apply_executed(before: ThermalState, executed: ExecutedPulses) -> ThermalSta
 
 
 class EndedPlan(NamedTuple):
-    """Plan that ended early, with its initial state and its executed pulses.
+    """Plan that ended early, with its executed pulses.
 
-    heat_before, budget_before: initial state, on the plan's own time line; start_s: board time of the plan's zero
-    dropped: number of pulses at the plan's end that the board will never get; executed: None without a report
+    start_s: board time of the plan's zero; executed: None without a report
+    dropped: number of pulses at the plan's end that the board will never get
     """
 
-    heat_before: ThermalState
-    budget_before: BudgetState
     start_s: float
     plan: PulsePlan
     dropped: int
@@ -65,8 +63,6 @@ class EndedPlan(NamedTuple):
     def from_plan(cls, plan: ActivePlan) -> Self:
         """Build it from a plan that waits, runs or has ended."""
         return cls(
-            plan.heat_before,
-            plan.budget_before,
             plan.record.start_s,
             PulsePlan(**{item.name: getattr(plan.planned.plan, item.name) for item in fields(PulsePlan)}),
             plan.rest_count if plan.is_interrupted else plan.record.dropped,
@@ -74,17 +70,32 @@ class EndedPlan(NamedTuple):
         )
 
 
+class EndedPlans(NamedTuple):
+    """Consecutive plans that ended early.
+
+    heat_before, budget_before: initial state of the first one, on its own time line
+    """
+
+    heat_before: ThermalState
+    budget_before: BudgetState
+    plans: tuple[EndedPlan, ...]
+
+    @classmethod
+    def from_plans(cls, plans: Sequence[ActivePlan]) -> Self:
+        """Build it from one plan or more that wait, run or have ended."""
+        return cls(plans[0].heat_before, plans[0].budget_before, tuple(map(EndedPlan.from_plan, plans)))
+
+
 def rewind_estimate(
-    ended: Sequence[EndedPlan], gate_off_s: float, budget: Budget, on_progress: Callable[[], None]
+    ended: EndedPlans, gate_off_s: float, budget: Budget, on_progress: Callable[[], None]
 ) -> ThermalEstimate:
     """Build the estimate after plans that ended early, without their dropped pulses.
 
     The heat counts only executed pulses. The budget counts every pulse that may have started before board time
     gate_off_s, when the gate is off for certain.
     """
-    first = ended[0]
-    heat, state, zero_s = first.heat_before, first.budget_before, first.start_s
-    for record in ended:
+    heat, state, zero_s = ended.heat_before, ended.budget_before, ended.plans[0].start_s
+    for record in ended.plans:
         plan = record.plan
         heat, state = heat.copy_shifted(zero_s - record.start_s), shift_state(state, zero_s - record.start_s)
         zero_s = record.start_s
@@ -102,5 +113,5 @@ def estimate_before_rest(plan: ActivePlan, budget: Budget, on_progress: Callable
     """Build the estimate before a plan that waits, or before the rest of one that was interrupted."""
     if plan.first_row:
         ended = EndedPlan.from_plan(plan)._replace(dropped=plan.rest_count)
-        return rewind_estimate([ended], inf, budget, on_progress)
+        return rewind_estimate(EndedPlans.from_plans([plan])._replace(plans=(ended,)), inf, budget, on_progress)
     return ThermalEstimate.from_plan(plan.heat_before, plan.budget_before, plan.record.start_s)

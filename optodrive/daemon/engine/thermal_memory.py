@@ -5,7 +5,7 @@ import pickle
 import struct
 from typing import NamedTuple
 
-from optodrive.daemon.engine.thermal_estimate import EndedPlan, ThermalEstimate
+from optodrive.daemon.engine.thermal_estimate import EndedPlans, ThermalEstimate
 
 SLOT_BYTES = 256 * 2**20
 """Room for one state. Memory that was never written costs nothing."""
@@ -18,13 +18,13 @@ SHARE = struct.Struct("<d")
 class SavedThermalState(NamedTuple):
     """State at a host time and the board time then, s.
 
-    estimate: after all plans; plans: those that were running, or the first that waited, whose pulses `estimate` counts
+    estimate: after all plans; ended: those that were running, or the first that waited, whose pulses `estimate` counts
     """
 
     host_s: float
     board_s: float
     estimate: ThermalEstimate
-    plans: tuple[EndedPlan, ...]
+    ended: EndedPlans | None
 
 
 class ThermalMemory:
