@@ -10,7 +10,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.units import um_to_m
 from optodrive.device.config import PixelLayout
-from optodrive.planning.stimuli.streamed_frame import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
+from optodrive.planning.stimuli.binary_frame import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
 
 HeightsLike = Mapping[int, float] | ArrayLike
 """Peak heights in µm: {pixel: height}, [p] by pixel, or [rows, columns] by position; NaN or 0: no target."""

@@ -19,7 +19,7 @@ from optodrive.client.humanware import NAMED_KEYS
 from optodrive.client.reader_channels import READ_BYTES, ReaderChannel
 from optodrive.client.stream import Stream
 from optodrive.core.errors import InputError
-from optodrive.planning.stimuli.text import CellSlot
+from optodrive.planning.stimuli.cell_slots import CellSlot
 
 FRAME_S = 0.1
 NOT_SHOWN = ("refused", "failed", "stopped")

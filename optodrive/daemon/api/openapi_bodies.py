@@ -2,12 +2,12 @@
 
 from typing import Any
 
+from optodrive.planning.stimuli.binary_frame import FRAME_NUMBER_MAX
 from optodrive.planning.stimuli.frame_json import ID_MAX, TARGET_KEYS
 from optodrive.planning.stimuli.json_values import PRIORITY_MAX, TIME_MAX_S
 from optodrive.planning.stimuli.labels import KEY_MAX, LABELS_MAX, NUMBER_MAX, TEXT_MAX
 from optodrive.planning.stimuli.pattern_registry import describe_patterns
 from optodrive.planning.stimuli.sequence_file import FRAMES_MAX, TRAINS_MAX
-from optodrive.planning.stimuli.streamed_frame import FRAME_NUMBER_MAX
 
 Schema = dict[str, Any]
 

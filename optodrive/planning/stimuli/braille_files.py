@@ -7,7 +7,8 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.braille import Cell
-from optodrive.planning.stimuli.text import Spacing, show_lines
+from optodrive.planning.stimuli.cell_slots import Spacing
+from optodrive.planning.stimuli.text import show_lines
 
 BRAILLE_ASCII = " A1B'K2L@CIF/MSP\"E3H9O6R^DJG>NTQ,*5<-U8V.%[$+X!&;:4\\0Z7(_?W]#Y)="
 """The character of each cell, by its dots as bits, dot 1 lowest (North American Braille Computer Code)."""

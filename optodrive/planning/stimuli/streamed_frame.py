@@ -1,20 +1,14 @@
 """Parse one frame of a running stream, from JSON text or from two bytes per pixel."""
 
-import struct
-
 import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.planning.stimuli.binary_frame import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
 from optodrive.planning.stimuli.frame_json import parse_targets_m
 from optodrive.planning.stimuli.json_values import decode_json, require_object
 
-MAGIC = b"ODF1"
-HEADER = struct.Struct("<4sI")
-HEIGHT_UNIT_M = 1e-7
-"""Unit of binary heights, m."""
-FRAME_NUMBER_MAX = 0xFFFF_FFFF
 FRAME_DURATION_S = 3600.0
 """Nominal duration of a streamed frame, s; the next frame, or one complete drawing, ends it earlier."""
 

@@ -6,9 +6,10 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII, build_braille_file
+from optodrive.planning.stimuli.cell_slots import Spacing, find_line_slots
 from optodrive.planning.stimuli.liblouis import TABLES
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.text import Spacing, build_text, find_line_slots
+from optodrive.planning.stimuli.text import build_text
 
 PEF = (
     '<?xml version="1.0" encoding="UTF-8"?><pef version="2008-1" xmlns="http://www.daisy.org/ns/2008/pef"><head/>'

@@ -11,9 +11,10 @@ from liblouis_judge import ALPHABETS, draw_lines, judge
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import liblouis
+from optodrive.planning.stimuli.cell_slots import Spacing, find_line_slots
 from optodrive.planning.stimuli.liblouis import LIBRARY, translate_lines
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.text import Spacing, build_text, find_line_slots
+from optodrive.planning.stimuli.text import build_text
 
 
 def has_library():
