@@ -7,7 +7,7 @@ from statistics import median
 import numpy as np
 from measuring import build_display, measure_times_s, running_daemon, to_ms
 
-from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
+from optodrive.daemon.engine.display_snapshot import EmittedPulses, LiveThermalState
 from optodrive.planning.pipeline import warm_up
 
 SECONDS, SNAPSHOTS = 12, 300
@@ -21,11 +21,7 @@ def measure_snapshots():
     live, pixel = LiveThermalState(display), np.arange(0, 1511, 2)
     size, none = len(pixel), np.zeros(len(pixel))
     start_s = 5e-3 * np.arange(size)
-    live.apply(
-        ExecutedBatch(
-            None, pixel, pixel, start_s, np.full(size, 4e-3), np.full(size, 2.0), none, none, none.astype(int)
-        )
-    )
+    live.apply(EmittedPulses(pixel, start_s, np.full(size, 4e-3), np.full(size, 2.0), none, none, none.astype(int)))
     for what, compute_snapshot in (("all heights", live.state_at), ("the budget", live.compute_usage)):
         times = (5e-3 * size + 0.033 * k for k in count())
         taken_s = measure_times_s(lambda: compute_snapshot(next(times)), SNAPSHOTS)

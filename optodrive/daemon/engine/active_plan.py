@@ -43,6 +43,7 @@ class ActivePlan:
     growth: plans the rest once it is due, None for a whole plan
     cycle: refresh cycle of the stream before this plan, None for the first one
     first_row: first row that was not executed when the plan was interrupted last
+    initial_pixels: pixel at which the mirrors of each stage point when its points begin; None if one is unknown
     zero_s: time of the plan at which its points begin; origin_s: the same, or when the light went off meanwhile
     is_interrupted: whether the rows from first_row on were dropped, and are not yet planned again
     executed, executed_rows, simulated_m: what the board reports, [n executed] plan rows, and displacements computed
@@ -60,6 +61,7 @@ class ActivePlan:
     growth: SequencePlanner | None = None
     cycle: RefreshCycle | None = None
     first_row: int = 0
+    initial_pixels: tuple[int, ...] | None = None
     zero_s: float = 0.0
     origin_s: float = 0.0
     is_interrupted: bool = False

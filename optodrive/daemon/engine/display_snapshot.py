@@ -3,8 +3,8 @@
 The planner's thermal state is ahead of emission; this one follows it. It is not thread-safe.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -18,15 +18,9 @@ from optodrive.planning.limiter.limiter import commit_executed, shift_state
 from optodrive.planning.limiter.usage import Usage, compute_panel_k, compute_usage
 
 
-class ExecutedBatch(NamedTuple):
-    """Executed pulses of a plan, [n], also as input for the limiter.
+class EmittedPulses(NamedTuple):
+    """Pulses that boards report as executed, [n], as input for the heat and the limiter. start_s: board time."""
 
-    row: plan row
-    start_s: board time
-    """
-
-    plan: ActivePlan
-    row: IntArray
     pixel: IntArray
     start_s: FloatArray
     width_s: FloatArray
@@ -36,14 +30,37 @@ class ExecutedBatch(NamedTuple):
     stage: IntArray
 
     @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """Return the pulses of several parts, one after another."""
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def join_in_order(batches: Iterable[EmittedPulses]) -> Iterator[EmittedPulses]:
+    """Join consecutive batches, none empty, as far as each begins after the last pulse of the one before."""
+    parts: list[EmittedPulses] = []
+    for batch in batches:
+        if parts and batch.start_s[0] < parts[-1].start_s[-1]:
+            yield EmittedPulses.join(parts)
+            parts = []
+        parts.append(batch)
+    if parts:
+        yield EmittedPulses.join(parts)
+
+
+class ExecutedBatch(NamedTuple):
+    """Executed pulses of a plan, [n], and their rows in the plan."""
+
+    plan: ActivePlan
+    row: IntArray
+    pulses: EmittedPulses
+
+    @classmethod
     def from_progress(cls, progress: PlanProgress, scales: Sequence[WireScale]) -> "ExecutedBatch":
         """Build the batch from the boards' reports. scales: of each stage."""
         active, job = progress.run
         plan, reported = active.planned.plan, job.read_reported(progress.begin, progress.end, scales)
         row, tick_s = reported.row, scales[0].tick_s
-        return cls(
-            plan=active,
-            row=row,
+        pulses = EmittedPulses(
             pixel=plan.pixel[row],
             start_s=np.asarray(reported.on_tick * tick_s, dtype=np.float64),
             width_s=np.asarray(reported.on_ticks * tick_s, dtype=np.float64),
@@ -52,6 +69,7 @@ class ExecutedBatch(NamedTuple):
             y_rad=plan.y_rad[row],
             stage=reported.stage,
         )
+        return cls(active, row, pulses)
 
 
 class LiveThermalState:
@@ -66,9 +84,9 @@ class LiveThermalState:
         self._peaks = self._build_no_peaks()
         self.out_of_order = 0
 
-    def apply(self, executed: ExecutedBatch) -> FloatArray:
+    def apply(self, executed: EmittedPulses) -> FloatArray:
         """Add pulses, in order of time. Return the displacement to which each raises its pixel, [n], m."""
-        displacement_m = np.zeros(len(executed.row))
+        displacement_m = np.zeros(len(executed.pixel))
         columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
         try:
             peaks = self._heat.apply_pulses(*columns)
@@ -76,7 +94,7 @@ class LiveThermalState:
             for held, values in zip(self._peaks, peaks, strict=True):
                 np.maximum.at(held, executed.pixel, values)
         except ValueError:
-            self.out_of_order += len(executed.row)
+            self.out_of_order += len(executed.pixel)
         self._budget = commit_executed(executed.pixel, executed.stage, executed, self._budget, self._display.budget)
         return displacement_m
 

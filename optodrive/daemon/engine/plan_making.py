@@ -106,6 +106,7 @@ def make_plan(
         crc=zlib.crc32(payload),
         growth=None if growth is None or growth.is_complete else growth,
         cycle=snapshot.cycle,
+        initial_pixels=snapshot.initial_pixels,
     )
 
 

@@ -62,6 +62,7 @@ class RestartedPlan:
         plan.replace_rows(planned, self.points, self.crc, self.summary_json)
         plan.is_interrupted = False
         plan.zero_s = plan.origin_s = zero_s
+        plan.initial_pixels = None
 
 
 def restart_plans(

@@ -37,23 +37,28 @@ class PlanningSnapshot:
 
 
 def build_cut_snapshot(
-    running: ActivePlan, thermal: ThermalEstimate, min_start_s: float, budget: Budget, tick_s: float
+    running: ActivePlan,
+    thermal: ThermalEstimate,
+    min_start_s: float,
+    budget: Budget,
+    tick_s: float,
+    follows: bool = False,
 ) -> PlanningSnapshot | None:
     """Build the snapshot for truncating a running plan before its first point after board time min_start_s.
 
-    Return None if no pulse would be left, or none would be dropped.
+    follows: whether the plan's points follow those of another plan, so that no point of it must be left
+    Return None if no pulse would be left of a plan that must keep one, or none would be dropped.
     """
     plan, zero_s = running.planned.plan, running.record.start_s
-    cut = PointCut.find(running.points, (min_start_s - zero_s - running.zero_s) / tick_s)
-    if not 0 < cut.row < len(plan):
+    min_tick = (min_start_s - zero_s - running.zero_s) / tick_s
+    cut = PointCut.find(running.points, min_tick if follows else max(1.0, min_tick))
+    if cut.row == len(plan) or (not cut.row and any(cut.kept_points)):
         return None
     end_s = running.zero_s + cut.end_tick * tick_s
     kept = slice(cut.row)
     heat = running.heat_before.copy()
     heat.apply_pulses(plan.pixel[kept], plan.start_s[kept], plan.width_s[kept], plan.power_w[kept])
     state = commit_until(plan, float(plan.start_s[cut.row]), running.budget_before, budget)
-    pairs = zip(cut.aim_rows, running.points.stages, strict=True)
-    is_aim_unknown = any(row == -1 and len(points) for row, points in pairs)  # a lost stage has no points
     return PlanningSnapshot(
         thermal=thermal,
         start_s=zero_s + end_s,
@@ -61,9 +66,22 @@ def build_cut_snapshot(
         budget=shift_state(state, -end_s),
         predecessor=running,
         cut=cut,
-        initial_pixels=None if is_aim_unknown else tuple(plan.pixel[cut.aim_rows].tolist()),
-        cycle=continue_cycle(running, cut.row),
+        initial_pixels=_find_initial_pixels(running, cut),
+        cycle=continue_cycle(running, cut.row) if cut.row else running.cycle,
     )
+
+
+def _find_initial_pixels(running: ActivePlan, cut: PointCut) -> tuple[int, ...] | None:
+    """Return the pixels at which the mirrors point at the end of the kept points."""
+    pixels: list[int] = []
+    for stage, (row, points) in enumerate(zip(cut.aim_rows, running.points.stages, strict=True)):
+        if row >= 0 or not len(points):  # a lost stage has no points, and its mirrors no place
+            pixels.append(int(running.planned.plan.pixel[row]))
+        elif running.initial_pixels is not None and not cut.kept_points[stage]:
+            pixels.append(running.initial_pixels[stage])
+        else:
+            return None
+    return tuple(pixels)
 
 
 def continue_cycle(streamed: ActivePlan, row: int) -> RefreshCycle:

@@ -5,7 +5,7 @@ It runs in a thread of its own. Without readers it only follows the executed pul
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from optodrive.core.ipc import Message
 from optodrive.core.json_model import JsonModel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
+from optodrive.daemon.engine.display_snapshot import EmittedPulses, ExecutedBatch, LiveThermalState, join_in_order
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.progress import ClockShift, merge_events
 from optodrive.daemon.engine.telemetry_events import (
@@ -63,8 +63,8 @@ class TelemetryProducer:
         self._executed_state = LiveThermalState(engine.display)
         self._touch = TouchReport(engine.display.layout)
         self._tracker, self._page_m = "", np.zeros(0)
-        self._batches: deque[Message] = deque(maxlen=BATCHES_MAX)
-        self._batch_number = 0
+        self._batches: deque[Message] = deque()
+        self._batch_number = self._kept_pulses = 0
         self._announced_rows: dict[ActivePlan, int] = {}
         self._next_s: dict[str, float] = {}
         self._board_clock_reference = (0.0, 0.0)
@@ -170,16 +170,24 @@ class TelemetryProducer:
         self._tracker, self._page_m = tracker, page_m
 
     def _collect_executed(self) -> None:
+        waiting: list[EmittedPulses] = []
         for event in merge_events(self._engine.drain_events()):
             if isinstance(event, ClockShift):
+                self._apply(waiting)
                 self._executed_state.shift_clock(event.delay_s)
                 self._touch.clear()
+                waiting = []
                 continue
-            executed = ExecutedBatch.from_progress(event, self._engine.scales)
-            if len(executed.row):
-                self._touch.add(executed.pixel, executed.start_s, self._executed_state.apply(executed))
-                columns = (executed.start_s, executed.width_s, executed.power_w)
-                self._add_batch("executed", executed.plan, executed.row, *columns)
+            plan, row, pulses = ExecutedBatch.from_progress(event, self._engine.scales)
+            if len(row):
+                waiting.append(pulses)
+                self._add_batch("executed", plan, row, pulses.start_s, pulses.width_s, pulses.power_w)
+        self._apply(waiting)
+
+    def _apply(self, batches: Sequence[EmittedPulses]) -> None:
+        """Add executed pulses to the display's state, many at once: a call costs more than a hundred pulses."""
+        for pulses in join_in_order(batches):
+            self._touch.add(pulses.pixel, pulses.start_s, self._executed_state.apply(pulses))
 
     def _announce_planned(self, board_s: float) -> None:
         """Publish the planned pulses that start soon."""
@@ -217,8 +225,8 @@ class TelemetryProducer:
         }
         message = Message("pulses", fields, batch.model_dump_json().encode())
         self._batches.append(message)
-        kept_pulses = sum(batch.fields["count"] for batch in self._batches)
-        while kept_pulses > PULSES_KEPT_MAX:
-            kept_pulses -= self._batches.popleft().fields["count"]
+        self._kept_pulses += len(row)
+        while self._kept_pulses > PULSES_KEPT_MAX or len(self._batches) > BATCHES_MAX:
+            self._kept_pulses -= self._batches.popleft().fields["count"]
         if self._readers:
             self._publish_message(message)

@@ -22,13 +22,13 @@ class PointCut(NamedTuple):
 
     @classmethod
     def find(cls, points: StagePoints, sent_tick: float) -> Self:
-        """Find the earliest cut that keeps the first point and each that begins before sent_tick from the plan's zero.
+        """Find the earliest cut that keeps each point that begins before sent_tick from the plan's zero.
 
         A kept point that only moves the mirrors towards a pulse keeps the pulse: the mirrors' heat counts with it.
         """
         ends = [one.compute_end_ticks() for one in points.stages]
         # A point begins at the end of the one before it.
-        kept = [min(len(end), int(np.searchsorted(end[:-1], sent_tick)) + 1) for end in ends]
+        kept = [0 if sent_tick <= 0 else min(len(end), int(np.searchsorted(end[:-1], sent_tick)) + 1) for end in ends]
         row = -1
         while True:
             for stage, one in enumerate(points.stages):

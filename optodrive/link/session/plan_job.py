@@ -110,6 +110,8 @@ class PlanJob:
             return self._count - position
         # A point starts at the end of its predecessor. With a float, numpy would convert all ticks at every call.
         due_tick = floor(now_tick + self._send_ahead_ticks)
+        if due_tick < self.start_tick:
+            return 0
         due_count = int(np.searchsorted(self._end_tick[: self._count], due_tick, side="right")) + 1
         return max(0, min(due_count, self._count) - position)
 
@@ -117,9 +119,9 @@ class PlanJob:
     def next_due_tick(self) -> float | None:
         """Board tick from which the next point may be sent, None if it need not wait."""
         position = self.next_to_send - self.first_index
-        if self._send_ahead_ticks == inf or position == 0 or position >= self._count:
+        if self._send_ahead_ticks == inf or position >= self._count:
             return None
-        return float(self._end_tick[position - 1]) - self._send_ahead_ticks
+        return float(self.end_tick_after(position)) - self._send_ahead_ticks
 
     def take_payload(self, count: int, now_tick: float) -> bytes:
         """Return the bytes of the next points and mark them as sent."""

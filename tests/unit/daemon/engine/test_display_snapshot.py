@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
+from optodrive.daemon.engine.display_snapshot import EmittedPulses, LiveThermalState, join_in_order
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 
@@ -15,7 +15,7 @@ def executed(pixel, start_s, width_s=0.01, power_w=2.0):
     count = len(pixel)
     zeros = np.zeros(count)
     columns = pixel, start_s, np.full(count, width_s), np.full(count, power_w), zeros, zeros
-    return ExecutedBatch(None, np.arange(count), *columns, stage=np.zeros(count, dtype=np.int64))
+    return EmittedPulses(*columns, stage=np.zeros(count, dtype=np.int64))
 
 
 def shares(live, at_s):
@@ -34,6 +34,14 @@ def test_single_reports_equal_one_batch():
         assert live.state_at(1.32).displacement_m == pytest.approx(heat.state_at(1.32).displacement_m)
     assert shares(stepwise, 1.32) == pytest.approx(shares(batch, 1.32), rel=1e-6, abs=1e-9)
     assert shares(batch, 1.32)["pixel_mean_power"] > 0.02
+
+
+def test_batches_are_joined_until_one_begins_before_the_last_pulse():
+    batches = [executed([1, 2], [1.0, 1.1]), executed(3, 1.2), executed([3, 4], [1.15, 1.3]), executed(5, 1.3)]
+    joined = list(join_in_order(batches))
+    assert [batch.pixel.tolist() for batch in joined] == [[1, 2, 3], [3, 4, 5]]
+    assert [batch.start_s.tolist() for batch in joined] == [[1.0, 1.1, 1.2], [1.15, 1.3, 1.3]]
+    assert list(join_in_order([])) == []
 
 
 @pytest.mark.parametrize("at_once", [True, False])

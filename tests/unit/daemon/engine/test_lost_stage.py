@@ -218,7 +218,7 @@ def test_a_plan_that_waits_is_planned_anew_for_the_others(rig):
 def test_the_telemetry_gets_each_executed_pulse_with_its_pixel(rig):
     record = lose(rig)
     rig.until(lambda: record.has_ended)
-    batches = [ExecutedBatch.from_progress(event, rig.remote.scales) for event in rig.queue.accounts.events]
+    batches = [ExecutedBatch.from_progress(event, rig.remote.scales).pulses for event in rig.queue.accounts.events]
     names = "start_s", "pixel", "stage"
     start_s, pixel, stage = (np.concatenate([getattr(batch, name) for batch in batches]) for name in names)
     assert len(start_s) == record.executed_count

@@ -64,6 +64,19 @@ def test_a_streamed_plan_replaces_the_unsent_rest_without_a_pause(rig):
     assert rig.session.board.underruns == 0
 
 
+def test_a_streamed_plan_that_has_not_begun_is_replaced_as_a_whole(rig):
+    first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
+    rig.until(lambda: first.executed_count >= 1)
+    second, third = (submit(rig, build_frame(height_um, duration_s=9.0), streamed=True) for height_um in (80.0, 90.0))
+    assert (second.dropped, third.start_s) == (16, second.start_s)
+    finish(rig, third)
+    assert [record.status for record in (first, second, third)] == ["superseded", "superseded", "done"]
+    assert (first.executed_count + first.dropped, second.executed_count, third.executed_count) == (16, 0, 16)
+    assert len(rig.list_emitted()) == first.executed_count + 16
+    assert third.execution.simulated_m == pytest.approx(90e-6, rel=0.01)
+    assert rig.session.board.underruns == 0
+
+
 @pytest.fixture
 def attempts(monkeypatch):
     """The identifiers of the plans that are made, one for each attempt."""

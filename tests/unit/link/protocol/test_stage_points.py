@@ -57,7 +57,7 @@ def test_a_pause_before_the_points_shifts_all_of_them(ticks):
 
 def test_a_cut_keeps_what_may_have_been_sent_and_all_rows_before_it(plan):
     points = StagePoints.from_plan(plan, SCALES)
-    for sent_tick in (-1000.0, 0.0, 3e4, 1e5, 2.5e5):
+    for sent_tick in (1.0, 3e4, 1e5, 2.5e5):
         cut = PointCut.find(points, sent_tick)
         for one, kept in zip(points.stages, cut.kept_points, strict=True):
             ends = one.compute_end_ticks()
@@ -66,6 +66,11 @@ def test_a_cut_keeps_what_may_have_been_sent_and_all_rows_before_it(plan):
             assert not (one.row[kept:][one.row[kept:] >= 0] < cut.row).any()
             assert ends[kept - 1] <= cut.end_tick
         assert [int(plan.stage[row]) for row in cut.aim_rows] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("sent_tick", [-1000.0, 0.0])
+def test_a_cut_before_the_begin_keeps_nothing(plan, sent_tick):
+    assert PointCut.find(StagePoints.from_plan(plan, SCALES), sent_tick) == ([0, 0, 0], 0, 0, [-1, -1, -1])
 
 
 def test_a_stage_without_pulses_idles_in_short_points():
