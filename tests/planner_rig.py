@@ -122,9 +122,10 @@ class PlannerRig(ServiceRig):
         options=MappingProxyType({}),
         caller_left=NEVER,
         lists_pulses=True,
+        refreshes=False,
     ):
         """Plan a sequence. Return its future. A streamed one grows unless its answer lists its pulses."""
-        push = Push("push", options, self.clock.now_s(), epoch, caller, streamed, lists_pulses)
+        push = Push("push", options, self.clock.now_s(), epoch, caller, streamed, lists_pulses, refreshes=refreshes)
         request = PlanningRequest(lambda: BuiltRequest(sequence), push, self.remote.board_s(), caller_left)
         return self.planner.submit(request)
 

@@ -117,6 +117,7 @@ class PlanQueue(QueuedPlans):
             self.accounts.totals["planned"] += record.pulse_count
             record.change_status(PlanStatus.QUEUED if snapshot.predecessor is None else PlanStatus.RUNNING)
             record.planned_after_s = self._session.board_s() - record.arrived_s
+            self.stream.follow_withdrawn(plan, snapshot)
             self._plan_store.add(plan)
             return True
 

@@ -75,6 +75,13 @@ class QueueStream:
         self._plans.running.append(PlanRun(plan, job))
         return True
 
+    @staticmethod
+    def follow_withdrawn(plan: ActivePlan, snapshot: PlanningSnapshot) -> None:
+        """Count the light of a refresh from the arrival of the fingers that a refresh withdrawn as a whole followed."""
+        withdrawn = snapshot.predecessor
+        if plan.record.refreshes and withdrawn is not None and snapshot.cut is not None and not snapshot.cut.row:
+            plan.record.arrived_s = min(plan.record.arrived_s, withdrawn.record.arrived_s)
+
     @property
     def must_preempt(self) -> bool:
         """Whether a newer streamed plan must preempt others first."""

@@ -15,8 +15,8 @@ from optodrive.planning.listed_pulses import ListedPulses
 from planner_rig import PlannerRig, build_frame, build_train
 
 
-def submit(rig, sequence, streamed=False, caller=""):
-    return rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed, caller).result().plan)
+def submit(rig, sequence, streamed=False, caller="", **options):
+    return rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed, caller, **options).result().plan)
 
 
 def finish(rig, record):
@@ -75,6 +75,21 @@ def test_a_streamed_plan_that_has_not_begun_is_replaced_as_a_whole(rig):
     assert len(rig.list_emitted()) == first.executed_count + 16
     assert third.execution.simulated_m == pytest.approx(90e-6, rel=0.01)
     assert rig.session.board.underruns == 0
+
+
+@pytest.mark.parametrize("refreshes", [True, False])
+def test_light_of_a_refresh_counts_from_the_fingers_of_the_one_that_it_replaced_as_a_whole(rig, refreshes):
+    first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
+    rig.until(lambda: first.executed_count >= 1)
+    second = submit(rig, build_frame(80.0, duration_s=9.0), streamed=True)
+    second.arrived_s -= 0.005
+    third = submit(rig, build_frame(90.0, duration_s=9.0), streamed=True, refreshes=refreshes)
+    assert second.dropped == 16
+    assert third.arrived_s - second.arrived_s == pytest.approx(0.0 if refreshes else 0.005)
+    assert third.planned_after_s == 0.0
+    finish(rig, third)
+    light_s = third.start_s + third.first_pulse_s
+    assert third.arrived_s + third.first_light_after_s == pytest.approx(light_s, abs=1e-4)
 
 
 @pytest.fixture
