@@ -155,7 +155,7 @@ class ServiceRig:
         number, payload = next(self.job_numbers), points.encode_payload()
         fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "ahead_s": ahead_s}
         fields |= {"pause": self.pause_number if pause is None else pause, "counts": [len(points)]}
-        fields |= {"kept_points": [kept_points], "crc": zlib.crc32(payload)}
+        fields |= {"kept_points": [kept_points], "crc": zlib.crc32(payload), "holds_first": False}
         return number, self.find_result(PLANNER, self.request(PLANNER, "splice", payload, **fields))
 
     def extend(self, number, points, epoch=None, pause=None, crc=None):

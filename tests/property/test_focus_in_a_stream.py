@@ -39,10 +39,10 @@ def stream(display, seed):
     plan = make(display, rng, PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget))
     tables, pixels = [], []
     for number in range(PLANS):
-        follows = number > 0
+        may_withdraw = number > 0
         after_s = rng.uniform(0.0, 0.6) * plan.record.duration_s if number % 2 == 0 else -0.001
         min_start_s = plan.record.start_s + after_s
-        snapshot = build_cut_snapshot(plan, thermal, min_start_s, display.budget, tick_s, follows)
+        snapshot = build_cut_snapshot(plan, thermal, min_start_s, display.budget, tick_s, may_withdraw)
         if snapshot is None:  # it is too late for another plan
             continue
         (points,), (kept,) = plan.points.stages, snapshot.cut.kept_points

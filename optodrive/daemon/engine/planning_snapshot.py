@@ -42,16 +42,16 @@ def build_cut_snapshot(
     min_start_s: float,
     budget: Budget,
     tick_s: float,
-    follows: bool = False,
+    may_withdraw: bool = False,
 ) -> PlanningSnapshot | None:
     """Build the snapshot for truncating a running plan before its first point after board time min_start_s.
 
-    follows: whether the plan's points follow those of another plan, so that no point of it must be left
+    may_withdraw: whether no point of the plan must be left
     Return None if no pulse would be left of a plan that must keep one, or none would be dropped.
     """
     plan, zero_s = running.planned.plan, running.record.start_s
     min_tick = (min_start_s - zero_s - running.zero_s) / tick_s
-    cut = PointCut.find(running.points, min_tick if follows else max(1.0, min_tick))
+    cut = PointCut.find(running.points, min_tick if may_withdraw else max(1.0, min_tick))
     if cut.row == len(plan) or (not cut.row and any(cut.kept_points)):
         return None
     end_s = running.zero_s + cut.end_tick * tick_s

@@ -2,11 +2,11 @@
 
 A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed plan
 leave only `lead_s` before they are due; a newer plan cuts the running one at the first point that has not left
-(`build_cut_snapshot`) and is spliced behind it, one job for the board. Of a plan that follows another and has not begun
-nothing is left: the newer one begins where it would have begun. The lead is longer without real-time priority, because
-a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is refused by link,
-and the plan is made again; after two such plans `truncate` cuts the running one at once, and the third begins behind it
-without a deadline.
+(`build_cut_snapshot`) and is spliced behind it, one job for the board. A refresh of a standing page that has not begun
+is withdrawn as a whole: the newer one begins where it would have begun. The lead is longer without real-time priority,
+because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is refused
+by link, and the plan is made again; after two such plans `truncate` cuts the running one at once, and the third begins
+behind it without a deadline.
 
 A plan may grow: its rest is planned when the points behind it must leave, unless a newer plan came (`plan_growth.py`).
 If that is too late, because the computer stalled, the rest becomes a frame of its own behind it.
@@ -60,15 +60,17 @@ class QueueStream:
     ) -> PlanningSnapshot | None:
         """Build the snapshot of a plan that truncates a running one, None if that is not possible any more."""
         min_start_s = self._session.board_s() + self.lead_s + planning_time_s
-        budget, tick_s, follows = self._display.budget, self._session.tick_s, len(self._plans.running) > 1
-        return build_cut_snapshot(running, thermal, min_start_s, budget, tick_s, follows)
+        may_withdraw = running.record.refreshes and len(self._plans.running) > 1
+        budget, tick_s = self._display.budget, self._session.tick_s
+        return build_cut_snapshot(running, thermal, min_start_s, budget, tick_s, may_withdraw)
 
     def splice(self, plan: ActivePlan, predecessor: ActivePlan, cut: PointCut) -> bool:
         """Continue the points of a running plan with those of a new one. Return False if the cut has been sent."""
         if not self._plans.running or self._plans.running[-1].plan is not predecessor:
             return False
         zero_s, ahead_s = plan.record.start_s, self.lead_s
-        job = self._session.splice(plan.points, cut.kept_points, zero_s, plan.epoch, ahead_s, plan.crc)
+        refreshes = plan.record.refreshes
+        job = self._session.splice(plan.points, cut.kept_points, zero_s, plan.epoch, ahead_s, plan.crc, refreshes)
         if job is None:
             return False
         predecessor.record.dropped = predecessor.record.pulse_count - cut.row

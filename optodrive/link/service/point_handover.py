@@ -136,7 +136,8 @@ class PointHandover:
         job, error = None, None
         try:
             self._require_allowed(message)
-            job = self._boards.splice(points, _parse_kept(fields, points), _parse_ahead_s(fields))
+            kept, ahead_s = _parse_kept(fields, points), _parse_ahead_s(fields)
+            job = self._boards.splice(points, kept, ahead_s, bool(fields["holds_first"]))
         except OptodriveError as refusal:
             error = refusal
         outcome: dict[str, Any] = {"start_tick": None, "first_index": None}

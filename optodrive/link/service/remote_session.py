@@ -158,9 +158,11 @@ class RemoteSession(LinkStatus):
         epoch: int,
         send_ahead_s: float,
         crc: int | None = None,
+        holds_first: bool = False,
     ) -> RemoteJob | None:
         """Truncate the last job to `kept_points` points of each stage and continue with `points` without a pause.
 
+        holds_first: whether the new points may be withdrawn until the first one is due to be sent
         zero_s: time of board_s() of the new plan's zero; on one board it is where the kept points end
         Return None if it is too late for that, if the epoch has passed, or if the link process does not answer.
         """
@@ -177,7 +179,8 @@ class RemoteSession(LinkStatus):
         payload = points.encode_payload()
         self._job_number += 1
         number = self._job_number
-        fields = {"job": number, "epoch": epoch, "pause": self._drained_number, "kept_points": list(kept_points)}
+        fields: dict[str, Any] = {"job": number, "epoch": epoch, "pause": self._drained_number}
+        fields |= {"kept_points": list(kept_points), "holds_first": holds_first}
 
         added: list[RemoteJob] = []
 

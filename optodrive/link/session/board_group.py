@@ -234,8 +234,12 @@ class BoardGroup(GroupState):
         if self.lost is not None and len(points.stages[self.lost.stage]):
             raise NotReadyError(f"stage {self.names[self.lost.stage]!r} was lost: {self.lost.reason}")
 
-    def splice(self, points: StagePoints, kept_points: Sequence[int], send_ahead_s: float) -> StagedJob | None:
+    def splice(
+        self, points: StagePoints, kept_points: Sequence[int], send_ahead_s: float, holds_first: bool = False
+    ) -> StagedJob | None:
         """Truncate the last job to `kept_points` points of each stage and continue with `points` without a pause.
+
+        holds_first: as for `PlanJob`
 
         Return None, with nothing changed, if it is too late for that on one board.
         """
@@ -251,7 +255,8 @@ class BoardGroup(GroupState):
             timing, last = None, session.last_job
             if self._host_time is not None and last is not None:
                 timing = self._host_time.build_timing(session, last.find_host_end_tick(kept))
-            part = session.splice(one, kept, min(send_ahead_s, SEND_AHEAD_MAX_S) if timing else send_ahead_s, timing)
+            ahead_s = min(send_ahead_s, SEND_AHEAD_MAX_S) if timing else send_ahead_s
+            part = session.splice(one, kept, ahead_s, timing, holds_first)
             if part is None:
                 raise LinkError("a board could not be spliced although the others were")
             parts.append(part)

@@ -45,7 +45,8 @@ class PlanJob:
 
     first_index, next_to_send: point indices, which count over the session
     start_tick: board tick of the plan's zero
-    send_ahead_ticks: maximum time from sending a point to its start
+    send_ahead_ticks: maximum time from sending a point to its start, unless it is the first
+    holds_first: whether the first point waits as well, so that the job can be withdrawn until then
     first_sent_tick: board tick at which the first point was sent
     timing: times by the host's clock, which the points follow; None if they keep to the board's own clock
     """
@@ -58,6 +59,7 @@ class PlanJob:
         start_tick: int,
         send_ahead_ticks: float = inf,
         timing: PointTiming | None = None,
+        holds_first: bool = False,
     ) -> None:
         self.number = number
         self.first_index = first_index
@@ -65,6 +67,7 @@ class PlanJob:
         self.next_to_send = first_index
         self.first_sent_tick: float | None = None
         self._send_ahead_ticks = send_ahead_ticks
+        self._holds_first = holds_first
         self._table = points.table.astype("<u2")
         self._count = len(points)
         self._timing = timing
@@ -110,7 +113,7 @@ class PlanJob:
             return self._count - position
         # A point starts at the end of its predecessor. With a float, numpy would convert all ticks at every call.
         due_tick = floor(now_tick + self._send_ahead_ticks)
-        if due_tick < self.start_tick:
+        if self._holds_first and due_tick < self.start_tick:
             return 0
         due_count = int(np.searchsorted(self._end_tick[: self._count], due_tick, side="right")) + 1
         return max(0, min(due_count, self._count) - position)
@@ -119,7 +122,8 @@ class PlanJob:
     def next_due_tick(self) -> float | None:
         """Board tick from which the next point may be sent, None if it need not wait."""
         position = self.next_to_send - self.first_index
-        if self._send_ahead_ticks == inf or position >= self._count:
+        waits = position < self._count and (position > 0 or self._holds_first)
+        if self._send_ahead_ticks == inf or not waits:
             return None
         return float(self.end_tick_after(position)) - self._send_ahead_ticks
 

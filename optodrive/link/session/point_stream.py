@@ -49,7 +49,7 @@ class PointStream:
         """
         self._number += 1
         self._started = self._end_sent = False
-        return self._append(points, start_tick, send_ahead_ticks, timing)
+        return self._append(points, start_tick, send_ahead_ticks, timing, holds_first=False)
 
     @property
     def sent_index(self) -> int:
@@ -80,14 +80,19 @@ class PointStream:
         return self._jobs[-1].end_tick_after(kept_points) >= min_end_tick
 
     def splice(
-        self, points: WirePoints, kept_points: int, send_ahead_ticks: float, timing: PointTiming | None = None
+        self,
+        points: WirePoints,
+        kept_points: int,
+        send_ahead_ticks: float,
+        timing: PointTiming | None = None,
+        holds_first: bool = False,
     ) -> PlanJob:
         """Truncate the last job to `kept_points` points and append others without a pause, if can_splice().
 
-        timing: as for `PlanJob`
+        timing, holds_first: as for `PlanJob`
         """
         self.truncate(kept_points)
-        return self._append(points, self._jobs[-1].end_tick_after(kept_points), send_ahead_ticks, timing)
+        return self._append(points, self._jobs[-1].end_tick_after(kept_points), send_ahead_ticks, timing, holds_first)
 
     def can_extend(self, job: PlanJob, min_end_tick: float) -> bool:
         """Return whether other points may follow those of a whole job without a pause. min_end_tick: as above."""
@@ -107,9 +112,14 @@ class PointStream:
         return True
 
     def _append(
-        self, points: WirePoints, start_tick: int, send_ahead_ticks: float, timing: PointTiming | None
+        self,
+        points: WirePoints,
+        start_tick: int,
+        send_ahead_ticks: float,
+        timing: PointTiming | None,
+        holds_first: bool,
     ) -> PlanJob:
-        job = PlanJob(self._number, points, self._next_index, start_tick, send_ahead_ticks, timing)
+        job = PlanJob(self._number, points, self._next_index, start_tick, send_ahead_ticks, timing, holds_first)
         self._next_index = job.end_index
         self._jobs.append(job)
         return job

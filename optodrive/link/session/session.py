@@ -249,15 +249,20 @@ class BoardSession(BoardLink):
         return self._points.can_splice(kept_points, (self.board_s() + SPLICE_LEAD_S) / self.scale.tick_s)
 
     def splice(
-        self, points: WirePoints, kept_points: int, send_ahead_s: float, timing: PointTiming | None = None
+        self,
+        points: WirePoints,
+        kept_points: int,
+        send_ahead_s: float,
+        timing: PointTiming | None = None,
+        holds_first: bool = False,
     ) -> PlanJob | None:
         """Truncate the last job to `kept_points` points and continue with `points` without a pause.
 
-        Return None if it is too late for that. timing: as for `PlanJob`
+        Return None if it is too late for that. timing, holds_first: as for `PlanJob`
         """
         if not self.can_splice(kept_points):
             return None
-        return self._points.splice(points, kept_points, send_ahead_s / self.scale.tick_s, timing)
+        return self._points.splice(points, kept_points, send_ahead_s / self.scale.tick_s, timing, holds_first)
 
     def can_extend(self, job: PlanJob) -> bool:
         """Return whether it is early enough to append points to a job, which must be the last one, without a pause."""

@@ -64,10 +64,13 @@ def test_a_streamed_plan_replaces_the_unsent_rest_without_a_pause(rig):
     assert rig.session.board.underruns == 0
 
 
-def test_a_streamed_plan_that_has_not_begun_is_replaced_as_a_whole(rig):
+def test_a_refresh_that_has_not_begun_is_replaced_as_a_whole(rig):
     first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
     rig.until(lambda: first.executed_count >= 1)
-    second, third = (submit(rig, build_frame(height_um, duration_s=9.0), streamed=True) for height_um in (80.0, 90.0))
+    heights_um = (80.0, 90.0)
+    second, third = (
+        submit(rig, build_frame(each, duration_s=9.0), streamed=True, refreshes=True) for each in heights_um
+    )
     assert (second.dropped, third.start_s) == (16, second.start_s)
     finish(rig, third)
     assert [record.status for record in (first, second, third)] == ["superseded", "superseded", "done"]
@@ -77,11 +80,21 @@ def test_a_streamed_plan_that_has_not_begun_is_replaced_as_a_whole(rig):
     assert rig.session.board.underruns == 0
 
 
+def test_a_frame_that_has_not_begun_keeps_a_pulse(rig):
+    """Its first point may have left."""
+    first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
+    rig.until(lambda: first.executed_count >= 1)
+    second, third = (submit(rig, build_frame(height_um, duration_s=9.0), streamed=True) for height_um in (80.0, 90.0))
+    assert (second.dropped, third.start_s > second.start_s) == (15, True)
+    finish(rig, third)
+    assert (second.executed_count, third.executed_count) == (1, 16)
+
+
 @pytest.mark.parametrize("refreshes", [True, False])
 def test_light_of_a_refresh_counts_from_the_fingers_of_the_one_that_it_replaced_as_a_whole(rig, refreshes):
     first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
     rig.until(lambda: first.executed_count >= 1)
-    second = submit(rig, build_frame(80.0, duration_s=9.0), streamed=True)
+    second = submit(rig, build_frame(80.0, duration_s=9.0), streamed=True, refreshes=True)
     second.arrived_s -= 0.005
     third = submit(rig, build_frame(90.0, duration_s=9.0), streamed=True, refreshes=refreshes)
     assert second.dropped == 16

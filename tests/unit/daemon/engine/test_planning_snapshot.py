@@ -28,23 +28,23 @@ def running():
     return make_plan(DISPLAY, SCALES, request, built, snapshot, "p1", lambda fraction: None)
 
 
-def cut(running, at_s, follows=False):
+def cut(running, at_s, may_withdraw=False):
     thermal = ThermalEstimate(running.heat_before, running.budget_before)
-    return build_cut_snapshot(running, thermal, START_S + at_s, DISPLAY.budget, SCALES[0].tick_s, follows)
+    return build_cut_snapshot(running, thermal, START_S + at_s, DISPLAY.budget, SCALES[0].tick_s, may_withdraw)
 
 
 @pytest.mark.parametrize("at_s", [-0.01, 0.0])
-def test_a_plan_that_follows_another_may_be_cut_where_it_begins(running, at_s):
+def test_a_plan_that_may_be_withdrawn_is_cut_where_it_begins(running, at_s):
     for initial_pixels in ((17,), None):
         running.initial_pixels = initial_pixels
-        snapshot = cut(running, at_s, follows=True)
+        snapshot = cut(running, at_s, may_withdraw=True)
         assert (snapshot.cut.kept_points, snapshot.cut.row) == ([0], 0)
         assert (snapshot.start_s, snapshot.initial_pixels, snapshot.cycle) == (START_S, initial_pixels, running.cycle)
         assert np.array_equal(snapshot.budget.mirror_rad, running.budget_before.mirror_rad)
         first = cut(running, at_s)
         assert first.cut.row == 1
         assert first.initial_pixels == (int(running.planned.plan.pixel[0]),)
-    assert cut(running, 1e-6, follows=True).cut == cut(running, at_s).cut
+    assert cut(running, 1e-6, may_withdraw=True).cut == cut(running, at_s).cut
 
 
 def test_within_a_pause_of_the_mirrors_the_pulse_after_it_is_kept(running):

@@ -9,11 +9,15 @@ from wire_points import build_points
 START_TICK, AHEAD_TICKS, DUTY = 100_000, 20_000, 100
 
 
-def test_each_point_waits_until_it_begins_soon():
+@pytest.mark.parametrize("holds_first", [True, False])
+def test_each_point_waits_until_it_begins_soon_and_the_first_one_if_it_is_held(holds_first):
     points = build_points(5, DUTY)
-    job = PlanJob(1, points, 30, START_TICK, AHEAD_TICKS)
+    job = PlanJob(1, points, 30, START_TICK, AHEAD_TICKS, holds_first=holds_first)
     begins = [START_TICK, *(START_TICK + points.compute_end_ticks()[:-1]).tolist()]
-    for position, begin in enumerate(begins):
+    if not holds_first:
+        assert (job.next_due_tick, job.count_sendable(0.0)) == (None, 1)
+        job.take_payload(1, 0.0)
+    for position, begin in list(enumerate(begins))[1 - holds_first :]:
         assert job.next_due_tick == begin - AHEAD_TICKS
         assert job.count_sendable(begin - AHEAD_TICKS - 0.5) == 0
         assert job.count_sendable(begin - AHEAD_TICKS) == 1
