@@ -10,6 +10,7 @@ from random import Random
 import h5py
 import numpy as np
 import pytest
+from shown_output import COMPILATION
 
 from labs import lab
 from optodrive.cli.main import run
@@ -55,6 +56,7 @@ def diagnoses_or_refuses(path, capsys):
         warnings.simplefilter("error")
         status = run(["diagnose", str(path), "--json", "-"])
     output, error = capsys.readouterr()
+    error = COMPILATION.sub("", error)
     if status == 0:
         answer = json.loads(output, parse_constant=pytest.fail)
         assert answer["verdict"] in ("none", "instrument", "cause", "ambiguous", "unexplained", "incomplete")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shown_output import COMPILATION
 
 from displays import DISPLAYS
 from optodrive.cli.main import run
@@ -88,7 +89,7 @@ def calibrate(command, folder, measurement):
 def test_a_recording_in_a_wrong_unit_is_refused_in_one_line(command, quantity, unit, tmp_path, capsys):
     wrong = Measurement(tuple(CASES[command, quantity, unit](item) for item in RECORDINGS[command]().runs))
     assert calibrate(command, tmp_path, wrong) == 2
-    error = capsys.readouterr().err.strip()
+    error = COMPILATION.sub("", capsys.readouterr().err).strip()
     assert "\n" not in error
     assert quantity in error
     assert f"likely in {unit}" in error
