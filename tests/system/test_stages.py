@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from signalled_processes import assert_dark_within_lease, assert_stayed_dark
 
 LEASE_S = PATIENT_LEASE_S
 SKEW_MAX_S = 0.01
+PERIOD_S = 0.02
+"""Time from one pulse of `long_train` to the next."""
 SKEW = ("[limits]\n", f"[limits]\nstage_skew_max_s = {SKEW_MAX_S}\n")
 """Change of the configuration: on a busy computer an exchange with a board takes milliseconds."""
 GOES_ON = '[daemon]\non_stage_loss = "that_stage"\n'
@@ -206,6 +209,7 @@ def test_light_that_would_be_late_is_not_emitted(bench):
     os.kill(link, signal.SIGSTOP)
     try:
         wait_for(lambda: all(board.of("state")[-1]["state"] != "RUNNING" for board in bench.boards), "the last points")
+        time.sleep(2 * PERIOD_S)  # until the next pulse would be late on every board
         begins = [len(board.events()) for board in bench.boards]
     finally:
         os.kill(link, signal.SIGCONT)
