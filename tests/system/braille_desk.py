@@ -152,12 +152,15 @@ class Desk:
         self.reader.kill()
         self.command.stop()
 
-    def find_emitted(self, since, times=1):
-        """Return the pixels that have at least `times` pulses from pulse number `since` on."""
+    def find_emitted(self, since):
+        """Return the pixels that have pulses from pulse number `since` on."""
+        return set(self.count_emitted(since))
+
+    def count_emitted(self, since):
+        """Return the number of pulses of each pixel from pulse number `since` on."""
         codes = cell_codes()
         pulses = self.board.of("pulse")[since:]
-        counts = Counter(int(np.abs(codes - (pulse["x"], pulse["y"])).sum(axis=1).argmin()) for pulse in pulses)
-        return {pixel for pixel, count in counts.items() if count >= times}
+        return Counter(int(np.abs(codes - (pulse["x"], pulse["y"])).sum(axis=1).argmin()) for pulse in pulses)
 
     def wait_for_light(self, cells):
         """Wait until the board emits a pulse that these cells have."""
@@ -176,9 +179,11 @@ class Desk:
 
         def is_shown():
             nonlocal since
-            if self.find_emitted(since) - expected:  # the rest of the cells before
-                since = len(self.board.of("pulse"))
-            return self.find_emitted(since, times=2) == expected and (expected or is_dark(self))
+            counts = self.count_emitted(since)
+            if counts.keys() - expected:  # the rest of the cells before
+                since += counts.total()
+                return False
+            return counts.keys() == expected and (min(counts.values()) >= 2 if expected else is_dark(self))
 
         try:
             wait_for(is_shown, f"{cells.hex()}, after pulse {since}")

@@ -131,7 +131,7 @@ class BrlttyGraphic(DotGraphic):
 
 def find_drawn(desk, since):
     """Return the pixels of the graphic display emitted twice. BRLTTY writes its status to the line of text."""
-    return {pixel for pixel in desk.find_emitted(since, times=2) if LAYOUT.row[pixel] < 18}
+    return {pixel for pixel, count in desk.count_emitted(since).items() if count >= 2 and LAYOUT.row[pixel] < 18}
 
 
 @pytest.mark.skipif(not has_driver("dp"), reason="needs a BRLTTY with a driver of the DotPad: 6.6 or later")

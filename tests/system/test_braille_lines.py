@@ -69,9 +69,10 @@ def wait_for_window(desk, lines):
 
     def is_shown():
         nonlocal since
-        if desk.find_emitted(since) - expected:
-            since = len(desk.board.of("pulse"))
-        return desk.find_emitted(since) == expected
+        counts = desk.count_emitted(since)
+        if counts.keys() - expected:
+            since += counts.total()
+        return counts.keys() == expected
 
     wait_for(is_shown, f"{lines}, after pulse {since}")
 
