@@ -133,10 +133,8 @@ class PlannerServer:
         payload: bytes,
         audit: dict[str, object],
     ) -> None:
-        if client.requests.pop(request_id, None) is None:
-            return
-        reply = self._send_result if push.refreshes else self._reply
-        reply(connection, request_id, status, payload, audit)
+        if client.requests.pop(request_id, None) is not None:
+            self._reply(connection, request_id, status, payload, audit, is_explained=not push.refreshes)
 
     def _drop(self, client: _Client, request_id: int) -> None:
         """Forget a request: one that waits is not planned, and one that is being planned ends."""
@@ -182,19 +180,11 @@ class PlannerServer:
         status: int,
         payload: bytes,
         audit: dict[str, object] | None = None,
+        is_explained: bool = True,
     ) -> None:
-        """Send a result, after the state that explains it."""
-        self._publish_state(0.0)
-        self._send_result(connection, request_id, status, payload, audit)
-
-    def _send_result(
-        self,
-        connection: MessageSocket,
-        request_id: int,
-        status: int,
-        payload: bytes,
-        audit: dict[str, object] | None = None,
-    ) -> None:
+        """Send a result, after the state that explains it unless nobody looks at that."""
+        if is_explained:
+            self._publish_state(0.0)
         fields = {"id": request_id, "status": status, "audit": audit or {}}
         self._engine.message_loop.send(connection, Message("result", fields, payload))
 
