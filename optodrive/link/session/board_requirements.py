@@ -81,8 +81,13 @@ class BoardRequirements:
             max_s = limits.max_on_us * 1e-6
             raise InputError("limits.pulse_width_max_s", values.pulse_width_max_s, f"at most {max_s:g}", "board")
         if abs(limits.full_power_uw - requested.full_power_uw) > 0.01 * requested.full_power_uw:
-            board_w = limits.full_power_uw * 1e-6
-            raise InputError("laser.max_power_w", values.max_power_w, f"{board_w:g}, the setting of the board", "board")
+            # Neither number is known to be true: to follow the lower one would count less light than the diode emits.
+            expected = (
+                f"the firmware's full power, now {limits.full_power_uw * 1e-6:g} W (full_power_uw in its settings.h). "
+                "Both state the power at the sample at full duty: measure it there with a power meter, the board off, "
+                "the driver's input at full level, then set both to what is measured, and neither lower"
+            )
+            raise InputError("laser.max_power_w", values.max_power_w, expected, "board")
         if limits.spot_uj < values.pulse_energy_max_j * 1e6:
             max_j = limits.spot_uj * 1e-6
             raise InputError("limits.pulse_energy_max_j", values.pulse_energy_max_j, f"at most {max_j:g}", "board")

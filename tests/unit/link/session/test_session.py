@@ -191,6 +191,21 @@ def test_an_incompatible_board_is_rejected_with_the_key(settings, config, says):
     assert not rig.session.connected
 
 
+@pytest.mark.parametrize(("configured_w", "firmware_uw"), [(5.0, 2_450_000), (1.0, 2_450_000), (2.45, 5_000_000)])
+def test_a_contradiction_about_full_power_names_both_sides_and_advises_neither_number(configured_w, firmware_uw):
+    """A stronger diode with the firmware's default: obeying "expected 2.45" would count half of its light."""
+    rig = Rig(
+        BoardSettings(replace(DEFAULT_LIMITS, full_power_uw=firmware_uw)), changed("laser", max_power_w=configured_w)
+    )
+    with pytest.raises(InputError) as caught:
+        rig.connect()
+    line = str(caught.value)
+    assert line.startswith(f"laser.max_power_w: got {configured_w}, expected the firmware's full power, now ")
+    assert f"{firmware_uw * 1e-6:g} W (full_power_uw in its settings.h)" in line
+    assert "measure it there with a power meter" in line
+    assert line.endswith("set both to what is measured, and neither lower")
+
+
 @pytest.mark.parametrize(("field", "value"), [("major", 2), ("tick_hz", 999)])
 def test_another_protocol_or_tick_is_rejected(field, value):
     requirements = build_board_requirements(CONFIG)
