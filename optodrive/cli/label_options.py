@@ -28,9 +28,9 @@ def parse_label_options(options: list[str]) -> dict[str, str | int | float | boo
 
 def add_labels(source: str, body: bytes, options: list[str]) -> dict[str, object]:
     """Return the decoded body of FRAMES.json with labels, which replace those of the same key."""
-    from optodrive.planning.stimuli.sequence_file import parse_json
+    from optodrive.planning.stimuli.json_values import decode_json
 
-    decoded = parse_json(body, source)
+    decoded = decode_json(body, source)
     if not isinstance(decoded, dict):
         raise InputError(source, decoded, "an object with frames, trains")
     own = decoded.get("labels", {})

@@ -124,8 +124,11 @@ def escape_unprintable(text: str) -> str:
 
 
 def abbreviate(value: object, limit: int = 60) -> str:
-    """Return `repr` of a value, cut to `limit` characters."""
-    text = repr(value)
+    """Return `repr` of a value, cut to `limit` characters. A value may nest deeper than Python's stack."""
+    try:
+        text = repr(value)
+    except RecursionError:
+        return "deeper nesting"
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 

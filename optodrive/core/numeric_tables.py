@@ -11,6 +11,8 @@ from optodrive.core.types.arrays import FloatArray
 ROWS_PER_WRITE = 50_000
 """Rows formatted per write."""
 COMMENT = "#"
+FORMULA_STARTS = "=+-@\t\r"
+"""Characters with which a spreadsheet begins a formula."""
 
 
 def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
@@ -36,6 +38,12 @@ def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
         place = f"{path}: row {row + first_row}: {columns[column]}"
         raise InputError(place, float(table[row, column]), "a finite number")
     return table
+
+
+def escape_formula(cell: object) -> object:
+    """Return a cell, text that a spreadsheet would run as a formula with an apostrophe before it."""
+    runs = isinstance(cell, str) and cell[1:] and cell[0] in FORMULA_STARTS and not _is_number(cell)
+    return f"'{cell}" if runs else cell
 
 
 def split_comments(path: Path) -> tuple[list[str], str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import create_folder, lock_folder, write_text
+from optodrive.core.numeric_tables import escape_formula
 from optodrive.study.study_file import MATCHED_PARAMETERS, Study
 from optodrive.study.trial_log import read_log
 
@@ -121,13 +122,13 @@ def _describe_task(study: Mapping[str, Any]) -> dict[str, Any]:
     """Return the sidecar of a table: BIDS fields, columns, and the design."""
     response, columns = study["response"], {name: dict(column) for name, column in COLUMNS.items()}
     if response["answers"]:
-        columns["answer"]["Levels"] = {answer: answer for answer in response["answers"]}
+        columns["answer"]["Levels"] = {escape_formula(answer): answer for answer in response["answers"]}
     else:
         columns["answer"]["Description"] += ", a magnitude between 0 and 1"
     for factor, values in _list_varied(study).items():
         columns[factor] = {
             "Description": f"Parameter `{factor}` of the stimulus `{study['stimulus']['pattern']}`",
-        } | ({"Levels": {str(value): str(value) for value in values}} if values else {})
+        } | ({"Levels": {escape_formula(str(value)): str(value) for value in values}} if values else {})
     return {
         "TaskName": study["name"].replace("-", ""),
         "TaskDescription": f"{study['title']}: {_describe_procedure(study)}",
@@ -173,7 +174,7 @@ def _describe_participants() -> dict[str, Any]:
 
 
 def _format_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "".join("\t".join(row) + "\n" for row in [head, *rows])
+    return "".join("\t".join(str(escape_formula(cell)) for cell in row) + "\n" for row in [head, *rows])
 
 
 def _dump(document: object) -> str:

@@ -27,6 +27,7 @@ from starlette.websockets import WebSocket
 from optodrive.core.errors import InputError, OptodriveError
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES
 from optodrive.daemon.api.socket_token import read_subprotocol_token, select_subprotocol
+from optodrive.daemon.server.bounded_websocket import Utf8WebSocket
 from optodrive.study.page_address import PageAddress
 from optodrive.study.page_http import HostCheck, build_response, read_files
 from optodrive.study.page_messages import (
@@ -78,7 +79,7 @@ class StudyPages:
         self._server = uvicorn.Server(
             uvicorn.Config(
                 HostCheck(self._build_app(), hosts),
-                ws="websockets-sansio",
+                ws=Utf8WebSocket,
                 ws_max_size=MESSAGE_MAX_BYTES,
                 ws_per_message_deflate=False,  # a small frame could need any amount of memory
                 ws_ping_interval=PING_INTERVAL_S,

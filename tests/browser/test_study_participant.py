@@ -354,12 +354,13 @@ def test_the_response_time_is_that_between_the_boards_last_gate_off_and_the_answ
         ('{"kind": "stop"}', 1008),
         ('{"kind": "answer", "trial": -1, "attempt": 1, "presentation": 1, "answer": "x", "handled_s": 0}', 1008),
         (" " * 2000, 1009),
+        (b'{"kind": "\xff"}', 1007),
     ],
 )
 def test_a_message_that_is_none_closes_the_page_and_the_session_waits(study, text, code):
     with open_wire(study.urls["participant"]) as wire:
         wire.wait_for("start")
-        wire.socket.send(text)
+        wire.socket.send(text, text=True)
         assert wire.read_close()[0] == code
     with open_wire(study.urls["participant"]) as wire:
         wire.wait_for("start")

@@ -410,6 +410,19 @@ def test_fragments_are_bounded(port, fragment):
         assert send_and_get_close_code(stream, [fragment] * 200) in (1009, None)
 
 
+@pytest.mark.parametrize("pieces", [[b"{\xff}"], [b"{", b"\xff}"], [b"caf\xc3"]])
+def test_text_that_is_not_utf_8_closes_the_stream_without_a_traceback(port, caplog, pieces):
+    """One clear line for the client, and none in the log."""
+    with open_websocket(port) as stream:
+        stream.send(["caf\u00e9"[:3], "\u00e9"])
+        assert stream.recv() == "4"
+        stream.send(pieces, text=True)
+        with pytest.raises(ConnectionClosed) as closed:
+            stream.recv()
+    assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1007, "text that is not UTF-8")
+    assert caplog.records == []
+
+
 HANDSHAKE = (
     b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"

@@ -6,7 +6,7 @@ from pydantic import Field, ValidationError
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.json_model import JsonModel
-from optodrive.planning.stimuli.sequence_file import parse_json
+from optodrive.planning.stimuli.json_values import decode_json
 
 BODY_MAX_BYTES = 1000
 DIM_SCHEMA: dict[str, Any] = {
@@ -28,7 +28,7 @@ def parse_dim_request(body: bytes) -> DimRequest:
     """Parse a body. Raise InputError, also for invalid JSON and for a repeated key."""
     if len(body) > BODY_MAX_BYTES:
         raise InputError("body", Unquoted(f"{len(body)} bytes"), f"at most {BODY_MAX_BYTES}")
-    decoded = parse_json(body, "body") if body.strip() else None
+    decoded = decode_json(body, "body") if body.strip() else None
     try:
         return DimRequest.model_validate(decoded)
     except ValidationError:

@@ -7,9 +7,10 @@ from typing import NamedTuple, Never
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.stimuli.json_values import decode_json
 from optodrive.planning.stimuli.labels import parse_labels
 from optodrive.planning.stimuli.pattern_registry import build_pattern, find_pattern
-from optodrive.planning.stimuli.sequence_file import parse_json, parse_request
+from optodrive.planning.stimuli.sequence_file import parse_request
 
 LabelValues = Mapping[str, str | int | float | bool]
 ParameterValues = Mapping[str, str | float | bool | None]
@@ -28,7 +29,7 @@ def build_request(display: DisplayModel, source: str, name: str, body: bytes) ->
     """Build the sequence of a body: of FRAMES.json, or of the parameters of the named pattern. Raise InputError."""
     if source == "sequence":
         return BuiltRequest(*parse_request(body, display.config, "body"))
-    decoded = parse_json(body, "body") if body.strip() else {}
+    decoded = decode_json(body, "body") if body.strip() else {}
     if not isinstance(decoded, dict):
         raise InputError("body", decoded, "an object of the pattern's parameters")
     labels = parse_labels(decoded.pop("labels", {}), "body: labels")

@@ -26,7 +26,7 @@ SLICES_PER_TURN = 16
 READ_BYTES = 16_384
 FRAMES_PER_S, FRAMES_BURST = 50.0, 100.0
 """Pace of control frames and fragments."""
-TOO_BIG = 1009
+INVALID_DATA, TOO_BIG = 1007, 1009
 EMPTY_S = 0.05
 """A socket that has had no input for this time while it was read is empty: what comes later arrives then."""
 
@@ -36,7 +36,22 @@ class _Arrival(NamedTuple):
     earliest_s: float
 
 
-class BoundedWebSocket(WebSocketsSansIOProtocol):
+class Utf8WebSocket(WebSocketsSansIOProtocol):
+    """uvicorn's protocol, which closes the connection at text that is not UTF-8, without a traceback in the log."""
+
+    def send_receive_event_to_app(self) -> None:
+        """Queue a message that is complete."""
+        try:
+            if self.curr_msg_data_type == "text" and not self.close_sent:
+                b"".join(self.frames).decode()
+        except UnicodeDecodeError:
+            self.conn.fail(INVALID_DATA, "text that is not UTF-8")
+            self.handle_parser_exception()
+            return
+        super().send_receive_event_to_app()
+
+
+class BoundedWebSocket(Utf8WebSocket):
     """uvicorn's protocol with bounded and paced input."""
 
     _pump_handle: asyncio.Handle | None = None

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.numeric_tables import escape_formula
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.hdf5 import Hdf5Tree
 from optodrive.lab.recording.reader import open_tree
@@ -61,7 +62,7 @@ def read_trials_if_any(path: Path) -> list[Trial]:
 
 
 def format_csv(trials: list[Trial]) -> str:
-    """Return a table with one row per trial and one column per label."""
+    """Return a table with one row per trial and one column per label, of which a spreadsheet runs nothing."""
     keys = list(dict.fromkeys(key for trial in trials for key in trial.labels))
     onsets = [f"{kind}_{clock}" for kind in ("requested", "executed") for clock in CLOCKS]
     head = ["plan", "name", "run", "status", "error", *onsets, "planned_pulses", "executed_pulses"]
@@ -72,7 +73,7 @@ def format_csv(trials: list[Trial]) -> str:
         times = [onset[clock] for onset in (trial.requested, trial.executed) for clock in CLOCKS]
         cells = [trial.plan, trial.name, trial.run, trial.status, trial.error, *times]
         labels = [json.dumps(value) if isinstance(value := trial.labels.get(key), bool) else value for key in keys]
-        writer.writerow([*cells, trial.planned_pulses, trial.executed_pulses, *labels])
+        writer.writerow(map(escape_formula, [*cells, trial.planned_pulses, trial.executed_pulses, *labels]))
     return out.getvalue()
 
 

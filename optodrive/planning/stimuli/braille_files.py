@@ -1,9 +1,12 @@
 """Frames from braille that was translated elsewhere: BRF (braille ASCII) and PEF (the Portable Embosser Format)."""
 
 import re
-from xml.etree import ElementTree
+from xml.etree.ElementTree import ParseError
 
-from optodrive.core.errors import InputError
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import fromstring
+
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.braille import Cell
@@ -12,6 +15,8 @@ from optodrive.planning.stimuli.text import show_lines
 
 BRAILLE_ASCII = " A1B'K2L@CIF/MSP\"E3H9O6R^DJG>NTQ,*5<-U8V.%[$+X!&;:4\\0Z7(_?W]#Y)="
 """The character of each cell, by its dots as bits, dot 1 lowest (North American Braille Computer Code)."""
+NOT_MARKUP = b"\xef\xbb\xbf\xff\xfe\0 \t\r\n"
+"""Bytes that may precede markup in UTF-8 and UTF-16."""
 PEF = "{http://www.daisy.org/ns/2008/pef}"
 FIRST_CELL, LAST_SIX_DOT_CELL = 0x2800, 0x283F
 
@@ -21,7 +26,9 @@ def build_braille_file(config: Config, where: str, file: bytes, height_m: float,
 
     Raises InputError (bad_text, does_not_fit).
     """
-    rows = _read_pef(file, f"{where}: file") if file.lstrip()[:1] == b"<" else _read_brf(file, f"{where}: file")
+    rows = (
+        _read_pef(file, f"{where}: file") if file.lstrip(NOT_MARKUP)[:1] == b"<" else _read_brf(file, f"{where}: file")
+    )
     lines = [[word for word in _split_words(row) if word] for row in rows]
     if not any(lines):
         raise InputError(f"{where}: file", "no cell", "braille with at least one raised dot", code="bad_text")
@@ -42,11 +49,11 @@ def _read_brf(file: bytes, where: str) -> list[str]:
 
 def _read_pef(file: bytes, where: str) -> list[str]:
     """Return the rows of a PEF file."""
-    if b"<!DOCTYPE" in file or b"<!ENTITY" in file:
-        raise InputError(where, "a document type", "a PEF file without one", code="bad_text")
     try:
-        root = ElementTree.fromstring(file)  # noqa: S314 - nothing is expanded without a document type
-    except ElementTree.ParseError as error:
+        root = fromstring(file, forbid_dtd=True)
+    except DefusedXmlException:
+        raise InputError(where, Unquoted("a document type"), "a PEF file without one", code="bad_text") from None
+    except (ParseError, ValueError, LookupError) as error:  # an unknown encoding is none of the parser's own errors
         raise InputError(where, str(error), "a PEF file, which is well-formed XML", code="bad_text") from None
     if root.tag != f"{PEF}pef":
         raise InputError(where, root.tag[:80], f"the root element {PEF}pef", code="bad_text")

@@ -14,7 +14,7 @@ TIME_MAX_S = 86_400.0
 
 
 def decode_json(body: bytes | str, where: str) -> object:
-    """Decode JSON text (UTF-8). Raise InputError (bad_json) for invalid JSON and for repeated keys."""
+    """Decode JSON text (UTF-8). Raise InputError (bad_json) if it is invalid, repeats a key or nests too deep."""
 
     def require_unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
         table = dict(pairs)
@@ -31,6 +31,8 @@ def decode_json(body: bytes | str, where: str) -> object:
         near = error.doc[max(0, error.pos - 10) : error.pos + 10]
         expected = f"valid JSON ({error.msg}, line {error.lineno} column {error.colno})"
         raise InputError(where, near, expected, code="bad_json") from None
+    except RecursionError:
+        raise InputError(where, body[:20], "JSON that nests less deep", code="bad_json") from None
     except ValueError:
         raise InputError(
             where, "a number of thousands of digits", "numbers that fit a float", code="bad_json"

@@ -28,14 +28,6 @@ def load_sequence(path: str | Path, config: Config) -> FrameSequence:
     return parse_sequence(read_bounded(Path(path)), config, Path(path).name)
 
 
-def parse_json(body: bytes | str, where: str) -> object:
-    """Decode JSON text. Raise InputError (bad_json) for invalid JSON and for too deep nesting."""
-    try:
-        return decode_json(body, where)
-    except RecursionError:
-        raise InputError(where, body[:20], "JSON that nests less deep", code="bad_json") from None
-
-
 def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
     """Parse a sequence for a display from JSON text or decoded JSON. `where` names the source in errors.
 
@@ -47,10 +39,20 @@ def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
 
 def parse_request(body: object, config: Config, where: str) -> tuple[FrameSequence, Labels]:
     """Parse a sequence and its labels. Raise InputError as `parse_sequence`."""
-    try:
-        return _parse_decoded(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
-    except RecursionError:  # the repr of a value that nests deeper than Python's stack
-        raise InputError(where, "deeper nesting", "objects and lists at most 4 deep", code="bad_json") from None
+    decoded = decode_json(body, where) if isinstance(body, bytes | str) else body
+    table = require_object(decoded, where, ("frames", "trains", "labels"), ())
+    labels = parse_labels(table.get("labels", {}), f"{where}: labels")
+    pixel_count = len(build_pixel_layout(config.display))
+    frame_list = require_list(table.get("frames", []), f"{where}: frames", _compute_frames_max(pixel_count))
+    train_list = require_list(table.get("trains", []), f"{where}: trains", TRAINS_MAX)
+    if not frame_list and not train_list:
+        raise InputError(where, "neither frames nor trains", "at least one of them", code="bad_json")
+    intensity_model = IntensityModel(config)
+    sequence = FrameSequence(
+        frames=parse_frames(frame_list, f"{where}: frames", pixel_count, intensity_model),
+        trains=_parse_trains(train_list, f"{where}: trains", config, pixel_count, intensity_model),
+    )
+    return sequence, labels
 
 
 def validate_sequence(sequence: FrameSequence, where: str, config: Config) -> FrameSequence:
@@ -96,22 +98,6 @@ def _frame_to_json(frame: TactileFrame) -> dict[str, object]:
 
 def _priority_to_json(item: TactileFrame | Train) -> dict[str, object]:
     return {"priority": item.priority} if item.priority else {}
-
-
-def _parse_decoded(decoded: object, config: Config, where: str) -> tuple[FrameSequence, Labels]:
-    table = require_object(decoded, where, ("frames", "trains", "labels"), ())
-    labels = parse_labels(table.get("labels", {}), f"{where}: labels")
-    pixel_count = len(build_pixel_layout(config.display))
-    frame_list = require_list(table.get("frames", []), f"{where}: frames", _compute_frames_max(pixel_count))
-    train_list = require_list(table.get("trains", []), f"{where}: trains", TRAINS_MAX)
-    if not frame_list and not train_list:
-        raise InputError(where, "neither frames nor trains", "at least one of them", code="bad_json")
-    intensity_model = IntensityModel(config)
-    sequence = FrameSequence(
-        frames=parse_frames(frame_list, f"{where}: frames", pixel_count, intensity_model),
-        trains=_parse_trains(train_list, f"{where}: trains", config, pixel_count, intensity_model),
-    )
-    return sequence, labels
 
 
 def _parse_trains(

@@ -38,10 +38,7 @@ def _parse_binary(message: bytes, pixel_count: int) -> tuple[int, FloatArray]:
 
 
 def _parse_text(message: str, expected_number: int, pixel_count: int) -> tuple[int, FloatArray]:
-    try:
-        table = require_object(decode_json(message, "frame"), "frame", ("frame", "target_um"), ("target_um",))
-    except RecursionError:
-        raise InputError("frame", message[:20], "JSON that nests less deep", code="bad_json") from None
+    table = require_object(decode_json(message, "frame"), "frame", ("frame", "target_um"), ("target_um",))
     number = table.get("frame", expected_number)
     if type(number) is not int or not 0 <= number <= FRAME_NUMBER_MAX:
         raise InputError("frame.frame", number, f"a whole number, 0…{FRAME_NUMBER_MAX}", code="bad_frame")

@@ -1,5 +1,6 @@
 """The file of a session and its writer process, without a board."""
 
+import csv
 import json
 import os
 import resource
@@ -131,6 +132,17 @@ def test_the_trials_of_a_session_are_a_table(session, tmp_path, capsys):
         "p10,n,run2,done,,,,,60.0,,1000000060.0,3,3,,,",
         "",
     ]
+
+
+def test_what_a_caller_wrote_is_no_formula_of_a_spreadsheet(tmp_path):
+    path, out = tmp_path / "a.h5", tmp_path / "trials.csv"
+    written = ["=1+1", "+A1", "-A1", "@SUM(1)", "a", -1.5]
+    recorded(path, [trial(f"p{k}", 1.0, {"=cmd": value}, "failed", "=2+2") for k, value in enumerate(written)], [])
+    assert run(["recording", "trials", str(path), "--out", str(out)]) == 0
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["label_=cmd"] for row in rows] == ["'=1+1", "'+A1", "'-A1", "'@SUM(1)", "a", "-1.5"]
+    assert {row["error"] for row in rows} == {"'=2+2"}
 
 
 def test_show_lists_the_trials_too(session, capsys):

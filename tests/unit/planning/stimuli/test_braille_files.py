@@ -16,6 +16,12 @@ PEF = (
     '<body><volume cols="40" rows="25" rowgap="0" duplex="true"><section>{}</section></volume></body></pef>'
 )
 
+DOCUMENT_TYPES = [
+    f'<?xml version="1.0" encoding="{name}"?><!DOCTYPE pef [<!ENTITY a "⠃">]><pef>&a;</pef>'.encode(codec)
+    for name, codec in (("UTF-8", "utf-8"), ("UTF-16", "utf-16"), ("UTF-16", "utf-16-le"), ("UTF-16", "utf-16-be"))
+]
+"""In UTF-16 with and without a byte order mark, which hides the letters from a search for bytes."""
+
 
 def read_cells(sequence, name="display-1511"):
     """Return the cells of all pages, as characters of Unicode's braille block without spaces."""
@@ -74,7 +80,8 @@ def test_the_frames_are_those_of_the_same_text():
         (b"A\nB`", r"file: row 2: got '`', expected braille ASCII"),
         (b"<pef", "well-formed XML"),
         (b"<html></html>", "expected the root element {http://www.daisy.org/ns/2008/pef}pef"),
-        (b'<!DOCTYPE pef [<!ENTITY a "b">]><pef/>', "expected a PEF file without one"),
+        *((text, "got a document type, expected a PEF file without one") for text in DOCUMENT_TYPES),
+        (b'<?xml version="1.0" encoding="nonsense"?><pef/>', "well-formed XML"),
         (PEF.format("<page><row>ab</row></page>").encode(), r"file: row 1: got 'a', expected cells of six dots"),
         (PEF.format("<page><row>⡀</row></page>").encode(), "expected cells of six dots"),
     ],

@@ -3,12 +3,13 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.planning.stimuli import json_values
-from optodrive.planning.stimuli.sequence_file import parse_json, parse_sequence
+from optodrive.planning.stimuli.json_values import decode_json
+from optodrive.planning.stimuli.sequence_file import parse_sequence
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 CONFIG = DISPLAYS["display-16"].config
 PARSERS = {
-    "a pattern's parameters": lambda text: parse_json(text, "body"),
+    "a pattern's parameters": lambda text: decode_json(text, "body"),
     "a sequence": lambda text: parse_sequence(text.encode(), CONFIG, "body"),
     "a streamed frame": lambda text: parse_live_frame(text, 0, 16),
 }
@@ -55,4 +56,4 @@ def test_a_repeated_key_is_refused_in_linear_time(parser, body, monkeypatch):
 
 def test_the_first_repeated_key_is_named():
     with pytest.raises(InputError, match="'b'"):
-        parse_json('{"a": 1, "b": {"a": 1}, "c": 2, "b": 3, "a": 4}', "body")
+        decode_json('{"a": 1, "b": {"a": 1}, "c": 2, "b": 3, "a": 4}', "body")

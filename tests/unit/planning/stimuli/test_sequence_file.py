@@ -11,9 +11,9 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import sequence_file, train_json
+from optodrive.planning.stimuli.json_values import decode_json
 from optodrive.planning.stimuli.sequence_file import (
     load_sequence,
-    parse_json,
     parse_sequence,
     sequence_to_json,
     validate_sequence,
@@ -188,7 +188,9 @@ def test_a_value_nested_too_deep_for_its_repr_is_refused():
     deep = []
     for _ in range(5000):
         deep = [deep]
-    assert refusal({"frames": [{**FRAME, "show_at_s": deep}]})[0] == "bad_json"
+    code, message = refusal({"frames": [{**FRAME, "show_at_s": deep}]})
+    assert code == "bad_time"
+    assert "frames[0].show_at_s: got deeper nesting" in message
 
 
 def test_a_pixel_named_twice_is_refused():
@@ -264,9 +266,9 @@ def test_files_are_read(tmp_path):
 
 
 def test_parse_json_decodes_text():
-    assert parse_json('{"a": [1, 2.5]}', "body") == {"a": [1, 2.5]}
+    assert decode_json('{"a": [1, 2.5]}', "body") == {"a": [1, 2.5]}
     with pytest.raises(InputError, match="valid JSON"):
-        parse_json(b"{'a': 1}", "body")
+        decode_json(b"{'a': 1}", "body")
 
 
 def test_a_full_frame_of_the_largest_display_is_read_in_few_lines_per_pixel():
