@@ -11,6 +11,7 @@ from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_answer, print_json
 from optodrive.core.errors import MISSING, InputError
 
+EXCHANGE_REMEDY = "state the uid of each stage's board, or its port's name below /dev/serial/by-id"
 Answer = TypeVar("Answer", int, float, str)
 
 
@@ -103,8 +104,10 @@ def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     if tokens and os.access(tokens, os.R_OK):
         read_private_tokens(Path(tokens))
     name, pixels = display.config.name, len(display.layout)
-    line = f"{name}: {pixels} pixels, configuration valid"
-    print_answer({"name": name, "pixels": pixels, "ok": True}, [line], json)
+    exchangeable = display.config.find_exchangeable_boards()
+    warnings = [] if exchangeable is None else [f"{exchangeable}; {EXCHANGE_REMEDY}"]
+    lines = [f"{name}: {pixels} pixels, configuration valid", *(f"warning: {each}" for each in warnings)]
+    print_answer({"name": name, "pixels": pixels, "ok": True, "warnings": warnings}, lines, json)
 
 
 @GROUP.command()

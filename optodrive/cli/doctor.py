@@ -83,7 +83,8 @@ def examine(config: str | None, root: Path = Path("/"), stage: str | None = None
     Raise InputError for a stage that the configuration does not have.
     """
     from optodrive.cli import doctor_host as host
-    from optodrive.cli.doctor_finding import report_problem
+    from optodrive.cli.config import EXCHANGE_REMEDY
+    from optodrive.cli.doctor_finding import report_problem, report_warning
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.errors import InputError
     from optodrive.device.config_file import load_config
@@ -100,6 +101,9 @@ def examine(config: str | None, root: Path = Path("/"), stage: str | None = None
     stages = loaded.list_stage_configs() if stage is None else (loaded.select_stage(stage),)
     findings += [host.check_clock(clock, loaded.lease_s), host.check_governor(root)]
     findings += [*host.check_disk(), host.check_kernels()]
+    exchangeable = loaded.find_exchangeable_boards()
+    if exchangeable is not None:
+        findings.append(report_warning("stages", exchangeable, EXCHANGE_REMEDY))
     for one in stages:
         found = _examine_board(one, clock, root)
         if len(loaded.stages) > 1:

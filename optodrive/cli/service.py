@@ -65,7 +65,9 @@ def remove(root: RootOption = Path("/"), json: JsonOption = False) -> None:
     actions = Installation(root).remove()
     if not _print_files("action", actions, json) and actions:
         print("stop the service if it is running: systemctl disable --now optodrive; then systemctl daemon-reload")
-        print("kept: /var/lib/optodrive (tokens, audit file), the user optodrive")
+        print(
+            "kept: /var/lib/optodrive (tokens, audit file), /var/cache/optodrive (compiled kernels), the user optodrive"
+        )
 
 
 @GROUP.command()

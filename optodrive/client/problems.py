@@ -20,6 +20,8 @@ from optodrive.daemon.api.tokens import ENVIRONMENT_VARIABLE
 from optodrive.daemon.responses.problem import Problem
 
 INPUT_ERROR_STATUSES = (400, 404, 413, 422)
+UPSTREAM_LOST = (502, 503, 504)
+"""Statuses with which a proxy says that it does not reach the server behind it."""
 ERROR_BY_CODE: dict[str, type[OptodriveError]] = {
     "not_ready": NotReadyError,
     "stopped": StoppedError,
@@ -30,11 +32,17 @@ ERROR_BY_CODE: dict[str, type[OptodriveError]] = {
 
 
 def parse_problem(status: int, body: bytes) -> OptodriveError:
-    """Parse the body of an error response. Return LinkError if it is not a problem document."""
+    """Parse the body of an error response.
+
+    Return LinkError if it is not a problem document. The daemon sends one with each error, so it came from a proxy.
+    """
     try:
         problem = Problem.model_validate_json(body, extra="ignore")
     except ValidationError:
-        return LinkError(f"the daemon answered {status} without a problem document")
+        if status in UPSTREAM_LOST:
+            lost = f"a proxy answered {status}: the daemon behind it is not there"
+            return LinkError(f"{lost}; is `optodrive serve` running?")
+        return LinkError(f"{status} without a problem document: a proxy or another program answered, not the daemon")
     return build_error(problem)
 
 

@@ -213,6 +213,17 @@ class Config(Section):
             for stage in self.stages
         )
 
+    def find_exchangeable_boards(self) -> str | None:
+        """Return a sentence that names the stages whose boards may change places, None if none may.
+
+        The kernel numbers ports in the order in which they appear, and a board is recognised by its uid alone.
+        """
+        boards = {stage.name: stage.board for stage in self.stages if stage.board.is_numbered and not stage.board.uid}
+        if len(self.stages) < 2 or not boards:
+            return None
+        named = ", ".join(f"{name!r} on {board.port}" for name, board in boards.items())
+        return f"the numbers of ports change with each plug and start, and a stage may get another's board: {named}"
+
     @property
     def lease_s(self) -> float:
         """Longest time after the last lease until a board closes its gate, s."""

@@ -1,5 +1,6 @@
 """The sections of a configuration and their keys."""
 
+import re
 from os.path import realpath
 from typing import Annotated, Literal, Self
 
@@ -279,6 +280,11 @@ class BoardSection(Section):
         if self.transport in NETWORK_DACS:
             return (self.transport, self.port)
         return (self.transport, self.vendor_id, self.product_id, self.serial_number, self.uid)
+
+    @property
+    def is_numbered(self) -> bool:
+        """Whether the port's name is a number that the kernel gives in the order in which ports appear."""
+        return self.transport == "serial" and re.fullmatch(r"/dev/tty(ACM|USB)\d+", self.port) is not None
 
     @property
     def timing_slack_s(self) -> float:

@@ -7,8 +7,10 @@ until its entry is on the disk, and is refused if the entry cannot be written; S
 import asyncio
 import json
 import os
+import stat
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
@@ -16,6 +18,8 @@ from threading import Semaphore, Thread
 from typing import NamedTuple
 
 QUEUE_MAX = 1000
+LINE_MAX_BYTES = 1_000_000
+"""Longest incomplete line that is completed, bytes; an entry is much shorter."""
 WRITE_TIMEOUT_S = 2.0
 AuditFields = Mapping[str, object]
 
@@ -42,11 +46,11 @@ class AuditLog:
         self._report = report
         self._now = now
         self._queue: SimpleQueue[_Entry | None] = SimpleQueue()
+        self._may_be_torn = True  # by an earlier process, on a disk that was full or lost its power
         # A daemon thread: one that hangs in a write must not keep the process from ending.
         self._writer = Thread(target=self._run, name="audit", daemon=True)
         self._writer.start()
         self._free_slots = Semaphore(QUEUE_MAX)
-        self._has_partial_line = False
         self._is_failing = False
 
     def record(self, fields: AuditFields) -> None:
@@ -71,6 +75,8 @@ class AuditLog:
         return entry.future
 
     def _run(self) -> None:
+        with suppress(OSError):  # the first entry reports it
+            self._complete_last_line()
         while (entry := self._queue.get()) is not None:
             try:
                 self._write(entry.line, entry.to_disk)
@@ -83,7 +89,7 @@ class AuditLog:
 
     def _write(self, line: str, to_disk: bool) -> None:
         try:
-            self._append(("\n" if self._has_partial_line else "") + line + "\n", to_disk)
+            self._append(line + "\n", to_disk)
         except OSError as error:
             if not self._is_failing:
                 self._report(
@@ -93,9 +99,32 @@ class AuditLog:
             raise
         if self._is_failing:
             self._report(f"audit: {self._path} is writable again")
-        self._is_failing = self._has_partial_line = False
+        self._is_failing = False
+
+    def _complete_last_line(self) -> None:
+        """Replace a last line that was cut off by an entry that quotes it, so that every line of the file is JSON."""
+        if self._may_be_torn and self._path.exists() and stat.S_ISREG(self._path.stat().st_mode):
+            with self._path.open("r+b", buffering=0) as file:
+                size = file.seek(0, os.SEEK_END)
+                file.seek(max(0, size - LINE_MAX_BYTES))
+                torn = file.read(LINE_MAX_BYTES).rpartition(b"\n")[2]
+                if torn:
+                    quoted = {"event": "incomplete", "line": torn.decode("ascii", "backslashreplace")}
+                    entry = json.dumps({"at": self._now().isoformat(timespec="milliseconds"), **quoted}) + "\n"
+                    file.seek(size - len(torn))
+                    try:
+                        written = file.write(entry.encode("ascii"))
+                        if written < len(entry):
+                            file.write(entry[written:].encode("ascii"))  # raises the cause
+                    except OSError:  # no room: nothing of the old line may be lost
+                        file.truncate(size)
+                        file.seek(size - len(torn))
+                        file.write(torn)
+                        raise
+        self._may_be_torn = False
 
     def _append(self, text: str, to_disk: bool) -> None:
+        self._complete_last_line()
         # Opened for each entry: a file that was moved away is created anew, and a lost disk is detected.
         # Non-blocking: a pipe without a reader is an error, not a wait.
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
@@ -104,9 +133,9 @@ class AuditLog:
             data = text.encode("ascii")
             written = os.write(handle, data)
             if written < len(data):
-                self._has_partial_line = True
+                self._may_be_torn = True
                 os.write(handle, data[written:])  # raises the cause
-                self._has_partial_line = False
+                self._may_be_torn = False
             if to_disk:
                 os.fsync(handle)
         finally:

@@ -200,6 +200,9 @@ def test_remove_leaves_what_was_edited(install, at):
     at(CONFIG_PATH).write_text(at(CONFIG_PATH).read_text() + "# mine\n")
     output = install(command="remove").out
     assert f"{CONFIG_PATH}: edited, kept" in output
+    unit = at(UNIT_PATH).name
+    for folder in ("/var/lib/optodrive", "/var/cache/optodrive"):
+        assert folder in output, unit
     assert not at(UNIT_PATH).exists()
     assert at(CONFIG_PATH).exists()
     at(CONFIG_PATH).unlink()

@@ -68,8 +68,11 @@ def test_an_error_of_the_daemon_arrives_at_the_caller_unchanged(error):
 
 def test_a_response_without_a_problem_document_is_a_link_error():
     for body in (b"<html>", b"[1]", b'{"error": 1}'):
-        with pytest.raises(LinkError, match="502 without a problem document"):
-            parse_response(HEALTH, httpx.Response(502, content=body))
+        with pytest.raises(LinkError, match="500 without a problem document: a proxy or another program answered"):
+            parse_response(HEALTH, httpx.Response(500, content=body))
+        for status in (502, 503, 504):
+            with pytest.raises(LinkError, match=f"a proxy answered {status}: the daemon behind it is not there"):
+                parse_response(HEALTH, httpx.Response(status, content=body))
 
 
 @pytest.mark.parametrize("body", [b"<html>", b"[]", b"\xff"])

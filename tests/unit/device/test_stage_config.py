@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from optodrive.cli.doctor import examine
 from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config, locate_shipped
@@ -38,6 +39,44 @@ def test_a_stage_states_what_differs_from_the_sections(tmp_path):
     assert right.laser.pwm_hz == config.laser.pwm_hz
     assert (left.scanner.aim_error_m, right.scanner) == (1e-5, config.scanner)
     assert left.reach.tolist() == [column <= 1 for _ in range(4) for column in range(4)]
+
+
+NUMBERED = """
+[[stages]]
+name = "left"
+board = { transport = "serial", port = "PORT_A", uid = "UID_A" }
+[[stages]]
+name = "right"
+board = { transport = "serial", port = "PORT_B", uid = "UID_B" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("ports", "uids", "named"),
+    [
+        (("/dev/ttyACM0", "/dev/ttyACM1"), ("", ""), ("'left' on /dev/ttyACM0", "'right' on /dev/ttyACM1")),
+        (("/dev/ttyUSB0", "/dev/ttyACM10"), ("", ""), ("'left' on /dev/ttyUSB0", "'right' on /dev/ttyACM10")),
+        (("/dev/ttyACM0", "/dev/ttyACM1"), ("0a", ""), ("'right' on /dev/ttyACM1",)),
+        (("/dev/ttyACM0", "/dev/serial/by-id/usb-b"), ("", ""), ("'left' on /dev/ttyACM0",)),
+        (("/dev/ttyACM0", "/dev/ttyACM1"), ("0a", "0b"), ()),
+        (("/dev/serial/by-id/usb-a", "/dev/serial/by-id/usb-b"), ("", ""), ()),
+        (("/dev/ttyAMA0", "/dev/ttyAMA1"), ("", ""), ()),  # fixed by the circuit
+    ],
+)
+def test_boards_that_may_change_places_are_named_by_check_and_doctor(tmp_path, capsys, ports, uids, named):
+    stages = NUMBERED
+    for name, value in zip(("PORT_A", "PORT_B", "UID_A", "UID_B"), (*ports, *uids), strict=True):
+        stages = stages.replace(name, value)
+    load(tmp_path, stages)
+    path = str(tmp_path / "display.toml")
+    assert run(["config", "check", "--config", path]) == 0
+    said = capsys.readouterr().out
+    found = [item for item in examine(path, tmp_path) if item.check == "stages"]
+    assert [item.status for item in found] == ["warning"] * bool(named)
+    texts = [said, *(item.observation for item in found)]
+    assert all(name in text for text in texts for name in named)
+    assert ("warning: " in said) == bool(named)
+    assert all(f"'{name}' on" not in said for name in ("left", "right") if not any(name in each for each in named))
 
 
 def test_without_stages_the_sections_are_the_only_one():

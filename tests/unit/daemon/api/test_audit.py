@@ -28,7 +28,7 @@ def audit(tmp_path, reports):
 
 
 def read_entries(folder):
-    return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines() if line.endswith("}")]
+    return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
 
 
 def test_entries_are_appended_in_order(audit, tmp_path, reports):
@@ -63,9 +63,42 @@ def test_a_disk_that_is_full_is_said_once_and_again_when_it_is_not(audit, tmp_pa
     assert len(reports) == 1
     assert "arming is refused" in reports[0]
     assert asyncio.run(audit.record_durably({"event": "after"})) is None
-    # The incomplete line stays on a line of its own, so that later entries are readable.
-    assert [line["event"] for line in read_entries(tmp_path)] == ["requested", "after"]
+    first, incomplete, last = read_entries(tmp_path)  # every line is JSON, and what was cut off is quoted
+    assert [entry["event"] for entry in (first, incomplete, last)] == ["requested", "incomplete", "after"]
+    assert incomplete["line"].startswith('{"at": "2026')
     assert "again" in reports[1]
+
+
+@pytest.mark.parametrize("torn", ['{"at": "2026-01-01", "ev', "x", '{"at": "\\', "a" * 30_000])
+def test_a_line_that_an_earlier_process_left_incomplete_is_quoted_at_the_next_start(tmp_path, reports, torn):
+    path = tmp_path / "audit.jsonl"
+    path.write_text(f'{{"event": "older"}}\n{torn}')
+    first = AuditLog(path, reports.append, lambda: NOW)
+    first.close()  # without an entry
+    assert [entry["event"] for entry in read_entries(tmp_path)] == ["older", "incomplete"]
+    assert read_entries(tmp_path)[1]["line"] == torn
+    size = path.stat().st_size
+    second = AuditLog(path, reports.append, lambda: NOW)
+    second.close()
+    assert path.stat().st_size == size
+    assert reports == []
+
+
+def test_an_incomplete_line_stays_whole_while_there_is_no_room_to_quote_it(tmp_path, reports):
+    path, torn = tmp_path / "audit.jsonl", '{"event": "stop", "na'
+    path.write_text(f'{{"event": "older"}}\n{torn}')
+    before = path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 10, hard))
+    try:
+        audit = AuditLog(path, reports.append, lambda: NOW)
+        assert asyncio.run(audit.record_durably({"event": "requested"})) is not None
+        assert path.read_bytes() == before
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert asyncio.run(audit.record_durably({"event": "after"})) is None
+    audit.close()
+    assert [entry.get("line") for entry in read_entries(tmp_path)] == [None, torn, None]
 
 
 def test_a_blocked_disk_delays_nothing(audit, reports, monkeypatch):
