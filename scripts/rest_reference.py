@@ -16,7 +16,9 @@ HEAD = """# REST API
 
 Generated from the daemon's OpenAPI document, which the daemon serves at `/openapi.json`. Every route except
 `/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route. Errors are problem
-documents (RFC 9457) with a stable `code`. [Streaming](../how-to/stream-frames.md) describes the WebSocket,
+documents (RFC 9457) with a stable `code`. A request whose query or body says something that its route does not read,
+such as a misspelt option, is refused with its name and the nearest known one; only STOP is never refused for that.
+[Streaming](../how-to/stream-frames.md) describes the WebSocket,
 [the client](../how-to/use-the-python-client.md) its use from Python.
 """
 PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem):

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from optodrive.core.errors import InputError
 from optodrive.core.types.push_options import list_push_options, select_push_options
 
 
@@ -16,19 +15,13 @@ def add_push_options(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(**values: Any) -> None:
-        if values.pop("strict"):
-            raise InputError("--strict", "an option that is gone", "--policy refuse in its place")
         options = select_push_options(values)
         command(**values, **options)
 
     parameters = [each for each in signature(command).parameters.values() if each.kind is not Parameter.VAR_KEYWORD]
     for name, kind, text in list_push_options():
         option = typer.Option(f"--{name.replace('_', '-')}", help=f"{text[0].upper()}{text[1:]}.")
-        parameters.append(_build_parameter(name, kind | None, option, None))
-    parameters.append(_build_parameter("strict", bool, typer.Option("--strict", hidden=True), False))
+        optional: Any = kind | None
+        parameters.append(Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[optional, option]))
     run.__signature__ = signature(command).replace(parameters=parameters)  # type: ignore[attr-defined]
     return run
-
-
-def _build_parameter(name: str, kind: Any, option: Any, default: object) -> Parameter:
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])

@@ -139,9 +139,16 @@ def suggest_nearest(name: str, known: list[str]) -> str:
 
 def suggest_near_name(name: str, known: list[str]) -> str:
     """Return a phrase with the known name nearest to `name`, one that begins with it first, or an empty text."""
-    longer = [each for each in known if len(name) > 1 and each.startswith(name)]
-    match = get_close_matches(name, longer, n=1, cutoff=0.0) or get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"nearest is '{match[0]}'" if match else ""
+    simplified = {_simplify(each): each for each in known}
+    longer = [each for each in simplified if len(name) > 1 and each.startswith(_simplify(name))]
+    match = get_close_matches(_simplify(name), longer, n=1, cutoff=0.0)
+    match = match or get_close_matches(_simplify(name), simplified, n=1, cutoff=0.5)
+    return f"nearest is '{simplified[match[0]]}'" if match else ""
+
+
+def _simplify(name: str) -> str:
+    """Return a name as names are compared: DRY-RUN is dry_run."""
+    return name.casefold().replace("-", "_")
 
 
 class Unquoted:

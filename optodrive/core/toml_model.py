@@ -1,7 +1,7 @@
 """Tables of TOML files as pydantic models, with one-line errors."""
 
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -124,9 +124,17 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
 
 
 def _list_known_keys(model: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:
+    """Return the keys of the table at a path, which may lead through arrays and tables of tables."""
+    models = [model]
     for part in path:
-        item = model.model_fields.get(str(part))
-        if item is None or not (isinstance(item.annotation, type) and issubclass(item.annotation, BaseModel)):
-            return []
-        model = item.annotation
-    return list(model.model_fields)
+        fields = [each.model_fields[str(part)].annotation for each in models if str(part) in each.model_fields]
+        if fields:
+            models = [found for field in fields for found in _find_models(field)]
+    return list(dict.fromkeys(key for each in models for key in each.model_fields))
+
+
+def _find_models(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models within a type, such as of a list or of a union."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for item in get_args(annotation) for found in _find_models(item)]

@@ -49,10 +49,3 @@ def test_delayed_frames_reach_their_targets(armed):
 
 def test_a_wrong_policy_is_rejected(armed):
     assert armed.call("POST", "/v1/plans", status=422, json=FRAMES, params={"policy": "perhaps"})["code"] == "bad_input"
-
-
-@pytest.mark.parametrize("path", ["/v1/plans", "/v1/patterns/pixel"])
-def test_strict_is_refused_in_favour_of_the_policy(armed, path):
-    answer = armed.call("POST", path, status=422, json=FRAMES, params={"strict": True, "dry_run": True})
-    assert answer["code"] == "bad_input"
-    assert answer["detail"] == "query.strict: got 'true', expected policy=refuse in its place"

@@ -149,4 +149,5 @@ def read_request(scope: Scope) -> RequestContext:
     client = scope.get("client")
     # A caller on the Unix socket has no address.
     address = client[0] if client and client[0] else "unix"
-    return RequestContext(scope.get("method", "WEBSOCKET"), scope["path"], headers, address)
+    query = scope.get("query_string", b"").decode("latin-1")
+    return RequestContext(scope.get("method", "WEBSOCKET"), scope["path"], headers, address, query=query)

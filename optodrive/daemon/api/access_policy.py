@@ -1,12 +1,15 @@
-"""The access policy: which Host, Origin, token, role, rate and body size a request needs.
+"""The access policy: which Host, Origin, token, role, rate, body size and options a request needs.
 
-The checks run in that order, before any route. STOP needs a token of any role; its rate and body are not checked.
+The checks run in that order, before any route. STOP needs a token of any role; its rate, query and body are not
+checked, because a STOP that is refused leaves the laser on.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from urllib.parse import parse_qsl
 
+from optodrive.core.errors import InputError, Unquoted, suggest_nearest
 from optodrive.daemon.api.audit import AuditLog
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES, TEXT_MAX, check_host_and_origin
 from optodrive.daemon.api.rate_limit import RateLimiter
@@ -17,13 +20,14 @@ from optodrive.daemon.api.route_table import STOP, Route, RouteTable
 from optodrive.daemon.api.socket_token import is_websocket_request, read_subprotocol_token
 from optodrive.daemon.api.static_files import is_page_request, read_cookie_token
 from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
+from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.problem import Problem, build_problem
 from optodrive.device.config_sections import DaemonSection
 
 
 @dataclass
 class RequestContext:
-    """A request as far as the policy has identified it: its headers, address, token and route."""
+    """A request as far as the policy has identified it: its query, headers, address, token and route."""
 
     method: str
     path: str
@@ -31,6 +35,7 @@ class RequestContext:
     address: str
     token: Token = ANONYMOUS
     route: Route | None = None
+    query: str = ""
 
     @property
     def audit_fields(self) -> dict[str, object]:
@@ -98,7 +103,12 @@ class AccessPolicy:
         request.route = route
         if is_stop:
             return None
-        return self._check_rate(request) or self._check_route(request, table) or self._check_size(request)
+        return (
+            self._check_rate(request)
+            or self._check_route(request, table)
+            or self._check_size(request)
+            or _check_options(request)
+        )
 
     def find_token(self, request: RequestContext) -> Token | None:
         """Return the valid token that a request presents, None if there is none."""
@@ -143,6 +153,31 @@ class AccessPolicy:
             return None
         detail = f"content-length: got {length[:20]}, expected at most {limit} bytes"
         return build_problem(413, "body_too_large", "Body too large", detail)
+
+
+def _check_options(request: RequestContext) -> Problem | None:
+    """Return why a request is refused whose query or body says something that its route does not read."""
+    assert request.route is not None  # noqa: S101 - checked before
+    try:
+        check_query(request.query, request.route.options)
+    except InputError as error:
+        return build_error_problem(error)
+    has_body = request.headers.get("content-length", "0") != "0" or "transfer-encoding" in request.headers
+    if has_body and not request.route.takes_body:
+        return build_error_problem(InputError("body", Unquoted("a body"), f"none: {request.route.key} takes no body"))
+    return None
+
+
+def check_query(query: str, known: Sequence[str]) -> None:
+    """Raise InputError for a key that a query may not have, and for one that it has twice."""
+    seen = set()
+    for key, _ in parse_qsl(query, keep_blank_values=True):
+        if key not in known:
+            expected = f"a known key, {suggest_nearest(key[:60], list(known))}" if known else "no query"
+            raise InputError("query", key, expected, code="unknown_key")
+        if key in seen:
+            raise InputError("query", key, "each key once", code="repeated_key")
+        seen.add(key)
 
 
 def _read_presented_token(request: RequestContext) -> str:

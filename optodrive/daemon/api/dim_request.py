@@ -6,6 +6,7 @@ from pydantic import Field, ValidationError
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.json_model import JsonModel
+from optodrive.core.toml_model import build_input_error
 from optodrive.planning.stimuli.json_values import decode_json
 
 BODY_MAX_BYTES = 1000
@@ -28,9 +29,8 @@ def parse_dim_request(body: bytes) -> DimRequest:
     """Parse a body. Raise InputError, also for invalid JSON and for a repeated key."""
     if len(body) > BODY_MAX_BYTES:
         raise InputError("body", Unquoted(f"{len(body)} bytes"), f"at most {BODY_MAX_BYTES}")
-    decoded = decode_json(body, "body") if body.strip() else None
+    decoded = decode_json(body, "body") if body.strip() else {}
     try:
         return DimRequest.model_validate(decoded)
-    except ValidationError:
-        text = body[:BODY_MAX_BYTES].decode("utf-8", "replace")
-        raise InputError("body", Unquoted(text or "nothing"), '{"share": a number from 0 to 1}') from None
+    except ValidationError as error:
+        raise build_input_error(error, "body", DimRequest) from None

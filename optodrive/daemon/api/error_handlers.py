@@ -1,14 +1,16 @@
 """Problem documents for errors that routes and the framework raise."""
 
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
 
 from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
+from fastapi.exceptions import RequestValidationError, ValidationException, WebSocketRequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
+from starlette.websockets import WebSocket
 
-from optodrive.core.errors import BusyError, OptodriveError
+from optodrive.core.errors import BusyError, InputError, OptodriveError
 from optodrive.daemon.api.request_limits import BodyTooLargeError
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
@@ -26,9 +28,11 @@ def add_error_handlers(app: FastAPI) -> None:
 
     @handles(RequestValidationError)
     async def handle_validation_error(request: Request, error: RequestValidationError) -> Response:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        return _build_response(build_problem(422, "bad_input", "Bad input", f"{where}: {first['msg']}", where=where))
+        return _build_response(_describe_invalid_value(error))
+
+    @partial(app.add_exception_handler, WebSocketRequestValidationError)
+    async def handle_socket_validation_error(socket: WebSocket, error: Any) -> None:
+        await socket.send_denial_response(_build_response(_describe_invalid_value(error)))
 
     @handles(HTTPException)
     async def handle_http_error(request: Request, error: HTTPException) -> Response:
@@ -46,6 +50,13 @@ def add_error_handlers(app: FastAPI) -> None:
     @handles(MemoryError)
     async def handle_memory_error(request: Request, error: MemoryError) -> Response:
         return _build_response(build_error_problem(BusyError("not enough memory for this request; try again later")))
+
+
+def _describe_invalid_value(error: ValidationException) -> Problem:
+    """Return the problem document for the first value of a query or a path that is invalid."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return build_error_problem(InputError(where, first["input"], first["msg"].removeprefix("Input should be ")))
 
 
 def _build_response(problem: Problem) -> Response:

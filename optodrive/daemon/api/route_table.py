@@ -9,6 +9,8 @@ from re import Pattern
 from typing import Any, TypeVar
 
 from fastapi import FastAPI
+from fastapi.dependencies.models import Dependant
+from fastapi.routing import APIRoute, APIWebSocketRoute
 from starlette.routing import BaseRoute, WebSocketRoute, compile_path
 from starlette.routing import Route as HttpRoute
 
@@ -49,12 +51,17 @@ class RoleRoutes:
 
 @dataclass(frozen=True)
 class Route:
-    """One entry of the table. `key` is its method and path template."""
+    """One entry of the table. `key` is its method and path template.
+
+    options: names of the parameters that its query may have; takes_body: whether it reads a body
+    """
 
     key: str
     min_role: Role | None
     method: str
     path: Pattern[str]
+    options: tuple[str, ...]
+    takes_body: bool
 
     @property
     def is_audited(self) -> bool:
@@ -101,4 +108,13 @@ def _build_entries(route: BaseRoute) -> Iterator[Route]:
         raise TypeError(f"the route {route.path} states no role; declare it with RoleRoutes")
     for method in sorted(methods):
         min_role: Role | None = getattr(route, ROLE_ATTRIBUTE)
-        yield Route(f"{method} {route.path}", min_role, method, compile_path(route.path)[0])
+        options = tuple(_list_options(route.dependant)) if isinstance(route, APIRoute | APIWebSocketRoute) else ()
+        takes_body = isinstance(route, APIRoute) and "requestBody" in (route.openapi_extra or {})
+        yield Route(f"{method} {route.path}", min_role, method, compile_path(route.path)[0], options, takes_body)
+
+
+def _list_options(dependant: Dependant) -> Iterator[str]:
+    """List the query's parameters of a route and of everything that it depends on."""
+    yield from (parameter.alias for parameter in dependant.query_params)
+    for each in dependant.dependencies:
+        yield from _list_options(each)

@@ -54,8 +54,3 @@ def test_a_reduced_variant_does_not_fit_and_a_refusal_fails(frames, options, sta
 def test_the_help_lists_the_statuses(capsys):
     assert run(["--help"]) == 0
     assert " ".join(capsys.readouterr().out.split()).endswith(SUMMARY)
-
-
-def test_strict_is_refused_in_favour_of_the_policy(frames, capsys):
-    assert run(["plan", frames(LATE), "--config", "display-16", "--strict"]) == 2
-    assert "expected --policy refuse in its place" in capsys.readouterr().err

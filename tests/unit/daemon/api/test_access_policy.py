@@ -182,7 +182,7 @@ def test_a_client_that_hangs_up_during_its_body_is_no_error(audited, caplog):
 
 def build_request(token, key, address="127.0.0.1"):
     method, _, path = key.partition(" ")
-    return RequestContext(method, path, {}, address, token, Route(key, "viewer", method, re.compile(path)))
+    return RequestContext(method, path, {}, address, token, Route(key, "viewer", method, re.compile(path), (), False))
 
 
 def test_the_streams_of_one_caller_are_bounded():
