@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.device.config_sections import DIRECT_WIRING, Wiring
 from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, FieldGeometry, beam_position_m
 from optodrive.device.field_surface import Extent, evaluate_terms
 
@@ -33,8 +34,8 @@ GUESS_MARGIN = 1.1
 class CalibratedField:
     """Map from codes to display positions: physical geometry plus a smooth surface. Arrays are read-only.
 
-    surface_m: [2, TERM_COUNT] coefficients of x and y; rad_per_code, focal_length_m: of the configuration that the
-    field was calibrated with; sigma_grid_m: [k, k] standard uncertainty per axis over the extent, rows by y
+    surface_m: [2, TERM_COUNT] coefficients of x and y; rad_per_code, focal_length_m, wiring: of the configuration that
+    the field was calibrated with; sigma_grid_m: [k, k] standard uncertainty per axis over the extent, rows by y
     display: name of the display that it was calibrated on, "" if unknown
     """
 
@@ -45,6 +46,7 @@ class CalibratedField:
     focal_length_m: float
     sigma_grid_m: FloatArray
     display: str = ""
+    wiring: Wiring = DIRECT_WIRING
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

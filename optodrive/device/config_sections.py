@@ -2,7 +2,7 @@
 
 import re
 from os.path import realpath
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -145,6 +145,18 @@ class ServoSection(Section):
     """Half-width of delay_s, s."""
 
 
+class Wiring(NamedTuple):
+    """Relation of the converter's outputs X and Y to the axes of the display, by the keys of ScannerSection."""
+
+    swap_axes: bool = False
+    invert_x: bool = False
+    invert_y: bool = False
+
+
+DIRECT_WIRING = Wiring()
+"""Output X along x, output Y along y."""
+
+
 class ScannerSection(ServoSection):
     """The mirrors and the lens. Without a calibrated field the lens is an ideal f-theta lens, x = f · 2 · angle."""
 
@@ -162,6 +174,18 @@ class ScannerSection(ServoSection):
     """When a step to the next pixel is sent: as the light ends, or as early as the focus stays on the absorber."""
     half_range_codes: int = HALF_RANGE_CODES
     """Codes of the converter from the centre to the end of the range: 32767, for a laser DAC 2047."""
+
+    swap_axes: bool = False
+    """Whether output X moves the beam along y, and output Y along x."""
+    invert_x: bool = False
+    """Whether the sign of output X is turned: a larger code of it moves the beam to smaller x, or y if swapped."""
+    invert_y: bool = False
+    """Whether the sign of output Y is turned."""
+
+    @property
+    def wiring(self) -> Wiring:
+        """Relation of the converter's outputs to the axes of the display."""
+        return Wiring(self.swap_axes, self.invert_x, self.invert_y)
 
     @property
     def rad_per_code(self) -> float:

@@ -11,7 +11,7 @@ from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.device.calibrated_field import CalibratedField
-from optodrive.device.config_sections import FocalLength
+from optodrive.device.config_sections import FocalLength, Wiring
 from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
 from optodrive.device.field_surface import ORDER, TERM_COUNT, Extent
 
@@ -29,6 +29,9 @@ Displacement = Annotated[float, Item(ge=-1, le=1), PIXEL_OFFSET]
 class _Scanner(Section):
     rad_per_code: Annotated[float, Item(gt=0), PlausibleRange(3e-8, 4e-4, "rad")]
     focal_length_m: FocalLength
+    swap_axes: bool = False
+    invert_x: bool = False
+    invert_y: bool = False
 
 
 class _Extent(Section):
@@ -73,6 +76,7 @@ def format_field(field: CalibratedField, about: dict[str, str | float | int]) ->
     lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]
     lines += ["", "[scanner] # of the configuration that it was calibrated with"]
     lines += [f"rad_per_code = {field.rad_per_code!r}", f"focal_length_m = {field.focal_length_m!r}"]
+    lines += [f"{key} = {str(value).lower()}" for key, value in field.wiring._asdict().items()]
     lines += ["", "[extent] # codes for which it is calibrated"]
     lines += [f"{key} = {float(getattr(extent, key))!r}" for key in ("x_code", "y_code", "x_half", "y_half")]
     lines += ["", "[geometry]"]
@@ -105,6 +109,7 @@ def load_field(path: Path) -> CalibratedField:
         focal_length_m=content.scanner.focal_length_m,
         sigma_grid_m=np.array(grid),
         display=str(content.about.get("display", "")),
+        wiring=Wiring(*(getattr(content.scanner, key) for key in Wiring._fields)),
     )
     if not field.is_finite:
         raise InputError(

@@ -8,6 +8,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 from optodrive.device.calibrated_field import CalibratedField
 from optodrive.device.config import Config
+from optodrive.device.config_sections import Wiring
 from optodrive.device.field_file import load_field
 from optodrive.device.pixel_map import build_aim_layout, load_pixel_map
 from optodrive.device.scan_field import IdealField, ScanField
@@ -74,6 +75,10 @@ def _check_scanner(field: CalibratedField, config: Config) -> None:
                 f"this display is {config.name}"
             )
             raise InputError(f"scanner.{name}", value, expected)
+    for key, wired, calibrated_so in zip(Wiring._fields, scanner.wiring, field.wiring, strict=True):
+        if wired != calibrated_so:
+            expected = f"{str(calibrated_so).lower()}, as when {_describe(field, config)} was made; calibrate again"
+            raise InputError(f"scanner.{key}", str(wired).lower(), expected)
 
 
 def _check_pixels(field: CalibratedField, config: Config) -> None:

@@ -58,6 +58,7 @@ def build_scales(config: Config) -> tuple[WireScale, ...]:
             rad_per_code=stage.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
             full_power_w=stage.laser.max_power_w,
             tick_s=1.0 / TICK_HZ,
+            **stage.scanner.wiring._asdict(),
         )
         for stage in config.list_stage_configs()
     )
@@ -71,7 +72,7 @@ def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CO
     (scale,) = build_scales(config)
     layout = build_aim_layout(config)
     angles_rad = load_scan_field(config).angles_rad(layout.x_m, layout.y_m)
-    codes = np.stack([scale.to_codes(angle_rad) for angle_rad in angles_rad])
+    codes = np.stack(scale.to_outputs(*(scale.to_codes(angle_rad) for angle_rad in angles_rad)))
     return BoardRequirements(
         limits=_build_limits(config, scale, codes, margin_codes),
         cell_max_codes=_compute_cell_max(codes, list_adjacent_pixels(layout), scale, config),
@@ -114,8 +115,8 @@ def build_bench_requirements(config: Config, margin_m: float) -> BoardRequiremen
 def _compute_cell_max(codes: IntArray, adjacent: IntArray, scale: WireScale, config: Config) -> int:
     """Return the largest cell of the board's spot guards that no two pixels share, in codes.
 
-    codes: [2, p] of the pixels; adjacent: [2, n] pairs of adjacent ones. Pixels a whole cell apart along one axis share
-    none.
+    codes: [2, p] of the outputs for the pixels; adjacent: [2, n] pairs of adjacent ones. Pixels a whole cell apart
+    along one axis share none.
     """
     one, other = adjacent
     if codes.shape[1] == 1:

@@ -227,6 +227,7 @@ class _FieldFitter:
             focal_length_m=self.prior.focal_length_m,
             sigma_grid_m=_sigma_m(jacobian, covariance).reshape(SIGMA_GRID_NODES, SIGMA_GRID_NODES),
             display=self.prior.display,
+            wiring=self.prior.wiring,
         )
         return FieldFit(
             field=field,

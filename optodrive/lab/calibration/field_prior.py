@@ -7,6 +7,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.config_sections import DIRECT_WIRING, Wiring
 from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, FieldGeometry
 from optodrive.device.field_surface import Extent
 
@@ -25,7 +26,7 @@ class FieldPrior:
     """Prior distribution of a field's parameters.
 
     mean, sigma: of each parameter of the geometry; extent: codes of the field; display_extent: codes of the display
-    rad_per_code, focal_length_m: of the configuration; noise_m, surface_m: expected rms per axis
+    rad_per_code, focal_length_m, wiring: of the configuration; noise_m, surface_m: expected rms per axis
     field_area_m2: area over which outliers are uniformly distributed; display: name of the display
     """
 
@@ -39,6 +40,7 @@ class FieldPrior:
     noise_m: float = SPOT_NOISE_M
     surface_m: float = SURFACE_RMS_M
     display: str = ""
+    wiring: Wiring = DIRECT_WIRING
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -82,4 +84,5 @@ class FieldPrior:
             display_extent=Extent(float(CENTRE_CODE), float(CENTRE_CODE), display_m[0] / code_m, display_m[1] / code_m),
             field_area_m2=4.0 * half_m[0] * half_m[1],
             display=config.name,
+            wiring=scanner.wiring,
         )

@@ -10,7 +10,8 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.device.config_sections import Wiring
 from optodrive.device.field_geometry import CENTRE_CODE
 from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.lab.calibration.field_prior import FieldPrior
@@ -74,7 +75,7 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
         found = f"positions {residual_m / max(scale, 1.0) * 1e3:.1f} mm off any affine map"
         raise InputError(f"{where}: x_m, y_m", found, "valid spots for the most part; nearly all look like outliers")
     _check_scale(where, scale)
-    _check_axes(where, matrix / scale)
+    _check_axes(where, matrix / scale, prior.wiring)
     if float(np.hypot(*shift)) > SHIFT_MAX_M:
         found = f"{shift[0] * 1e3:.1f}, {shift[1] * 1e3:.1f} mm with both mirrors in the middle position"
         raise InputError(
@@ -151,15 +152,17 @@ def _check_scale(where: str, scale: float) -> None:
         )
 
 
-def _check_axes(where: str, directions: FloatArray) -> None:
+def _check_axes(where: str, directions: FloatArray, wiring: Wiring) -> None:
     """Check the orientation of the axes and the rotation.
 
-    directions: [2, 2] without scale
+    directions: [2, 2] without scale, from codes along the axes to positions; wiring: that the spots were made with
     """
     similarity = {signs: float(np.array(signs) @ directions.ravel()) / 2.0 for signs in [*AXIS_ERRORS, (1, 0, 0, 1)]}
     nearest = max(similarity, key=lambda signs: similarity[signs])
     if nearest in AXIS_ERRORS:
-        expected = "x_m that increases with x_code, and y_m with y_code"
+        matching = _correct_wiring(np.array(nearest).reshape(2, 2), wiring)
+        keys = ", ".join(f"{key} = {str(value).lower()}" for key, value in matching._asdict().items())
+        expected = f"x_m that increases with x_code, and y_m with y_code; measure again with [scanner] {keys}"
         raise InputError(f"{where}: x_m, y_m", AXIS_ERRORS[nearest], expected)
     turn_rad = float(np.arctan2(directions[1, 0] - directions[0, 1], directions[0, 0] + directions[1, 1]))
     if abs(turn_rad) > TURN_MAX_RAD:
@@ -168,3 +171,15 @@ def _check_axes(where: str, directions: FloatArray) -> None:
             f"a display turned by {degrees(turn_rad):.1f}°",
             f"at most {degrees(TURN_MAX_RAD):.0f}°",
         )
+
+
+def _correct_wiring(directions: IntArray, wiring: Wiring) -> Wiring:
+    """Return the wiring with which spots whose directions were [2, 2] under another one lie along the axes.
+
+    Outputs are W · axes, and positions D · axes; with positions in place of axes the outputs are W · D⁻¹ · positions.
+    """
+    signs = np.where([wiring.invert_x, wiring.invert_y], -1, 1)
+    outputs = signs[:, None] * (np.eye(2, dtype=np.int64)[::-1] if wiring.swap_axes else np.eye(2, dtype=np.int64))
+    corrected = outputs @ directions.T  # the inverse of a signed permutation
+    inverted = corrected.sum(axis=1) < 0
+    return Wiring(bool(corrected[0, 0] == 0), bool(inverted[0]), bool(inverted[1]))

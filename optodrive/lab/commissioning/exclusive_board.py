@@ -117,33 +117,35 @@ class ExclusiveBoard(ArmedBoard):
 
     def check_range(self, x_code: int, y_code: int) -> None:
         """Raise InputError for codes beyond the display and its margin."""
-        limits = self.requirements.limits
-        for axis, code in (("x", x_code), ("y", y_code)):
-            low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
+        for axis, code, low, high in zip("xy", (x_code, y_code), *self._code_limits, strict=True):
             if not low <= code <= high:
                 raise InputError(
                     f"{axis}_code",
                     code,
-                    f"{low} to {high}, the display and {format_quantity(FIELD_MARGIN_M, 'm')} more",
+                    f"{low:g} to {high:g}, the display and {format_quantity(FIELD_MARGIN_M, 'm')} more",
                 )
 
     @property
     def half_travel_codes(self) -> tuple[int, int]:
         """Way of mirrors x and y from the centre to either side that spans the display, within the board's range."""
-        layout, scanner, limits = build_pixel_layout(self.config.display), self.config.scanner, self.requirements.limits
+        layout, scanner = build_pixel_layout(self.config.display), self.config.scanner
         code_m = 2.0 * scanner.focal_length_m * scanner.rad_per_code
         x_codes, y_codes = (
             round(max(float(np.abs(axis_m).max()), HALF_TRAVEL_MIN_M) / code_m) for axis_m in (layout.x_m, layout.y_m)
         )
-        return (
-            min(x_codes, limits.x_max - CENTRE_CODE, CENTRE_CODE - limits.x_min),
-            min(y_codes, limits.y_max - CENTRE_CODE, CENTRE_CODE - limits.y_min),
-        )
+        room = np.abs(self._code_limits - CENTRE_CODE).min(axis=0).tolist()
+        return min(x_codes, room[0]), min(y_codes, room[1])
 
     def clip_codes(self, codes: FloatArray) -> FloatArray:
         """Clip codes [k, 2] to the board's range."""
+        return np.clip(codes, *self._code_limits)
+
+    @property
+    def _code_limits(self) -> IntArray:
+        """Lowest and highest codes of the board's range along x and y, [2, 2]."""
         limits = self.requirements.limits
-        return np.clip(codes, [limits.x_min, limits.y_min], [limits.x_max, limits.y_max])
+        outputs = np.array([limits.x_min, limits.x_max]), np.array([limits.y_min, limits.y_max])
+        return np.sort(np.column_stack(self.session.scale.to_axes(*outputs)), axis=0)
 
     def _account(
         self, plan: PulsePlan, budget: Budget, pulses: int, points: WirePoints | None = None

@@ -201,7 +201,10 @@ class Homing:
             if abs(own_m - commanded_m) > SPOT_TOLERANCE * commanded_m or abs(other_m) > SPOT_TOLERANCE * commanded_m:
                 measured = f"{own_m:.4f} m along {AXES[axis]}, {other_m:.4f} m along {AXES[1 - axis]}"
                 raise _build_refusal(
-                    name, what, measured, f"{expected} along {AXES[axis]}: axes mirrored or exchanged, or another lens?"
+                    name,
+                    what,
+                    measured,
+                    f"{expected} along {AXES[axis]}: scanner.swap_axes, invert_x or invert_y, or another lens?",
                 )
         message = f"±{commanded_rad / 2:.4f} rad, {_describe_evidence(high)}"
         return HomingResult(name, message, {"plus": _position_details(high), "minus": _position_details(low)})

@@ -14,7 +14,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import PulsePlan
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, find_weakest_pixel
 from optodrive.lab.commissioning.spot_bounds import max_settling_s
-from optodrive.link.protocol.quantisation import CENTRE_CODE, GATE_OFF_STEP_TICKS, TICKS_MAX, WirePoints
+from optodrive.link.protocol.quantisation import CENTRE_CODE, GATE_OFF_STEP_TICKS, TICKS_MAX, WirePoints, WireScale
 from optodrive.planning.limiter.limiter import galvo_feasible_prefix
 
 SIZE_FRACTIONS = (1.0, 0.2, 0.033)
@@ -103,15 +103,16 @@ def build_move_plan(run: StepRun, board: ExclusiveBoard) -> PulsePlan:
     )
 
 
-def build_gate_off_points(run: StepRun) -> WirePoints:
+def build_gate_off_points(run: StepRun, scale: WireScale) -> WirePoints:
     """Build the points on the wire: gate-on time and duty of each are zero. A long hold takes several points."""
     rows = []
-    for (x_code, y_code), hold_ticks in zip(run.codes.tolist(), run.hold_ticks.tolist(), strict=True):
+    outputs = np.column_stack(scale.to_outputs(*run.codes.T)).tolist()
+    for (x_output, y_output), hold_ticks in zip(outputs, run.hold_ticks.tolist(), strict=True):
         rest_ticks = hold_ticks
         while rest_ticks > TICKS_MAX:  # the first point is long enough for any settling
-            rows.append((x_code, y_code, GATE_OFF_STEP_TICKS, 0, 0))
+            rows.append((x_output, y_output, GATE_OFF_STEP_TICKS, 0, 0))
             rest_ticks -= GATE_OFF_STEP_TICKS
-        rows.append((x_code, y_code, rest_ticks, 0, 0))
+        rows.append((x_output, y_output, rest_ticks, 0, 0))
     return WirePoints(np.array(rows, dtype=np.uint16), np.arange(len(rows)))
 
 
@@ -121,7 +122,7 @@ def play_run(run: StepRun, board: ExclusiveBoard) -> FloatArray:
     The first step is at LEAD_IN_S. Raises LinkError if the board held a position for another time than planned, which
     a recording could not show.
     """
-    points = build_gate_off_points(run)
+    points = build_gate_off_points(run, board.session.scale)
     end_tick = board.play_gate_off(build_move_plan(run, board), points)
     held_ticks = np.diff(end_tick) - points.table[1:, 2].astype(np.int64)
     if held_ticks.any():

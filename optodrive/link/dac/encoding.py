@@ -43,7 +43,8 @@ class PointScale(DacScale, bits=12):
         rad_per_code = config.scanner.range_rad / DAC_HALF_RANGE_CODES
         dac_format = find_format(config.board.transport)(config.board.points_per_s)
         settling = build_settling_table(config)
-        return cls(rad_per_code, config.laser.max_power_w, dac_format, settling.early_points, settling.early_dwell_us)
+        early = settling.early_points, settling.early_dwell_us
+        return cls(rad_per_code, config.laser.max_power_w, dac_format, *early, **config.scanner.wiring._asdict())
 
     @property
     def point_s(self) -> float:
@@ -105,7 +106,7 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     last[:-1] -= last[:-1] == first[1:]  # a blank point separates adjacent pulses
     emitting = (level > 0) & (last > first)  # the mirrors skip pulses without emission
     first, last, level = first[emitting], last[emitting], level[emitting]
-    x, y = scale.to_codes(plan.x_rad[emitting]), scale.to_codes(plan.y_rad[emitting])
+    x, y = scale.to_outputs(scale.to_codes(plan.x_rad[emitting]), scale.to_codes(plan.y_rad[emitting]))
     early = np.where(_find_early_steps(plan, scale), scale.early_points, 0)[emitting]
     before = np.concatenate([[0], last[:-1]])[: len(last)]
     run_lengths = np.column_stack([first - before, last - first]).ravel()
@@ -188,7 +189,8 @@ def decode(chunks: Sequence[bytes], scale: PointScale) -> PointPulses:
     is_early = _match_early_steps(points, run_starts, run_ends, begin_ticks / scale.format.clock_hz, scale)
     run_ends = np.where(np.append(is_early[1:], False), np.append(run_ends[1:], 0), run_ends)[~is_early]
     run_starts = run_starts[~is_early]
-    x, y, level = points[run_starts].T
+    x_output, y_output, level = points[run_starts].T
+    x, y = scale.to_axes(x_output, y_output)
     return PointPulses(
         start_s=begin_ticks[run_starts] / scale.format.clock_hz,
         width_s=(begin_ticks[run_ends] - begin_ticks[run_starts]) / scale.format.clock_hz,

@@ -32,7 +32,7 @@ CENTRE_CODE, CODE_MAX = WireScale.CENTRE_CODE, WireScale.CODE_MAX
 class WirePoints:
     """Points of a plan on the wire.
 
-    table: uint16 [n, 5] of x, y, gate-off ticks, gate-on ticks and duty
+    table: uint16 [n, 5] of the outputs X and Y, gate-off ticks, gate-on ticks and duty
     row: [n] row of the pulse in the plan, -1 for a point inserted into a long pause or after the last pulse
     """
 
@@ -116,7 +116,7 @@ def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
         found = f"{plan.width_s[first]:.4g} s at {plan.power_w[first]:.4g} W"
         raise LocalProtocolError(f"a pulse of {found} does not fit a point of the wire")
     aim_row = rows[_find_next_gate_on(duty)]
-    x, y = scale.to_codes(plan.x_rad[aim_row]), scale.to_codes(plan.y_rad[aim_row])
+    x, y = scale.to_outputs(scale.to_codes(plan.x_rad[aim_row]), scale.to_codes(plan.y_rad[aim_row]))
     gate_off = start - np.concatenate([[0], (start + width)[:-1]])
     if len(rows) and gate_off.min() < 0:
         raise LocalProtocolError("pulses overlap, or the first begins before the plan")
@@ -147,7 +147,8 @@ def _find_next_gate_on(duty: IntArray) -> IntArray:
 def decode(payload: bytes, scale: WireScale) -> DecodedPulses:
     """Decode the concatenated payloads of DATA frames. Gate-off points only advance time."""
     table = np.frombuffer(payload, dtype="<u2").reshape(-1, 5).astype(np.int64)
-    x, y, off, on, duty = table.T
+    x_output, y_output, off, on, duty = table.T
+    x, y = scale.to_axes(x_output, y_output)
     end = np.cumsum(off + on)
     gate_on = np.flatnonzero(on > 0)
     return DecodedPulses(

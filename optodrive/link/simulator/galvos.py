@@ -10,6 +10,7 @@ from optodrive.device.config import Config
 from optodrive.device.config_sections import HALF_RANGE_CODES
 from optodrive.device.gate_timing import build_servo
 from optodrive.device.servo import Servo
+from optodrive.link.board_setup import build_scales
 
 CENTRE_CODE = HALF_RANGE_CODES + 1
 OUTPUT_NOISE_RAD = 1e-5
@@ -34,7 +35,7 @@ class SimulatedGalvos:
 
     def __init__(self, config: Config, seed: int | np.random.SeedSequence) -> None:
         self._servo = build_servo(config.scanner)
-        self._code_rad = config.scanner.rad_per_code
+        (self._scale,) = build_scales(config)
         self._random = np.random.default_rng(seed)
         self._base_rad = (0.0, 0.0)
         self._target_rad = (0.0, 0.0)
@@ -42,9 +43,10 @@ class SimulatedGalvos:
         self._stuck_rad: dict[int, float] = {}
         self.readback_inverted = False
 
-    def move_to(self, x_code: int, y_code: int, at_us: int) -> None:
-        """Command both mirrors to codes at a time."""
-        target_rad = (x_code - CENTRE_CODE) * self._code_rad, (y_code - CENTRE_CODE) * self._code_rad
+    def move_to(self, x_output: int, y_output: int, at_us: int) -> None:
+        """Command both mirrors to codes at a time. x_output, y_output: of the converter, wired as configured."""
+        x_codes, y_codes = self._scale.to_axes(np.array(x_output), np.array(y_output))
+        target_rad = float(self._scale.to_angles_rad(x_codes)), float(self._scale.to_angles_rad(y_codes))
         if target_rad == self._target_rad:
             return
         x_rad, y_rad = (after - before for after, before in zip(target_rad, self._target_rad, strict=True))
@@ -73,7 +75,7 @@ class SimulatedGalvos:
     def codes(self, at_us: int) -> tuple[float, float]:
         """Return the codes of x and y whose steady-state angles are the present ones."""
         x_rad, y_rad = self.angles_rad(at_us)
-        return CENTRE_CODE + x_rad / self._code_rad, CENTRE_CODE + y_rad / self._code_rad
+        return CENTRE_CODE + x_rad / self._scale.rad_per_code, CENTRE_CODE + y_rad / self._scale.rad_per_code
 
     def position_output_rad(self, at_us: int) -> tuple[float, float]:
         """Return the noisy position outputs of x and y, rad."""
@@ -87,16 +89,17 @@ def measure_position_outputs(config: Config, commands: FloatArray, until_s: floa
 
     commands: [m, 3] t_s, x_rad, y_rad in order; the mirrors rest at the first ones
     """
-    galvos, outputs, period_us = SimulatedGalvos(config, seed), [], round(1e6 * TRACE_PERIOD_S)
-    codes = np.rint(CENTRE_CODE + commands[:, 1:] / config.scanner.rad_per_code).astype(int).tolist()
+    galvos, readings, period_us = SimulatedGalvos(config, seed), [], round(1e6 * TRACE_PERIOD_S)
+    (scale,) = build_scales(config)
+    codes = np.column_stack(scale.to_outputs(*scale.to_codes(commands[:, 1:]).T)).tolist()
     galvos.move_to(codes[0][0], codes[0][1], round(-1e6 * MOVE_HISTORY_S))
     steps = list(zip(np.rint(1e6 * commands[1:, 0]).astype(int).tolist(), codes[1:], strict=True))
     for at_us in range(0, round(1e6 * until_s), period_us):
         while steps and steps[0][0] <= at_us:
-            due_us, (x_code, y_code) = steps.pop(0)
-            galvos.move_to(x_code, y_code, due_us)
-        outputs.append((at_us * 1e-6, *galvos.position_output_rad(at_us)))
-    return np.array(outputs)
+            due_us, (x_output, y_output) = steps.pop(0)
+            galvos.move_to(x_output, y_output, due_us)
+        readings.append((at_us * 1e-6, *galvos.position_output_rad(at_us)))
+    return np.array(readings)
 
 
 def _move_response_rad(servo: Servo, displacement_rad: float, elapsed_s: float) -> float:

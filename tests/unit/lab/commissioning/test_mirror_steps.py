@@ -48,8 +48,8 @@ def replace_points(monkeypatch, change):
     """Replace the points of the steps by mutants."""
     build = mirror_steps.build_gate_off_points
 
-    def mutate(run):
-        points = build(run)
+    def mutate(run, scale):
+        points = build(run, scale)
         return WirePoints(change(points.table.copy()), points.row)
 
     monkeypatch.setattr(mirror_steps, "build_gate_off_points", mutate)
