@@ -181,7 +181,7 @@ class StudyPages:
         while True:
             wake.clear()
             view = self._respondent.build_operator_view()
-            await page.send_json({**view.model_dump(mode="json"), "participant_url": self.participant_url})
+            await page.send_json({**view.model_dump(mode="json"), "participant_token": self._participant_token})
             if view.phase in ("done", "stopped"):
                 return Closure(NORMAL, "")
             await wake.wait()

@@ -4,7 +4,6 @@ A browser cannot send a bearer header for a page, so GET requests for `/` and `/
 too; the page's requests to the API carry the header. A cookie is not bound to a port, so its name contains the port.
 """
 
-from http.cookies import CookieError, SimpleCookie
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from mimetypes import guess_type
@@ -37,13 +36,14 @@ def is_page_request(method: str, path: str) -> bool:
 
 
 def read_cookie_token(headers: dict[str, str]) -> str:
-    """Return the token in a browser's cookie, '' if there is none."""
-    try:
-        cookies = SimpleCookie(headers.get("cookie", ""))
-    except CookieError:
-        return ""
-    found = cookies.get(f"optodrive-{_parse_port(headers.get('host', ''))}")
-    return "" if found is None else found.value
+    """Return the token in a browser's cookie, '' if there is none.
+
+    Of several with one name, the first is that of the longest path (RFC 6265, 5.4): of the display's own page at an
+    address where a proxy shows several.
+    """
+    cookie = f"optodrive-{_parse_port(headers.get('host', ''))}"
+    pairs = (part.strip().partition("=") for part in headers.get("cookie", "").split(";"))
+    return next((value for name, _, value in pairs if name == cookie), "")
 
 
 def _parse_port(host: str) -> str:

@@ -16,13 +16,14 @@ export class Problem extends Error {
   }
 }
 
+// path: from the root of the daemon, which a proxy may show below a path of its own.
 export function request(method, path, { body, signal } = {}) {
   const headers = { Authorization: `Bearer ${token()}` };
   if (body !== undefined) {
     headers["Content-Type"] = "application/json";
   }
   const text = body === undefined ? undefined : JSON.stringify(body);
-  return fetch(path, { method, headers, body: text, signal, cache: "no-store" });
+  return fetch(`.${path}`, { method, headers, body: text, signal, cache: "no-store" });
 }
 
 export async function call(method, path, options = {}) {

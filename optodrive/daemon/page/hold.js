@@ -59,7 +59,7 @@ export class HoldControl {
     if (pointer !== undefined) {
       this.button.setPointerCapture(pointer);
     }
-    const socket = new WebSocket(`${location.protocol.replace("http", "ws")}//${location.host}/v1/hold`, ["optodrive", `bearer.${encodeBase64url(token())}`]);
+    const socket = new WebSocket(new URL("v1/hold", location.href.split("#")[0].replace("http", "ws")), ["optodrive", `bearer.${encodeBase64url(token())}`]);
     this.socket = socket;
     this.button.toggleAttribute("data-held", true);
     const beat = () => socket.readyState === WebSocket.OPEN && socket.send("beat");

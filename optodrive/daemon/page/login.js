@@ -10,13 +10,14 @@ async function signIn(token) {
   // Cookies and headers allow only these characters; generated tokens contain no others.
   const isValid = /^[\w.~+/=-]+$/.test(token);
   const headers = { Authorization: `Bearer ${token}` };
-  if (!isValid || (await fetch("/v1/state", { headers, cache: "no-store" })).status === 401) {
+  if (!isValid || (await fetch("v1/state", { headers, cache: "no-store" })).status === 401) {
     return "This is not the token of the daemon that runs here now.";
   }
-  document.cookie = `${name}=${token}; Path=/; SameSite=Strict`;
+  // Below a proxy's path, so that the pages of several displays at one address keep a token each.
+  document.cookie = `${name}=${token}; Path=${location.pathname}; SameSite=Strict`;
   // A busy browser may send a request before it has stored the cookie.
   for (let attempt = 0; attempt < ATTEMPTS; attempt += 1) {
-    if ((await fetch("/", { cache: "no-store" })).ok) {
+    if ((await fetch("./", { cache: "no-store" })).ok) {
       location.reload();
       return "";
     }

@@ -51,7 +51,7 @@ export class Status {
 
   // reason: why the token is revoked; "" if that is not known
   showInvalidToken(reason) {
-    const login = Object.assign(createElement("a", "Enter another one"), { href: "/" });
+    const login = Object.assign(createElement("a", "Enter another one"), { href: "./" });
     const text = reason ? `${reason[0].toUpperCase()}${reason.slice(1)}` : "The daemon does not know this page’s token: it was revoked, or the daemon was restarted";
     this.#showAlert([createElement("strong", `${text}.`), createElement("span", "The display is not live, and STOP of this page is refused: in doubt use the emergency stop or the key."), login]);
   }

@@ -1,7 +1,7 @@
 // The operator's page: the newest view of the session beside its participant, pause, and STOP.
 
-import { Announcer } from "/page/announcer.js";
-import { PageSocket, UNAUTHORISED } from "/page/page_socket.js";
+import { Announcer } from "./announcer.js";
+import { PageSocket, UNAUTHORISED } from "./page_socket.js";
 
 const find = (id) => document.getElementById(id);
 const announcer = new Announcer(find("said"));
@@ -19,7 +19,7 @@ const STATES = {
 
 let view = null;
 let said = "";
-const socket = new PageSocket("/operator/socket", onView, onLost);
+const socket = new PageSocket("operator/socket", onView, onLost);
 
 find("pause").addEventListener("click", () => {
   if (isLive()) {
@@ -28,7 +28,12 @@ find("pause").addEventListener("click", () => {
 });
 find("stop").addEventListener("click", stop);
 addEventListener("keydown", (event) => event.key === "Escape" && !event.repeat && stop());
-find("copy").addEventListener("click", () => navigator.clipboard.writeText(view.participant_url));
+find("copy").addEventListener("click", () => navigator.clipboard.writeText(buildParticipantUrl()));
+
+// The participant's page is beside this one, also behind a proxy.
+function buildParticipantUrl() {
+  return new URL(`participant#token=${view.participant_token}`, location.href).href;
+}
 
 function isLive() {
   return view !== null && !["done", "stopped"].includes(view.phase);
@@ -56,7 +61,7 @@ function onView(newest) {
   find("progress-bar").value = answered;
   find("pause").textContent = view.is_paused ? "Go on" : "Pause";
   find("pause").setAttribute("aria-disabled", !isLive());
-  find("address").textContent = view.participant_url;
+  find("address").textContent = buildParticipantUrl();
   showPage();
   showNow();
   find("rows").replaceChildren(...view.rows.toReversed().map(buildRow));

@@ -6,7 +6,7 @@ const FINAL_CODES = [NORMAL, INVALID, UNAUTHORISED, REPLACED];
 const FINAL_PHASES = ["done", "stopped"];
 
 export class PageSocket {
-  // path: of the WebSocket; onView: gets each view; onLost: gets the code of a close, and whether it is tried again
+  // path: of the WebSocket from the page's folder; onView: gets each view; onLost: gets the code of a close, and whether it is tried again
   constructor(path, onView, onLost) {
     this.path = path;
     this.onView = onView;
@@ -23,8 +23,7 @@ export class PageSocket {
 
   #open() {
     const token = new URLSearchParams(location.hash.slice(1)).get("token") || "";
-    const scheme = location.protocol.replace("http", "ws");
-    const socket = new WebSocket(`${scheme}//${location.host}${this.path}`, ["optodrive", `bearer.${encodeBase64url(token)}`]);
+    const socket = new WebSocket(new URL(this.path, location.href.split("#")[0].replace("http", "ws")), ["optodrive", `bearer.${encodeBase64url(token)}`]);
     this.socket = socket;
     let isOver = false; // after the last view the connection may end in any way
     socket.addEventListener("message", ({ data }) => {

@@ -1,8 +1,8 @@
 // The participant's page. It shows the newest view of the session and sends what the participant does.
 
-import { Announcer } from "/page/announcer.js";
-import { Answers } from "/page/answers.js";
-import { INVALID, PageSocket, REPLACED, UNAUTHORISED } from "/page/page_socket.js";
+import { Announcer } from "./announcer.js";
+import { Answers } from "./answers.js";
+import { INVALID, PageSocket, REPLACED, UNAUTHORISED } from "./page_socket.js";
 
 const find = (id) => document.getElementById(id);
 const announcer = new Announcer(find("said"));
@@ -21,7 +21,7 @@ const answers = new Answers(
   (answer, event) => sendAbout({ kind: "answer", answer, handled_s: measureDelay(event) }),
   () => sendAbout({ kind: "again" }),
 );
-const socket = new PageSocket("/participant/socket", onView, onLost);
+const socket = new PageSocket("participant/socket", onView, onLost);
 find("begin").addEventListener("click", () => socket.send({ kind: "ready" }));
 find("break").addEventListener("click", () => socket.send({ kind: "break" }));
 

@@ -65,6 +65,8 @@ def test_the_cookie_opens_the_page_for_get_alone(send_request):
     for path, method in [("/v1/state", "GET"), ("/v1/telemetry", "GET"), ("/v1/stop", "POST"), ("/", "POST")]:
         assert send_request(path, method, cookie=cookie)[0] == 401
     assert send_request("/pages", cookie=cookie)[0] == 401
+    assert send_request("/", cookie=f"other=1; {cookie}; optodrive-8450=of-the-shorter-path")[0] == 200
+    assert send_request("/", cookie=f"optodrive-8450=of-the-longer-path; {cookie}")[0] == 401
 
 
 @pytest.mark.parametrize("cookie", ["optodrive-8450=wrong", "optodrive-8451=the-token", "optodrive-8450=", "=;=;", ""])
