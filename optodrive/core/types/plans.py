@@ -132,7 +132,8 @@ class BudgetState:
 class ExecutedPulses:
     """Pulses that the board reports as executed, one row per pulse in order, all arrays [n].
 
-    on_tick: tick of gate on, of the board, or of the host if there are several stages; width_ticks: gate-on duration
+    on_tick: tick of gate on, of the board, or of the host if there are several stages; width_ticks: gate-on duration;
+    of a pulse that was trimmed to nothing, the tick at which it would have begun, and 0
     pixel, stage: of the plan's row; start_s: on_tick counted from the tick of the plan's start, s
     complete: whether no report is missing
     """

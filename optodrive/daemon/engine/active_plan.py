@@ -20,11 +20,12 @@ from optodrive.planning.planned_sequence import PlannedSequence
 class RefreshCycle(NamedTuple):
     """When a stream has drawn each pixel last.
 
-    drawn_s: [p] board time of the start of the last pulse, −infinity without one; begun_s: the pixels drawn since then
-    have had their turn
+    drawn_s: [p] board time of the start of the last pulse, −infinity without one; width_s: [p] its width, NaN without
+    begun_s: the pixels drawn since then have had their turn
     """
 
     drawn_s: FloatArray
+    width_s: FloatArray
     begun_s: float
 
     @property

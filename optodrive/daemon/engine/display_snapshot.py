@@ -12,6 +12,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.progress import PlanProgress
 from optodrive.link.protocol.quantisation import WireScale
+from optodrive.link.session.plan_job import find_begin_tick
 from optodrive.physics.nominal_display import DisplayState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_executed, shift_state
@@ -60,9 +61,10 @@ class ExecutedBatch(NamedTuple):
         active, job = progress.run
         plan, reported = active.planned.plan, job.read_reported(progress.begin, progress.end, scales)
         row, tick_s = reported.row, scales[0].tick_s
+        on_tick = find_begin_tick(reported.on_tick, reported.on_ticks, row, plan, tick_s)
         pulses = EmittedPulses(
             pixel=plan.pixel[row],
-            start_s=np.asarray(reported.on_tick * tick_s, dtype=np.float64),
+            start_s=np.asarray(on_tick * tick_s, dtype=np.float64),
             width_s=np.asarray(reported.on_ticks * tick_s, dtype=np.float64),
             power_w=reported.power_w,
             x_rad=plan.x_rad[row],

@@ -13,6 +13,7 @@ from optodrive.core.finger_tracks import FingerTracks, PredictedFinger
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.core.types.stimuli import FrameSequence
+from optodrive.daemon.engine.active_plan import RefreshCycle
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.device.config import PixelLayout
 from optodrive.planning.display_model import DisplayModel
@@ -28,6 +29,7 @@ AHEAD_SLOTS = 2
 MOVE_S = 4e-4
 """Typical time of a move between two pixels under the same finger."""
 FIRST_WIDTH_S = 4e-3
+"""Assumed width of a page's pulses before the first one."""
 MARGIN_MIN_S, MARGIN_MAX_S = 0.04, 0.07
 """Light that is planned beyond the lead of the stream: the next refresh comes meanwhile, and finds some unsent."""
 MARGIN_INTERVALS, INTERVALS_KEPT = 2.0, 8
@@ -47,7 +49,6 @@ class PageRefresh:
         self._tracks = FingerTracks()
         self._seen_s = -inf
         self._lock = threading.Lock()
-        self._width_s = FIRST_WIDTH_S
         self._page_m, self._selected_s = np.zeros(len(layout)), -inf
         self._intervals_s = deque([inf], INTERVALS_KEPT)
 
@@ -85,9 +86,7 @@ class PageRefresh:
         now_s = self._clock.now_s()
         self._intervals_s.append(now_s - self._selected_s)
         self._page_m, self._selected_s = frame.target_m, now_s
-        if snapshot.predecessor is not None:
-            self._width_s = float(snapshot.predecessor.planned.plan.width_s.mean())
-        pixel_time_s = self._width_s + MOVE_S
+        pixel_time_s = _find_width_s(frame.target_m, snapshot.cycle) + MOVE_S
         begin_s = now_s + snapshot.start_s - self._board_s()
         margin_s = min(MARGIN_MAX_S, max(MARGIN_MIN_S, MARGIN_INTERVALS * max(self._intervals_s)))
         slots = ceil((self._lead_s() + margin_s) / SLOT_S)
@@ -111,3 +110,12 @@ class PageRefresh:
         distance_m2 = (self._layout.x_m - x_m) ** 2 + (self._layout.y_m - y_m) ** 2
         is_under: BoolArray = (distance_m2 <= (radius_m + margin_m) ** 2).any(axis=1)
         return is_under
+
+
+def _find_width_s(page_m: FloatArray, cycle: RefreshCycle | None) -> float:
+    """Return the mean width of the last pulses of a page's pixels, s."""
+    if cycle is None:
+        return FIRST_WIDTH_S
+    widths_s = cycle.width_s[page_m > 0.0]
+    known_s = widths_s[np.isfinite(widths_s)]
+    return float(known_s.mean()) if len(known_s) else FIRST_WIDTH_S

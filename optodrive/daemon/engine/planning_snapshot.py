@@ -1,7 +1,7 @@
 """State from which a plan is made: the plan's zero, and heat and budget at that time."""
 
 from dataclasses import dataclass
-from math import inf
+from math import inf, nan
 
 import numpy as np
 
@@ -91,11 +91,13 @@ def continue_cycle(streamed: ActivePlan, row: int) -> RefreshCycle:
     """
     plan, zero_s = streamed.planned.plan, streamed.record.start_s
     if streamed.cycle is None:
-        drawn_s, begun_s = np.full(len(streamed.heat_before.pixels), -inf), zero_s
+        pixels = len(streamed.heat_before.pixels)
+        drawn_s, width_s, begun_s = np.full(pixels, -inf), np.full(pixels, nan), zero_s
     else:
-        drawn_s, begun_s = streamed.cycle.drawn_s.copy(), streamed.cycle.begun_s
+        drawn_s, width_s, begun_s = streamed.cycle.drawn_s.copy(), streamed.cycle.width_s.copy(), streamed.cycle.begun_s
     drawn_s[[pulse.pixel for pulse in streamed.planned.skipped]] = zero_s  # their heat holds them up
     drawn_s[plan.pixel[:row]] = zero_s + plan.start_s[:row]
+    width_s[plan.pixel[:row]] = plan.width_s[:row]
     left = np.concatenate([plan.pixel[row:], streamed.unplanned_pixels])
     end_s = zero_s + float((plan.start_s + plan.width_s)[:row].max(initial=0.0))
-    return RefreshCycle(drawn_s, end_s if (drawn_s[left] >= begun_s).all() else begun_s)
+    return RefreshCycle(drawn_s, width_s, end_s if (drawn_s[left] >= begun_s).all() else begun_s)

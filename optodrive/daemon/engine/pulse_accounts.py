@@ -64,7 +64,9 @@ class PulseAccounts:
             record.first_byte_after_s = job.first_sent_tick * self._session.tick_s - record.arrived_s
         if plan.executed is not None and plan.executed_rows is not None and len(plan.executed):
             executed, rows = plan.executed, plan.executed_rows
-            record.first_light_after_s = record.start_s + float(executed.start_s[0]) - record.arrived_s
+            light_s = executed.start_s[executed.width_s > 0.0]
+            if len(light_s):
+                record.first_light_after_s = record.start_s + float(light_s[0]) - record.arrived_s
             if len(scales) == 1:  # several boards drop what would come late
                 record.delay_s = float(executed.start_s[-1] - start_s[rows[-1]])
             record.timing_error = compute_timing_error(start_s[rows], executed.start_s)

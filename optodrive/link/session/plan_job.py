@@ -22,12 +22,24 @@ LATE_OFF_MAX_TICKS = 100
 
 
 class ReportedPulses(NamedTuple):
-    """Executed pulses, all [n]: plan row, tick of gate on, gate-on time in ticks, duty in 1/65535."""
+    """Executed pulses, all [n]: plan row, tick of gate on, gate-on time in ticks, duty in 1/65535.
+
+    on_tick: without light the end of the point, see `find_begin_tick`
+    """
 
     row: IntArray
     on_tick: IntArray
     on_ticks: IntArray
     duty: IntArray
+
+
+def find_begin_tick(on_tick: IntArray, on_ticks: IntArray, row: IntArray, plan: PulsePlan, tick_s: float) -> IntArray:
+    """Return the tick at which each reported pulse began, [n].
+
+    A pulse that was trimmed to nothing is a point without light, which the board reports at its end.
+    """
+    width_ticks = np.rint(plan.width_s[row] / tick_s).astype(np.int64)
+    return np.asarray(np.where(on_ticks == 0, on_tick - width_ticks, on_tick), dtype=np.int64)
 
 
 class PointTiming(NamedTuple):
@@ -278,7 +290,8 @@ class PlanJob:
         """Return the reported pulses of `plan`. They are complete if none is missing from the untruncated part."""
         done = self._pulse_points[self._on_tick[self._pulse_points] >= 0]
         row = self.list_executed_rows()
-        on_tick, width_ticks = self._on_tick[done], self._on_ticks[done]
+        width_ticks = self._on_ticks[done]
+        on_tick = find_begin_tick(self._on_tick[done], width_ticks, row, plan, tick_s)
         return ExecutedPulses(
             on_tick=on_tick,
             width_ticks=width_ticks,

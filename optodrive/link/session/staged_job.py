@@ -9,11 +9,14 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses, PulsePlan
 from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
 from optodrive.link.protocol.stage_points import StagePoints
-from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.plan_job import PlanJob, find_begin_tick
 
 
 class StageReports(NamedTuple):
-    """Executed pulses of all stages, all [n]: plan row, tick of gate on, gate-on time in ticks, power and stage."""
+    """Executed pulses of all stages, all [n]: plan row, tick of gate on, gate-on time in ticks, power and stage.
+
+    on_tick: without light the end of the point, see `find_begin_tick`
+    """
 
     row: IntArray
     on_tick: IntArray
@@ -118,12 +121,13 @@ class StagedJob:
         scales: of each stage
         """
         reported, tick_s = self.read_reported(0, len(self._row), scales), scales[0].tick_s
+        on_tick = find_begin_tick(reported.on_tick, reported.on_ticks, reported.row, plan, tick_s)
         return ExecutedPulses(
-            on_tick=reported.on_tick,
+            on_tick=on_tick,
             width_ticks=reported.on_ticks,
             pixel=plan.pixel[reported.row],
             power_w=reported.power_w,
-            start_s=np.asarray((reported.on_tick - self.zero_tick) * tick_s, dtype=np.float64),
+            start_s=np.asarray((on_tick - self.zero_tick) * tick_s, dtype=np.float64),
             width_s=np.asarray(reported.on_ticks * tick_s, dtype=np.float64),
             stage=reported.stage,
             complete=all(part.is_complete for part in self.parts),

@@ -5,7 +5,8 @@ some hundred dots each gets its turn about once a second, where touch wants twen
 pixel of the page is due REFRESH_PERIOD_S after its last pulse, and nothing is drawn before: a page of few dots takes no
 more energy than its rate needs. As soon as a pixel under a finger is due, all of them that are due within BURST_S are
 drawn in one burst, those without light for the longest time first. The beam time until the next of them is due goes to
-the rest of the page in the same way, unless it is too short for the mirrors to be worth the way, which heats them.
+the rest of the page in the same way, unless that is too short for the mirrors to be worth the way, which heats them. It
+is worth it for fewer pixels if more pulses never fit between two bursts under fingers, as wide ones do.
 
 A burst takes a short path. Bursts without a pause between them are one frame with a visiting order of its own.
 """
@@ -27,7 +28,7 @@ BURST_S = 0.012
 BURST_MAX_S = 0.024
 """Longest burst under fingers. A newer refresh replaces the end of its path, which would leave one finger dark."""
 REST_MIN = 6
-"""Pixels away from the fingers that are worth the mirrors' way."""
+"""Pixels away from the fingers that are worth the mirrors' way between two bursts under fingers."""
 SLOT_S = 0.01
 """Light is planned for a number of slots, in each of which the places of the fingers are taken as fixed."""
 
@@ -67,13 +68,20 @@ def select_bursts(
             chosen = _take_oldest(due_touched_s, now_s + BURST_S, span_s, pixel_time_s)
         else:
             chosen = _take_oldest(due_rest_s, now_s, min(next_s, horizon_s) - now_s, pixel_time_s)
-            if not len(chosen) or len(chosen) < min(REST_MIN, int(np.count_nonzero(~touched))):
+            if len(chosen) < (1 if next_s >= horizon_s else _count_worthwhile(touched, pixel_time_s)):
                 now_s = max(min(next_s, float(due_rest_s[due_rest_s > now_s].min(initial=inf))), now_s + pixel_time_s)
                 continue
         bursts.append(Burst(now_s, page[chosen]))
         due_s[chosen] = now_s + np.arange(len(chosen)) * pixel_time_s + REFRESH_PERIOD_S
         now_s += len(chosen) * pixel_time_s
     return bursts
+
+
+def _count_worthwhile(touched: BoolArray, pixel_time_s: float) -> int:
+    """Return how many pixels away from the fingers are worth the mirrors' way before fingers need the beam again."""
+    touched_count = int(np.count_nonzero(touched))
+    between_s = REFRESH_PERIOD_S - touched_count * pixel_time_s
+    return min(REST_MIN, len(touched) - touched_count, max(1, int(between_s / pixel_time_s)))
 
 
 def _take_oldest(due_s: FloatArray, until_s: float, span_s: float, pixel_time_s: float) -> IntArray:

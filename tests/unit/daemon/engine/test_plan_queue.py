@@ -7,12 +7,14 @@ import pytest
 
 from link_service_rig import OPERATOR, PLANNER, WEB, ServiceRig
 from optodrive.core.errors import BusyError, InputError, StoppedError
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import planner
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.planning.listed_pulses import ListedPulses
 from planner_rig import PlannerRig, build_frame, build_train
+from standing_rig import StandingRig, build_display, build_page
 
 
 def submit(rig, sequence, streamed=False, caller="", **options):
@@ -353,3 +355,20 @@ def test_a_plan_may_follow_a_new_link_process_at_once(rig):
 
 def test_an_empty_plan_is_done_at_once(rig):
     assert finish(rig, submit(rig, build_frame(0.0))).status == "done"
+
+
+def test_pulses_that_caps_leave_without_light_are_no_delay(monkeypatch):
+    """The board reports their points at the end."""
+    display = build_display(display_mean_power_max_w=0.05)
+    rig = StandingRig(monkeypatch, display).ready()
+    rig.arm()
+    rig.run(0.02)
+    page_m = build_page(display, range(40), 100.0)
+    first, second = (submit(rig, FrameSequence((TactileFrame("f", 0.0, 1.0, page_m),))) for _ in range(2))
+    finish(rig, second)
+    for record in (first, second):
+        assert record.status == "done", record.error
+        assert record.execution.width_s[-1] == 0.0
+        assert record.delay_s == pytest.approx(0.0, abs=2e-6)
+        assert abs(record.timing_error.max_abs_s) <= 2e-6
+    assert second.first_light_after_s is None
