@@ -213,6 +213,11 @@ class Config(Section):
             for stage in self.stages
         )
 
+    @property
+    def lasers(self) -> tuple[LaserSection, ...]:
+        """The laser of each stage."""
+        return tuple(stage.laser for stage in self.stages) or (self.laser,)
+
     def find_exchangeable_boards(self) -> str | None:
         """Return a sentence that names the stages whose boards may change places, None if none may.
 

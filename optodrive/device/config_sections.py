@@ -118,6 +118,8 @@ class LaserSection(Section):
     """Incident power at the sample at full duty, W."""
     pwm_hz: Annotated[Positive, PlausibleRange(50.0, 1e7, "Hz")]
     """Frequency of the pulse-width modulation, Hz; pulses are whole periods wide."""
+    threshold_w: Annotated[float, Field(ge=0), PlausibleRange(0.0, 10.0, "W")] = 0.0
+    """Incident power below which the module emits nothing, W, 0 if it has no threshold. Pulses below it are counted."""
     focus_width_m: FocusSide
     """Width of the focus on the absorber in x, m."""
     focus_height_m: FocusSide

@@ -49,6 +49,7 @@ def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | No
         predicted_max_target_um=None if max_row is None else _finite_or_none(m_to_um(float(plan.target_m[max_row]))),
         target_max_um=m_to_um(float(target_m.max())) if len(plan) else 0.0,
         headroom_min_k=float(plan.headroom_k.min()),
+        below_threshold=planned.below_threshold,
         trimmed=_summarize_trimming(planned),
         shortfall=None if planned.shortfall is None else _summarize_shortfall(planned.shortfall),
         delays=[DelaySummary.from_object(each, source=_name_source(planned, each.source)) for each in planned.delays],

@@ -70,7 +70,7 @@ class PlannedSequence:
     shortfall: under policy "trim", None if no pulse was trimmed; delays: under policy "delay"
     galvo_pause_s: total of the pauses in which the mirrors' coils cool
     early_step_s: time by which steps precede the end of the light on a pixel where the mirrors have come to rest
-    dead_pixels: dead pixels that frames requested and that were omitted
+    threshold_w: [s] of each stage's laser; dead_pixels: dead pixels that frames requested and that were omitted
     """
 
     sequence: FrameSequence
@@ -86,7 +86,14 @@ class PlannedSequence:
     early_step_s: float
     heat: ThermalState
     budget: BudgetState
+    threshold_w: FloatArray
     dead_pixels: tuple[int, ...] = ()
+
+    @property
+    def below_threshold(self) -> int:
+        """Number of pulses that are too weak for their stage's laser to emit."""
+        plan = self.plan
+        return int(np.count_nonzero((plan.power_w > 0.0) & (plan.power_w < self.threshold_w[plan.stage])))
 
     @property
     def stage_count(self) -> int:

@@ -92,6 +92,7 @@ class PlanSummary(JsonModel):
     predicted_max_pixel, predicted_max_um, predicted_max_target_um: the pulse with the largest predicted displacement
     target_max_um: the largest target
     beam_on_s: of all stages together; beam_on_fraction: of the time of all stages
+    below_threshold: pulses below laser.threshold_w, which emit nothing
     early_step_s: time by which steps precede the end of the light, 0 if they follow it
     """
 
@@ -110,6 +111,7 @@ class PlanSummary(JsonModel):
     predicted_max_target_um: float | None
     target_max_um: float
     headroom_min_k: float
+    below_threshold: int
     trimmed: TrimmingSummary
     shortfall: ShortfallSummary | None
     delays: list[DelaySummary]

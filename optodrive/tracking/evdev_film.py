@@ -5,15 +5,17 @@ CLOCK_MONOTONIC here, and the state of all slots, which is read at the begin and
 """
 
 import fcntl
+import platform
 import select
 import stat
 import struct
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Self
 
-from optodrive.core.errors import InputError, LinkError, Unquoted
+from optodrive.core.errors import MISSING, InputError, LinkError, Unquoted
 from optodrive.core.extras import import_extra
 from optodrive.tracking.input_events import (
     ABS_MT_POSITION_X,
@@ -48,6 +50,9 @@ class EvdevFilm:
     """An opened film. Raises InputError for a path that is none, and LinkError where it is disconnected."""
 
     def __init__(self, path: Path) -> None:
+        if platform.machine() != "x86_64" and find_spec("evdev") is None:  # the extra has no evdev there
+            expected = f"`pip install evdev`, which needs a compiler and the kernel's headers on {platform.machine()}"
+            raise InputError("evdev", MISSING, expected, "missing_extra")
         evdev = import_extra("evdev", extra="tracking")
         try:
             self._device: Any = evdev.InputDevice(str(path))

@@ -16,6 +16,7 @@ from rig import TOKEN, running, wait_for
 from test_standing_frames import LEAD, PLACES, compute_lead, send_page, show
 from touch_film import SimulatedFilm
 
+pytest.importorskip("evdev", reason="evdev is built from its source on this processor")
 CORNERS = (0, 18, 417, 397)
 PAGE = tuple(range(50, 400))
 

@@ -16,8 +16,9 @@ PULSE_INTERVAL_S = 1.0
 
 
 def default_power_w(config: Config) -> float:
-    """Return the lowest power at which the reference board's readback detects light, at most that of a spot, W."""
-    return min(DUTY_SHARE * config.laser.max_power_w, max_spot_power_w(config))
+    """Return the lowest power that is emitted and that the reference board's readback detects, at most a spot's, W."""
+    lowest_w = max(DUTY_SHARE * config.laser.max_power_w, config.laser.threshold_w)
+    return min(lowest_w, max_spot_power_w(config))
 
 
 def emit_first_light(

@@ -37,7 +37,10 @@ def max_spot_power_w(config: Config) -> float:
 
 def check_spot_power(config: Config, power_w: float, option: str = "--spot-power-mw") -> None:
     """Raise InputError, naming the option, for a power outside the range of a spot."""
-    max_w = max_spot_power_w(config)
+    max_w, threshold_w = max_spot_power_w(config), config.laser.threshold_w
+    if 0.0 < power_w < threshold_w:
+        expected = f"at least laser.threshold_w, {format_number(threshold_w * 1e3)} mW, below which nothing is emitted"
+        raise InputError(option, Unquoted(f"{power_w * 1e3:g} mW"), expected)
     if not 0.0 < power_w <= max_w:
         raise InputError(
             option, Unquoted(f"{power_w * 1e3:g} mW"), f"more than 0 and at most {format_number(max_w * 1e3)} mW"

@@ -25,6 +25,14 @@ def test_a_device_is_told_from_a_recording(tmp_path):
     assert not is_device(tmp_path / "none")
 
 
+def test_another_processor_than_x86_64_is_told_to_build_evdev(monkeypatch):
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    monkeypatch.setattr("optodrive.tracking.evdev_film.find_spec", lambda name: None)
+    needs = "evdev: missing, expected `pip install evdev`, which needs a compiler and the kernel's headers on aarch64"
+    with pytest.raises(InputError, match=needs):
+        EvdevFilm(Path("/dev/null"))
+
+
 @pytest.mark.parametrize(
     ("module", "name", "open_source"),
     [("evdev", "evdev", lambda: EvdevFilm(Path("/dev/null"))), ("cv2", "OpenCV", lambda: Camera("0"))],

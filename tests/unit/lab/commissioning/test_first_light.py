@@ -10,6 +10,7 @@ from optodrive.core.errors import BoardFaultError, InputError, RefusedError
 from optodrive.lab.commissioning.first_light import default_power_w, emit_first_light
 from optodrive.lab.commissioning.spot_bounds import max_spot_power_w, spot_width_s
 from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX
+from optodrive.planning.display_model import DisplayModel
 
 
 class Rig(ExclusiveRig):
@@ -62,6 +63,17 @@ def test_no_more_than_a_spot(display, power_w, pulses):
 
 def test_the_default_is_never_more_than_a_spot(any_display):
     assert default_power_w(any_display.config) <= max_spot_power_w(any_display.config)
+
+
+def test_spots_below_the_threshold_are_refused_and_the_default_lies_above(display):
+    laser = display.config.laser.model_copy(update={"threshold_w": 0.03})
+    rig = Rig(DisplayModel.from_config(display.config.model_copy(update={"laser": laser})))
+    assert default_power_w(rig.held.config) == 0.03
+    with pytest.raises(InputError, match=r"got 20 mW, expected at least laser\.threshold_w, 30 mW"):
+        rig.emit(0.02, 1)
+    assert not rig.of("gate")
+    rig.emit(0.03, 1)
+    assert len(rig.of("pulse")) == 1
 
 
 @pytest.mark.parametrize(
