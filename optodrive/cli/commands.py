@@ -9,6 +9,7 @@ import typer
 
 from optodrive.cli.exit_status import INTERRUPTED, SUMMARY
 from optodrive.cli.invocation import Invocation
+from optodrive.core.daemon_url import check_environment
 from optodrive.core.errors import OptodriveError
 
 UsageError: Any = typer.BadParameter.__bases__[0]
@@ -44,6 +45,9 @@ MODULES = {
 }
 """Commands by module below `optodrive.cli`, in the order of the help: its functions of these names, or its GROUP."""
 
+UNCONDITIONAL = ("stop", "support")
+"""Commands that a wrong environment does not prevent: what makes dark, and what reports."""
+
 
 def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> int:
     """Run a command and return its exit status. Print a known error as one line on stderr.
@@ -53,12 +57,17 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
     modules: dict[str, Any] = sys.modules
     modules.setdefault("httpx._main", None)  # its own command line, which it leaves out where rich is not installed
     invocation = Invocation(tuple(arguments), stopped)
-    app = build_app(arguments[0] if arguments else None)
+    command = arguments[0] if arguments else None
+    app = build_app(command)
     try:
+        if command not in UNCONDITIONAL:
+            check_environment()
         status = app(args=arguments, prog_name="optodrive", standalone_mode=False, obj=invocation)
         sys.stdout.flush()
         if status == INTERRUPTED:  # some versions of typer convert Ctrl-C to a status
             raise KeyboardInterrupt
+        if command == "stop":  # the display that it names is dark, but perhaps another one was meant
+            check_environment()
         return status if isinstance(status, int) else 0
     except OptodriveError as error:
         print(f"optodrive: {error}", file=sys.stderr)

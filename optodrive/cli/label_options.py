@@ -22,6 +22,8 @@ def parse_label_options(options: list[str]) -> dict[str, str | int | float | boo
         key, equals, text = option.partition("=")
         if not equals:
             raise InputError("--label", option, "KEY=VALUE")
+        if key in labels:
+            raise InputError("--label", option, "each key once")
         labels[key] = _convert(text)
     return parse_labels(labels, "--label")
 

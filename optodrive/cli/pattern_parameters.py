@@ -24,6 +24,8 @@ def parse_parameters(command: str, pattern: str, values: list[str]) -> dict[str,
                 key, content = known[0].name, value  # a value without a key sets the first parameter: play text "hello"
             elif not equals:
                 raise InputError(f"{command} {pattern}", value, "key=value")
+        if key in parsed:
+            raise InputError(f"{command} {pattern}: {key}", content, "each parameter once")
         parsed[key] = content
     for parameter in known:
         if parameter.kind == "file" and parameter.name in parsed:

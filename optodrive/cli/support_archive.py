@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from optodrive.cli.redaction import Redaction
 from optodrive.cli.service_files import CONFIG_PATH, UNIT_PATH
+from optodrive.core.daemon_url import VARIABLE_PREFIX
 from optodrive.core.errors import OptodriveError
 from optodrive.core.files import read_last_lines
 from optodrive.daemon.api.tokens import (
@@ -35,7 +36,7 @@ ENTRY_MAX_BYTES = 2_000_000
 JOURNAL = ("journalctl", "--unit=optodrive", "--lines=5000", "--no-pager", "--output=short-iso-precise")
 JOURNAL_TIMEOUT_S = 20.0
 DAEMON_TIMEOUT_S = 5.0
-VARIABLES = ("OPTODRIVE_", "NUMBA_", "XDG_RUNTIME_DIR", "LANG")
+VARIABLES = (VARIABLE_PREFIX, "NUMBA_", "XDG_RUNTIME_DIR", "LANG")
 """Beginnings of the names of environment variables that matter here."""
 
 

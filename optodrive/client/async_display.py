@@ -9,18 +9,20 @@ from optodrive.client.async_stream import AsyncStream
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.hold import AsyncHold
 from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations
-from optodrive.core.daemon_url import read_default_url
+from optodrive.core.daemon_url import check_environment, read_default_url
 from optodrive.core.errors import OptodriveError
-from optodrive.core.types.push_options import Policy
+from optodrive.core.types.push_options import Policy, check_keywords
 from optodrive.daemon.responses.state import StateReport
 
 
+@check_keywords
 class AsyncDisplay(DisplayOperations):
     """A display behind a running daemon, as an asynchronous context manager. See `Display`."""
 
     def __init__(
         self, url: str | None = None, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
     ) -> None:
+        check_environment()
         self._client = AsyncHttp(Endpoint(url or read_default_url(), token))
         super().__init__(self._client, reconnect_timeout_s)
         self._reconnect_timeout_s = reconnect_timeout_s

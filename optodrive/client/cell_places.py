@@ -75,7 +75,7 @@ def plan_area(display: Display, lines: list[list[CellSlot]], height_um: float) -
     pixels = [pixel for line in lines for slot in line for pixel in slot.values()]
     if not pixels:
         return CellArea(0, 0, 0.0)
-    plan = display.preview(dict.fromkeys(pixels, height_um), PLANNED_S)
+    plan = display.show(dict.fromkeys(pixels, height_um), PLANNED_S, dry_run=True)
     return CellArea(len(lines), len(lines[0]), plan.summary.duration_s)
 
 

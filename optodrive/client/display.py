@@ -1,42 +1,32 @@
 """A display, controlled from Python."""
 
 from base64 import b64encode
-from collections.abc import Callable, Coroutine
-from functools import wraps
+from collections.abc import Mapping
 from html import escape
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar
+from typing import Any, Self, Unpack
 
 import numpy as np
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import run_blocking
 from optodrive.client.fingers import Fingers
+from optodrive.client.heights import HeightsLike
 from optodrive.client.hold import Hold
 from optodrive.client.http import BlockingHttp
-from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations
+from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations, LabelsLike
+from optodrive.client.plan import Plan
 from optodrive.client.stream import Stream
-from optodrive.core.daemon_url import read_default_url
+from optodrive.core.daemon_url import check_environment, read_default_url
 from optodrive.core.errors import OptodriveError
-from optodrive.core.types.push_options import Policy
+from optodrive.core.types.push_options import Policy, PushOptions, check_keywords
 from optodrive.daemon.responses.state import StateReport
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def _block(
-    operation: Callable[Concatenate[DisplayOperations, P], Coroutine[Any, Any, T]],
-) -> Callable[Concatenate["Display", P], T]:
-    """Build the method that blocks until an operation has ended."""
-
-    @wraps(operation)
-    def run(display: "Display", /, *arguments: P.args, **options: P.kwargs) -> T:
-        return run_blocking(operation(display._operations, *arguments, **options))
-
-    return run
+from optodrive.device.config import PixelLayout
+from optodrive.planning.effective_config import EffectiveConfig
+from optodrive.planning.stimuli.pattern import PatternDescription
 
 
+@check_keywords
 class Display:
     """A display behind a running daemon, as a context manager that stops everything that this client started.
 
@@ -44,13 +34,14 @@ class Display:
     token: if None, OPTODRIVE_TOKEN, else the file that the daemon wrote
     reconnect_timeout_s: how long requests to a daemon that has responded before are repeated if it is unreachable
 
-    Only `arm` arms; a restarted daemon has a DISARMED board. A client that only reads (state, preview, patterns, …)
+    Only `arm` arms; a restarted daemon has a DISARMED board. A client that only reads, or plans with dry_run,
     stops nothing.
     """
 
     def __init__(
         self, url: str | None = None, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
     ) -> None:
+        check_environment()
         self._client = BlockingHttp(Endpoint(url or read_default_url(), token))
         self._operations = DisplayOperations(self._client, reconnect_timeout_s)
         self._reconnect_timeout_s = reconnect_timeout_s
@@ -90,22 +81,128 @@ class Display:
         self._hold = Hold(self._client.endpoint)
         return self.state()
 
-    disarm = _block(DisplayOperations.disarm)
-    dim = _block(DisplayOperations.dim)
-    pause = _block(DisplayOperations.pause)
-    resume = _block(DisplayOperations.resume)
-    stop = _block(DisplayOperations.stop)
-    state = _block(DisplayOperations.state)
-    config = _block(DisplayOperations.config)
-    layout = property(_block(DisplayOperations.layout))
-    show = _block(DisplayOperations.show)
-    push = _block(DisplayOperations.push)
-    play = _block(DisplayOperations.play)
-    preview = _block(DisplayOperations.preview)
-    patterns = _block(DisplayOperations.patterns)
-    plan = _block(DisplayOperations.plan)
-    cancel = _block(DisplayOperations.cancel)
-    wait = _block(DisplayOperations.wait)
+    def disarm(self) -> StateReport:
+        """Disarm the board. This also acknowledges a fault whose cause is gone."""
+        return run_blocking(self._operations.disarm())
+
+    def dim(self, share: float) -> StateReport:
+        """Cap the power of every pulse of the plans from now on, as a share of the laser's, 0 to 1.
+
+        It stays when this client leaves. Only an armer may raise it again; RefusedError for others.
+        """
+        return run_blocking(self._operations.dim(share))
+
+    def pause(self) -> StateReport:
+        """Switch the gate off and keep the board armed and all plans, for five minutes at most. Then it is disarmed.
+
+        Streamed frames are refused meanwhile. NotReadyError if the board is not armed.
+        """
+        return run_blocking(self._operations.pause())
+
+    def resume(self) -> StateReport:
+        """Play the rest of the paused plan, limited again, and the plans that wait.
+
+        NotReadyError if the board is not armed.
+        """
+        return run_blocking(self._operations.resume())
+
+    def stop(self) -> StateReport:
+        """Switch the gate off, drop all plans, disarm the board. Raise LinkError if no answer confirms it."""
+        return run_blocking(self._operations.stop())
+
+    def state(self) -> StateReport:
+        """Return the state of board, link and queue."""
+        return run_blocking(self._operations.state())
+
+    def config(self) -> EffectiveConfig:
+        """Return the daemon's configuration with everything derived from it."""
+        return run_blocking(self._operations.config())
+
+    @property
+    def layout(self) -> PixelLayout:
+        """The positions of the pixels: x_m, y_m, row, column, all [p]. Rows count from the bottom."""
+        return run_blocking(self._operations.layout())
+
+    def patterns(self) -> list[PatternDescription]:
+        """Return the named patterns and their parameters."""
+        return run_blocking(self._operations.patterns())
+
+    def show(
+        self,
+        heights_um: HeightsLike | None = None,
+        duration_s: float = 1.0,
+        *,
+        intensity: HeightsLike | None = None,
+        simultaneous: bool = False,
+        dry_run: bool = False,
+        wait: bool = True,
+        labels: LabelsLike = None,
+        **options: Unpack[PushOptions],
+    ) -> Plan:
+        """Raise each pixel once to its height within duration_s. Wait until that is done unless `wait` is False.
+
+        heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
+        positions without a pixel are ignored)
+        intensity: in the same forms, the perceived intensity in thresholds, in place of heights_um
+        simultaneous: raise all pixels within one relaxation time
+        dry_run: plan and limit only; nothing moves
+        labels: recorded with the plan: at most 32 of text, numbers and truth values
+        options: `policy` and `fit`, as PushOptions describes them
+
+        Raises InputError, NotReadyError if the board is not armed, and RefusedError for a plan that fails.
+        """
+        return run_blocking(
+            self._operations.show(
+                heights_um,
+                duration_s,
+                intensity=intensity,
+                simultaneous=simultaneous,
+                dry_run=dry_run,
+                wait=wait,
+                labels=labels,
+                **options,
+            )
+        )
+
+    def push(
+        self,
+        sequence: Mapping[str, Any],
+        *,
+        dry_run: bool = False,
+        wait: bool = True,
+        labels: LabelsLike = None,
+        **options: Unpack[PushOptions],
+    ) -> Plan:
+        """Show frames and trains in the form of FRAMES.json. The other arguments and errors are those of `show`."""
+        return run_blocking(self._operations.push(sequence, dry_run=dry_run, wait=wait, labels=labels, **options))
+
+    def play(
+        self,
+        /,
+        name: str,
+        *,
+        dry_run: bool = False,
+        wait: bool = True,
+        labels: LabelsLike = None,
+        **parameters: Any,
+    ) -> Plan:
+        """Play a named pattern with its parameters by name, as `patterns` lists them.
+
+        parameters: of the pattern, together with `policy` and `fit`; the other arguments and errors are those of `show`
+        """
+        return run_blocking(self._operations.play(name, dry_run=dry_run, wait=wait, labels=labels, **parameters))
+
+    def plan(self, plan: Plan | str) -> Plan:
+        """Return a plan's present report."""
+        return run_blocking(self._operations.plan(plan))
+
+    def cancel(self, plan: Plan | str) -> Plan:
+        """Remove a plan from the queue, or end it if it runs. The board stays armed."""
+        return run_blocking(self._operations.cancel(plan))
+
+    def wait(self, plan: Plan | str) -> Plan:
+        """Wait until a plan has ended and return it. Raise RefusedError if it failed or was stopped."""
+        return run_blocking(self._operations.wait(plan))
 
     def stream(self, policy: Policy = "trim", *, standing: bool = False) -> Stream:
         """Open a stream of frames, of which the newest wins: `with display.stream() as stream: stream.send(…)`.

@@ -13,11 +13,13 @@ from optodrive.client.problems import build_error
 from optodrive.client.socket_connection import open_connection
 from optodrive.core.errors import LinkError, OptodriveError
 from optodrive.core.types.fingers import FingerPlace
+from optodrive.core.types.push_options import check_keywords
 from optodrive.daemon.responses.fingers import FingersRefusal, validate_fingers
 
 PATH = "/v1/fingers"
 
 
+@check_keywords
 class Fingers:
     """A tracker's connection. `Display.fingers()` builds one: `with display.fingers() as fingers: fingers.send(…)`."""
 

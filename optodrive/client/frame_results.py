@@ -1,6 +1,7 @@
 """Common parts of both streams: the address, the buffer of results, and the errors of refused frames."""
 
 from collections import deque
+from urllib.parse import urlencode
 
 from optodrive.client.problems import build_error
 from optodrive.core.errors import LinkError, NotReadyError, RefusedError
@@ -57,7 +58,7 @@ class ResultBuffer:
 
 def build_stream_path(policy: Policy, standing: bool) -> str:
     """Build the path of the stream's WebSocket."""
-    return f"/v1/stream?policy={policy}&standing={str(standing).lower()}"
+    return f"/v1/stream?{urlencode({'policy': policy, 'standing': str(standing).lower()})}"
 
 
 def build_closed_error() -> NotReadyError:

@@ -23,8 +23,8 @@ from optodrive.client.requests import (
     build_push_request,
     build_read_request,
 )
-from optodrive.core.errors import NotReadyError
-from optodrive.core.types.push_options import PushOptions, select_push_options
+from optodrive.core.errors import InputError, NotReadyError, abbreviate, suggest_near_name
+from optodrive.core.types.push_options import PushOptions, check_keywords, list_push_options, select_push_options
 from optodrive.daemon.responses.state import StateReport
 from optodrive.device.config import PixelLayout, build_pixel_layout
 from optodrive.planning.effective_config import EffectiveConfig
@@ -36,6 +36,7 @@ LabelsLike = Mapping[str, str | int | float | bool] | None
 """Labels of a plan, None for those of its body."""
 
 
+@check_keywords
 class DisplayOperations:
     """Operations of one display.
 
@@ -51,7 +52,7 @@ class DisplayOperations:
         self._layout: PixelLayout | None = None
 
     async def arm(self) -> StateReport:
-        """Arm the board unless it is armed already."""
+        """See `Display.arm`."""
         self.may_emit = True
         try:
             return await self._policy.call(ARM)
@@ -62,53 +63,44 @@ class DisplayOperations:
             return state
 
     async def disarm(self) -> StateReport:
-        """Disarm the board. This also acknowledges a fault whose cause is gone."""
+        """See `Display.disarm`."""
         return await self._policy.call(DISARM)
 
     async def dim(self, share: float) -> StateReport:
-        """Cap the power of every pulse of the plans from now on, as a share of the laser's, 0 to 1.
-
-        It stays when this client leaves. Only an armer may raise it again; RefusedError for others.
-        """
+        """See `Display.dim`."""
         return await self._policy.call(build_dim_request(share))
 
     async def pause(self) -> StateReport:
-        """Switch the gate off and keep the board armed and all plans, for five minutes at most. Then it is disarmed.
-
-        Streamed frames are refused meanwhile. NotReadyError if the board is not armed.
-        """
+        """See `Display.pause`."""
         return await self._policy.call(PAUSE)
 
     async def resume(self) -> StateReport:
-        """Play the rest of the paused plan, limited again, and the plans that wait.
-
-        NotReadyError if the board is not armed.
-        """
+        """See `Display.resume`."""
         self.may_emit = True
         return await self._policy.call(RESUME)
 
     async def stop(self) -> StateReport:
-        """Switch the gate off, drop all plans, disarm the board. Raise LinkError if no answer confirms it."""
+        """See `Display.stop`."""
         state = await self._policy.stop(STOP)
         self.may_emit = False
         return state
 
     async def state(self) -> StateReport:
-        """Return the state of board, link and queue."""
+        """See `Display.state`."""
         return await self._policy.call(READ_STATE)
 
     async def config(self) -> EffectiveConfig:
-        """Return the daemon's configuration with everything derived from it."""
+        """See `Display.config`."""
         return await self._policy.call(READ_CONFIG)
 
     async def layout(self) -> PixelLayout:
-        """Return the positions of the pixels: x_m, y_m, row, column, all [p]. Rows count from the bottom."""
+        """See `Display.layout`."""
         if self._layout is None:
             self._layout = build_pixel_layout((await self.config()).display)
         return self._layout
 
     async def patterns(self) -> list[PatternDescription]:
-        """Return the named patterns and their parameters."""
+        """See `Display.patterns`."""
         return (await self._policy.call(LIST_PATTERNS)).patterns
 
     async def show(
@@ -118,32 +110,28 @@ class DisplayOperations:
         *,
         intensity: HeightsLike | None = None,
         simultaneous: bool = False,
+        dry_run: bool = False,
         wait: bool = True,
         labels: LabelsLike = None,
         **options: Unpack[PushOptions],
     ) -> Plan:
-        """Raise each pixel once to its height within duration_s. Wait until that is done unless `wait` is False.
-
-        heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
-        positions without a pixel are ignored)
-        intensity: in the same forms, the perceived intensity in thresholds, in place of heights_um
-        labels: recorded with the plan: at most 32 of text, numbers and truth values
-        options: `policy` and `fit`, as PushOptions describes them
-        """
+        """See `Display.show`."""
         target = encode_target(heights_um, intensity, await self.layout())
         body = build_frame_body(target, duration_s, simultaneous)
-        return await self.push(body, wait=wait, labels=labels, **options)
+        return await self.push(body, dry_run=dry_run, wait=wait, labels=labels, **options)
 
     async def push(
         self,
         sequence: Mapping[str, Any],
         *,
+        dry_run: bool = False,
         wait: bool = True,
         labels: LabelsLike = None,
         **options: Unpack[PushOptions],
     ) -> Plan:
-        """Show frames and trains in the form of FRAMES.json."""
-        return await self._submit(build_push_request(_add_labels(sequence, labels), options, dry_run=False), wait)
+        """See `Display.push`."""
+        request = build_push_request(_add_labels(sequence, labels), options, dry_run)
+        return await (self._report(request) if dry_run else self._submit(request, wait))
 
     async def play(
         self,
@@ -155,38 +143,26 @@ class DisplayOperations:
         labels: LabelsLike = None,
         **parameters: Any,
     ) -> Plan:
-        """Play a named pattern with its parameters by name.
-
-        dry_run: plan only; parameters: of the pattern, together with the options of `show`
-        """
+        """See `Display.play`."""
         options = select_push_options(parameters)
         request = build_play_request(name, _add_labels(parameters, labels), options, dry_run)
-        return await (self._report(request) if dry_run else self._submit(request, wait))
-
-    async def preview(
-        self,
-        heights_um: HeightsLike | None = None,
-        duration_s: float = 1.0,
-        *,
-        intensity: HeightsLike | None = None,
-        simultaneous: bool = False,
-        **options: Unpack[PushOptions],
-    ) -> Plan:
-        """Plan a frame as `show` would. Nothing moves."""
-        target = encode_target(heights_um, intensity, await self.layout())
-        body = build_frame_body(target, duration_s, simultaneous)
-        return await self._report(build_push_request(body, options, dry_run=True))
+        try:
+            return await (self._report(request) if dry_run else self._submit(request, wait))
+        except InputError as error:
+            if error.code == "unknown_parameter":
+                raise _suggest_keyword(error, parameters) from None
+            raise
 
     async def plan(self, plan: Plan | str) -> Plan:
-        """Return a plan's present report."""
+        """See `Display.plan`."""
         return await self._report(build_read_request(_get_plan_id(plan)))
 
     async def cancel(self, plan: Plan | str) -> Plan:
-        """Remove a plan from the queue, or end it if it runs. The board stays armed."""
+        """See `Display.cancel`."""
         return await self._report(build_cancel_request(_get_plan_id(plan)))
 
     async def wait(self, plan: Plan | str) -> Plan:
-        """Wait until a plan has ended and return it. Raise RefusedError if it failed or was stopped."""
+        """See `Display.wait`."""
         poll = build_read_request(_get_plan_id(plan), pulses=False)
         while not (await self._policy.call(poll)).has_ended:
             await self._http.sleep(POLL_PERIOD_S)
@@ -209,6 +185,17 @@ class DisplayOperations:
 def _add_labels(body: Mapping[str, Any], labels: LabelsLike) -> Mapping[str, Any]:
     """Return the body with labels, which replace its own."""
     return body if labels is None else {**body, "labels": dict(labels)}
+
+
+def _suggest_keyword(error: InputError, parameters: Mapping[str, Any]) -> InputError:
+    """Return the error of a parameter that the pattern does not have, with the nearest keyword of `play` if any is."""
+    keywords = ["dry_run", "wait", "labels", *(option.name for option in list_push_options())]
+    unknown = next((name for name in parameters if abbreviate(name) == abbreviate(error.value)), "")
+    near = suggest_near_name(unknown, keywords)
+    expected = f"{error.expected}; of the keywords of play, {near}" if near else error.expected
+    described = InputError(error.where, error.value, expected, error.code)
+    described.problem = error.problem
+    return described
 
 
 def _get_plan_id(plan: Plan | str) -> str:

@@ -8,11 +8,12 @@ from optodrive.client.endpoint import Endpoint
 from optodrive.client.frame_results import RESULT_TIMEOUT_S
 from optodrive.client.heights import HeightsLike
 from optodrive.client.loop_thread import LoopThread
-from optodrive.core.types.push_options import Policy
+from optodrive.core.types.push_options import Policy, check_keywords
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.device.config import PixelLayout
 
 
+@check_keywords
 class Stream:
     """An open stream. `Display.stream()` builds one. A broken connection is restored at the next frame."""
 

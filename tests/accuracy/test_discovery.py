@@ -13,7 +13,7 @@ from optodrive.core.errors import InputError
 from optodrive.lab.discovery import OdeModel, Parameter, Record, discover
 from optodrive.lab.discovery.input_files import read_record
 
-SILVERBOX = os.environ.get("OPTODRIVE_SILVERBOX")
+SILVERBOX = os.environ.get("SILVERBOX_CSV")
 SAMPLE_RATE_HZ = 610.35
 
 
@@ -64,7 +64,7 @@ def test_no_finding_in_sixty_records_without_an_effect():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(SILVERBOX is None, reason="OPTODRIVE_SILVERBOX does not name the benchmark's silverbox.csv.gz")
+@pytest.mark.skipif(SILVERBOX is None, reason="SILVERBOX_CSV does not name the benchmark's silverbox.csv.gz")
 @pytest.mark.timeout(1500)
 def test_cubic_spring_of_the_silverbox():
     with gzip.open(Path(SILVERBOX), "rt") as file:

@@ -45,7 +45,7 @@ def test_arm_show_and_the_result(board, daemon):
 def test_a_preview_and_a_read_only_client_have_no_effect(board, daemon):
     daemon.arm()
     with Display(daemon.url, TOKEN) as display:
-        plan = display.preview({17: 90.0})
+        plan = display.show({17: 90.0}, dry_run=True)
         assert (plan.status, plan.planned, plan.sent) == ("planned", 1, 0)
         assert plan.heights_um[17] == pytest.approx(90.0, rel=0.02)
         assert display.play("pixel", dry_run=True).planned
@@ -58,12 +58,12 @@ def test_a_preview_and_a_read_only_client_have_no_effect(board, daemon):
 
 
 def test_an_intensity_is_planned_as_the_height_that_it_stands_for(daemon, display):
-    plans = [display.preview(intensity={17: value}) for value in (5.0, 10.0)]
+    plans = [display.show(intensity={17: value}, dry_run=True) for value in (5.0, 10.0)]
     assert [(plan.status, plan.planned) for plan in plans] == [("planned", 1)] * 2
     assert plans[0].heights_um[17] == pytest.approx(75.6, rel=0.02)
     assert plans[1].heights_um[17] == pytest.approx(147.0, rel=0.02)
     with pytest.raises(InputError, match=r"frames\[0\].intensity.17: got 99.0, expected at most 24") as refused:
-        display.preview(intensity={17: 99.0})
+        display.show(intensity={17: 99.0}, dry_run=True)
     assert refused.value.problem["code"] == "target_unreachable"
 
 
@@ -296,7 +296,7 @@ def test_the_async_client(board, daemon):
     async def session():
         async with AsyncDisplay(daemon.url, TOKEN) as display:
             assert (await display.arm()).board.is_armed
-            assert (await display.preview({17: 50.0})).sent == 0
+            assert (await display.show({17: 50.0}, dry_run=True)).sent == 0
             plan = await display.show({17: 90.0})
             assert (plan.status, plan.executed) == ("done", 1)
             assert (await display.play("pixel")).status == "done"

@@ -8,7 +8,7 @@ import pytest
 from forked_process import run_process
 from optodrive.daemon.runtime_folder import find_link_socket
 from optodrive.link.service.operator_client import stop_board
-from rig import OPTODRIVE, long_train, running, wait_for
+from rig import OPTODRIVE, TOKEN, long_train, running, wait_for
 
 
 def find_others(daemon):
@@ -52,6 +52,22 @@ def test_stop_needs_only_the_link_process(board, daemon, tmp_path, suspended):
     assert "Traceback" not in ended.stderr
     assert board.of("gate")[-1]["on"] is False
     assert board.of("state")[-1]["state"] in ("DISARMED", "FAULT")
+
+
+@pytest.mark.parametrize("runtime", ["its own", "none"])
+def test_a_misspelt_variable_is_told_only_after_the_stop(runtime, board, daemon, tmp_path):
+    """By the link process's socket, and over HTTP where that is not found."""
+    daemon.arm()
+    daemon.call("POST", "/v1/plans", json=long_train(seconds=20.0))
+    wait_for(lambda: board.of("pulse"), "light")
+    folder = tmp_path if runtime == "its own" else tmp_path / "none"
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(folder), "OPTODRIVE_ULR": "x"}
+    ended = run_process([OPTODRIVE, "stop", "--url", daemon.url], env=environment, capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert "DISARMED" in ended.stdout
+    assert "environment: got 'OPTODRIVE_ULR'" in ended.stderr
+    assert board.of("gate")[-1]["on"] is False
+    assert daemon.board_state() == "DISARMED"
 
 
 def test_a_second_daemon_on_the_same_socket_leaves_the_direct_stop_of_the_first(tmp_path):

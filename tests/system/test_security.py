@@ -192,7 +192,7 @@ def test_command_line_and_client_use_the_unix_socket(running, folder):
     output = run_process(command, capture_output=True, text=True, env=environment, check=True).stdout
     assert json.loads(output)["display"] == running.state()["display"]
     with Display(place, TOKEN) as display:
-        assert display.preview({5: 60.0}).planned == 1
+        assert display.show({5: 60.0}, dry_run=True).planned == 1
         with display.stream() as stream, pytest.raises(NotReadyError):
             stream.wait(stream.send({5: 60.0}))
 

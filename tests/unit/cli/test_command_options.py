@@ -1,0 +1,93 @@
+"""Options, commands and variables that the command line does not have are refused by name, with the nearest."""
+
+import inspect
+import re
+from difflib import get_close_matches
+
+import pytest
+from typer.main import get_command
+
+from optodrive.cli.commands import build_app
+from optodrive.cli.main import run
+from optodrive.client import Display
+from optodrive.core.daemon_url import ENVIRONMENT_VARIABLES
+from optodrive.daemon.api import tokens
+
+
+def list_commands(command, path=()):
+    """List all commands with their words."""
+    if not hasattr(command, "commands"):
+        yield path, command
+        return
+    for name, each in command.commands.items():
+        yield from list_commands(each, (*path, name))
+
+
+ROOT = get_command(build_app())
+COMMANDS = [pytest.param(path, command, id=" ".join(path)) for path, command in list_commands(ROOT)]
+GROUPS = {path[:k] for path, _ in list_commands(ROOT) for k in range(len(path))}
+
+
+def list_flags(command):
+    return [flag for option in command.params for flag in (*option.opts, *option.secondary_opts) if flag[:2] == "--"]
+
+
+@pytest.mark.parametrize(("path", "command"), COMMANDS)
+def test_an_unknown_option_is_refused_by_name(path, command, capsys):
+    assert not command.ignore_unknown_options
+    assert not command.allow_extra_args
+    assert run([*path, "--surely-unknown", "1"]) == 2
+    assert capsys.readouterr().err == "optodrive: No such option: --surely-unknown\n"
+
+
+@pytest.mark.parametrize(("path", "command"), COMMANDS)
+def test_a_misspelt_option_is_refused_with_the_nearest(path, command, capsys):
+    flags = list_flags(command)
+    for flag in flags:
+        wrong = flag + "x"
+        assert run([*path, wrong]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"optodrive: No such option: {wrong} ")
+        assert get_close_matches(wrong, flags)[0] in re.findall(r"--[\w-]+", error)[1:], error
+        if "_" in (underscored := f"--{flag[2:].replace('-', '_')}"):
+            assert run([*path, underscored]) == 2
+            assert flag in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("group", sorted(GROUPS))
+def test_an_unknown_command_is_refused_by_name(group, capsys):
+    assert run([*group, "surely-unknown"]) == 2
+    assert "No such command 'surely-unknown'" in capsys.readouterr().err
+
+
+def test_the_client_has_a_dry_run_where_a_command_has_one():
+    commands = {path[-1] for path, command in list_commands(ROOT) if "--dry-run" in list_flags(command)}
+    assert commands == {"push", "play"}
+    for name in commands:
+        assert "dry_run" in inspect.signature(getattr(Display, name)).parameters
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["play", "text", "text=a", "text=b"], "play text: text: got 'b', expected each parameter once"),
+        (["play", "text", "a", "text=b"], "play text: text: got 'b', expected each parameter once"),
+        (["play", "pixel", "--label", "a=1", "--label", "a=2"], "--label: got 'a=2', expected each key once"),
+    ],
+)
+def test_a_repeated_value_is_refused(arguments, error, capsys):
+    assert run(arguments) == 2
+    assert capsys.readouterr().err == f"optodrive: {error}\n"
+
+
+def test_a_misspelt_variable_of_the_environment_is_refused(monkeypatch, capsys):
+    assert {tokens.ENVIRONMENT_VARIABLE, tokens.FILE_ENVIRONMENT_VARIABLE} < set(ENVIRONMENT_VARIABLES)
+    monkeypatch.setenv("OPTODRIVE_TOKN", "secret")
+    for path, _ in list_commands(ROOT):
+        if path not in (("stop",), ("support",)):
+            assert run([*path, "--help"]) == 2, path
+            error = capsys.readouterr().err
+            assert error == (
+                "optodrive: environment: got 'OPTODRIVE_TOKN', expected a known variable, "
+                "nearest is 'OPTODRIVE_TOKEN'\n"
+            )
