@@ -55,7 +55,7 @@ class StandingRig(PlannerRig):
     def pass_time(self, duration_s):
         """Let the link process run while the planner computes."""
         if duration_s:
-            super(PlannerRig, self).run(duration_s, duration_s)
+            super(PlannerRig, self).run(duration_s)
 
     def show(self, page_m):
         """Let a new frame stand. Return its report, None if it was refused."""

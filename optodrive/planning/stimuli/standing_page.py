@@ -81,7 +81,7 @@ def _count_worthwhile(touched: BoolArray, pixel_time_s: float) -> int:
     """Return how many pixels away from the fingers are worth the mirrors' way before fingers need the beam again."""
     touched_count = int(np.count_nonzero(touched))
     between_s = REFRESH_PERIOD_S - touched_count * pixel_time_s
-    return min(REST_MIN, len(touched) - touched_count, max(1, int(between_s / pixel_time_s)))
+    return max(1, min(REST_MIN, len(touched) - touched_count, int(between_s / pixel_time_s)))
 
 
 def _take_oldest(due_s: FloatArray, until_s: float, span_s: float, pixel_time_s: float) -> IntArray:
@@ -91,7 +91,10 @@ def _take_oldest(due_s: FloatArray, until_s: float, span_s: float, pixel_time_s:
 
 
 def build_refresh(page: TactileFrame, bursts: list[Burst], layout: PixelLayout, pixel_time_s: float) -> Refresh:
-    """Return the frames that draw bursts in their time."""
+    """Return the frames that draw bursts in their time.
+
+    A frame draws a pixel once: the heat of its first pulse must be known when its second one is planned.
+    """
     frames: list[TactileFrame] = []
     orders: dict[int, IntArray] = {}
     runs: list[tuple[float, list[IntArray]]] = []
@@ -99,7 +102,7 @@ def build_refresh(page: TactileFrame, bursts: list[Burst], layout: PixelLayout, 
     origin: int | None = None
     for begin_s, pixels in bursts:
         order = compute_visiting_order(pixels, layout.row, layout.column, layout.x_m, layout.y_m, origin)
-        if begin_s > end_s + pixel_time_s:
+        if begin_s > end_s + pixel_time_s or np.isin(order, np.concatenate(runs[-1][1])).any():
             runs.append((begin_s, []))
         runs[-1][1].append(order)
         end_s, origin = begin_s + len(pixels) * pixel_time_s, int(order[-1])

@@ -154,3 +154,16 @@ def test_a_page_that_is_not_due_is_a_frame_without_pixels():
     bursts = select_bursts(target_m, np.zeros((SLOTS, COUNT), dtype=bool), np.full(COUNT, -np.inf), 0.0, PIXEL_S)
     sequence, _ = build_refresh(page, bursts, LAYOUT, PIXEL_S)
     assert [frame.target_m.any() for frame in sequence.frames] == [False]
+
+
+@given(count=st.integers(1, 12), fingers=st.integers(0, 12), pixel_s=st.floats(1e-3, 2e-2))
+def test_no_frame_of_a_refresh_draws_a_pixel_twice(count, fingers, pixel_s):
+    """The width of a frame's pulses follows from the heat before the frame."""
+    target_m = np.zeros(COUNT)
+    target_m[:count] = 50e-6
+    is_touched = np.tile(touch(*range(fingers))(0.0), (SLOTS, 1))
+    bursts = select_bursts(target_m, is_touched, np.full(COUNT, -np.inf), 0.0, pixel_s)
+    sequence, orders = build_refresh(TactileFrame("page", 0.0, 1.0, target_m), bursts, LAYOUT, pixel_s)
+    for k, _ in enumerate(sequence.frames):
+        assert len(set(orders[k].tolist())) == len(orders[k])
+    assert sum(map(len, orders.values())) == sum(len(burst.pixels) for burst in bursts)
