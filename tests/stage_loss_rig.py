@@ -82,9 +82,11 @@ class LossRig(StageRig):
     pixel_by_codes: pixel at which a beam with these codes points
     """
 
-    def __init__(self, monkeypatch, count, name="display-16", on_stage_loss="that_stage", **changes):
+    def __init__(
+        self, monkeypatch, count, name="display-16", on_stage_loss="that_stage", link_type=LossyLink, **changes
+    ):
         display = build_stages(name, count, **changes)
-        super().__init__(monkeypatch, display, link_type=LossyLink, on_stage_loss=on_stage_loss)
+        super().__init__(monkeypatch, display, link_type=link_type, on_stage_loss=on_stage_loss)
         self.ready()
         scale, moves = build_scales(display.config)[0], display.scan_head.moves
         codes = zip(scale.to_codes(moves.x_rad).tolist(), scale.to_codes(moves.y_rad).tolist(), strict=True)

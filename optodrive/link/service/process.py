@@ -25,7 +25,7 @@ from optodrive.link.service.link_service import LinkService
 from optodrive.link.service.settings import BoardSettings, LinkSettings
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
-from optodrive.link.transport.base import Transport
+from optodrive.link.transport.base import Transport, guard_opening
 from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
@@ -46,8 +46,10 @@ class PortOpener:
         """Return whether the port is open, False while it needs more time. Raise the error of a failure."""
         if self._thread is None:
             self._error = None
-            self._thread = threading.Thread(target=self._open, name="open-port", daemon=True)
-            self._thread.start()
+            thread = threading.Thread(target=self._open, name="open-port", daemon=True)
+            with guard_opening(self._transport.name):  # there may be no room for a thread
+                thread.start()
+            self._thread = thread
         if self._thread.is_alive():
             return False
         self._thread = None
@@ -189,6 +191,9 @@ def main(arguments: list[str] | None = None) -> int:
         except OptodriveError as error:
             supervisor.report_failure(str(error), error.exit_status)
             return error.exit_status
+        except OSError as error:  # of its socket, or of the folder of a simulated board
+            supervisor.report_failure(f"the link process cannot start: {error}")
+            return 1
         exit_stack.callback(process.close)
         process.install_signals()
         settle_memory()

@@ -23,6 +23,10 @@ class MemoryLink:
         """Return None: nothing waits for this link."""
         return None
 
+    def describe_fault(self) -> str:
+        """Return an empty text, because this link has no faults."""
+        return ""
+
     def close(self) -> None:
         """Report the loss of the link to the board."""
         self._core.on_link_lost(self._now_us())

@@ -40,6 +40,10 @@ class CapturingTransport:
         """Return the descriptor of the link, None without one."""
         return self._transport.fileno()
 
+    def describe_fault(self) -> str:
+        """Return the evident fault of the open link, or an empty text."""
+        return self._transport.describe_fault()
+
     def close(self) -> None:
         """Close the link. It may be opened again."""
         self._record_close()

@@ -88,13 +88,12 @@ class LinkCaptureWriter:
             self._warn(f"capture to {self.path} stopped: {reason}; the session continues")
 
     def _write_all(self) -> None:
-        with self._file:
-            while (entry := self._queue.get()) is not None:
-                try:
+        try:
+            with self._file:  # whose close may fail, too
+                while (entry := self._queue.get()) is not None:
                     self._write(pack_entry(entry))
-                except OSError as error:
-                    self._stop(error.strerror or str(error))
-                    return
+        except OSError as error:
+            self._stop(error.strerror or str(error))
 
     def _write(self, packed: bytes) -> None:
         while packed:

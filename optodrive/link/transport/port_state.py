@@ -1,4 +1,4 @@
-"""State of a serial port according to the operating system: available, missing, denied or in use."""
+"""State of a serial port according to the operating system: available, missing, denied, in use or unknown."""
 
 import os
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from optodrive.core.errors import escape_unprintable
 
 ROOT = Path("/")
 SERIAL_NAMES = ("ttyACM*", "ttyUSB*")
-PortStatus = Literal["not_a_file", "available", "missing", "denied", "in_use"]
+PortStatus = Literal["not_a_file", "available", "missing", "denied", "in_use", "unknown"]
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,16 @@ def read_command_name(pid: int, root: Path = ROOT) -> str:
 
 
 def read_port_state(port: str, root: Path = ROOT) -> PortState:
-    """Return the present state of a port without opening it."""
+    """Return the present state of a port without opening it, `unknown` if the system does not tell it. Never raise."""
     if not port.startswith("/"):
         return PortState("not_a_file")
+    try:
+        return _read_device_state(port, root)
+    except Exception:  # no descriptor is left to look, or the port vanishes meanwhile
+        return PortState("unknown")
+
+
+def _read_device_state(port: str, root: Path) -> PortState:
     path = join_root(root, port)
     try:
         exists = path.exists()

@@ -1,18 +1,24 @@
 """Transport over a serial port, with pyserial."""
 
+import errno
 import os
+import termios
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import serial
-from serial.tools import list_ports
 
 from optodrive.core.errors import InputError, LinkError
-from optodrive.link.transport.base import TransportKind
+from optodrive.link.transport.base import TransportKind, guard_opening, guard_port
+from optodrive.link.transport.port_state import list_serial_ports
 
 WRITE_TIMEOUT_S = 0.5
 WRITE_RETRY_S = 0.001
+SETTING_NAMES = ("input flags", "output flags", "character format", "line mode or echo", "bit rate", "bit rate")
+"""What the fields of termios set, in their order."""
+PIPES = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_r", "pipe_abort_write_w")
 
 
 class SerialPort:
@@ -23,27 +29,27 @@ class SerialPort:
         self._config_key = config_key
         self._baud = baud
         self._serial: serial.Serial | None = None
+        self._settings: list[Any] = []
+        self._node: os.stat_result | None = None
 
     def open(self) -> None:
         """Open the port.
 
         Raise InputError if it does not exist or access is denied, LinkError if it is in use.
         """
-        if not Path(self.name).exists():
-            present = ", ".join(port.device for port in list_ports.comports()) or "none found"
-            raise InputError(self._config_key, self.name, f"a serial port that exists ({present})", "no_port")
-        try:
+        with guard_opening(self.name, self._config_key):
+            if not Path(self.name).exists():
+                present = ", ".join(list_serial_ports()) or "none found"
+                raise InputError(self._config_key, self.name, f"a serial port that exists ({present})", "no_port")
             self._serial = serial.Serial(
                 self.name, self._baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
             )
-        except serial.SerialException as error:
-            if error.errno == 13:
-                raise InputError(
-                    self._config_key, self.name, "permission to open it (group dialout?)", "no_port"
-                ) from None
-            raise LinkError(f"{self.name} cannot be opened: {error}; is it in use by another program?") from None
-        except OSError as error:
-            raise LinkError(f"{self.name} cannot be opened: {error}") from None
+            try:
+                self._settings = termios.tcgetattr(self._serial.fileno())
+                self._node = os.fstat(self._serial.fileno())
+            except Exception:
+                self.close()
+                raise
 
     def _require_open(self) -> serial.Serial:
         if self._serial is None:
@@ -53,13 +59,11 @@ class SerialPort:
     def read(self, timeout_s: float) -> bytes:
         """Return the bytes that have arrived. Wait at most timeout_s for the first."""
         port = self._require_open()
-        try:
+        with guard_port(self.name):
             if port.timeout != timeout_s:  # setting it costs system calls
                 port.timeout = timeout_s
             first: bytes = port.read(1)
             return first + port.read(port.in_waiting) if first else b""
-        except (OSError, TypeError) as error:  # pyserial raises TypeError when the port is closed under a read
-            raise self._build_lost_error(error) from None
 
     def write(self, data: bytes) -> None:
         """Write all of data. Raise LinkError if the device does not accept it within half a second.
@@ -67,35 +71,74 @@ class SerialPort:
         pyserial would poll the device after each write, which waits for a worker of the kernel.
         """
         port, rest, deadline_s = self._require_open(), memoryview(data), None
-        while rest:
-            try:
-                rest = rest[os.write(port.fileno(), rest) :]
-            except BlockingIOError as error:
-                deadline_s = deadline_s or time.monotonic() + WRITE_TIMEOUT_S
-                if time.monotonic() > deadline_s:
-                    raise self._build_lost_error(error) from None
-                time.sleep(WRITE_RETRY_S)
-            except OSError as error:
-                raise self._build_lost_error(error) from None
-
-    def _build_lost_error(self, error: Exception) -> LinkError:
-        detail = "" if Path(self.name).exists() else f"; {self.name} is missing: unplugged, or its power is off"
-        return LinkError(f"link to {self.name} lost: {error}{detail}")
+        with guard_port(self.name):
+            while rest:
+                try:
+                    rest = rest[os.write(port.fileno(), rest) :]
+                except BlockingIOError:
+                    deadline_s = deadline_s or time.monotonic() + WRITE_TIMEOUT_S
+                    if time.monotonic() > deadline_s:
+                        raise TimeoutError(errno.ETIMEDOUT, "no room in its buffer") from None
+                    time.sleep(WRITE_RETRY_S)
 
     def fileno(self) -> int | None:
         """Return the descriptor of the open port."""
-        return None if self._serial is None else int(self._serial.fileno())
+        with guard_port(self.name):
+            return None if self._serial is None else int(self._serial.fileno())
+
+    def describe_fault(self) -> str:
+        """Return that the port is missing or replaced, or that another program has changed its settings."""
+        if self._serial is None or self._node is None:
+            return ""
+        with suppress(Exception):  # of a port that has failed
+            try:
+                node = Path(self.name).stat()
+            except FileNotFoundError:
+                return f"{self.name} is missing: unplugged, or its power is off"
+            if (node.st_dev, node.st_ino) != (self._node.st_dev, self._node.st_ino):
+                return (
+                    f"{self.name} was unplugged and is back, or its hub or adapter failed for an instant: "
+                    "check plug, cable and hub"
+                )
+            return self._describe_changed_settings(termios.tcgetattr(self._serial.fileno()))
+        return ""
+
+    def _describe_changed_settings(self, settings: list[Any]) -> str:
+        names = [name for name, was, now in zip(SETTING_NAMES, self._settings, settings, strict=False) if was != now]
+        if self._settings[-1] != settings[-1]:
+            names.append("control characters")
+        if not names:
+            return ""
+        return (
+            f"another program changed the settings of {self.name} while it was open ({', '.join(dict.fromkeys(names))})"
+            ": run no stty and no terminal program on the board's port"
+        )
 
     def close(self) -> None:
         """Close the port."""
         if self._serial is not None:
             port, self._serial = self._serial, None
-            with suppress(OSError):  # closing an unplugged device fails
+            with suppress(Exception):  # closing an unplugged device fails
                 port.close()
+            if port.is_open:
+                _abandon(port)
 
     def release(self) -> None:
         """Close the port."""
         self.close()
+
+
+def _abandon(port: serial.Serial) -> None:
+    """Close the rest of a port whose close has failed.
+
+    The kernel has released its descriptor all the same. pyserial would close that number again when the object is
+    collected, and it may belong to another file by then.
+    """
+    port.fd = None
+    for name in PIPES:
+        with suppress(Exception):
+            os.close(getattr(port, name))
+    port.is_open = False
 
 
 TRANSPORT = TransportKind("serial", lambda port: SerialPort(port.port, port.baud))

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from optodrive.core.errors import LinkError
-from optodrive.link.transport.base import TransportKind
+from optodrive.link.transport.base import TransportKind, guard_opening
 from optodrive.link.transport.port_settings import PortSettings
 from optodrive.link.transport.serial_port import SerialPort
 
@@ -39,7 +39,8 @@ class SimulatedBoard(SerialPort):
     def open(self) -> None:
         """Start the board process if necessary and open its port."""
         if self._process is None or self._process.poll() is not None:
-            self._start()
+            with guard_opening(self.name):
+                self._start()
         super().open()
 
     def release(self) -> None:

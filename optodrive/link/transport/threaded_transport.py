@@ -10,8 +10,7 @@ import threading
 from collections import deque
 from contextlib import suppress
 
-from optodrive.core.errors import OptodriveError
-from optodrive.link.transport.base import Transport
+from optodrive.link.transport.base import Transport, guard_opening, guard_port
 
 READ_S = 0.05
 """Longest wait of a read, and so the delay of closing the port."""
@@ -32,23 +31,30 @@ class ThreadedTransport:
         if self._last_reader is not None:
             self._last_reader.join()
         try:
-            self._transport.open()
-        except OptodriveError:
+            with guard_opening(self.name):
+                self._transport.open()
+                self._reader = self._last_reader = _Reader(self._transport)
+        except Exception:
             self._transport.close()
             raise
-        self._reader = self._last_reader = _Reader(self._transport)
 
     def read(self, timeout_s: float) -> bytes:
         """Return the bytes that have arrived. Wait at most timeout_s for the first."""
-        return b"" if self._reader is None else self._reader.take(timeout_s)
+        with guard_port(self.name):
+            return b"" if self._reader is None else self._reader.take(timeout_s)
 
     def write(self, data: bytes) -> None:
         """Hand all of data to the operating system."""
-        self._transport.write(data)
+        with guard_port(self.name):
+            self._transport.write(data)
 
     def fileno(self) -> int | None:
         """Return the descriptor that reports received bytes, None if the link is closed."""
         return None if self._reader is None else self._reader.descriptor
+
+    def describe_fault(self) -> str:
+        """Return the evident fault of the open link, or an empty text."""
+        return self._transport.describe_fault()
 
     def close(self) -> None:
         """Let the thread close the link after its read. The link may be opened again."""
@@ -75,7 +81,11 @@ class _Reader:
         self._lock = threading.Lock()
         self._stopped = self._finished = False
         self._thread = threading.Thread(target=self._run, name="read-port", daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError:  # there is no room for a thread
+            os.close(self.descriptor)
+            raise
 
     def take(self, timeout_s: float) -> bytes:
         if timeout_s > 0.0:

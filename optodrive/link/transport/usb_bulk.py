@@ -7,9 +7,9 @@ import usb.core
 import usb.util
 
 from optodrive.core.errors import MISSING, InputError, LinkError
-from optodrive.link.transport.base import TransportKind
+from optodrive.link.transport.base import TransportKind, guard_opening, guard_port
 from optodrive.link.transport.port_settings import PortSettings
-from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
+from optodrive.link.transport.usb_device import find_device, timeout_ms
 
 WRITE_TIMEOUT_S = 0.5
 READ_BYTES = 4096
@@ -44,15 +44,13 @@ class UsbBulk:
 
         Raise InputError if there is none or access is denied, LinkError if it is in use.
         """
-        self._device = find_device(*self._ids, backend=self._backend)
-        try:
-            self._claim()
-        except usb.core.USBError as error:
-            self.close()
-            raise build_open_error(self.name, error) from None
-        except InputError:
-            self.close()
-            raise
+        with guard_opening(self.name, "board"):
+            self._device = find_device(*self._ids, backend=self._backend)
+            try:
+                self._claim()
+            except Exception:
+                self.close()
+                raise
 
     def _claim(self) -> None:
         for interface in self._device.get_active_configuration():
@@ -78,20 +76,17 @@ class UsbBulk:
     def read(self, timeout_s: float) -> bytes:
         """Return the bytes that have arrived. Wait at most timeout_s, rounded to a millisecond, for the first."""
         self._require_open()
-        try:
-            return bytes(self._in.read(READ_BYTES, timeout_ms(timeout_s)))
-        except usb.core.USBTimeoutError:
-            return b""
-        except usb.core.USBError as error:
-            raise build_lost_error(self.name, error) from None
+        with guard_port(self.name):
+            try:
+                return bytes(self._in.read(READ_BYTES, timeout_ms(timeout_s)))
+            except usb.core.USBTimeoutError:
+                return b""
 
     def write(self, data: bytes) -> None:
         """Write all of data. Raise LinkError if the device does not accept it within half a second."""
         self._require_open()
-        try:
+        with guard_port(self.name):
             written_bytes = self._out.write(data, timeout_ms(WRITE_TIMEOUT_S)) if data else 0
-        except usb.core.USBError as error:
-            raise build_lost_error(self.name, error) from None
         if written_bytes != len(data):
             raise LinkError(f"link to {self.name} lost: it accepted {written_bytes} of {len(data)} bytes")
 
@@ -103,11 +98,15 @@ class UsbBulk:
         """Return None: libusb has no descriptor that reports received bytes."""
         return None
 
+    def describe_fault(self) -> str:
+        """Return an empty text: the errors of a USB device state its faults."""
+        return ""
+
     def close(self) -> None:
         """Release the device. The board does not notice and turns the gate off when its lease expires."""
         device, self._device = self._device, None
         if device is not None:
-            with suppress(usb.core.USBError):  # releasing an unplugged device fails
+            with suppress(Exception):  # releasing an unplugged device fails
                 usb.util.dispose_resources(device)
 
     def release(self) -> None:

@@ -16,7 +16,8 @@ from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
 from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.laser_dac import LaserDac
-from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
+from optodrive.link.transport.base import build_lost_error, guard_opening, guard_port
+from optodrive.link.transport.usb_device import find_device, timeout_ms
 
 VENDOR_ID, PRODUCT_ID = 0x1209, 0xE500
 INTERFACE, ALTERNATE_SETTING = 0, 1
@@ -60,10 +61,8 @@ class Helios(LaserDac):
         """
         self._device = find_device(VENDOR_ID, PRODUCT_ID, backend=self._backend)
         try:
-            self._identify()
-        except usb.core.USBError as error:
-            self._release()
-            raise build_open_error("the Helios", error) from None
+            with guard_opening("the Helios", "board"):
+                self._identify()
         except BaseException:
             self._release()
             raise
@@ -91,9 +90,9 @@ class Helios(LaserDac):
 
     def _release(self) -> None:
         device, self._device = self._device, None
-        with suppress(usb.core.USBError):  # the alternate setting without endpoints also stops it
+        with suppress(Exception):  # the alternate setting without endpoints also stops it
             device.set_interface_altsetting(INTERFACE, 0)
-        with suppress(usb.core.USBError):
+        with suppress(Exception):
             usb.util.dispose_resources(device)
 
     # --- commands -----------------------------------------------------------------------------------------------
@@ -156,11 +155,9 @@ class Helios(LaserDac):
     def _write(self, endpoint: int, data: bytes, timeout_s: float) -> int:
         if self._device is None:
             raise LinkError("the Helios is not open")
-        try:
+        with guard_port("the Helios"):
             written_bytes: int = self._device.write(endpoint, data, timeout_ms(timeout_s))
-        except usb.core.USBError as error:
-            raise build_lost_error("the Helios", error) from None
-        return written_bytes
+            return written_bytes
 
     def _read_answer(self, timeout_s: float = ANSWER_TIMEOUT_S) -> bytes:
         """Return one answer. Raise USBTimeoutError without an answer, LinkError if the link fails."""
@@ -168,7 +165,7 @@ class Helios(LaserDac):
             return bytes(self._device.read(ANSWER_ENDPOINT, ANSWER_BYTES, timeout_ms(timeout_s)))
         except usb.core.USBTimeoutError:
             raise
-        except usb.core.USBError as error:
+        except Exception as error:
             raise build_lost_error("the Helios", error) from None
 
     def _query(self, command: int, min_bytes: int) -> bytes:

@@ -70,7 +70,7 @@ def test_a_plan_is_armed_streamed_and_reported_over_usb():
 def test_unplugging_during_a_plan_turns_the_gate_off_and_is_reported():
     rig = Rig().streaming()
     rig.usb.unplug()
-    with pytest.raises(LinkError, match=r"link to usb 1209:0001 lost: .*unplugged, or without power"):
+    with pytest.raises(LinkError, match=r"link to usb 1209:0001 lost: .*unplugged, reset or without power"):
         rig.session.step(STEP_S, renew_lease=True)
     rig.session.disconnect()
     assert not rig.core.gate
@@ -103,7 +103,7 @@ def test_a_board_that_accepts_no_bytes_is_a_lost_link():
     rig.link.open()
     rig.usb.stalled = True
     began_s = rig.clock.now_s()
-    with pytest.raises(LinkError, match="timed out"):
+    with pytest.raises(LinkError, match="accepts no bytes"):
         rig.link.write(b"x")
     assert rig.clock.now_s() - began_s == pytest.approx(0.5)
 
@@ -134,7 +134,7 @@ def test_the_reason_for_a_failed_open_is_reported():
         rig.link.open()
     rig = Rig()
     rig.usb.claim_errno = errno.EBUSY
-    with pytest.raises(LinkError, match="is it in use by another program"):
+    with pytest.raises(LinkError, match="another program has it open"):
         rig.link.open()
     rig = Rig(one_way=True)
     with pytest.raises(InputError, match="a bulk endpoint in each direction"):
