@@ -151,7 +151,8 @@ def write_stimuli(folder):
     write_checkout(folder)
     (folder / "page.brf").write_text(",HELLO _W4")
     (folder / "graph.svg").write_text(
-        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 20 20"><path class="axes" d="M0 10H20M10 0V20"/>'
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 20 20" fill="none" stroke="black" '
+        'stroke-width=".2"><path class="axes" d="M0 10H20M10 0V20"/>'
         '<path d="M1 18C7 18 13 2 19 2"/></svg>'
     )
 

@@ -24,7 +24,9 @@ NEEDED = {
     "image": {"file": picture()},
     "animation": {"file": picture()},
     "braille-file": {"file": b",HELLO"},
-    "drawing": {"file": b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M0 0L9 9"/></svg>'},
+    "drawing": {
+        "file": b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M0 0L9 9" stroke="red"/></svg>'
+    },
 }
 DEFAULTS = [(name, NEEDED.get(name, {})) for name in PATTERNS]
 LOW = [(name, {"height_um": 10}) for name in ("all", "checker", "edge")]
