@@ -2,35 +2,51 @@
 
 Theory of operation. A discovery ends in a formula. The pixel gets its values at equal distances over the range that the
 data covered, and takes them linearly between these and constant beyond: so no formula is evaluated where nothing was
-measured, kernels know one shape only, and its largest value, by which the limiter bounds it, is that of a knot.
+measured, kernels know one shape only, and no value anywhere, tails included, is larger or smaller than those of knots.
 
-Bound. With R the largest resistance of a bridge, f the function and θ the absorber's rise:
-- light, a factor 1 + f on the power, or f(P) on top of it: the power is at most (1 + max f) or (1 + max f(P) / P) times
-  the nominal one, and so is every rise.
+Bound. A file may hold any table, so nothing is assumed of one but what is computed from all of its knots
+(`_find_extremes`) or refused. With R the largest resistance of a bridge, f the function, u the absorber's rise over its
+wall and v the one that the limiter computes without the term, which never falls faster nor rises more slowly:
+- light, a factor 1 + f on the power, or f(P) on top of it: the power is at most (1 + max f) or (1 + max f(P) / P)
+  times the nominal one, and so is every rise.
 - heat capacity C / (1 + f): warming is that of C under (1 + max f) times the power, since less flows off than
-  (1 + f) θ / R; cooling is that of the largest capacity.
-- heat flow f(θ) ≤ b θ into the absorber, or by the rise of a memory, which is never warmer than the absorber was: it
-  raises the absorber by R b of its own largest rise at most, which is therefore at most 1 / (1 − R b) times that
-  without the flow; so is the heat that reaches the wall. It does so later, with the time constant 1 / λ of the slowest
-  mode of absorber and memory. With λ τ = 1 − 1 / g, there the memory is g times as warm as the absorber, and
-  λ = (1 / R − b g) / C; without a memory g is 1.
+  (1 + f) u / R; cooling is that of the largest capacity.
+- heat flow into the absorber, f(u) ≤ b u for u > 0, or f(m) ≤ b m by the rise m of a memory, a mean of earlier u: with
+  U(t) the largest u so far, v + R b U is a supersolution, hence U ≤ v / (1 − R b). For u < 0, f(u) drives u towards 0
+  and never past it, because f(0) = 0. A memory below 0 would add heat out of cooling and is refused (f(m) ≤ 0, m < 0).
+  U is the largest rise over a wall that was colder then. So the cap on u and the wall's rise w together is kept if
+  R b / (1 − R b) times the mean age of that heat (the memory's time and R C) times the fastest rise of w is left of it.
+  To the wall the heat comes later, with the time constant 1 / λ of the slowest mode of absorber and memory. With
+  λ τ = 1 − 1 / g, there the memory is g times as warm as the absorber, and λ = (1 / R − b g) / C; without a memory g
+  is 1. A smaller C makes g larger, a larger C and R make λ smaller, and each is taken at that end.
   All three are rises over the wall: a flow that followed the wall's own rise would feed on that of the whole panel.
 - heat flow by the rise of the gas: only one that is nowhere positive is bounded.
 - gas: it is at most τ max f warmer, of which a finger feels the share that the touch surface takes.
 - displacement and force heat nothing.
 Factors of light multiply; functions of a heat capacity add up, and so do feedbacks b R and b R g: with fewer of them g
-is only larger.
+is only larger. A product of places, such as light and flow, is a supersolution of a supersolution.
+
+Proof obligations, each of which a table could break and a mutant in the tests does:
+1. f(0) = 0 of each added function, to an absolute `ZERO_SHARE` of the largest plausible value: f(z) / z is then
+   largest at a knot, and the cold pixel in the dark stays cold. A tolerance relative to the table's own values is none.
+2. Extremes are taken over every knot, those beyond any temperature too, as the tails are constant.
+3. The slowest mode is at least as slow as that of every pixel within the declared uncertainty: b R g < `MAX_FEEDBACK`.
+4. No factor 1 + f is negative: the product of two would be light.
+5. All memories have one time constant, as the pixel has one memory.
+6. Every number is within `RANGES` and `LARGEST`, so that no sum, ratio or time constant leaves the range of floats.
 """
 
 from collections.abc import Sequence
 from math import inf, sqrt
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.kernels import kernel
-from optodrive.core.toml_model import Section
+from optodrive.core.quantity import format_quantity
+from optodrive.core.toml_model import ConflictError, Section
 from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import (
     ABSORBER,
@@ -75,7 +91,15 @@ MAX_FEEDBACK = 0.8
 """Largest R b g of a heat flow that the limiter bounds: heat then leaves an absorber five times as slowly."""
 SHORTEST_S = 2.5e-3
 """Shortest time constant that the integrator's longest step resolves."""
-NEGLIGIBLE = 1e-6
+RANGES = {"power": (0.0, 100.0, "W"), "since_opening": (0.0, 1000.0, "s")}
+RISES = (-2000.0, 2000.0, "K")
+"""Plausible ends of a table, by the quantity, and those of all others, which are rises."""
+MIN_SPAN = 1e-3
+"""Smallest plausible distance of a table's ends, in the quantity's unit."""
+LARGEST = {"light": 10.0, "heat_capacity": 10.0, "absorber": 10.0, "gas": 1e6, "displacement": 0.01, "force": 1.0}
+"""Largest plausible value in each place, in the unit of `UNITS`; of light by its power in W."""
+ZERO_SHARE = 1e-9
+"""Share of the largest plausible value that counts as 0: of a heat flow 10 nW, or some microkelvin."""
 
 
 class DiscoveredTerm(Section):
@@ -109,21 +133,73 @@ class DiscoveredTerm(Section):
             raise ValueError(f"unit {unit}, not '{self.unit}'")
         if not self.low < self.high:
             raise ValueError(f"low less than high, not {self.low:g} and {self.high:g}")
+        self._check_plausible(unit)
         if (self.memory_time_s is not None) != (self.depends_on == "memory"):
             raise ValueError("memory_time_s together with depends_on = 'memory', and only with it")
-        at_zero = float(np.interp(0.0, np.linspace(self.low, self.high, KNOTS), self.values))
-        if self.where in ADDED and abs(at_zero) > NEGLIGIBLE * max(map(abs, self.values)):
-            raise ValueError(f"values that are 0 where {self.depends_on} is 0: a cold pixel stays cold")
-        if self.where == "heat_capacity" and 1.0 + min(self.values) < MIN_CAPACITY_SHARE:
-            raise ValueError(f"values above {MIN_CAPACITY_SHARE - 1.0:g}, of which a heat capacity is divided by 1 + f")
+        if self.where in ADDED and not abs(self._compute_at_zero()) <= find_zero(self.where):
+            expected = f"0 {unit} where {self.depends_on} is 0: a cold pixel stays cold"
+            raise ConflictError("values", self._compute_at_zero(), expected)
+        if self.where == "absorber" and self.depends_on == "memory":
+            z = np.linspace(self.low, self.high, KNOTS)
+            for number in np.flatnonzero((z < 0.0) & (np.array(self.values) > find_zero(self.where))):
+                expected = "at most 0 W where the memory is colder than the wall: its cold would heat"
+                raise ConflictError(f"values.{number}", self.values[number], expected)
         return self
 
+    def _check_plausible(self, unit: str) -> None:
+        """Raise ConflictError for an end or a value that no pixel has."""
+        lowest, highest, end_unit = RANGES.get(self.depends_on, RISES)
+        for name, end in (("low", self.low), ("high", self.high)):
+            if not lowest <= end <= highest:
+                raise ConflictError(name, end, f"{lowest:g} to {highest:g} {end_unit}")
+        if not self.high - self.low >= MIN_SPAN:
+            raise ConflictError("high", self.high, f"at least {MIN_SPAN:g} {end_unit} above low, {self.low:g}")
+        lowest, highest = self._find_plausible_values()
+        for number, value in enumerate(self.values):
+            if not lowest <= value <= highest:
+                raise ConflictError(f"values.{number}", value, f"{lowest:g} to {highest:g} {unit}")
+
+    def _find_plausible_values(self) -> tuple[float, float]:
+        """Return the smallest and the largest plausible value."""
+        highest = LARGEST[self.where]
+        if self.where == "heat_capacity":
+            return MIN_CAPACITY_SHARE - 1.0, highest
+        return -1.0 if self.where == "light" and self.depends_on != "power" else -highest, highest
+
+    def _compute_at_zero(self) -> float:
+        """Return the value where the quantity is 0."""
+        return float(np.interp(0.0, np.linspace(self.low, self.high, KNOTS), self.values))
+
     def find_rate_per_s(self, c_j_per_k: float) -> float:
-        """Return the largest rate at which the term alone moves the state that it depends on."""
+        """Return the largest rate at which the term alone moves the state that it depends on, or oscillates with it."""
         steepest = float(np.abs(np.diff(self.values)).max()) * (KNOTS - 1) / (self.high - self.low)
         if self.where == "absorber" and self.depends_on == "absorber":
             return steepest / c_j_per_k
+        if self.where == "absorber" and self.memory_time_s is not None:
+            return sqrt(steepest / (c_j_per_k * self.memory_time_s))
         return steepest if self.where == "gas" and self.depends_on in ("gas", "drive") else 0.0
+
+
+def find_zero(where: str) -> float:
+    """Return the largest value that counts as 0 in a place, in its unit."""
+    return ZERO_SHARE * LARGEST[where]
+
+
+def check_set(terms: Sequence[DiscoveredTerm], where: str, c_j_per_k: float) -> None:
+    """Raise InputError for terms that do not go together, or are too fast for the integrator's steps.
+
+    where: place of the tables; c_j_per_k: the smallest heat capacity of an absorber
+    """
+    times_s = [term.memory_time_s for term in terms]
+    first_s = next((time_s for time_s in times_s if time_s is not None), None)
+    for number, (term, time_s) in enumerate(zip(terms, times_s, strict=True)):
+        if time_s not in (None, first_s):
+            expected = f"{first_s:g} s as of the other terms: the pixel has one memory"
+            raise InputError(f"{where}.{number}.memory_time_s", time_s, expected)
+        rate_per_s = term.find_rate_per_s(c_j_per_k)
+        if rate_per_s * SHORTEST_S > 1.0:
+            found, expected = format_quantity(1.0 / rate_per_s, "s", 2), f"{format_quantity(SHORTEST_S, 's')} or more"
+            raise InputError(f"{where}.{number}.values", Unquoted(f"a time constant of {found}"), expected)
 
 
 def list_values(terms: Sequence[DiscoveredTerm]) -> dict[str, float]:
@@ -132,7 +208,7 @@ def list_values(terms: Sequence[DiscoveredTerm]) -> dict[str, float]:
     for slot, term in enumerate(terms):
         head = (PLACES.index(term.where), QUANTITIES.index(term.depends_on), term.low)
         row[slot * SLOT : (slot + 1) * SLOT] = (*head, (term.high - term.low) / (KNOTS - 1), *term.values)
-        row[MEMORY_TIME] = max(row[MEMORY_TIME], term.memory_time_s or 0.0)
+        row[MEMORY_TIME] = term.memory_time_s or row[MEMORY_TIME]
     return {str(column): float(row[column]) for column in np.flatnonzero(row)}
 
 
@@ -241,51 +317,71 @@ class Discovered(Term):
         """Return the bound of all functions together, see the theory of operation, or None if one of them has none."""
         row = self.pack(values)
         power = fastest = slowest = 1.0
-        rise_k = feedback = late_feedback = 0.0
+        rise_k = feedback = late_feedback = age_s = 0.0
         slots = [row[slot * SLOT : (slot + 1) * SLOT] for slot in range(MAX_SLOTS)]
         for slot in sorted(slots, key=lambda slot: slot[0]):  # heat capacities before heat flows
             place, quantity = int(slot[0]), int(slot[1])
-            highest, lowest = max(0.0, float(slot[HEAD:].max())), min(0.0, float(slot[HEAD:].min()))
-            ratio = _find_largest_ratio(slot) if place in (LIGHT, HEAT_FLOW) else 0.0
-            if place == LIGHT and quantity != OF_POWER:
-                power *= 1.0 + highest
-            elif place == LIGHT:
-                power *= 1.0 + ratio
+            lowest, highest, ratio = _find_extremes(slot)
+            if place == LIGHT:
+                power *= 1.0 + (ratio if quantity == OF_POWER else highest)
             elif place == HEAT_CAPACITY:
                 fastest, slowest = fastest + highest, slowest + lowest
-            elif place == HEAT_FLOW and highest > 0.0:
-                own = inf if quantity == OF_GAS else ratio * envelope.r_k_per_w
-                feedback += own
-                if quantity == OF_MEMORY and own < inf:
-                    absorber_s = envelope.r_k_per_w * envelope.c_j_per_k / fastest
-                    own *= _find_memory_share(own, float(row[MEMORY_TIME]) / absorber_s)
-                late_feedback += own
+            elif place == HEAT_FLOW and highest > find_zero("absorber"):
+                own, memory_s = ratio * envelope.r_k_per_w, 0.0
+                if quantity == OF_GAS or not own < 1.0:
+                    return None
+                late = own
+                if quantity == OF_MEMORY and own > 0.0:
+                    memory_s = float(row[MEMORY_TIME])
+                    late = _find_late_feedback(own, memory_s / (envelope.r_k_per_w * envelope.c_min_j_per_k / fastest))
+                feedback, late_feedback = feedback + own, late_feedback + late
+                age_s += own * (memory_s + envelope.r_k_per_w * envelope.c_max_j_per_k)
             elif place == GAS_RATE:
                 rise_k += envelope.gas_share * envelope.tau_g_s * highest
         if not power < inf or late_feedback > MAX_FEEDBACK or slowest < MIN_CAPACITY_SHARE:
             return None
         return HeatGainBound(
-            power * fastest / (1.0 - feedback), 1.0 / slowest, 1.0 / (1.0 - late_feedback), uniform_rise_k=rise_k
+            power_factor=power * fastest / (1.0 - feedback),
+            capacity_factor=1.0 / slowest,
+            delay_factor=1.0 / (1.0 - late_feedback),
+            uniform_rise_k=rise_k,
+            absorber_age_s=age_s / (1.0 - feedback),
         )
 
 
-def _find_largest_ratio(slot: FloatArray) -> float:
-    """Return the largest f(z) / z of a function for z > 0, at least 0, infinite if it is positive at 0.
+class _Extremes(NamedTuple):
+    """Bounds of a function over all that can be reached.
 
-    Between knots the ratio is monotone, and beyond the last one it falls.
+    lowest, highest: smallest and largest value, at most and at least 0; ratio: largest f(z) / z for z > 0, at least 0,
+    infinite if the function is positive at 0
+    """
+
+    lowest: float
+    highest: float
+    ratio: float
+
+
+def _find_extremes(slot: FloatArray) -> _Extremes:
+    """Return the extremes of a slot's function.
+
+    Values between knots and beyond them lie between those of knots. Between knots the ratio is monotone, and beyond the
+    last one it falls in size.
     """
     z, values = slot[2] + slot[3] * np.arange(KNOTS), slot[HEAD:]
-    if float(np.interp(0.0, z, values)) > NEGLIGIBLE * float(np.abs(values).max()):
-        return inf
-    positive = z > 0.0
-    return max(0.0, float((values[positive] / z[positive]).max())) if positive.any() else 0.0
+    lowest, highest, positive = min(0.0, float(values.min())), max(0.0, float(values.max())), z > 0.0
+    if int(slot[0]) not in (LIGHT, HEAT_FLOW):
+        return _Extremes(lowest, highest, 0.0)
+    if float(np.interp(0.0, z, values)) > find_zero(PLACES[int(slot[0])]):
+        return _Extremes(lowest, highest, inf)
+    ratio = max(0.0, float((values[positive] / z[positive]).max())) if positive.any() else 0.0
+    return _Extremes(lowest, highest, ratio)
 
 
-def _find_memory_share(feedback: float, ratio: float) -> float:
-    """Return how warm the memory is beside the absorber in the slowest mode of both, 1 or more.
+def _find_late_feedback(feedback: float, ratio: float) -> float:
+    """Return the feedback b R g of the slowest mode of absorber and memory, at least b R.
 
-    feedback: b R; ratio: the memory's time constant over R C. With g = 1 / (1 − λ τ) and λ τ = ratio (1 − b R g), g
-    solves b R ratio g² + (1 − ratio) g − 1 = 0.
+    feedback: b R; ratio: the memory's time constant over R C, with the smallest C. With g = 1 / (1 − λ τ) and
+    λ τ = ratio (1 − b R g), g solves b R ratio g² + (1 − ratio) g − 1 = 0.
     """
-    slope = 1.0 - ratio
-    return 2.0 / (slope + sqrt(slope**2 + 4.0 * feedback * ratio))
+    excess = ratio - 1.0
+    return (excess + sqrt(excess**2 + 4.0 * feedback * ratio)) / (2.0 * ratio)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -10,7 +11,6 @@ from pydantic import Field, model_validator
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.plausibility import PlausibleRange, guess_unit
-from optodrive.core.quantity import format_quantity
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
@@ -19,7 +19,7 @@ from optodrive.device.config_file import locate_shipped
 from optodrive.device.config_sections import BridgeWidth
 from optodrive.device.pixel_map import load_pixel_map
 from optodrive.physics.discovered_term import KEY as DISCOVERED
-from optodrive.physics.discovered_term import MAX_SLOTS, SHORTEST_S, DiscoveredTerm, list_values
+from optodrive.physics.discovered_term import MAX_SLOTS, DiscoveredTerm, check_set, list_values
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.terms import all_terms, check_requirements, find_term
 
@@ -180,11 +180,8 @@ def load_parameters(name: str | Path) -> ParameterSet:
     terms = {key: _complete_term(f"{path}: terms.{key}", key, values) for key, values in parameters.terms.items()}
     parameters = parameters.model_copy(update={"terms": terms})
     check_requirements(f"{path}: terms", parameters.terms)
-    for number, term in enumerate(parameters.discovered):
-        rate_per_s = term.find_rate_per_s(parameters.C_mean.value)
-        if rate_per_s * SHORTEST_S > 1.0:
-            found, expected = format_quantity(1.0 / rate_per_s, "s", 2), f"{format_quantity(SHORTEST_S, 's')} or more"
-            raise InputError(f"{path}: discovered.{number}.values", f"a time constant of {found}", expected)
+    c_min_j_per_k = min(parameters.C_mean.value, *(row.C.value for row in parameters.bridge), inf)
+    check_set(parameters.discovered, f"{path}: discovered", c_min_j_per_k)
     for key in parameters.planner_terms:
         if key not in parameters.term_keys:
             raise InputError(

@@ -81,9 +81,9 @@ class OperatingEnvelope(NamedTuple):
     """Largest values that a display can reach.
 
     absorber_k: rise of one absorber; summed_absorbers_k: sum of all absorbers' rises under all beams; full_w: power of
-    the strongest laser; all_power_w: that of all lasers together; r_k_per_w: resistance of a hot bridge; c_j_per_k: the
-    smallest heat capacity of an absorber; tau_g_s: time constant of the gas; gas_share: share of the gas's rise that a
-    touch surface takes.
+    the strongest laser; all_power_w: that of all lasers together; r_k_per_w: resistance of a hot bridge; c_min_j_per_k,
+    c_max_j_per_k: the smallest and the largest heat capacity of an absorber; tau_g_s: time constant of the gas;
+    gas_share: share of the gas's rise that a touch surface takes.
     """
 
     absorber_k: float
@@ -91,7 +91,8 @@ class OperatingEnvelope(NamedTuple):
     full_w: float
     all_power_w: float
     r_k_per_w: float
-    c_j_per_k: float
+    c_min_j_per_k: float
+    c_max_j_per_k: float
     tau_g_s: float
     gas_share: float
 
@@ -100,13 +101,15 @@ class HeatGainBound(NamedTuple):
     """Upper bound on the heat that a term adds.
 
     Factors on the absorbed power, on the heat capacity of a hot absorber, and on the time constant with which heat
-    leaves an absorber for its wall; an additional rise of everything, K.
+    leaves an absorber for its wall; an additional rise of everything, K; and one of absorbers, K per rate of rise of
+    what they stand on, K/s, because they return heat of an earlier time.
     """
 
     power_factor: float = 1.0
     capacity_factor: float = 1.0
     delay_factor: float = 1.0
     uniform_rise_k: float = 0.0
+    absorber_age_s: float = 0.0
 
 
 NO_HEAT_GAIN = HeatGainBound()

@@ -15,7 +15,7 @@ from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
 from optodrive.physics.terms import all_terms
 from optodrive.physics.terms.wall_heating import compute_capacity
-from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
+from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels, HeatBound
 from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
 from optodrive.planning.limiter.nominal_model import (
     NominalPanel,
@@ -59,9 +59,21 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     skew_s = limits.stage_skew_max_s if len(stages) > 1 else 0.0
     powers_w = (stage.laser.max_power_w for stage in stages)
     heat = build_heat_bound(model, uncertainty, caps, *powers_w, skew_s=skew_s)
+    late_k = heat_gain.absorber_age_s * compute_fastest_rise_k_per_s(heat, caps)
+    if not late_k < caps.absorber_k:
+        expected = f"more than {base_c + late_k:.1f} °C, to which the terms of {parameters.name} may warm it"
+        raise InputError("limits.absorber_max_c", limits.absorber_max_c, expected)
+    caps = caps._replace(absorber_k=caps.absorber_k - late_k)
     galvos = [build_galvo_model(stage) for stage in stages]
     check_galvo_cap(limits.galvo_acceleration_rms_max_rad_per_s2, galvos)
     return Budget(caps, heat, GalvoModels.from_models(*galvos))
+
+
+def compute_fastest_rise_k_per_s(heat: HeatBound, caps: CapValues) -> float:
+    """Return the fastest rise of a wall on its panel, K/s, by light and neighbours."""
+    wall_k_per_s = heat.wall_specht_ratio * float(heat.wall_k_per_j[0] * heat.power_max_w.sum())
+    lateral_k_per_s = 4.0 * heat.lateral_w_per_k * min(caps.wall_k, caps.touch_k) / float(heat.wall_j_per_k[0])
+    return wall_k_per_s + lateral_k_per_s + heat.absorber_per_panel * heat.panel_k_per_s
 
 
 def compute_long_move_load(galvo: GalvoModel) -> float:
@@ -138,6 +150,7 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
         sum(powers_w),
         r_k_per_w * (1 + config.limits.uncertainty.bridge_resistance) * _compute_bridge_factor(config, terms) ** 2,
         float(pixels.c_j_per_k.min()) * (1 - config.limits.uncertainty.absorber_capacity),
+        float(pixels.c_j_per_k.max()) * (1 + config.limits.uncertainty.absorber_capacity),
         float(pixels.tau_g_s.max()) * (1 + config.limits.uncertainty.gas_lag),
         terms.get("touch_surface", {}).get("gas_share", 0.0) * (1 + config.limits.uncertainty.touch_share),
     )
@@ -164,7 +177,7 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
 def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnvelope) -> HeatGainBound:
     """Combine the bounds of all terms outside the thermal bound."""
     power = capacity = delay = 1.0
-    uniform_rise_k = 0.0
+    uniform_rise_k = absorber_age_s = 0.0
     for key in terms:
         if key in BOUNDED_TERMS:
             continue
@@ -177,7 +190,8 @@ def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnve
         capacity *= term_gain.capacity_factor
         delay *= term_gain.delay_factor
         uniform_rise_k += term_gain.uniform_rise_k
-    return HeatGainBound(power, capacity, delay, uniform_rise_k)
+        absorber_age_s += term_gain.absorber_age_s
+    return HeatGainBound(power, capacity, delay, uniform_rise_k, absorber_age_s * capacity)
 
 
 def _compute_uncertainty_factor(config: Config, terms: Mapping[str, TermValues], capacity: float) -> float:

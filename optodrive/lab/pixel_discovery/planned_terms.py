@@ -3,14 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import ValidationError
 
+from optodrive.core.toml_model import build_input_error
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery import Curve
 from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.pixel_model import AFTER, LIGHT
-from optodrive.physics.discovered_term import KNOTS, NEGLIGIBLE, UNITS, DiscoveredTerm
+from optodrive.physics.discovered_term import KNOTS, UNITS, DiscoveredTerm
 
 RATE_OF_ABSORBER, RATE_OF_GAS = "dabsorber/dt", "dgas/dt"
+NEGLIGIBLE = 1e-6
 BASE = ("R", "C", "tau_g", "kappa", "phi")
 
 
@@ -44,7 +47,10 @@ def build_planned_terms(discovery: PixelDiscovery) -> PlannedTerms:
         elif _acts_when_cold(finding, finding.curve):
             refused.append(f"{finding.formula} acts on a pixel without light")
         else:
-            terms.append(_build_term(finding, finding.curve, discovery.parameters, discovery.epsilon))
+            try:
+                terms.append(_build_term(finding, finding.curve, discovery.parameters, discovery.epsilon))
+            except ValidationError as error:
+                refused.append(str(build_input_error(error, finding.formula)))
     return PlannedTerms(base, tuple(terms), tuple(refused))
 
 
@@ -61,9 +67,13 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
     Rates of the absorber become heat flows by its capacity, absorbed light becomes incident light.
     """
     variable, *factor = finding.depends_on
-    z = _choose_knots(float(curve.x[0]), float(curve.x[-1]))
+    where, depends_on, low = finding.where, variable, float(curve.x[0])
+    if where == RATE_OF_ABSORBER and depends_on in ("memory", "gas"):
+        low = max(0.0, low)  # its cold would heat, and there is hardly a record of it
+    z = _choose_knots(low, float(curve.x[-1]))
     low, high, values = float(z[0]), float(z[-1]), curve.evaluate(z)
-    where, depends_on = finding.where, variable
+    if not factor:  # by less than is negligible, see `_acts_when_cold`
+        values = values - float(np.interp(0.0, z, values))
     if finding.where == RATE_OF_GAS:
         where = "gas"
     elif finding.where == RATE_OF_ABSORBER:
@@ -71,10 +81,12 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
         if factor == ["heating"]:
             where, capacity = "heat_capacity", 1.0
         elif factor == [LIGHT]:
-            where, depends_on = "light", variable
+            where = "light"
         elif variable == LIGHT:
             where, depends_on, low, high, capacity = "light", "power", low / epsilon, high / epsilon, capacity / epsilon
         values = values * capacity
+    if where == "light" and depends_on != "power":
+        values = np.maximum(values, -1.0)  # darkness
     return DiscoveredTerm.model_validate(
         {
             "where": where,

@@ -146,14 +146,14 @@ def test_a_parameter_set_states_it_and_plans_with_it(tmp_path):
         ({"depends_on": '"memory"', "memory_time_s": "0.05"}, "depends_on one of absorber, gas, drive where"),
         ({"unit": '"mm"'}, "unit m, not 'mm'"),
         ({"low": "60.0"}, "low less than high"),
-        ({"values": str([1e-6] * KNOTS)}, "values that are 0 where gas is 0"),
+        ({"values": str([1e-6] * KNOTS)}, r"discovered\.0\.values: got 1e-06, expected 0 m where gas is 0"),
         ({"values": "[0.0, 1.0]"}, "65 values, not 2"),
         ({"values": str([float("nan")] * KNOTS)}, r"discovered\.0\.values\.0: got nan"),
         ({"memory_time_s": "0.05"}, "memory_time_s together with depends_on = 'memory'"),
         ({"where": '"absorber"', "depends_on": '"memory"', "unit": '"W"'}, "memory_time_s together with"),
         (
             {"where": '"heat_capacity"', "depends_on": '"absorber"', "unit": '"1"', "values": str([-0.95] * KNOTS)},
-            "values above -0.9",
+            r"discovered\.0\.values\.0: got -0\.95, expected -0\.9 to 10 1",
         ),
         (
             {"where": '"gas"', "depends_on": '"gas"', "unit": '"K/s"', "values": str([0.0, *[-1e4] * (KNOTS - 1)])},
