@@ -24,13 +24,18 @@ def new(
     rows: Annotated[int | None, typer.Option("--rows", min=1, max=200, help="Rows of pixels.")] = None,
     columns: Annotated[int | None, typer.Option("--columns", min=1, max=200, help="Columns of pixels.")] = None,
     pitch_mm: Annotated[
-        float | None, typer.Option("--pitch-mm", metavar="MM", help="Distance of neighbouring pixels.")
+        float | None,
+        typer.Option("--pitch-mm", min=0.01, max=1000.0, metavar="MM", help="Distance of neighbouring pixels."),
     ] = None,
     power_w: Annotated[
-        float | None, typer.Option("--power-w", metavar="W", help="Power of the laser on the pixels at full duty.")
+        float | None,
+        typer.Option(
+            "--power-w", min=1e-3, max=1000.0, metavar="W", help="Power of the laser on the pixels at full duty."
+        ),
     ] = None,
     lens_mm: Annotated[
-        float | None, typer.Option("--lens-mm", metavar="MM", help="Focal length of the f-theta lens.")
+        float | None,
+        typer.Option("--lens-mm", min=1.0, max=10_000.0, metavar="MM", help="Focal length of the f-theta lens."),
     ] = None,
     port: Annotated[
         str | None, typer.Option("--port", metavar="DEVICE", help="Serial device of the board, or: simulated.")

@@ -30,7 +30,10 @@ def doctor(
         typer.Option("--board", metavar="PORT", help="Examine the board on a serial port, without a configuration."),
     ] = None,
     baud: Annotated[
-        int, typer.Option("--baud", metavar="N", help="Rate of that port; a board's own USB ignores it.")
+        int,
+        typer.Option(
+            "--baud", min=9600, max=12_000_000, metavar="N", help="Rate of that port; a board's own USB ignores it."
+        ),
     ] = BAUD,
     watch: Annotated[bool, typer.Option("--watch", help="Repeat the checks until Ctrl-C and show changes.")] = False,
     json: JsonOption = False,
@@ -117,9 +120,12 @@ def examine_port(port: str, baud: int = BAUD, root: Path = Path("/")) -> list["F
     from optodrive.cli.doctor_bare_board import check_bare_board
     from optodrive.cli.doctor_port import check_port
     from optodrive.core.clock import MonotonicClock
+    from optodrive.core.errors import InputError
     from optodrive.device.config_sections import BoardSection
     from optodrive.link.transport.serial_port import SerialPort
 
+    if not port.startswith("/"):
+        raise InputError("--board", port, "the path of a serial port, such as /dev/ttyACM0")
     findings, free = check_port(BoardSection(transport="serial", port=port), root)
     return [*findings, *(check_bare_board(SerialPort(port, baud, "--board"), MonotonicClock()) if free else [])]
 

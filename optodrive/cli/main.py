@@ -19,6 +19,7 @@ from optodrive.core.garbage import collect_seldom, skip_last_collection
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its status."""
+    open_closed_streams()
     collect_seldom()
     # No command needs a multithreaded BLAS; starting its threads takes 0.1 s.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,6 +28,20 @@ def main(arguments: list[str] | None = None) -> None:
     status = run(sys.argv[1:] if arguments is None else arguments)
     skip_last_collection()
     sys.exit(status)
+
+
+def open_closed_streams() -> None:
+    """Open /dev/null in place of standard streams that the caller has closed.
+
+    The next file opened would take their numbers: text for stderr would go to the port of the board.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # opened at the lowest free number: this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if name == "stdin" else "w", encoding="utf-8", closefd=False))  # noqa: SIM115
 
 
 def run(arguments: list[str]) -> int:

@@ -35,6 +35,8 @@ def patterns(
             raise InputError("PATTERN", MISSING, "the name of a pattern, for --out")
         _write_pattern(pattern, values or [], out, config, json)
         return
+    if config is not None:
+        raise InputError("--config", config, "--out FRAMES.json beside it; descriptions are those of every display")
     if values:
         raise InputError("--out", MISSING, f"--out FRAMES.json for {values[0]}")
     name = None if pattern is None else find_pattern(pattern).name

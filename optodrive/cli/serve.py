@@ -35,6 +35,7 @@ def serve(
     from optodrive.daemon.supervisor.daemon import run
     from optodrive.lab.recording.storage import HDF5_SUFFIXES
 
+    check_output("--capture", capture)
     check_output("--record-session", record_session, *HDF5_SUFFIXES)
 
     def load() -> "Config":

@@ -102,7 +102,9 @@ def replay(
     limits: Annotated[
         Path | None, typer.Option("--limits", metavar="FILE", help="Limits of the simulated board, TOML.")
     ] = None,
-    baud: Annotated[int, typer.Option("--baud", min=300, help="Baud rate of the serial port.")] = 1_000_000,
+    baud: Annotated[
+        int, typer.Option("--baud", min=300, max=12_000_000, help="Baud rate of the serial port.")
+    ] = 1_000_000,
     json: JsonOption = False,
 ) -> None:
     """Send the captured bytes of the host to a board at their times. The exit status is 1 where its behaviour differs.

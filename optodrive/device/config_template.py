@@ -44,6 +44,11 @@ def write_template(display: NewDisplay, path: Path) -> tuple[str, Config]:
     """
     template = locate_shipped(f"{TEMPLATE}.toml").read_text(encoding="utf-8")
     config = build_config(path, parse_toml(template.encode(), TEMPLATE))
+    if display.port != SIMULATED and not display.port.startswith("/"):
+        expected = (
+            f"a serial device such as /dev/serial/by-id/..., or {SIMULATED}; how-to/use-a-laser-dac writes others"
+        )
+        raise InputError("--port", display.port, expected)
     half_field_m = 2.0 * config.scanner.range_rad * display.focal_length_m
     farthest_m = 0.5 * (max(display.rows, display.columns) - 1) * display.pitch_m
     if farthest_m > half_field_m:

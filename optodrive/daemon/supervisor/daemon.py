@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from optodrive.core.beat import BeatWriter
 from optodrive.core.clock import MonotonicClock
-from optodrive.core.errors import InputError
 from optodrive.core.forking import execute_module, fork_with_beat
 from optodrive.core.garbage import settle_memory
 from optodrive.core.scheduling import set_nice
@@ -61,8 +60,6 @@ def run(
         exit_stack.callback(log.close)
         for stage in config.list_stage_configs():
             find_transport_factory(build_port_settings(stage))  # refuses a laser DAC
-        if capture_path is not None and capture_path.exists():
-            raise InputError("--capture", str(capture_path), "a name that is free: nothing is overwritten")
         set_nice(NICE)  # every process inherits it, link while it still loads
         clock = MonotonicClock()
         notifier = Notifier(clock)
