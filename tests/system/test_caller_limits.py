@@ -4,7 +4,9 @@ import asyncio
 import fcntl
 import json
 import os
+import signal
 import socket
+from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, suppress
 from itertools import islice
@@ -100,6 +102,26 @@ def test_abandoned_dry_runs_do_not_hold_up_another_callers_push(rig, count, fram
     assert (pushed["name"], pushed["status"]) == ("armer", 201)
     said = [(line["name"], line["status"], line.get("hung_up"), line.get("plan")) for line in abandoned]
     assert said == [("operator", None, True, None)] * count
+
+
+def test_heavy_drawings_do_not_hold_up_another_callers_push(rig):
+    """In the audit log, the push stands before the drawings, which were sent first; one of them is suspended."""
+    arcs = "A5 5 0 0 1 9 9A5 5 0 0 1 0 0" * 50_000
+    svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9" stroke="red"><path d="M0 0{arcs}"/></svg>'
+    drawing = json.dumps({"file": b64encode(svg.encode()).decode()}).encode()
+    rig.arm()
+    audited = len(read_audit(rig, "POST /v1/plans")), len(read_audit(rig, "POST /v1/patterns/drawing"))
+    with ThreadPoolExecutor(CALLER_WAITING_MAX) as pool:
+        calls = [pool.submit(post, rig, drawing, "/v1/patterns/drawing") for _ in range(CALLER_WAITING_MAX)]
+        suspended = wait_for(lambda: suspend_dry_runs(rig.daemon), "a slow build")
+        for _ in range(3):
+            assert post(rig, SMALL, role="armer").status_code == 201
+        assert len(read_audit(rig, "POST /v1/plans")) == audited[0] + 3
+        assert len(read_audit(rig, "POST /v1/patterns/drawing")) == audited[1]
+        for pid in suspended:
+            os.kill(pid, signal.SIGCONT)
+        assert {call.result().status_code for call in calls} <= {201, 422}, "422: too slow on a slow computer"
+    rig.client.post("/v1/stop")
 
 
 def test_more_dry_runs_than_may_wait_are_refused_at_once(rig):

@@ -1,6 +1,6 @@
 """Waiting jobs of the preview process, bounded for each kind and each caller."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from optodrive.core.errors import BusyError
@@ -12,10 +12,19 @@ CALLER_WAITING_MAX = 4
 
 
 class Job(NamedTuple):
-    """A job with the connection that waits for its result."""
+    """A job with the connection that waits for its result.
+
+    is_slow: a build that took longer than usual, and was begun or begins again as a slow job
+    """
 
     client: MessageSocket
     message: Message
+    is_slow: bool = False
+
+    @property
+    def is_heavy(self) -> bool:
+        """Whether it runs beside the usual builds, at low priority: a dry run or a slow build."""
+        return self.is_slow or self.message.kind == "dry_run"
 
     @property
     def job_id(self) -> int:
@@ -43,12 +52,16 @@ class JobQueue:
             raise BusyError(f"too many requests wait: {len(same_kind)} before this one; try again later")
         self._jobs.append(job)
 
-    def take(self, kinds: set[str], busy_callers: set[str]) -> Job | None:
-        """Remove and return the next job of these kinds: the first of a caller without a running job, else the first.
+    def put_back(self, job: Job) -> None:
+        """Add a job again that was begun."""
+        self._jobs.append(job)
 
-        Return None if no job of these kinds waits.
+    def take(self, may_start: Callable[[Job], bool], busy_callers: set[str]) -> Job | None:
+        """Remove and return the next job that may start: the first of a caller without a running job, else the first.
+
+        Return None if there is none.
         """
-        candidates = [job for job in self._jobs if job.message.kind in kinds]
+        candidates = [job for job in self._jobs if may_start(job)]
         job = next((job for job in candidates if job.caller not in busy_callers), next(iter(candidates), None))
         if job is not None:
             self._jobs.remove(job)

@@ -18,8 +18,11 @@ from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.board_setup import build_scales
 from optodrive.planning.display_model import DisplayModel
 
-RUNNING_MAX, DRY_RUNS_MAX = 2, 1
-"""Jobs at once, and how many of them may be dry runs, so that a build never waits for one."""
+QUICK_MAX, HEAVY_MAX = 2, 3
+"""Usual builds at once, and dry runs and slow builds at once, one of a caller: a usual build waits for usual ones only.
+
+A build that turns out to be slow while too many heavy jobs run is ended, and begins again when it is its turn.
+"""
 LOOP_WAIT_S, ENDING_WAIT_S = 0.1, 0.01
 """Longest wait for messages, usually and while a worker ends."""
 
@@ -55,9 +58,13 @@ class PreviewServer:
         self._loop.poll(min(wait_s, next_check_s - time.monotonic()))
         now_s = time.monotonic()
         for slot in list(self._slots):
-            if slot.worker.check(now_s) and slot.job is not None:
+            if slot.job is None:
+                continue
+            if now_s >= slot.worker.deadline_s:
                 self._reply(slot.job, build_refusal(build_timeout_error(slot.job.message.kind)))
                 self._end_worker(slot)
+            elif not slot.job.is_heavy and slot.worker.is_slow(now_s):
+                self._treat_as_slow(slot, slot.job._replace(is_slow=True))
         self._collect_ended()
         self._start_jobs()
 
@@ -93,20 +100,32 @@ class PreviewServer:
             if slot.job is not None and slot.job.client is client and job_id in (None, slot.job.job_id):
                 self._end_worker(slot)
 
+    def _treat_as_slow(self, slot: _Slot, job: Job) -> None:
+        """Let a build that takes longer than usual go on beside the usual ones, or wait for its turn to do so."""
+        if self._may_start(job):
+            slot.job = job
+            slot.worker.demote()
+            return
+        slot.job = None
+        self._end_worker(slot)
+        self._queue.put_back(job)
+
+    def _list_running(self) -> list[Job]:
+        return [slot.job for slot in (*self._slots, *self._ending) if slot.job is not None]
+
+    def _may_start(self, job: Job) -> bool:
+        running = self._list_running()
+        heavy = [other.caller for other in running if other.is_heavy]
+        if job.is_heavy:
+            return len(heavy) < HEAVY_MAX and job.caller not in heavy
+        return len(running) - len(heavy) < QUICK_MAX
+
     def _start_jobs(self) -> None:
         """Start waiting jobs while the limits permit it. A spare worker is always ready."""
-        while True:
-            running = [slot.job for slot in (*self._slots, *self._ending) if slot.job is not None]
-            dry_runs = sum(job.message.kind == "dry_run" for job in running)
-            kinds = {"build"} if dry_runs >= DRY_RUNS_MAX else {"build", "dry_run"}
-            if len(running) >= RUNNING_MAX:
-                return
-            job = self._queue.take(kinds, {job.caller for job in running})
-            if job is None:
-                return
+        while job := self._queue.take(self._may_start, {job.caller for job in self._list_running()}):
             slot = next((slot for slot in self._slots if slot.job is None), None) or self._add_spare()
             slot.job = job
-            slot.worker.begin(job.message, time.monotonic())
+            slot.worker.begin(job.message, time.monotonic(), job.is_heavy)
             self._loop.send(slot.worker.connection, job.message)
             if all(slot.job is not None for slot in self._slots):
                 self._add_spare()

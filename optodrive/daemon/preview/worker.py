@@ -28,7 +28,10 @@ MEMORY_BYTES = {"build": 768_000_000, "dry_run": 1_500_000_000}
 DEMOTION = 10
 """Niceness of a slow job above that of the preview process."""
 QUICK_S = 0.1
-"""Duration of a usual build, s."""
+"""Longest processor time of a usual build, s."""
+CHECK_MIN_S = 0.005
+CPU_CLOCK = 2
+"""CPUCLOCK_SCHED of Linux: the processor time of a process, by the scheduler."""
 JOBS_MAX = 200
 """Jobs after which a worker is replaced."""
 LARGE_BYTES = 1_000_000
@@ -61,38 +64,49 @@ class Worker:
         self.pid = fork_child(lambda: _serve(child_end, run_job), "opto-worker", [child_end.fileno()])
         child_end.close()
         self.connection = MessageSocket(parent_end)
-        self.deadline_s = self._demote_at_s = float("inf")
+        self.deadline_s = self._check_at_s = float("inf")
         self.is_reusable = True
         self._kind = "build"
+        self._began_cpu_s = 0.0
         self._job_count = 0
 
-    def begin(self, job: Message, now_s: float) -> None:
+    def begin(self, job: Message, now_s: float, is_heavy: bool) -> None:
         """Start the clock of a job that is being sent."""
         self._kind = job.kind
         self._job_count += 1
         self.is_reusable &= self._job_count < JOBS_MAX and len(job.payload) < LARGE_BYTES
-        self.deadline_s, self._demote_at_s = now_s + WALL_S, now_s + QUICK_S
-        if job.kind == "dry_run":
-            self._demote()
+        self.deadline_s, self._check_at_s = now_s + WALL_S, now_s + QUICK_S
+        self._began_cpu_s = self._read_cpu_s()
+        if is_heavy:
+            self.demote()
 
     def finish(self) -> None:
         """Stop the clock."""
-        self.deadline_s = self._demote_at_s = float("inf")
+        self.deadline_s = self._check_at_s = float("inf")
 
     @property
     def next_check_s(self) -> float:
-        """Host time at which `check` must be called next."""
-        return min(self.deadline_s, self._demote_at_s)
+        """Host time at which `is_slow` or the deadline must be looked at next."""
+        return min(self.deadline_s, self._check_at_s)
 
-    def check(self, now_s: float) -> bool:
-        """Lower the priority of a slow job. Return whether the job has exceeded its time."""
-        if now_s >= self._demote_at_s:
-            self._demote()
-        return now_s >= self.deadline_s
+    def is_slow(self, now_s: float) -> bool:
+        """Return whether the job has taken more processor time than usual: a busy computer makes none slow."""
+        if now_s < self._check_at_s:
+            return False
+        rest_s = QUICK_S - (self._read_cpu_s() - self._began_cpu_s)
+        self._check_at_s = now_s + max(rest_s, CHECK_MIN_S)
+        return rest_s <= 0.0
 
-    def _demote(self) -> None:
+    def _read_cpu_s(self) -> float:
+        """Return the processor time of the process, of which the clock's number is made from its id."""
+        with suppress(OSError):  # it has ended
+            return time.clock_gettime((~self.pid << 3) | CPU_CLOCK)
+        return 0.0
+
+    def demote(self) -> None:
+        """Lower the priority of the process, which ends with its job."""
         self.is_reusable = False
-        self._demote_at_s = float("inf")
+        self._check_at_s = float("inf")
         os.setpriority(os.PRIO_PROCESS, self.pid, os.getpriority(os.PRIO_PROCESS, 0) + DEMOTION)
 
     def kill(self) -> None:
@@ -110,6 +124,8 @@ class Worker:
             return None
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
             return build_timeout_error(self._kind)
+        if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGABRT:
+            return build_memory_error(self._kind)  # by a compiled library
         return OptodriveError(f"the process that worked on the request: {describe_end(status)}")
 
 

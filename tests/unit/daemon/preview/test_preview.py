@@ -69,9 +69,9 @@ class Preview:
     def build(self, job_id, body, source="sequence", name="push", caller=""):
         self.send("build", job_id, body, source=source, push=Push(name, {}, 0.0, 0, caller)._asdict())
 
-    def dry_run(self, job_id, body):
+    def dry_run(self, job_id, body, caller=""):
         start = pickle.dumps(DryRunStart(*DISPLAY.build_cold_state(), 0.05))
-        push = Push("push", {}, 0.0, 0)._asdict()
+        push = Push("push", {}, 0.0, 0, caller)._asdict()
         self.send("dry_run", job_id, start + body, source="sequence", push=push, snapshot_bytes=len(start))
 
     def results(self, count):
@@ -270,8 +270,56 @@ def test_the_work_of_a_caller_that_left_ends_at_once(start, monkeypatch):
     assert_serves(preview)
 
 
+@pytest.mark.parametrize("kind", ["build", "dry_run"])
+def test_the_work_of_one_caller_delays_no_other_callers(start, monkeypatch, kind):
+    """In order: of the work that never ends nothing has been answered when the other callers have their results."""
+    lift_limits(monkeypatch, kind)
+    monkeypatch.setattr(jobs, "make_plan", build_slowly)
+    preview = start()
+    for job_id in range(4):
+        if kind == "build":
+            preview.build(job_id, b"bad", caller="one")
+        else:
+            preview.dry_run(job_id, SMALL, caller="one")
+    for job_id in range(10, 15):
+        preview.build(job_id, SMALL, caller="two")
+        assert preview.result().fields["id"] == job_id
+        assert len(preview.slow_workers()) <= 1, "one of a caller, also of builds that turned out to be slow"
+    preview.build(20, b"bad", caller="three")
+    wait_for(lambda: len(preview.slow_workers()) == 2)
+    assert_serves(preview)
+
+
+def test_a_build_that_was_ended_for_others_is_built_in_its_turn(start, monkeypatch):
+    lift_limits(monkeypatch, "build")
+    begun = [mp.get_context("fork").RawValue("i", 0) for _ in range(3)]
+
+    def end_at_the_third_time():
+        number = next(k for k, pid in enumerate(begun) if pid.value == 0)
+        begun[number].value = os.getpid()
+        return ({}, {}) if number == 2 else build_slowly()
+
+    preview = start(end_at_the_third_time)
+    preview.build(1, b"bad", caller="one")
+    wait_for(preview.slow_workers)
+    preview.build(2, b"bad", caller="one")
+    wait_for(lambda: begun[1].value and begun[1].value not in preview.workers())
+    preview.send("drop", 1)
+    assert problem(preview.result())[0] == 500  # what it returned is no sequence
+    assert begun[2].value
+    assert_serves(preview)
+
+
+def test_a_library_that_gives_up_for_want_of_memory_is_one_line(start):
+    preview = start(os.abort)
+    preview.build(1, b"bad")
+    status, document = problem(preview.result())
+    assert (status, document["code"]) == (422, "too_large")
+
+
 def test_the_queue_is_bounded_for_each_kind_and_each_caller(start, monkeypatch):
     lift_limits(monkeypatch, "build")
+    monkeypatch.setattr(worker, "QUICK_S", NO_LIMIT_S)
     preview = start()
     for job_id in range(12):
         preview.build(job_id, b"bad", caller=f"caller {job_id % 8}")
