@@ -63,10 +63,10 @@ CHANNELS = {
     },
     "hold": {
         "address": "/v1/hold",
-        "description": "An arming that lasts as long as the connection and a message per second. Role: armer.",
+        "description": "An arming that lasts as long as the connection and a beat per second. Role: armer.",
         "bindings": {"ws": {"method": "GET"}},
         "messages": {
-            "beat": {"summary": "any message, at least once per second", "payload": {}},
+            "beat": {"summary": "at least once per second", "contentType": "text/plain", "payload": {"const": "beat"}},
             "report": {"summary": "what became of the arming", "payload": _refer(HoldReport)},
         },
     },

@@ -127,6 +127,17 @@ def open_as_browser(daemon, secret):
     return connect(url, origin=origin, subprotocols=["optodrive", f"bearer.{encoded}"], compression=None)
 
 
+def wait_until_held(page):
+    """Send beats until the board is armed."""
+    while True:
+        page.send("beat")
+        try:
+            assert json.loads(page.recv(timeout=0.25)) == {"status": "armed"}
+            return
+        except TimeoutError:
+            pass
+
+
 def test_a_page_holds_with_the_token_among_the_subprotocols(running, board):
     with pytest.raises(InvalidStatus) as refused:
         open_as_browser(running, "not-a-token-of-anybody")
@@ -136,13 +147,16 @@ def test_a_page_holds_with_the_token_among_the_subprotocols(running, board):
     assert refused.value.response.status_code == 403
     with open_as_browser(running, TOKEN) as page:
         assert page.subprotocol == "optodrive"
-        while True:
-            page.send("beat")
-            try:
-                assert json.loads(page.recv(timeout=0.25)) == {"status": "armed"}
-                break
-            except TimeoutError:
-                pass
+        wait_until_held(page)
         assert running.board_state() == "ARMED"
         running.call("POST", "/v1/disarm")
         assert json.loads(page.recv()) == {"status": "ended", "reason": "ended by disarm"}
+
+
+@pytest.mark.parametrize("said", ['{"hold": false}', "Beat", b"beat"])
+def test_a_message_that_is_no_beat_ends_the_hold(running, board, said):
+    with open_as_browser(running, TOKEN) as page:
+        wait_until_held(page)
+        page.send(said)
+        assert json.loads(page.recv()) == {"status": "ended", "reason": f"message: got {said!r}, expected 'beat'"}
+    wait_for_dark(board)

@@ -60,7 +60,7 @@ def test_reports_of_a_hold_follow_the_schema(disarmed):
     _, daemon = disarmed
     report = build_validator("hold", "report")
     with open_socket(daemon, "/v1/hold") as hold:
-        hold.send("")
+        hold.send("beat")
         held = [json.loads(hold.recv())]
         with open_socket(daemon, "/v1/hold") as second:
             held.append(json.loads(second.recv()))

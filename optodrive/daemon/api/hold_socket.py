@@ -6,7 +6,7 @@ import time
 
 from starlette.websockets import WebSocket
 
-from optodrive.core.errors import OptodriveError
+from optodrive.core.errors import InputError, OptodriveError
 from optodrive.daemon.api.daemon_client import LinkClient
 from optodrive.daemon.api.scope_keys import ARRIVED_S
 from optodrive.daemon.api.socket_token import select_subprotocol
@@ -14,6 +14,7 @@ from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.hold import HoldReport
 
 NORMAL_CLOSURE, POLICY_VIOLATION = 1000, 1008
+BEAT = "beat"
 CLIENT_LEFT = "the client that held the board armed has left"
 
 
@@ -43,8 +44,14 @@ class HoldSocket:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _forward_beats(self) -> None:
-        """Take every message of the client as a beat, at the time of its arrival."""
+        """Take the client's messages as beats, at the time of their arrival. One that says something else lets go."""
         while (message := await self._socket.receive())["type"] != "websocket.disconnect":
+            said = message.get("text") or message.get("bytes") or ""
+            if said != BEAT:
+                reason = str(InputError("message", said, f"'{BEAT}'"))
+                self._link.release(self._arming, reason)  # before the answer, which may wait for the client
+                await self._send_last(HoldReport(status="ended", reason=reason), POLICY_VIOLATION)
+                return
             age_s = time.monotonic() - (message.get(ARRIVED_S) or time.monotonic())
             self._link.hold(self._arming, max(0.0, age_s))
 

@@ -1,5 +1,7 @@
 """Validity checks of a recording that raise InputError with the place of the violation."""
 
+from difflib import get_close_matches
+
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError, Unquoted, suggest_nearest
@@ -26,6 +28,11 @@ LONG_PULSE_S = 0.1
 """Overlapping pulses above this width, s, that would not overlap a thousand times shorter, are taken to be in ms."""
 OVERLAP_MAX_S = 1e-9
 """Tolerated overlap of consecutive pulses: the rounding error of their times."""
+RUN_ATTRIBUTES = ("group", "aim_x_m", "aim_y_m", "bridge_width_m", "started_at")
+"""Attributes of a run that have a meaning, besides `ambient_K`."""
+SIGNAL_ATTRIBUTES = ("pixel", "sigma", "unit", "units")
+MISSPELT_SIMILARITY = 0.8
+"""Similarity from which a free attribute is taken for a misspelt one, which would have no effect."""
 MODEL_PARAMETER_COUNT = 6
 """Number of parameters of the nominal pixel model, which is the minimum number of finite samples in a recording."""
 
@@ -39,8 +46,16 @@ def check_format(place: str, head: Attributes) -> None:
             raise InputError(f"{place}: {field}", head[field], f"{expected!r}, the one this release reads")
 
 
+def check_names(place: str, attributes: Attributes, known: tuple[str, ...]) -> None:
+    """Raise InputError for an attribute that is likely one of the known ones, misspelt. Any other is free."""
+    for name in attributes:
+        if name not in known and get_close_matches(name, known, n=1, cutoff=MISSPELT_SIMILARITY):
+            expected = f"{suggest_nearest(name, list(known))}, or a name that is less similar"
+            raise InputError(place, name, expected, code="unknown_key")
+
+
 def pop_ambient_k(place: str, attributes: Attributes) -> float:
-    """Remove the ambient temperature from a run's attributes and return it, K."""
+    """Remove the ambient temperature from a run's attributes, check the names of the others, and return it, K."""
     value = attributes.pop("ambient_K", None)
     if value is None:
         near = [name for name in attributes if name.lower().startswith("ambient")]
@@ -51,6 +66,7 @@ def pop_ambient_k(place: str, attributes: Attributes) -> float:
         likely = "" if unit is None else f"; this value is likely in {unit}"
         expected = f"a temperature between {AMBIENT.low:g} and {AMBIENT.high:g} K{likely}"
         raise InputError(f"{place}: ambient_K", value, expected)
+    check_names(place, attributes, RUN_ATTRIBUTES)
     return float(value)
 
 

@@ -110,6 +110,7 @@ def read_signal_attributes(tree: RecordingTree, run: str, signal: str) -> tuple[
     """Return the checked pixel and stated noise of a signal."""
     place = tree.format_place(run, signal)
     attributes = tree.read_signal_attributes(run, signal)
+    checks.check_names(place, attributes, checks.SIGNAL_ATTRIBUTES)
     checks.check_unit(place, signal, attributes)
     return checks.parse_pixel(place, signal, attributes), checks.parse_sigma(place, attributes)
 

@@ -25,7 +25,7 @@ class Socket:
 
     async def receive(self):
         await self._armed.wait()
-        return {"type": next(self._messages)}
+        return {"type": next(self._messages), "text": "beat"}
 
     async def send_text(self, text):
         self.sent.append(text)

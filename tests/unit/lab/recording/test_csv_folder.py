@@ -99,6 +99,8 @@ REFUSALS = {
     "run forgotten": (forgotten, ["/runs/extra: ambient_K"]),
     "no ambient": (text("recording.toml", "ambient_K", "ambient"), ["/runs/run2: ambient_K"]),
     "no pixel": (text("recording.toml", "pixel = 17", ""), ["/runs/run2/absorber_temperature_K: pixel"]),
+    "sigma misspelt": (text("recording.toml", "sigma =", "sigam ="), ["'sigam'", "nearest is 'sigma'"]),
+    "another width": (text("recording.toml", "bridge_width_m", "bridge_width_um"), ["nearest is 'bridge_width_m'"]),
     "pixel a date": (text("recording.toml", "pixel = 17", "pixel = 2024-01-01"), ["temperature_K: pixel", "'2024-"]),
     "unknown table": (text("recording.toml", "displacement_m]", "displacement_mm]"), ["nearest is 'displacement_m'"]),
     "unknown file": (
