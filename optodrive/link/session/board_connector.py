@@ -27,6 +27,7 @@ class BoardConnector:
         self._session = session
         self._clock = clock
         self._open_port = open_port
+        self._silence: OptodriveError | None = None
         self._steps: Iterator[float] | None = None
         self._wait_s = 0.0
         self._retry_at_s = -inf
@@ -39,6 +40,8 @@ class BoardConnector:
             elif self._steps is not None or self._clock.now_s() >= self._retry_at_s:
                 self._steps = self._steps or self._connect()
                 self._wait_s = next(self._steps)
+                if self._session.is_silent and self.error is not self._silence:
+                    self.error = self._silence = self._session.build_silence_error()
         except StopIteration:
             self._steps = self.error = None
         except (LinkError, InputError) as error:

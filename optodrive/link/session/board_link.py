@@ -34,6 +34,13 @@ from optodrive.link.transport.base import Transport
 
 HELLO_RETRY_S = 0.25
 CONNECT_TIMEOUT_S = 2.5
+"""Time after which a missing answer is reported."""
+HELLO_SLOW_S = 1.0
+"""Interval of HELLO from then on: a loader that waits for silence before it starts the firmware gets some."""
+BOOT_MAX_S = 10.0
+"""Longest start of a board that its port's opening resets: a caller of connect() waits for it."""
+REOPEN_S = 60.0
+"""Time without an answer after which the port is opened again, for drivers that have lost its settings."""
 HANDSHAKE_INTERVAL_S = 0.02
 """Interval between two requests of the handshake; a board that answers only some of them is not polled faster."""
 STATUS_INTERVAL_S = 0.2
@@ -54,6 +61,7 @@ class BoardLink:
 
     faults: number of times that the board reported each fault
     board: latest reported state of the board
+    is_silent: whether the port is open and no board has answered for CONNECT_TIMEOUT_S
     seeks_clock: whether the clocks are compared more often, because that of the board is not known well enough
     is_one_of_several: whether other boards share its display. It is then asked often: for its clock, because all keep
     the host's time, and for its status, because its silence must end the light of the others within a lease.
@@ -84,7 +92,7 @@ class BoardLink:
         }
         self.faults: Counter[str] = Counter()
         self.board = BoardView()
-        self.connected = self.seeks_clock = False
+        self.connected = self.seeks_clock = self.is_silent = False
         self.last_event_reason = ""
 
     @property
@@ -150,7 +158,7 @@ class BoardLink:
         """
         previous_sync = self._clock_sync
         try:
-            for wait_s in self._handshake():
+            for wait_s in self._handshake(BOOT_MAX_S if block else REOPEN_S):
                 self._exchange(wait_s if block else 0.0)
                 yield wait_s
         except (LinkError, InputError):
@@ -165,18 +173,25 @@ class BoardLink:
         self._transport.close()
         self._watch.on_reconnect_failed(self._clock.now_s())
 
-    def _handshake(self) -> Iterator[float]:
-        """Send the messages due in each step of the handshake, and yield how long to wait for bytes."""
+    def _handshake(self, patience_s: float) -> Iterator[float]:
+        """Send the messages due in each step of the handshake, and yield how long to wait for bytes.
+
+        The port stays open while no board answers: its opening resets some boards, which would never start.
+        """
         self._reset()
         self._send_hello()
-        deadline_s = self._clock.now_s() + CONNECT_TIMEOUT_S
+        began_s = self._clock.now_s()
         while self._connection.peer is None:
             self._retry_hello()
             yield HANDSHAKE_INTERVAL_S
-            if self._clock.now_s() > deadline_s:
-                raise LinkError(
-                    f"{self.port} is open, but no board answers: check its power, the port and the baud rate"
-                )
+            silent_s = self._clock.now_s() - began_s
+            if silent_s > CONNECT_TIMEOUT_S and not self.is_silent:
+                self.is_silent = True
+                self._watch.on_reconnect_failed(self._clock.now_s())
+            if silent_s > patience_s:
+                raise self.build_silence_error()
+        self.is_silent = False
+        deadline_s = self._clock.now_s() + CONNECT_TIMEOUT_S
         while not (self.is_acknowledged and self._clock_sync.is_synchronised and self.board.state != "UNKNOWN"):
             if self._clock.now_s() - self._clock_requested_s >= HANDSHAKE_INTERVAL_S:
                 self._request_clock()
@@ -188,13 +203,20 @@ class BoardLink:
             self._request_clock()
             yield 0.005
 
+    def build_silence_error(self) -> LinkError:
+        """Return the error while no board answers at the open port."""
+        return LinkError(f"{self.port} is open, but no board answers: check its power, the port and the baud rate")
+
     def _send_hello(self) -> None:
         """Begin a session. The board ends its previous activity and goes to DISARMED."""
         self._hello_sent_s = self._clock.now_s()
         self._connection.send_hello(secrets.randbits(32))
 
     def _retry_hello(self) -> None:
-        if self._connection.peer is None and self._clock.now_s() - self._hello_sent_s > HELLO_RETRY_S:
+        interval_s = HELLO_SLOW_S if self.is_silent else HELLO_RETRY_S
+        if self._connection.peer is None and self._clock.now_s() - self._hello_sent_s > interval_s:
+            if self.is_silent and (fault := self._transport.describe_fault()):
+                raise LinkError(fault)
             self._send_hello()
 
     def _on_hello_reply(self, peer: m.HelloReply, now_s: float) -> None:
@@ -212,6 +234,7 @@ class BoardLink:
         self._clock_sync = self._build_clock_sync()
         self._report_check = self._build_report_check()
         self.board = BoardView()
+        self.is_silent = False
         self._last_received_s = self._clock.now_s()
         self._clock_requested_s = -inf
         self._watch.on_opened()

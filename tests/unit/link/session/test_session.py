@@ -16,7 +16,7 @@ from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder, encode_frame
 from optodrive.link.protocol.quantisation import quantise
-from optodrive.link.session.board_link import CONNECT_TIMEOUT_S, SILENCE_TIMEOUT_S
+from optodrive.link.session.board_link import BOOT_MAX_S, CONNECT_TIMEOUT_S, SILENCE_TIMEOUT_S
 from optodrive.link.session.clock_sync import DRIFT_MAX, ClockSync
 from optodrive.link.session.fault_hints import FAULT_HINTS, get_fault_hint
 from optodrive.link.session.session import BoardSession
@@ -141,15 +141,18 @@ def test_hello_is_repeated_until_the_board_answers():
 
 
 @pytest.mark.parametrize(
-    ("kinds", "says"),
-    [(range(256), "is open, but no board answers"), ((0x90, 0x98, 0x83), "answers HELLO but nothing else")],
+    ("kinds", "says", "timeout_s"),
+    [
+        (range(256), "is open, but no board answers", BOOT_MAX_S),
+        ((0x90, 0x98, 0x83), "answers HELLO but nothing else", CONNECT_TIMEOUT_S),
+    ],
 )
-def test_a_missing_answer_is_a_link_error_within_the_timeout(kinds, says):
+def test_a_missing_answer_is_a_link_error_within_the_timeout(kinds, says, timeout_s):
     rig = Rig()
     rig.link.drop_frame = lambda frame: frame.type in kinds
     with pytest.raises(LinkError, match=says):
         rig.connect()
-    assert rig.clock.now_s() < 5.0 + CONNECT_TIMEOUT_S + 0.1
+    assert rig.clock.now_s() < 5.0 + timeout_s + 0.1
     assert not rig.session.connected
 
 
