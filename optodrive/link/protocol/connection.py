@@ -29,12 +29,16 @@ RTO_S = 0.025
 
 @dataclass
 class LinkCounters:
-    """Error counters of a link, as the host sees them."""
+    """Error counters of a link, as the host sees them.
+
+    naks: refusals; gaps: those of frames before which one was missing
+    """
 
     crc_errors: int = 0
     format_errors: int = 0
     retransmitted: int = 0
     naks: int = 0
+    gaps: int = 0
 
 
 class HostConnection:
@@ -60,7 +64,7 @@ class HostConnection:
         self._retransmit_done = False
         self._timer_start_s = 0.0
         self._nonce: int | None = None
-        self._nak_count = 0
+        self._nak_count = self._gap_count = 0
         self._retransmit_count = 0
         self._aborted_session = 0
         self.futile_transmissions = 0
@@ -86,7 +90,11 @@ class HostConnection:
         """Error counters since the connection was created."""
         frame_counters = self._decoder.counters
         return LinkCounters(
-            frame_counters.crc_errors, frame_counters.format_errors, self._retransmit_count, self._nak_count
+            frame_counters.crc_errors,
+            frame_counters.format_errors,
+            self._retransmit_count,
+            self._nak_count,
+            self._gap_count,
         )
 
     def send_hello(self, nonce: int) -> None:
@@ -196,8 +204,9 @@ class HostConnection:
                 if not self._advance_window(message.next_seq, now_s):
                     continue
                 # Every frame behind a gap is refused. Only the first NAK triggers a retransmission.
-                if message.reason == NAK_REASONS.index("SEQUENCE") and not self._retransmit_done:
-                    self._retransmit_pending = True
+                if message.reason == NAK_REASONS.index("SEQUENCE"):
+                    self._gap_count += 1
+                    self._retransmit_pending |= not self._retransmit_done
             messages.append(message)
         return messages
 

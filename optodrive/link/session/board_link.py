@@ -82,7 +82,7 @@ class BoardLink:
         self._report_check = self._build_report_check()
         self._hello_sent_s = self._status_requested_s = self._clock_requested_s = self._last_received_s = 0.0
         self._queue_points = self._reset_code = 0
-        self._watch = LinkWatch(transport.name, requirements.lease_s)
+        self._watch = LinkWatch(transport.name, requirements.lease_s, requirements.rto_s, transport.describe_fault)
         self._handlers: dict[type[m.Message], Callable[[Any, float], None]] = {
             m.HelloReply: self._on_hello_reply,
             m.Ack: self._on_ack,
@@ -354,7 +354,9 @@ class BoardLink:
             self.faults[fault] += 1
 
     def _on_clock_reply(self, message: m.ClockReply, now_s: float) -> None:
-        self._clock_sync.finish_exchange(message.host_t, now_s, message.tick * self.scale.tick_s)
+        duration_s = self._clock_sync.finish_exchange(message.host_t, now_s, message.tick * self.scale.tick_s)
+        if duration_s is not None:
+            self._watch.on_answer(now_s, duration_s)
 
     # --- statistics ---------------------------------------------------------------------------------------------
 
@@ -382,7 +384,7 @@ class BoardLink:
         host, board = self._connection.counters, self.board
         board_bad_frames = (board.crc_errors + board.format_errors) % BOARD_COUNTER_MODULUS
         bad_frames = host.crc_errors + host.format_errors, board_bad_frames
-        return LinkErrorCounts(*bad_frames, host.retransmitted, host.naks)
+        return LinkErrorCounts(*bad_frames, host.retransmitted, host.naks, host.gaps)
 
     def _describe_errors(self) -> str:
         counts = self._count_errors()

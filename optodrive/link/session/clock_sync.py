@@ -77,11 +77,14 @@ class ClockSync:
         self._request_s[stamp] = request_s
         return stamp
 
-    def finish_exchange(self, stamp: int, reply_s: float, board_s: float) -> None:
-        """Add the sample of a reply received at reply_s. Ignore an unknown stamp. board_s: board clock in the reply."""
+    def finish_exchange(self, stamp: int, reply_s: float, board_s: float) -> float | None:
+        """Add the sample of a reply received at reply_s, and return its round trip, s. Ignore an unknown stamp.
+
+        board_s: board clock in the reply
+        """
         request_s = self._request_s.pop(stamp, None)
         if request_s is None:
-            return
+            return None
         sample, samples = (reply_s - request_s, (request_s + reply_s) / 2, board_s), self._samples
         if not samples or self._number_interval(samples[-1]) != self._number_interval(sample):
             self._samples = (*samples[1 - self._samples_max :], sample)
@@ -89,6 +92,7 @@ class ClockSync:
             self._samples = (*samples[:-1], sample)
         # All brackets widen alike, so that the narrowest is the same at all times.
         self._best = min(self._samples, key=lambda each: each[0] - DRIFT_MAX * each[1])[1:]
+        return sample[0]
 
     def compute_contradiction_s(self, stamp: int, reply_s: float, board_s: float) -> float:
         """Return how far a reply lies outside the range that the latest exchange permits, s, 0 for an unknown stamp."""

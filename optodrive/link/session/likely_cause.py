@@ -1,6 +1,7 @@
 """Most likely cause of a lost link or an expired lease, in one sentence with a remedy."""
 
 from dataclasses import dataclass
+from math import inf
 
 from optodrive.core.quantity import format_quantity
 from optodrive.link.protocol.describe import describe_reset_cause
@@ -24,7 +25,11 @@ class LinkEvidence:
     silent: whether the board stopped answering, rather than the port reporting an error
     stall_s: longest time between two iterations of the host's loop
     host_bad_frames, board_bad_frames: frames received damaged
-    stalled: process without whose progress the lease was withheld, '' for none
+    gaps: frames that the board refused because one before them was missing
+    stalled: process without whose progress the lease was withheld for withheld_s, '' for none
+    port_fault: what the open port shows, as the transport describes it, '' for nothing
+    slowest_answer_s: longest time to the board's answer to a question
+    rto_s: time without an acknowledgement after which a frame is sent again
     """
 
     port: str
@@ -36,7 +41,12 @@ class LinkEvidence:
     board_bad_frames: int = 0
     retransmitted: int = 0
     naks: int = 0
+    gaps: int = 0
     stalled: str = ""
+    withheld_s: float = 0.0
+    port_fault: str = ""
+    slowest_answer_s: float = 0.0
+    rto_s: float = inf
 
 
 def diagnose_port(port: str, state: PortState) -> str | None:
@@ -60,8 +70,13 @@ def diagnose_link_loss(evidence: LinkEvidence) -> str:
     port_message = diagnose_port(evidence.port, evidence.port_state)
     if port_message is not None:
         return port_message
+    if evidence.port_fault:
+        return evidence.port_fault
     if not evidence.silent:
-        return describe_replug(evidence.port)
+        return (
+            f"{evidence.port} failed while it was open and is still there: its adapter, driver or hub failed, it was "
+            "unplugged for an instant, or another program reads from it; which of these is not known"
+        )
     return (
         _diagnose_host_stall(evidence)
         or _diagnose_corruption(evidence)
@@ -77,6 +92,7 @@ def diagnose_lease_expiry(evidence: LinkEvidence) -> str:
     return (
         _diagnose_host_stall(evidence)
         or _diagnose_process_stall(evidence)
+        or evidence.port_fault
         or _diagnose_corruption(evidence)
         or (
             "the host was on time and no frame arrived damaged: bytes were delayed on the link; "
@@ -96,7 +112,7 @@ def _diagnose_host_stall(evidence: LinkEvidence) -> str | None:
 
 
 def _diagnose_process_stall(evidence: LinkEvidence) -> str | None:
-    if not evidence.stalled:
+    if not evidence.stalled or evidence.withheld_s < STALL_LEASE_FRACTION * evidence.lease_s:
         return None
     if evidence.stalled == "web":
         return "the web process did not respond and the lease was withheld: see the daemon's log"
@@ -110,19 +126,27 @@ def _diagnose_corruption(evidence: LinkEvidence) -> str | None:
             f"bytes arrive damaged ({evidence.host_bad_frames} bad frames at the host, "
             f"{evidence.board_bad_frames} at the board in the last seconds): {NOISE_REMEDY}, and check board.baud"
         )
-    if evidence.naks or evidence.retransmitted:
+    late = ""
+    if evidence.slowest_answer_s > evidence.rto_s:
+        late = f"answers take up to {format_quantity(evidence.slowest_answer_s, 's')}"
+    if evidence.gaps:
         return (
-            f"bytes are lost on the link ({evidence.retransmitted} frames retransmitted, {evidence.naks} refused): "
-            "a hub or a converter is too slow; use a dedicated port, or a lower board.baud"
+            f"bytes are lost on the link ({evidence.retransmitted} frames retransmitted, {evidence.gaps} refused after "
+            f"a gap{f', {late}' if late else ''}): a hub or a converter is too slow; use a dedicated port, or a lower "
+            "board.baud"
+        )
+    if late:
+        return (
+            f"the link delays bytes: {late}, frames are sent again after {format_quantity(evidence.rto_s, 's')}, and "
+            "no byte is known to be lost; connect the board directly, not by a hub, a network or a virtual machine, "
+            "and see the latency timer in `optodrive doctor`"
+        )
+    if evidence.retransmitted:
+        return (
+            f"{evidence.retransmitted} frames were sent again because no acknowledgement came in time: bytes are lost "
+            "or late, which of the two is not known; use a dedicated port, or a lower board.baud"
         )
     return None
-
-
-def describe_replug(port: str) -> str:
-    """Return the cause for a port that failed and opened again while the board did not restart."""
-    return (
-        f"{port} was missing and is available again: replugged, or a hub failed; check the plug, the cable and the hub"
-    )
 
 
 def describe_receive_errors(board_bad_frames: int) -> str:

@@ -1,18 +1,19 @@
 """Monitor of a link and its service loop that determines the likely cause of a failure."""
 
 from collections import deque
+from collections.abc import Callable
+from math import inf
 from typing import NamedTuple
 
 from optodrive.link.session.likely_cause import (
     LinkEvidence,
     describe_receive_errors,
-    describe_replug,
     describe_restart,
     diagnose_lease_expiry,
     diagnose_link_loss,
     diagnose_port,
 )
-from optodrive.link.transport.port_state import PortState, read_port_state
+from optodrive.link.transport.port_state import PortState, describe_replug, read_port_state
 
 EVIDENCE_WINDOW_S = 5.0
 """Only events of this last period count as evidence."""
@@ -30,6 +31,7 @@ class LinkErrorCounts(NamedTuple):
     board_bad_frames: int = 0
     retransmitted: int = 0
     naks: int = 0
+    gaps: int = 0
 
     def count_since(self, then: "LinkErrorCounts") -> "LinkErrorCounts":
         """Return the errors counted since an earlier time."""
@@ -45,16 +47,25 @@ class LinkCause(NamedTuple):
 
 
 class LinkWatch:
-    """Monitor of one link. The session's loop calls it. Any thread may read `cause` and `longest_stall_s`."""
+    """Monitor of one link. The session's loop calls it. Any thread may read `cause` and `longest_stall_s`.
 
-    def __init__(self, port: str, lease_s: float) -> None:
+    rto_s: retransmission timeout; describe_fault: of the transport
+    """
+
+    def __init__(
+        self, port: str, lease_s: float, rto_s: float = inf, describe_fault: Callable[[], str] = lambda: ""
+    ) -> None:
         self.cause: LinkCause | None = None
         self.longest_stall_s = 0.0
         self._port = port
         self._lease_s = lease_s
+        self._rto_s = rto_s
+        self._describe_fault = describe_fault
+        self._answers: deque[tuple[float, float]] = deque()
         self._last_loop_s: float | None = None
-        self._lease_withheld_s: float | None = None
+        self._withheld_from_s = self._withheld_until_s = -inf
         self._stalled = ""
+        self._is_withheld = False
         self._stall_s, self._stall_at_s = 0.0, 0.0
         self._samples: deque[tuple[float, LinkErrorCounts]] = deque()
         self._counts = LinkErrorCounts()
@@ -66,14 +77,19 @@ class LinkWatch:
     def on_opened(self) -> None:
         """Reset the counters after the link was opened. The time for connecting is no stall."""
         self._samples.clear()
+        self._answers.clear()
         self._counts, self._last_loop_s, self._fault = LinkErrorCounts(), None, ""
 
     def on_loop(self, now_s: float, stalled: str, counts: LinkErrorCounts) -> None:
         """Record one loop iteration. stalled: process because of which the lease is not renewed, '' for none."""
         self._record_stall(now_s)
+        if stalled and not self._is_withheld:
+            self._withheld_from_s = now_s if self._last_loop_s is None else self._last_loop_s
+        if stalled or self._is_withheld:
+            self._withheld_until_s = now_s
+        self._stalled = stalled or self._stalled
+        self._is_withheld = bool(stalled)
         self._last_loop_s = now_s
-        if stalled:
-            self._lease_withheld_s, self._stalled = now_s, stalled
         self._counts = counts
         if not self._samples or now_s - self._samples[-1][0] >= SAMPLE_INTERVAL_S:
             self._samples.append((now_s, counts))
@@ -87,6 +103,12 @@ class LinkWatch:
         self.longest_stall_s = max(self.longest_stall_s, stall_s)
         if stall_s >= self._stall_s or now_s - self._stall_at_s > EVIDENCE_WINDOW_S:
             self._stall_s, self._stall_at_s = stall_s, now_s
+
+    def on_answer(self, now_s: float, duration_s: float) -> None:
+        """Record how long the board's answer to a question took."""
+        self._answers.append((now_s, duration_s))
+        while now_s - self._answers[0][0] > EVIDENCE_WINDOW_S:
+            self._answers.popleft()
 
     def on_status(self, fault: str, now_s: float, counts: LinkErrorCounts) -> None:
         """Record the board's fault, '' for none, and explain an expired lease."""
@@ -142,15 +164,18 @@ class LinkWatch:
     def _collect_evidence(self, now_s: float, state: PortState, silent: bool) -> LinkEvidence:
         oldest = self._samples[0][1] if self._samples else LinkErrorCounts()
         recent = self._counts.count_since(oldest)
-        withheld = (
-            self._lease_withheld_s is not None and now_s - self._lease_withheld_s < self._lease_s + SAMPLE_INTERVAL_S
-        )
+        until_s = now_s if self._is_withheld else self._withheld_until_s
+        is_recent = now_s - until_s < self._lease_s + SAMPLE_INTERVAL_S
         return LinkEvidence(
             port=self._port,
             port_state=state,
             silent=silent,
             lease_s=self._lease_s,
             stall_s=self._stall_s if now_s - self._stall_at_s <= EVIDENCE_WINDOW_S else 0.0,
-            stalled=self._stalled if withheld else "",
+            stalled=self._stalled if is_recent else "",
+            withheld_s=until_s - self._withheld_from_s if is_recent else 0.0,
+            port_fault=self._describe_fault(),
+            slowest_answer_s=max((duration_s for _, duration_s in self._answers), default=0.0),
+            rto_s=self._rto_s,
             **recent._asdict(),
         )

@@ -103,3 +103,10 @@ def _read_device_state(port: str, root: Path) -> PortState:
         return PortState("denied")
     port_holders = find_holders(port, root)
     return PortState("in_use" if port_holders else "available", port_holders)
+
+
+def describe_replug(port: str) -> str:
+    """Return the cause for a port that failed and is back, while the board did not restart."""
+    return (
+        f"{port} was missing and is available again: replugged, or a hub failed; check the plug, the cable and the hub"
+    )

@@ -12,7 +12,7 @@ import serial
 
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.transport.base import TransportKind, guard_opening, guard_port
-from optodrive.link.transport.port_state import list_serial_ports
+from optodrive.link.transport.port_state import describe_replug, list_serial_ports
 
 WRITE_TIMEOUT_S = 0.5
 WRITE_RETRY_S = 0.001
@@ -96,10 +96,7 @@ class SerialPort:
             except FileNotFoundError:
                 return f"{self.name} is missing: unplugged, or its power is off"
             if (node.st_dev, node.st_ino) != (self._node.st_dev, self._node.st_ino):
-                return (
-                    f"{self.name} was unplugged and is back, or its hub or adapter failed for an instant: "
-                    "check plug, cable and hub"
-                )
+                return describe_replug(self.name)
             return self._describe_changed_settings(termios.tcgetattr(self._serial.fileno()))
         return ""
 

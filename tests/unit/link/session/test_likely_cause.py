@@ -1,9 +1,13 @@
 """Likely causes of link failures, provoked on the simulated board in virtual time."""
 
 import os
+import random
+import re
 import subprocess
 import sys
+from collections import deque
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +15,7 @@ from test_session import CONFIG, Rig, plan
 
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.protocol import messages as m
 from optodrive.link.session.likely_cause import (
     STALL_LEASE_FRACTION,
     LinkEvidence,
@@ -23,6 +28,7 @@ from optodrive.link.session.link_watch import EVIDENCE_WINDOW_S, LinkErrorCounts
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.faulty_link import FaultyLink
 from optodrive.link.transport.port_state import PortHolder, PortState
+from optodrive.link.transport.serial_port import SerialPort
 
 LEASE_S = CONFIG.board.lease_s
 QUIET = LinkEvidence("/dev/ttyACM0", PortState("available"), silent=True, lease_s=LEASE_S)
@@ -150,8 +156,8 @@ def test_damage_of_sent_frames_lets_the_lease_expire():
 
 
 def test_lost_frames_without_damage_are_reported_as_lost_bytes():
-    evidence = replace(QUIET, naks=3, retransmitted=9)
-    assert "bytes are lost on the link (9 frames retransmitted, 3 refused)" in diagnose_link_loss(evidence)
+    evidence = replace(QUIET, naks=4, gaps=3, retransmitted=9)
+    assert "bytes are lost on the link (9 frames retransmitted, 3 refused after a gap)" in diagnose_link_loss(evidence)
     assert diagnose_lease_expiry(evidence) == diagnose_link_loss(evidence)
     assert "was on time" in diagnose_lease_expiry(QUIET)
 
@@ -165,7 +171,9 @@ def test_the_port_state_has_precedence():
     in_use = PortState("in_use", (PortHolder(12, "ModemManager"),))
     assert "in use by ModemManager, process 12" in diagnose_link_loss(replace(QUIET, port_state=in_use))
     assert diagnose_port("/dev/ttyACM0", PortState("available")) is None
-    assert "is available again: replugged" in diagnose_link_loss(replace(QUIET, silent=False))
+    failed = replace(QUIET, silent=False)
+    assert diagnose_link_loss(replace(failed, port_fault="changed")) == "changed"
+    assert "which of these is not known" in diagnose_link_loss(failed)
 
 
 def test_a_stall_counts_if_it_lets_the_lease_expire():
@@ -260,3 +268,96 @@ def test_a_board_that_counted_past_65535_while_it_was_silent_has_received_damage
     assert rig.core._link.decoder.counters.crc_errors > 65_535
     assert "damaged (" in get_cause(rig)
     assert "-" not in get_cause(rig)
+
+
+# --- what delays bytes, and what does not
+
+
+class DelayedRig(Rig):
+    """Rig whose line delays bytes in each direction by half of a random round trip of low_s to high_s."""
+
+    def __init__(self, low_s, high_s, seed):
+        super().__init__()
+        link, rng = self.link, random.Random(seed)
+        to_board, to_host = deque(), deque()
+        send, receive = super(type(link), link).write, super(type(link), link).read
+
+        def put(queue, data):
+            arrives_s = self.clock.now_s() + 0.5 * rng.uniform(low_s, high_s)
+            queue.append((max(arrives_s, queue[-1][0] if queue else 0.0), data))
+
+        def take(queue):
+            data = b""
+            while queue and queue[0][0] <= self.clock.now_s():
+                data += queue.popleft()[1]
+            return data
+
+        def read(timeout_s):
+            send(take(to_board))
+            data = receive(min(timeout_s, 0.001))
+            if data:
+                put(to_host, data)
+            return take(to_host)
+
+        link.write, link.read = partial(put, to_board), read
+
+
+@pytest.mark.parametrize(("low_s", "high_s"), [(0.1, 0.1), (0.18, 0.18), (0.1, 0.18), (0.0, 0.25)])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_long_round_trip_is_reported_as_delay_and_nobody_is_blamed(low_s, high_s, seed):
+    rig = DelayedRig(low_s, high_s, seed).connect()
+    rig.session.arm()
+    rig.until(lambda: rig.session.board.fault == "LINK")
+    rig.run(0.2)
+    assert re.match(r"the link delays bytes: answers take up to \d+ ms", get_cause(rig))
+    assert "lost" not in get_cause(rig).replace("no byte is known to be lost", "")
+
+
+@pytest.mark.parametrize("leases", [0.1, 0.5])
+def test_a_process_that_withheld_the_lease_for_an_instant_is_not_blamed(leases):
+    rig = Rig().connect().arm()
+    until_s = rig.clock.now_s() + leases * LEASE_S
+    while rig.clock.now_s() < until_s:
+        rig.session.step(0.002, renew_lease=False, stalled="web")
+    rig.run(0.5 * LEASE_S)
+    rig.link.drop_frame = lambda frame: frame.type == m.Lease.TYPE
+    rig.until(lambda: rig.session.board.state == "FAULT")
+    assert "bytes were delayed on the link" in get_cause(rig)
+
+
+def test_a_web_process_that_withheld_the_lease_is_blamed():
+    rig = Rig().connect().arm()
+    while rig.session.board.state != "FAULT":
+        rig.session.step(0.002, renew_lease=False, stalled="web")
+    assert "the web process did not respond" in get_cause(rig)
+
+
+def test_a_frame_that_was_sent_again_is_neither_lost_nor_late_for_certain():
+    assert "lost or late, which of the two is not known" in diagnose_link_loss(replace(QUIET, retransmitted=4))
+    refused = replace(QUIET, naks=3)  # of commands, and no sign of lost bytes
+    assert diagnose_link_loss(refused) == diagnose_link_loss(QUIET)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"), [(["9600"], "bit rate"), (["icanon", "echo"], "line mode"), (["sane"], "line mode")]
+)
+def test_stty_on_the_open_port_is_named(change, named):
+    master, slave = os.openpty()
+    port = SerialPort(os.ttyname(slave), 1_000_000)
+    port.open()
+    watch = LinkWatch(port.name, LEASE_S, describe_fault=port.describe_fault)
+    assert port.describe_fault() == ""
+    os.close(slave)
+    subprocess.run(["stty", "-F", port.name, *change], check=True)
+    for silent in (True, False):
+        cause = watch.on_lost(1.0, 0.0, silent).message
+        assert "another program changed the settings" in cause
+        assert named in cause
+    watch.on_loop(1.0, "", LinkErrorCounts())
+    watch.on_status("LINK", 1.01, LinkErrorCounts())
+    assert "another program changed the settings" in watch.cause.message
+    port.close()
+    port.open()
+    assert port.describe_fault() == ""
+    port.close()
+    os.close(master)
