@@ -1,10 +1,11 @@
 """`optodrive dac list | info | play`: play frames on a laser DAC instead of the board. Its former name is `helios`."""
 
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
-from time import time as time_of_day
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 import typer
@@ -25,11 +26,11 @@ from optodrive.core.types.push_options import PushOptions
 if TYPE_CHECKING:
     from optodrive.core.clock import Clock
     from optodrive.core.types.plans import BudgetState
-    from optodrive.link.dac.heat_memory import HeatMemory
     from optodrive.link.dac.laser_dac import LaserDac
     from optodrive.link.dac.player import PlaybackReport
     from optodrive.link.dac.verification import VerifiedChunks
     from optodrive.planning.display_model import DisplayModel
+    from optodrive.planning.heat_record import HeatRecord
     from optodrive.planning.planned_sequence import PlannedSequence
 
 TERMINATING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -60,15 +61,20 @@ def info(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Show the configured DAC and whether it may emit. It is stopped, and its light switched off."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.dac.registry import build_dac
+    from optodrive.planning.display_model import DisplayModel
+    from optodrive.planning.heat_record import read_heat
 
-    board = load_run_config(config, None).board
-    with build_dac(board, MonotonicClock()) as dac:
+    display, clock = DisplayModel.from_config(load_run_config(config, None)), MonotonicClock()
+    board = display.config.board
+    with build_dac(board, clock) as dac:
+        _, heat = read_heat(dac.transport, dac.find_identity(), display, clock)
         document = {
             "device": dac.format.label,
             "name": dac.name,
             "firmware": dac.firmware,
             "ready": dac.is_ready(),
             "may_emit": board.interlock_watched,
+            "heat": heat,
         }
     lines = [
         f"device           {document['device']}",
@@ -76,6 +82,7 @@ def info(config: ConfigOption = None, json: JsonOption = False) -> None:
         f"firmware         {document['firmware']}",
         f"ready            {'yes' if document['ready'] else 'no'}",
         f"may emit         {'yes' if document['may_emit'] else 'no: the configuration names no watched interlock'}",
+        f"heat             {document['heat']}",
     ]
     print_answer(document, lines, json)
 
@@ -92,11 +99,11 @@ def play(
     """Plan, limit and verify frames, play them on a DAC, report the sent pulses. Ctrl-C switches the light off."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.dac.encoding import PointScale
-    from optodrive.link.dac.heat_memory import HeatMemory
     from optodrive.link.dac.registry import build_dac
     from optodrive.link.dac.verification import encode_verified
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
+    from optodrive.planning.heat_record import HeatRecord
     from optodrive.planning.plan_summary import summarize_plan
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
@@ -107,25 +114,26 @@ def play(
     sequence = load_sequence(frames, display.config)
     announce_compilation()
     with _defer_signals() as raise_if_signalled, dac:
-        memory = HeatMemory.for_device(dac.name)
-        heat, cold_budget = display.build_cold_state()
-        budget = _recall_budget(memory, cold_budget, clock, raise_if_signalled)
-        with show_progress("planning") as on_progress:
-            planned_sequence, feasibility = check_feasibility(
-                display,
-                sequence,
-                heat,
-                budget,
-                _combine_progress(raise_if_signalled, on_progress),
-                **options,
+        identity = dac.find_identity()
+        with HeatRecord(dac.transport, identity, display, clock, raise_if_signalled) as record:
+            budget = _recall_budget(record, clock)
+            with show_progress("planning") as on_progress:
+                planned_sequence, feasibility = check_feasibility(
+                    display,
+                    sequence,
+                    display.build_cold_heat(),
+                    budget,
+                    _combine_progress(raise_if_signalled, on_progress),
+                    **options,
+                )
+            verified = encode_verified(
+                planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget
             )
-        verified = encode_verified(
-            planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget
-        )
-        with show_progress("playing") as on_progress:
-            playback = _play_and_store_heat(
-                dac, memory, planned_sequence, verified, clock, _combine_progress(raise_if_signalled, on_progress)
-            )
+            with show_progress("playing") as on_progress:
+                on_progress = _combine_progress(raise_if_signalled, on_progress)
+                playback = _play_and_record(
+                    dac, record, budget, display, planned_sequence, verified, clock, on_progress
+                )
     summary = summarize_plan(planned_sequence, feasibility)
     playback_summary = _summarize_playback(dac, display, planned_sequence, verified, playback)
     document = {**summary.model_dump(mode="json"), "dac": playback_summary}
@@ -164,35 +172,53 @@ def _combine_progress(
     return on_progress
 
 
-def _recall_budget(
-    memory: "HeatMemory", cold_budget: "BudgetState", clock: "Clock", raise_if_signalled: Callable[[], None]
-) -> "BudgetState":
-    """Return the present budget state, once the pulses of an earlier playback have ended."""
-    budget = memory.load(time_of_day(), cold_budget)
+def _recall_budget(record: "HeatRecord", clock: "Clock") -> "BudgetState":
+    """Return the present budget state, and say so if the display counts as hot."""
+    budget = record.load()
+    if record.hot_reason:
+        print(f"optodrive: the display counts as {record.describe()}", file=sys.stderr)
     while budget.at_s > 0.0:
-        raise_if_signalled()
-        clock.sleep(min(budget.at_s, 0.1))
-        budget = memory.load(time_of_day(), cold_budget)
+        clock.sleep(budget.at_s)
+        budget = record.load()
     return budget
 
 
-def _play_and_store_heat(
+def _play_and_record(
     dac: "LaserDac",
-    memory: "HeatMemory",
+    record: "HeatRecord",
+    before: "BudgetState",
+    display: "DisplayModel",
     planned_sequence: "PlannedSequence",
     verified: "VerifiedChunks",
     clock: "Clock",
     on_progress: Callable[[float], None],
 ) -> "PlaybackReport":
-    """Play, and save the heat before the first pulse and after the last: a killed playback counts in full."""
-    from optodrive.link.dac.heat_memory import ZERO_OFFSET_S
-    from optodrive.link.dac.player import play
+    """Play the chunks and record the heat after them.
 
-    memory.save(planned_sequence.budget, time_of_day() + ZERO_OFFSET_S)
+    Of a playback that ends early, what may have been sent counts.
+    """
+    from optodrive.link.dac.player import play
+    from optodrive.planning.limiter.limiter import commit_until
+
+    ends_s = [0.0, *accumulate(chunk.duration_s for chunk in verified.chunks)]
+    sent = 0
+
+    def note_progress(fraction: float) -> None:
+        nonlocal sent
+        sent = round(fraction * len(verified.chunks))
+        on_progress(fraction)
+
+    record.begin_use()
     try:
-        return play(dac, verified, clock, on_progress)
-    finally:
-        memory.save(planned_sequence.budget, time_of_day() - min(verified.duration_s, planned_sequence.budget.at_s))
+        playback = play(dac, verified, clock, note_progress)
+    except BaseException:
+        sent_s = ends_s[min(sent + 1, len(verified.chunks))]  # one more may have left
+        budget = commit_until(planned_sequence.plan, sent_s, before, display.budget)
+        # What was sent may have waited in the device, and its pulses have come as much later.
+        record.save(budget, max(0.0, ends_s[sent] - dac.format.host_loss_max_s))
+        raise
+    record.save(planned_sequence.budget, max(0.0, min(verified.duration_s, planned_sequence.budget.at_s)))
+    return playback
 
 
 def _summarize_playback(

@@ -13,6 +13,7 @@ from optodrive.link.dac.devices.helios import Helios
 from optodrive.link.dac.encoding import PointScale, decode, encode
 from optodrive.link.dac.verification import VerifiedChunks, encode_verified
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.heat_record import HeatRecord
 from optodrive.planning.pipeline import plan_sequence
 
 
@@ -67,3 +68,10 @@ class Bench:
         self.emulated = EmulatedHelios(self.clock, **device)
         self.device = self.emulated.device
         self.helios = Helios(board or build_config().board, self.clock, self.emulated)
+
+
+def record_cold(display, kind, identity):
+    """Record that a device's display is cold, as after a play long ago."""
+    with HeatRecord(kind, identity, display, ManualClock()) as record:
+        record.load()
+        record.save(display.build_cold_state()[1])

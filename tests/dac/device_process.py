@@ -69,6 +69,7 @@ def serve_ether_dream(address, broadcast_port, started, stopped, **device):
     core, zero_s = EtherDreamCore(**device), time.monotonic()
     arrivals_s, connections = [], {}
     with selectors.DefaultSelector() as selector, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
+        radio.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         radio.bind((address, 0))
         listener = socket.create_server((address, ETHER_DREAM_PORT))
         selector.register(listener, selectors.EVENT_READ)
@@ -78,7 +79,7 @@ def serve_ether_dream(address, broadcast_port, started, stopped, **device):
             now_s = time.monotonic() - zero_s
             core.advance(int(now_s * CLOCK_HZ))
             if broadcast_port and not events:  # more often than once per second, as the device does
-                radio.sendto(core.broadcast(), ("127.0.0.1", broadcast_port))
+                radio.sendto(core.broadcast(), ("127.255.255.255", broadcast_port))
             for key, _ in events:
                 if key.fileobj is listener:
                     stream, _ = listener.accept()

@@ -210,6 +210,9 @@ class VirtualStream:
         self.answers = self.connection.hello()
         return self
 
+    def getpeername(self):
+        return "127.0.0.1", 7765
+
     def settimeout(self, timeout_s):
         self.timeout_s = timeout_s
 

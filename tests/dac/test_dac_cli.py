@@ -1,12 +1,13 @@
 """`optodrive helios` on the emulated DAC, through the real pyusb, in virtual time."""
 
 import json
+import resource
 import signal
 
 import pytest
 import usb.backend.libusb1
 
-from dac.bench import Bench, build_display, build_frame, build_train
+from dac.bench import Bench, build_display, build_frame, build_train, record_cold
 from dac.emulated_helios import HostDeadError
 from optodrive.cli import dac as dac_cli
 from optodrive.cli.main import run
@@ -14,9 +15,10 @@ from optodrive.core.errors import LinkError
 from optodrive.device.config_file import locate_shipped
 from optodrive.link.dac import discovery
 from optodrive.link.dac.discovery import FoundDac
+from optodrive.planning import heat_record
 from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
-DAY_S = 1.7e9
+UP_S = 1e5
 LONG = build_train(width_s=0.04, gap_s=0.004, power_w=2.0, duration_s=1.0)
 
 
@@ -26,10 +28,10 @@ class Desk:
     def __init__(self, folder, monkeypatch):
         self.folder, self.bench = folder, Bench()
         self.clock = self.bench.clock
-        monkeypatch.setenv("XDG_STATE_HOME", str(folder))
+        record_cold(build_display(), "helios", "any")
         monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: self.bench.emulated)
         monkeypatch.setattr("optodrive.core.clock.MonotonicClock", lambda: self.clock)
-        monkeypatch.setattr(dac_cli, "time_of_day", lambda: DAY_S + self.clock.now_s())
+        monkeypatch.setattr(heat_record, "read_boot", lambda: ("a run", UP_S + self.clock.now_s()))
         self.frames = folder / "frames.json"
         self.ask(build_frame(build_display()))
 
@@ -60,6 +62,7 @@ def test_info_reports_identity_and_permission_to_emit(desk, capsys):
         "firmware": "6",
         "ready": True,
         "may_emit": True,
+        "heat": "recorded",
     }
     assert run(["helios", "info", *desk.config("false")]) == 0
     assert "may emit         no" in capsys.readouterr().out
@@ -71,7 +74,7 @@ def test_list_shows_what_is_on_usb_and_in_the_network(desk, capsys, monkeypatch)
     monkeypatch.setattr(discovery, "find_ether_dreams", lambda clock: [found])
     assert run(["dac", "list"]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        "helios                        Helios: USB bus 1 device 7; `info` asks for its name",
+        "helios                        Helios: USB bus 1 device 7, without serial_number; `info` asks for its name",
         "ether_dream  192.168.1.20     00:04:a3:01:02:03: revision 1.0, idle",
     ]
     desk.bench.emulated.unplugged_at_s = 0.0
@@ -169,12 +172,15 @@ def test_unplugging_during_playback_is_one_line_and_ends_emission(desk, capsys):
     assert not desk.bench.device.shutter
 
 
-def test_a_budget_file_that_cannot_be_written_prevents_emission(desk, capsys, monkeypatch):
-    blocked = desk.folder / "blocked"
-    blocked.write_text("")
-    monkeypatch.setenv("XDG_STATE_HOME", str(blocked))
-    assert desk.play() == 2
-    assert "a file that can be written" in capsys.readouterr().err
+def test_a_record_that_cannot_be_written_prevents_emission(desk, capsys):
+    """What the record says stands, and the next play would take the display as cold."""
+    command, limits = ["dac", "play", str(desk.frames), *desk.config()], resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        assert run(command) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "a file that can be written; nothing is emitted" in capsys.readouterr().err
     assert not desk.bench.device.light()
 
 

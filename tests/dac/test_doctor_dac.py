@@ -5,7 +5,7 @@ import json
 import pytest
 import usb.backend.libusb1
 
-from dac.bench import Bench, build_config
+from dac.bench import Bench, build_config, build_display, record_cold
 from dac.emulated_helios import EmulatedHelios
 from optodrive.cli.doctor_dac import check_dac
 from optodrive.cli.main import run
@@ -24,6 +24,7 @@ def examine(monkeypatch):
 
 def test_a_helios_in_order(examine):
     bench = Bench()
+    record_cold(build_display(), "helios", "any")
     findings = examine(bench, uid="Helios 1163021877")
     assert {finding.status for finding in findings.values()} == {"ok"}
     assert findings["board"].observation == "Helios 1163021877, firmware 6, stopped, its light off"
@@ -36,7 +37,11 @@ def test_a_helios_in_order(examine):
 
 def test_any_device_and_no_interlock_are_warnings(examine):
     findings = examine(Bench(), interlock_watched=False)
-    assert {check for check, finding in findings.items() if finding.status == "warning"} == {"board", "interlock"}
+    warnings = {check for check, finding in findings.items() if finding.status == "warning"}
+    assert warnings == {"board", "interlock", "heat"}
+    assert findings["heat"].observation == (
+        "the display counts as hot, because this machine has no record of its heat; it cools within 786 s"
+    )
     assert 'board.uid = "Helios 1163021877"' in findings["board"].remedy
     assert "nothing is emitted before" in findings["interlock"].remedy
 

@@ -3,14 +3,21 @@
 Anybody in the network can answer a search. No playback follows one: a network DAC is played at its configured address.
 """
 
+import ctypes
 import errno
+import fcntl
+import selectors
 import socket
+import struct
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, escape_unprintable
 from optodrive.link.dac.formats import ether_dream, idn
+from optodrive.link.dac.formats.helios import PRODUCT_ID, VENDOR_ID
 
 LISTENING_S = 1.5
 """An Ether Dream states itself once per second."""
@@ -18,6 +25,12 @@ ANSWERING_S = 0.5
 DATAGRAM_BYTES = 2048
 FOUND_MAX = 64
 """Found devices that are listed; a flood of false ones ends here."""
+BROADCAST_ADDRESS = "255.255.255.255"
+LIST_ADDRESSES = 0x8912
+"""SIOCGIFCONF: the IPv4 addresses of all interfaces that are up."""
+INTERFACE = struct.Struct("16sHH4s16x" if struct.calcsize("P") == 8 else "16sHH4s8x")
+"""`struct ifreq`: name, and a sockaddr_in of family, port and address."""
+INTERFACES_MAX = 256
 
 
 @dataclass(frozen=True)
@@ -42,14 +55,14 @@ def find_helios(backend: Any = None) -> list[FoundDac]:
     """Return the Helios DACs on USB, none without libusb. backend: of pyusb, None for libusb."""
     import usb.core
 
-    from optodrive.link.dac.devices.helios import PRODUCT_ID, VENDOR_ID
+    from optodrive.link.transport.usb_device import describe_device
 
     try:
         devices = list(usb.core.find(True, backend, idVendor=VENDOR_ID, idProduct=PRODUCT_ID))
     except usb.core.NoBackendError:
         return []
     return [
-        FoundDac("helios", "Helios", "", f"USB bus {device.bus} device {device.address}; `info` asks for its name")
+        FoundDac("helios", "Helios", "", f"USB {describe_device(device)}; `info` asks for its name")
         for device in devices
     ]
 
@@ -58,7 +71,23 @@ def find_ether_dreams(
     clock: Clock, listening_s: float = LISTENING_S, udp_port: int = ether_dream.BROADCAST_PORT
 ) -> list[FoundDac]:
     """Return the Ether Dreams whose broadcasts arrive within listening_s. Raise InputError if the port is taken."""
-    found: dict[str, FoundDac] = {}
+    return _collect(_parse_broadcast(*each) for each in _hear_broadcasts(clock, listening_s, udp_port))
+
+
+def hear_ether_dream(
+    host: str, clock: Clock, listening_s: float = LISTENING_S, udp_port: int = ether_dream.BROADCAST_PORT
+) -> str | None:
+    """Return the hardware address that the Ether Dream at an address broadcasts, None if nothing is heard of it."""
+    with suppress(InputError, OSError):
+        for data, source in _hear_broadcasts(clock, listening_s, udp_port):
+            dac = _parse_broadcast(data, source)
+            if source == host and dac is not None:
+                return dac.name
+    return None
+
+
+def _hear_broadcasts(clock: Clock, listening_s: float, udp_port: int) -> Iterator[tuple[bytes, str]]:
+    """Yield the datagrams that arrive on any interface, with their source. Raise InputError if the port is taken."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
         radio.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -67,40 +96,62 @@ def find_ether_dreams(
             if error.errno != errno.EADDRINUSE:
                 raise
             raise InputError("UDP port", udp_port, "a free one: another program listens for Ether Dreams") from None
-        until_s = clock.now_s() + listening_s
-        while len(found) < FOUND_MAX and (left_s := until_s - clock.now_s()) > 0.0:
-            radio.settimeout(left_s)
-            try:
-                data, (host, _) = radio.recvfrom(DATAGRAM_BYTES)
-            except TimeoutError:
-                break
-            dac = _parse_broadcast(data, host)
-            if dac is not None:
-                found.setdefault(dac.port, dac)
-    return sorted(found.values(), key=lambda dac: dac.port)
+        yield from _receive([radio], clock, listening_s)
 
 
 def find_idn_devices(
-    clock: Clock, listening_s: float = ANSWERING_S, address: tuple[str, int] = ("255.255.255.255", idn.UDP_PORT)
+    clock: Clock, listening_s: float = ANSWERING_S, address: tuple[str, int] | None = None
 ) -> list[FoundDac]:
-    """Return the IDN devices that answer a scan of the local network within listening_s."""
-    found: dict[str, FoundDac] = {}
+    """Return the IDN devices that answer a scan within listening_s.
+
+    address: that is asked, by default all devices behind every interface
+    """
+    target = (BROADCAST_ADDRESS, idn.UDP_PORT) if address is None else address
+    with ExitStack() as exit_stack:
+        radios = []
+        for source in list_addresses() if address is None else [""]:
+            radio = exit_stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            radio.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            with suppress(OSError):  # an interface that has just gone
+                radio.bind((source, 0))  # a broadcast leaves by the interface whose address its source is
+                radio.sendto(idn.PACKET.pack(idn.SCAN, 0, 1), target)
+                radios.append(radio)
+        return _collect(_parse_scan(*each) for each in _receive(radios, clock, listening_s))
+
+
+def list_addresses() -> list[str]:
+    """Return the IPv4 addresses of this computer on all interfaces but loopback."""
+    buffer = bytearray(INTERFACES_MAX * INTERFACE.size)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as radio:
-        radio.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        try:
-            radio.sendto(idn.PACKET.pack(idn.SCAN, 0, 1), address)
-        except OSError:  # a computer without a network
-            return []
-        until_s = clock.now_s() + listening_s
-        while len(found) < FOUND_MAX and (left_s := until_s - clock.now_s()) > 0.0:
-            radio.settimeout(left_s)
-            try:
-                data, (host, _) = radio.recvfrom(DATAGRAM_BYTES)
-            except TimeoutError:
+        view = (ctypes.c_char * len(buffer)).from_buffer(buffer)
+        request = struct.pack("iP", len(buffer), ctypes.addressof(view))
+        size, _ = struct.unpack("iP", fcntl.ioctl(radio, LIST_ADDRESSES, request))
+    entries = (INTERFACE.unpack_from(buffer, begin) for begin in range(0, size, INTERFACE.size))
+    addresses = [socket.inet_ntoa(address) for _, _, _, address in entries]
+    return [address for address in addresses if not address.startswith("127.")]
+
+
+def _receive(radios: list[socket.socket], clock: Clock, listening_s: float) -> Iterator[tuple[bytes, str]]:
+    """Yield datagrams with their source until listening_s has passed."""
+    until_s = clock.now_s() + listening_s
+    with selectors.DefaultSelector() as selector:
+        for radio in radios:
+            selector.register(radio, selectors.EVENT_READ)
+        while radios and (left_s := until_s - clock.now_s()) > 0.0:
+            for key, _ in selector.select(left_s):
+                with suppress(OSError):  # what an earlier datagram met
+                    data, (host, _) = key.fileobj.recvfrom(DATAGRAM_BYTES)  # type: ignore[union-attr]
+                    yield data, host
+
+
+def _collect(dacs: Iterator[FoundDac | None]) -> list[FoundDac]:
+    """Return the first dac of each address, in their order."""
+    found: dict[str, FoundDac] = {}
+    for dac in dacs:
+        if dac is not None:
+            found.setdefault(dac.port, dac)
+            if len(found) == FOUND_MAX:
                 break
-            dac = _parse_scan(data, host)
-            if dac is not None:
-                found.setdefault(dac.port, dac)
     return sorted(found.values(), key=lambda dac: dac.port)
 
 

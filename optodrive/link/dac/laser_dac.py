@@ -17,6 +17,8 @@ class LaserDac(ABC):
 
     open() and close(), and leaving the context for any reason, stop it and switch its light off.
     name, firmware: what it says of itself, known after open()
+    identity: what tells it from all others of its kind and nobody can change, None if it does not say, after open();
+    of an Ether Dream after find_identity()
     """
 
     transport: ClassVar[str]
@@ -26,6 +28,7 @@ class LaserDac(ABC):
         self.format = find_format(self.transport)(board.points_per_s)
         self.name = self.format.label
         self.firmware = ""
+        self.identity: str | None = None
         self._clock = clock
 
     def __enter__(self) -> Self:
@@ -49,6 +52,10 @@ class LaserDac(ABC):
 
         Raise InputError if it is not the configured one, LinkError if the link fails.
         """
+
+    def find_identity(self) -> str | None:
+        """Return the identity of the open DAC. Wait for it where it comes by itself."""
+        return self.identity
 
     @abstractmethod
     def close(self) -> None:

@@ -14,6 +14,7 @@ from optodrive.core.errors import InputError, LinkError
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
 from optodrive.link.dac.devices.network_address import parse_address
+from optodrive.link.dac.discovery import hear_ether_dream
 from optodrive.link.dac.formats import ether_dream as wire
 from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.formats.ether_dream import Status
@@ -34,16 +35,20 @@ CLEARABLE = wire.ESTOP_BY_PACKET | wire.ESTOP_BY_LINK
 class EtherDream(LaserDac):
     """One Ether Dream. It emits only while it plays.
 
-    connect: of the module socket, or the same for an emulated device
+    connect: of the module socket; hear: hears its hardware address; or the same for an emulated device
     """
 
     transport = "ether_dream"
 
     def __init__(
-        self, board: BoardSection, clock: Clock, connect: Callable[..., Any] = socket.create_connection
+        self,
+        board: BoardSection,
+        clock: Clock,
+        connect: Callable[..., Any] = socket.create_connection,
+        hear: Callable[[str, Clock], str | None] = hear_ether_dream,
     ) -> None:
         super().__init__(board, clock)
-        self._connect = connect
+        self._connect, self._hear = connect, hear
         self._stream: Any = None
         self._begun = False
         self._protocol = 0
@@ -55,8 +60,6 @@ class EtherDream(LaserDac):
         """
         address = parse_address(self.board.port, wire.TCP_PORT)
         self.name = f"Ether Dream at {self.board.port}"
-        if self.board.uid and self.board.uid != self.name:
-            raise InputError("board.uid", self.board.uid, f"{self.name}, or no name: the device tells none", "board")
         try:
             self._stream = self._connect(address, timeout=CONNECT_TIMEOUT_S)
             self._stream.settimeout(ANSWER_TIMEOUT_S)
@@ -65,10 +68,20 @@ class EtherDream(LaserDac):
         try:
             self._read_answer(wire.PING)  # sent by the device itself
             self.firmware = f"protocol {self._protocol}"
+            if self.board.uid and self.board.uid != (self.find_identity() or ""):
+                heard = "no broadcast of it on UDP 7654" if self.identity is None else self.identity
+                raise InputError("board.uid", heard, f"{self.board.uid}, the configured Ether Dream", "board")
             self.stop()
         except BaseException:
             self._release()
             raise
+
+    def find_identity(self) -> str | None:
+        """Return its hardware address, which it broadcasts once per second and never tells its client."""
+        if self.identity is None and self._stream is not None:
+            self.identity = self._hear(self._stream.getpeername()[0], self._clock)
+            self.name = self.identity or self.name
+        return self.identity
 
     def close(self) -> None:
         """Stop and release the DAC. Raise LinkError if it may not have received the stop. Do nothing if closed."""

@@ -15,11 +15,11 @@ from optodrive.core.errors import InputError, LinkError, LocalProtocolError, esc
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
 from optodrive.link.dac.formats.base import Chunk
+from optodrive.link.dac.formats.helios import PRODUCT_ID, VENDOR_ID
 from optodrive.link.dac.laser_dac import LaserDac
 from optodrive.link.transport.base import build_lost_error, guard_opening, guard_port
-from optodrive.link.transport.usb_device import find_device, timeout_ms
+from optodrive.link.transport.usb_device import describe_device, list_devices, read_serial_number, timeout_ms
 
-VENDOR_ID, PRODUCT_ID = 0x1209, 0xE500
 INTERFACE, ALTERNATE_SETTING = 0, 1
 COMMAND_ENDPOINT, ANSWER_ENDPOINT, FRAME_ENDPOINT = 0x06, 0x83, 0x02
 ANSWER_BYTES = 32
@@ -36,6 +36,8 @@ DRAIN_READS_MAX = 16
 QUERY_TRIES, ANSWER_TRIES = 2, 3
 """Number of times that a query is sent, and that its answer is awaited each time."""
 STOP_TRIES = 3
+ANY = "any"
+"""Identity of all that state no serial number, as the published firmware: they share what is remembered of one."""
 FRAME_TIMEOUT_S = 0.1
 """Longer than the USB transfer of the longest frame."""
 
@@ -59,7 +61,34 @@ class Helios(LaserDac):
 
         Raise InputError if it is not the configured one, LinkError if the link fails.
         """
-        self._device = find_device(VENDOR_ID, PRODUCT_ID, backend=self._backend)
+        devices = list_devices(VENDOR_ID, PRODUCT_ID, self.board.serial_number, self._backend)
+        device = devices[0] if len(devices) == 1 else self._choose(devices)
+        self._claim(device)
+        if self.board.uid not in ("", self.name):
+            self._release()
+            raise InputError("board.uid", self.name, f"{self.board.uid}, the configured Helios", "board")
+
+    def _choose(self, devices: list[Any]) -> Any:
+        """Return the device of several that has the configured name. Ask and stop all, for only they know it."""
+        chosen, listed = [], []
+        for device in devices:
+            try:
+                self._claim(device)
+            except (InputError, LinkError):
+                listed.append(f"one that cannot be opened ({describe_device(device)})")
+                continue
+            self._release()
+            listed.append(f"{self.name!r} ({describe_device(device)})")
+            if self.name == self.board.uid:
+                chosen.append(device)
+        if len(chosen) != 1:
+            expected = f"the name of one, or its board.serial_number: {', '.join(listed)}"
+            raise InputError("board.uid", self.board.uid, expected, "no_port")
+        return chosen[0]
+
+    def _claim(self, device: Any) -> None:
+        """Claim, identify and stop a device."""
+        self._device = device
         try:
             with guard_opening("the Helios", "board"):
                 self._identify()
@@ -75,8 +104,7 @@ class Helios(LaserDac):
         self.firmware = str(int.from_bytes(self._query(VERSION, 4)[:4], "little"))
         self._command(HOST_VERSION, PROTOCOL_VERSION)
         self.name = escape_unprintable(self._query(NAME, 1).split(b"\0")[0].decode("ascii", "replace"))
-        if self.board.uid and self.board.uid != self.name:
-            raise InputError("board.uid", self.name, f"{self.board.uid}, the configured Helios", "board")
+        self.identity = read_serial_number(self._device) or ANY
         self.stop()
 
     def close(self) -> None:

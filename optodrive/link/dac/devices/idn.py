@@ -71,6 +71,7 @@ class Idn(LaserDac):
             raise LinkError(f"no IDN device answers at {self.board.port}")
         _, version, status, _, unit, host = wire.SCAN_BODY.unpack_from(answer)
         self.name = wire.name_unit(unit)
+        self.identity = unit[1 : 1 + unit[0]].hex() if any(unit[1 : 1 + unit[0]]) else None
         self.firmware = f"protocol {version >> 4}.{version & 15} of {escape_unprintable(wire.decode_name(host))}"
         if self.board.uid and self.board.uid != self.name:
             raise InputError("board.uid", self.name, f"{self.board.uid}, the configured IDN device", "board")

@@ -8,6 +8,7 @@ from optodrive.core.errors import LocalProtocolError
 from optodrive.device.config_sections import DAC_POWER_STEPS
 from optodrive.link.dac.formats.base import CHUNK_MAX_S, Chunk, DacFormat, PointTable
 
+VENDOR_ID, PRODUCT_ID = 0x1209, 0xE500
 POINT_BYTES = 7
 TRAILER = struct.Struct("<HHB")
 """Points per second, number of points, flags."""
