@@ -46,6 +46,10 @@ def max_displacement_m(pixel: Pixel, drive: DriveRange) -> float:
     return pixel.kappa_m_per_k * pulse_peak(pixel, 0.0, 0.0, drive.max_power_w, drive.max_periods * drive.period_s)[0]
 
 
+MIN_DUTY = 1e-6
+"""Smallest duty of a pulse: below it, residual heat reaches the target but for rounding. A board's step is 1.5e-5."""
+
+
 @kernel
 def find_shortest_pulse(
     pixel: Pixel,
@@ -73,7 +77,8 @@ def find_shortest_pulse(
             high = middle
         else:
             low = middle
-    return high, _solve_duty(pixel, theta_k, gamma_k, target_k, high * period_s, max_power_w, peak_after_s)
+    duty = _solve_duty(pixel, theta_k, gamma_k, target_k, high * period_s, max_power_w, peak_after_s)
+    return (high, duty) if duty > MIN_DUTY else (0, 0.0)
 
 
 @kernel

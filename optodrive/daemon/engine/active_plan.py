@@ -41,6 +41,7 @@ class ActivePlan:
     heat_before, budget_before: initial state of the plan, on its own time line
     epoch: in which the request arrived; the board executes nothing of an older one
     crc: CRC-32 of the verified bytes of the points
+    holds_first: whether its first point waits until it must leave, so that a newer plan can replace it as a whole
     growth: plans the rest once it is due, None for a whole plan
     cycle: refresh cycle of the stream before this plan, None for the first one
     first_row: first row that was not executed when the plan was interrupted last
@@ -59,6 +60,7 @@ class ActivePlan:
     budget_before: BudgetState
     epoch: int
     crc: int
+    holds_first: bool = False
     growth: SequencePlanner | None = None
     cycle: RefreshCycle | None = None
     first_row: int = 0

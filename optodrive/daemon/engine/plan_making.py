@@ -23,7 +23,7 @@ from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.standing_page import Refresh
-from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
+from optodrive.planning.stimuli.streamed_frame import can_split, delay_frames, stale_pixels_first
 
 NEVER = threading.Event()
 """Event of a caller that does not leave."""
@@ -123,6 +123,8 @@ def _begin_streamed(
         sequence, orders = request.select(display, sequence, snapshot)
     elif snapshot.cycle is not None and can_split(sequence):
         sequence = stale_pixels_first(sequence, snapshot.cycle.refreshed)
+    if snapshot.pause_s and request.select is None:
+        sequence = delay_frames(sequence, snapshot.pause_s)
     policy, pixels = request.push.options.get("policy", "trim"), snapshot.initial_pixels
     heat, budget = snapshot.heat, snapshot.budget
     return SequencePlanner(display, sequence, heat, budget, policy, on_progress, pixels, orders)

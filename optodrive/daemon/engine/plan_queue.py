@@ -35,7 +35,7 @@ from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.progress import ClockShift, PlanRun
 from optodrive.daemon.engine.queue_pause import START_LEAD_S, QueuePause
-from optodrive.daemon.engine.queue_stream import STREAM_START_LEAD_S, QueueStream
+from optodrive.daemon.engine.queue_stream import STREAM_RESTART_S, STREAM_START_LEAD_S, QueueStream
 from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
@@ -82,8 +82,10 @@ class PlanQueue(QueuedPlans):
         return PlanningSnapshot(thermal, start_s, *thermal.shift_to_plan(start_s), cycle=cycle)
 
     def _earliest_start_s(self, streamed: bool, planning_time_s: float = 0.0) -> float:
-        lead_s = STREAM_START_LEAD_S if streamed else START_LEAD_S
-        return max(self.thermal.end_s, self._session.board_s() + planning_time_s) + lead_s
+        ready_s, end_s = self._session.board_s() + planning_time_s, self.thermal.end_s
+        if streamed:
+            return max(end_s + STREAM_RESTART_S, ready_s + STREAM_START_LEAD_S)
+        return max(end_s, ready_s) + START_LEAD_S
 
     def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot, cooling_max_m: float = inf) -> bool:
         """Accept a plan into the queue. Return False if its snapshot is stale, or if the plan is too late.
@@ -119,6 +121,8 @@ class PlanQueue(QueuedPlans):
             record.planned_after_s = self._session.board_s() - record.arrived_s
             self.stream.follow_withdrawn(plan, snapshot)
             self._plan_store.add(plan)
+            if snapshot.predecessor is not None and not record.pulse_count:
+                self.end_waiting(plan, PlanStatus.DONE, None)
             return True
 
     def require_epoch(self, epoch: int) -> None:

@@ -24,6 +24,7 @@ class PlanningSnapshot:
     predecessor, cut: running plan that the new one truncates, and where
     initial_pixels: pixel at which the mirrors of each stage point at the plan's zero; None if one is unknown
     cycle: when the stream has drawn each pixel last, None if no stream was before
+    pause_s: time of the plan before which a frame is not drawn, so that frames keep the rhythm in which they arrive
     """
 
     thermal: ThermalEstimate
@@ -34,6 +35,7 @@ class PlanningSnapshot:
     cut: PointCut | None = None
     initial_pixels: tuple[int, ...] | None = None
     cycle: RefreshCycle | None = None
+    pause_s: float = 0.0
 
 
 def build_cut_snapshot(
@@ -43,22 +45,28 @@ def build_cut_snapshot(
     budget: Budget,
     tick_s: float,
     may_withdraw: bool = False,
+    min_end_s: float = inf,
+    begin_s: float = -inf,
 ) -> PlanningSnapshot | None:
     """Build the snapshot for truncating a running plan before its first point after board time min_start_s.
 
     may_withdraw: whether no point of the plan must be left
-    Return None if no pulse would be left of a plan that must keep one, or none would be dropped.
+    min_end_s: board time at which the plan may end for another to follow it if nothing of it can be dropped; that one
+    then begins at begin_s
+    Return None if no pulse would be left of a plan that must keep one, or none would be dropped and it ends too early.
     """
     plan, zero_s = running.planned.plan, running.record.start_s
     min_tick = (min_start_s - zero_s - running.zero_s) / tick_s
     cut = PointCut.find(running.points, min_tick if may_withdraw else max(1.0, min_tick))
-    if cut.row == len(plan) or (not cut.row and any(cut.kept_points)):
-        return None
     end_s = running.zero_s + cut.end_tick * tick_s
+    is_whole = cut.row == len(plan)
+    if (is_whole and zero_s + end_s < min_end_s) or (not cut.row and any(cut.kept_points)):
+        return None
     kept = slice(cut.row)
     heat = running.heat_before.copy()
     heat.apply_pulses(plan.pixel[kept], plan.start_s[kept], plan.width_s[kept], plan.power_w[kept])
-    state = commit_until(plan, float(plan.start_s[cut.row]), running.budget_before, budget)
+    until_s = inf if is_whole else float(plan.start_s[cut.row])
+    state = commit_until(plan, until_s, running.budget_before, budget)
     return PlanningSnapshot(
         thermal=thermal,
         start_s=zero_s + end_s,
@@ -68,6 +76,7 @@ def build_cut_snapshot(
         cut=cut,
         initial_pixels=_find_initial_pixels(running, cut),
         cycle=continue_cycle(running, cut.row) if cut.row else running.cycle,
+        pause_s=max(0.0, begin_s - zero_s - end_s) if is_whole else 0.0,
     )
 
 

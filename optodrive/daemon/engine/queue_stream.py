@@ -2,8 +2,10 @@
 
 A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed plan
 leave only `lead_s` before they are due; a newer plan cuts the running one at the first point that has not left
-(`build_cut_snapshot`) and is spliced behind it, one job for the board. A refresh of a standing page that has not begun
-is withdrawn as a whole: the newer one begins where it would have begun. The lead is longer without real-time priority,
+(`build_cut_snapshot`) and is spliced behind it, one job for the board. If all points have left it follows them, with
+a pause if it comes early, as long as the light of the last one is not about to end (decision 79). Its first point is
+held back if yet another plan is expected before it must leave, and always for a refresh of a standing page: that one
+then withdraws the plan as a whole and begins where it would have begun. The lead is longer without real-time priority,
 because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is refused
 by link, and the plan is made again; after two such plans `truncate` cuts the running one at once, and the third begins
 behind it without a deadline.
@@ -23,11 +25,17 @@ from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.protocol.point_cut import PointCut
 from optodrive.link.service.remote_session import RemoteSession
+from optodrive.link.session.session import SPLICE_LEAD_S
 from optodrive.planning.display_model import DisplayModel
 
 STREAM_START_LEAD_S = 0.02
+"""Time from the end of a frame's planning to its light if the beam is free."""
+STREAM_RESTART_S = 0.01
+"""Time from the end of a job to the light of the next one, so that the board's report and START pass meanwhile."""
 SHARED_STREAM_LEAD_S = 0.04
 """Least lead of a stream if the link process has no real-time scheduling."""
+APPEND_LEAD_S = SPLICE_LEAD_S + 0.002
+"""Least time between a plan and the end of the light that it follows if all of that has left."""
 GROWTH_MARGIN_S = 0.01
 """Time reserved for the loop and the hand-over of a plan's rest, besides its planning."""
 
@@ -59,23 +67,41 @@ class QueueStream:
         self, running: ActivePlan, thermal: ThermalEstimate, planning_time_s: float
     ) -> PlanningSnapshot | None:
         """Build the snapshot of a plan that truncates a running one, None if that is not possible any more."""
-        min_start_s = self._session.board_s() + self.lead_s + planning_time_s
-        may_withdraw = running.record.refreshes and len(self._plans.running) > 1
+        planned_s = self._session.board_s() + planning_time_s
         budget, tick_s = self._display.budget, self._session.tick_s
-        return build_cut_snapshot(running, thermal, min_start_s, budget, tick_s, may_withdraw)
+        # Several boards end each job together: nothing follows what has left.
+        min_end_s = planned_s + APPEND_LEAD_S if len(self._session.scales) == 1 else inf
+        return build_cut_snapshot(
+            running,
+            thermal,
+            planned_s + self.lead_s,
+            budget,
+            tick_s,
+            running.holds_first,
+            min_end_s,
+            begin_s=planned_s + STREAM_START_LEAD_S,
+        )
 
     def splice(self, plan: ActivePlan, predecessor: ActivePlan, cut: PointCut) -> bool:
         """Continue the points of a running plan with those of a new one. Return False if the cut has been sent."""
         if not self._plans.running or self._plans.running[-1].plan is not predecessor:
             return False
-        zero_s, ahead_s = plan.record.start_s, self.lead_s
-        refreshes = plan.record.refreshes
-        job = self._session.splice(plan.points, cut.kept_points, zero_s, plan.epoch, ahead_s, plan.crc, refreshes)
-        if job is None:
-            return False
-        predecessor.record.dropped = predecessor.record.pulse_count - cut.row
-        self._plans.running.append(PlanRun(plan, job))
-        return True
+        zero_s, ahead_s, dropped = plan.record.start_s, self.lead_s, predecessor.record.pulse_count - cut.row
+        if not plan.record.pulse_count:  # it only ends what was shown: a job without points would be the last one
+            done = not dropped or self._session.truncate(cut.kept_points)
+        else:
+            due_in_s = zero_s - ahead_s - self._session.board_s()
+            interval_s = plan.record.arrived_s - predecessor.record.arrived_s  # the next one may come after as much
+            plan.holds_first = plan.record.refreshes or due_in_s > interval_s
+            job = self._session.splice(
+                plan.points, cut.kept_points, zero_s, plan.epoch, ahead_s, plan.crc, plan.holds_first
+            )
+            done = job is not None
+            if job is not None:
+                self._plans.running.append(PlanRun(plan, job))
+        if done:
+            predecessor.record.dropped = dropped
+        return done
 
     @staticmethod
     def follow_withdrawn(plan: ActivePlan, snapshot: PlanningSnapshot) -> None:

@@ -102,6 +102,11 @@ class PlanJob:
         """Return the scheduled end tick of the first `count` points."""
         return int(self._end_tick[count - 1]) if count else self.start_tick
 
+    @property
+    def follows_host(self) -> bool:
+        """Whether the points follow the host's clock, as those of several boards."""
+        return self._timing is not None
+
     def find_host_end_tick(self, count: int) -> int:
         """Return the tick of the host at which the first `count` points end. Only for a job with timing."""
         start_tick = 0 if self._timing is None else self._timing.start_tick

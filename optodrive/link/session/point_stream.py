@@ -1,6 +1,11 @@
 """Stream of points to the board: consecutive jobs, of which a newer one may truncate and follow the last.
 
 Sent points are final. Points not yet sent may be replaced by a newer plan without a pause.
+
+END leaves with the last point, a lead before the light ends, so that a stall of the host is no underrun. What follows
+after that moves the end: of several ENDs of a running job the board obeys the last, so each DATA has its own. If the
+host stalls until the board has ended the job at the former END, it is armed with points in its queue, and another
+START lets it go on: late, as after an underrun.
 """
 
 from collections import deque
@@ -13,6 +18,8 @@ from optodrive.link.session.plan_job import PlanJob, PointTiming
 
 MISSING_REPORT_RETRY_S = 0.1
 WATERMARK_POINTS = 48
+ENDS_KEPT = 64
+"""ENDs of a job of which the board may have obeyed an earlier one: more than are on their way at once."""
 
 
 class PointStream:
@@ -26,7 +33,8 @@ class PointStream:
         self._number = 0
         self._next_index = 0
         self._sent_index = 0
-        self._started = self._end_sent = False
+        self._started = self._end_was_moved = False
+        self._end_indices: deque[int] = deque(maxlen=ENDS_KEPT)
         self._reports_requested_s = 0.0
 
     def __bool__(self) -> bool:
@@ -48,7 +56,8 @@ class PointStream:
         send_ahead_ticks: maximum time from sending a point to its start; timing: as for `PlanJob`
         """
         self._number += 1
-        self._started = self._end_sent = False
+        self._started = self._end_was_moved = False
+        self._end_indices.clear()
         return self._append(points, start_tick, send_ahead_ticks, timing, holds_first=False)
 
     @property
@@ -66,16 +75,18 @@ class PointStream:
         return self._jobs[-1] if self._jobs else None
 
     def can_truncate(self, kept_points: int) -> bool:
-        """Return whether the last job can be truncated to `kept_points` points: no more were sent, nor END."""
-        return bool(self._jobs) and not self._end_sent and self._jobs[-1].can_truncate(kept_points)
+        """Return whether the last job can be truncated to `kept_points` points: no more were sent."""
+        return bool(self._jobs) and self._jobs[-1].can_truncate(kept_points)
 
     def can_splice(self, kept_points: int, min_end_tick: float) -> bool:
         """Return whether other points may follow the first `kept_points` of the last job without a pause.
 
         They may not if more were sent, or if the kept points end before min_end_tick, where the board might run out of
-        points.
+        points. Several boards end each job together: nothing follows the END of one.
         """
         if not self._started or not self.can_truncate(kept_points):
+            return False
+        if self._end_indices and self._jobs[-1].follows_host:
             return False
         return self._jobs[-1].end_tick_after(kept_points) >= min_end_tick
 
@@ -145,6 +156,19 @@ class PointStream:
         for job in self._jobs:
             job.record_executed(message)
 
+    @property
+    def may_have_ended(self) -> bool:
+        """Whether the board may have ended the job before it got an END that moves the end. It refuses that one."""
+        return self._end_was_moved
+
+    def restart_if_ended(self, link: HostConnection, done_index: int) -> None:
+        """Start the job again if the armed board has ended it before it got the END that moved the end."""
+        is_left = bool(self._jobs) and done_index < self._jobs[-1].end_index
+        if not self._end_was_moved or link.outstanding or not is_left or done_index not in self._end_indices:
+            return
+        link.send(m.Start(self._number, done_index, 0, min(WATERMARK_POINTS, max(1, self._sent_index - done_index))))
+        self._end_indices.clear()
+
     def send(self, link: HostConnection, done_index: int, queue_points: int, now_tick: float) -> None:
         """Send the points that are due and that the board has room for, START and END."""
         for job in self._jobs:
@@ -156,9 +180,12 @@ class PointStream:
                 self._send_points(link, job, count, now_tick)
             if not job.is_fully_sent:
                 return
-        if self._jobs and not self._end_sent and link.outstanding < link.window:
-            link.send(m.End(self._number, self._next_index))
-            self._end_sent = True
+        if self._jobs and not self._end_indices and link.outstanding < link.window:
+            self._send_end(link)
+
+    def _send_end(self, link: HostConnection) -> None:
+        self._end_indices.append(self._sent_index)
+        link.send(m.End(self._number, self._sent_index))
 
     def find_start_tick(self) -> int | None:
         """Return the board tick at which the next unsent point begins, None if all were sent."""
@@ -178,6 +205,9 @@ class PointStream:
         if not self._started:
             link.send(m.Start(self._number, job.first_index, job.start_tick, watermark))
             self._started = True
+        elif self._end_indices:
+            self._send_end(link)
+            self._end_was_moved = True
 
     def request_missing_reports(self, link: HostConnection, done_index: int, now_s: float) -> None:
         """Request lost reports again if the board has executed more points than it reported."""
@@ -189,5 +219,5 @@ class PointStream:
 
     def drop_finished(self, armed: bool) -> None:
         """Drop completely reported jobs, the last one only after the board has ended it."""
-        while self._jobs and self._jobs[0].is_finished and (len(self._jobs) > 1 or (self._end_sent and armed)):
+        while self._jobs and self._jobs[0].is_finished and (len(self._jobs) > 1 or (self._end_indices and armed)):
             self._jobs.popleft()

@@ -129,6 +129,8 @@ class BoardSession(BoardLink):
 
     def _on_nak(self, message: m.Nak, now_s: float) -> None:
         reason = m.NAK_REASONS[message.reason]
+        if reason == "STATE" and self._points.may_have_ended:
+            return  # the job is started again
         if reason not in m.NOT_CONSUMED and self._refusal is None:  # the first refusal causes the following ones
             self._refusal = reason
 
@@ -298,6 +300,8 @@ class BoardSession(BoardLink):
             return
         if self.board.state in ARMED_STATES:  # else the board has ended the job: only collect its reports
             now_tick = self.board_s() / self.scale.tick_s
+            if self.board.state == BoardState.ARMED:
+                self._points.restart_if_ended(self._connection, self.board.done_index)
             self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
         self._points.request_missing_reports(self._connection, self.board.done_index, self._clock.now_s())
         self._points.drop_finished(self.board.state == BoardState.ARMED)

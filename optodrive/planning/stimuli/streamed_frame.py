@@ -1,5 +1,7 @@
 """Parse one frame of a running stream, from JSON text or from two bytes per pixel."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from optodrive.core.errors import InputError
@@ -60,4 +62,12 @@ def stale_pixels_first(sequence: FrameSequence, refreshed: BoolArray) -> FrameSe
     parts = [np.where(part, frame.target_m, 0.0) for part in (~refreshed, refreshed)]
     return FrameSequence(
         tuple(TactileFrame(frame.frame_id, 0.0, frame.duration_s, part) for part in parts if part.any()) or (frame,)
+    )
+
+
+def delay_frames(sequence: FrameSequence, delay_s: float) -> FrameSequence:
+    """Return a sequence whose frames and trains begin later by a time, s."""
+    return FrameSequence(
+        tuple(replace(frame, show_at_s=frame.show_at_s + delay_s) for frame in sequence.frames),
+        tuple(replace(train, start_s=train.start_s + delay_s) for train in sequence.trains),
     )

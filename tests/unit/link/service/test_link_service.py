@@ -120,7 +120,7 @@ def test_points_appended_to_a_job_continue_it_without_a_pause(rig):
     assert rig.session.board.underruns == 0
 
 
-def test_points_are_appended_only_to_the_last_job_while_it_has_some_to_send(rig):
+def test_points_are_appended_only_to_the_last_job_while_it_runs(rig):
     rig.arm()
     first = rig.begin(build_points(200, DUTY), ahead_s=0.04)
     rig.run(0.15)
@@ -131,10 +131,13 @@ def test_points_are_appended_only_to_the_last_job_while_it_has_some_to_send(rig)
     assert not rig.extend(second, build_points(10, 2 * DUTY))["done"]
     rig.until(lambda: len(rig.list_emitted()) == 190 and rig.session.is_ready)
     third = rig.begin(build_points(20, DUTY), ahead_s=0.04)
-    rig.until(lambda: len(rig.list_emitted()) > 200)  # the last points have left, and END with them
+    rig.until(lambda: len(rig.list_emitted()) == 200)  # the last points have left, and END with them
+    assert rig.extend(third, build_points(10, DUTY))["done"]
+    rig.until(lambda: len(rig.list_emitted()) == 219)
     assert not rig.extend(third, build_points(10, 2 * DUTY))["done"]
     rig.run(0.5)
-    assert {duty for _, duty in rig.list_emitted()} == {DUTY}
+    assert [duty for _, duty in rig.list_emitted()] == [DUTY] * 220
+    assert rig.session.board.underruns == 0
 
 
 def test_appended_points_pass_the_gates_of_a_splice(rig):
