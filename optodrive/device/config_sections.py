@@ -279,7 +279,7 @@ class BoardSection(Section):
     product_id: UsbId | None = None
     """USB product of the board."""
     serial_number: str = ""
-    """USB serial number; empty: the only board of its kind."""
+    """USB serial number of a USB board, a Helios, or the serial port of a service; empty: the only one of its kind."""
     points_per_s: Annotated[int, Field(ge=20_000, le=50_000)] = 40_000
     """Point rate of a laser DAC, 1/s."""
     interlock_watched: bool = False
@@ -291,6 +291,10 @@ class BoardSection(Section):
             raise ConflictError("port", self.port, "a device for transport 'serial', for example \"/dev/ttyACM0\"")
         if self.transport in NETWORK_DACS and not self.port:
             raise ConflictError("port", self.port, 'the DAC\'s address, for example "192.168.1.20"')
+        if self.transport in NETWORK_DACS and self.serial_number:
+            raise ConflictError(
+                "serial_number", self.serial_number, "none: a network DAC has a uid, which `info` shows"
+            )
         for key, example in (("vendor_id", "0x1209"), ("product_id", "0x0001")):
             if self.transport == "usb" and getattr(self, key) is None:
                 raise ConflictError(key, None, f"a number for transport 'usb', for example {example}")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import build_pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import list_shipped_configs, load_config, locate_shipped
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.display_model import DisplayModel
@@ -136,3 +136,11 @@ def test_a_name_that_fits_no_line_is_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"config\.toml: name: got") as refused:
         load_config(path)
     assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize("transport", ["ether_dream", "idn"])
+def test_a_serial_number_of_a_network_dac_is_refused_and_not_ignored(transport):
+    table = load_config("display-16").model_dump()
+    table["board"] |= {"transport": transport, "port": "192.168.1.20", "serial_number": "A1"}
+    with pytest.raises(ValueError, match="serial_number"):
+        Config.model_validate(table)
