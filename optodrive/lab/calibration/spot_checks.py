@@ -8,12 +8,12 @@ from math import degrees
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config_sections import Wiring
 from optodrive.device.field_geometry import CENTRE_CODE
-from optodrive.lab.calibration.field_fit import FieldFit
+from optodrive.lab.calibration.field_fit import FieldFit, fit_field
 from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.spots import MeasuredSpots
 
@@ -29,6 +29,10 @@ COLUMNS_RATIO_MIN = 15.0
 """Smallest ratio of the two columns' scales for them to be in different units."""
 AFFINE_RESIDUAL_MAX_M = 3e-3
 """Largest median residual of an affine map through inliers, m."""
+ROW_LAGS = (1, -1)
+"""Rows by which positions may stand late or early by mistake."""
+DEVIATION_MAX_M = 5e-3
+"""Largest distance from an affine map that counts as such, m: it bounds the weight of outliers."""
 SCALE_TOLERANCE = 0.1
 """Largest relative deviation of the scale from 1."""
 TURN_MAX_RAD = 0.15
@@ -72,11 +76,13 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
     matrix, shift, residual_m = _fit_affine(commanded_m, measured_m)
     scale = float(np.sqrt(abs(np.linalg.det(matrix))))
     if residual_m > AFFINE_RESIDUAL_MAX_M * max(scale, 1.0):
+        _check_row_lag(where, commanded_m, measured_m)
         found = f"positions {residual_m / max(scale, 1.0) * 1e3:.1f} mm off any affine map"
         raise InputError(f"{where}: x_m, y_m", found, "valid spots for the most part; nearly all look like outliers")
     _check_scale(where, scale)
     _check_axes(where, matrix / scale, prior.wiring)
     if float(np.hypot(*shift)) > SHIFT_MAX_M:
+        _check_row_lag(where, commanded_m, measured_m)
         found = f"{shift[0] * 1e3:.1f}, {shift[1] * 1e3:.1f} mm with both mirrors in the middle position"
         raise InputError(
             f"{where}: x_m, y_m", found, f"the display's middle within {format_quantity(SHIFT_MAX_M, 'm')} of the beam"
@@ -84,11 +90,48 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
 
 
 def check_fit(where: str, fit: FieldFit) -> None:
-    """Check a fit. Raise InputError if half of its spots or more are outliers, or too few are inliers."""
-    outlier_count = int(fit.outlier.sum())
+    """Check a fit. Raise InputError if half of its spots or more are outliers, or too few are inliers.
+
+    Positions that stand one row late of a grid's codes are shifted by one step each, which a field can explain, except
+    for those at the ends of the grid's lines: fewer outliers remain when they are moved back.
+    """
+    outlier_count, table = int(fit.outlier.sum()), fit.spots.to_table()
+    for lag in ROW_LAGS if outlier_count > 1 and len(table) > SPOTS_MIN else ():
+        moved = np.column_stack([_shift_rows(table[:, :2], lag), _shift_rows(table[:, 2:], -lag)])
+        if 2 * fit_field(type(fit.spots).from_table(moved), fit.prior).outlier.sum() < outlier_count:
+            raise _lag_error(where, lag)
     if 2 * outlier_count >= len(fit.spots) or len(fit.spots) - outlier_count < SPOTS_MIN:
         found = f"{outlier_count} of {len(fit.spots)} spots are outliers"
         raise InputError(f"{where}: x_m, y_m", found, f"more inliers than outliers, and at least {SPOTS_MIN}")
+
+
+def _shift_rows(rows: FloatArray, lag: int) -> FloatArray:
+    """Return rows without the last ones, for a negative lag without the first ones."""
+    return rows[: len(rows) - lag] if lag > 0 else rows[-lag:]
+
+
+def _check_row_lag(where: str, commanded_m: FloatArray, measured_m: FloatArray) -> None:
+    """Raise InputError for positions that an affine map fits better, and at the middle, one row above or below."""
+    if len(commanded_m) <= SPOTS_MIN:
+        return
+    found = {
+        lag: _mean_deviation_m(_shift_rows(commanded_m, lag), _shift_rows(measured_m, -lag)) for lag in (0, *ROW_LAGS)
+    }
+    best = min(found, key=lambda lag: found[lag][0])
+    if best and found[best][1] < SHIFT_MAX_M:
+        raise _lag_error(where, best)
+
+
+def _mean_deviation_m(commanded_m: FloatArray, measured_m: FloatArray) -> tuple[float, float]:
+    """Return the mean distance from the affine map, each at most DEVIATION_MAX_M, and the map's shift at the middle."""
+    matrix, shift, _ = _fit_affine(commanded_m, measured_m)
+    distance_m = np.hypot(*(commanded_m @ matrix.T + shift - measured_m).T)
+    return float(np.minimum(distance_m, DEVIATION_MAX_M).mean()), float(np.hypot(*shift))
+
+
+def _lag_error(where: str, lag: int) -> InputError:
+    found = f"positions that belong to the codes one row {'above' if lag > 0 else 'below'}"
+    return InputError(f"{where}: x_m, y_m", Unquoted(found), "each position in the row of its codes")
 
 
 def _check_beam_moves(where: str, commanded_m: FloatArray, measured_m: FloatArray) -> None:

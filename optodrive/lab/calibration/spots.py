@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.numeric_tables import read_columns, split_comments, write_columns
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.field_geometry import CODE_MAX
@@ -67,6 +67,16 @@ def read_spots(path: Path, display: str = "") -> MeasuredSpots:
             f"{path}: row {row + find_first_line(path)}: {COLUMNS[column]}",
             float(table[row, column]),
             f"0 to {CODE_MAX}",
+        )
+    _, first, copies = np.unique(table, axis=0, return_index=True, return_inverse=True)
+    original = first[copies.ravel()]
+    repeated = np.flatnonzero(original != np.arange(len(table)))
+    if len(repeated):
+        row, line = int(repeated[0]), find_first_line(path)
+        raise InputError(
+            f"{path}: row {row + line}",
+            Unquoted(f"the numbers of row {original[row] + line}, as {len(repeated)} rows in all repeat others"),
+            "each measurement once: copies would make the field look more certain than it is",
         )
     return MeasuredSpots.from_table(table)
 

@@ -1,7 +1,10 @@
 """Checks of valid and invalid spots."""
 
+import csv
+
 import numpy as np
 import pytest
+from openpyxl import Workbook, load_workbook
 
 from hidden_field import CONFIG, PRIOR, grid_codes, measure_spots, random_codes
 from optodrive.core.errors import InputError
@@ -96,3 +99,116 @@ def test_spots_of_another_display_are_refused_by_name(tmp_path):
         read_spots(path, "yours")
     path.write_text(path.read_text().partition("\n")[2])  # a table of a user's own
     assert len(read_spots(path, "yours")) == len(MANY)
+
+
+def shift_positions(table, rows):
+    """Return spots whose positions stand some rows late, the first ones in the place of the last."""
+    return np.column_stack([table[:, :2], np.roll(table[:, 2:], rows, axis=0)])
+
+
+def check_both(spots):
+    check_spots("s.csv", spots, PRIOR)
+    check_fit("s.csv", fit_field(spots, PRIOR))
+
+
+def shuffled(table):
+    return np.random.default_rng(3).permutation(table)
+
+
+@pytest.mark.parametrize("order", ["rows", "columns", "any"])
+@pytest.mark.parametrize("lag", [1, -1])
+@pytest.mark.parametrize("side", [5, 9, 17])
+def test_positions_one_row_late_or_early_are_named(side, lag, order):
+    geometry = GroundTruthGeometry.sample(side, CONFIG)
+    table = measure_spots(geometry, grid_codes(side), np.random.default_rng(side), 0.0)[0].to_table()
+    if order != "rows":
+        table = shuffled(table) if order == "any" else table[np.lexsort((table[:, 1], table[:, 0]))]
+    good, wrong = (MeasuredSpots.from_table(each) for each in (table, shift_positions(table, lag)))
+    check_both(good)
+    named = f"positions that belong to the codes one row {'above' if lag > 0 else 'below'}"
+    with pytest.raises(InputError, match=named):
+        check_both(wrong)
+
+
+@pytest.mark.parametrize("count", [2, 3, 8])
+def test_copies_of_rows_are_refused_by_name(tmp_path, count):
+    path = tmp_path / "spots.csv"
+    write_spots(path, MeasuredSpots.from_table(np.tile(NINE, (count, 1))), "mine")
+    said = f"row 12: got the numbers of row 3, as {9 * (count - 1)} rows in all repeat others"
+    with pytest.raises(InputError, match=said):
+        read_spots(path)
+
+
+def format_rows(names, rows, separator, decimal=".", quote=""):
+    """Return a table as a spreadsheet writes it."""
+    cells = [[f"{quote}{name}{quote}" for name in names]]
+    cells += [[f"{value:.12g}".replace(".", decimal) for value in row] for row in rows]
+    if separator == "," and decimal == ",":
+        cells = [cells[0], *([f'"{cell}"' for cell in row] for row in cells[1:])]
+    return "".join(separator.join(row) + "\r\n" for row in cells)
+
+
+NAMES = ("x_code", "y_code", "x_m", "y_m")
+MILLIMETRES = ("x_code", "y_code", "x_mm", "y_mm")
+DIALECTS = {
+    "LibreOffice": (format_rows(NAMES, NINE, ",", quote='"'), "utf-8"),
+    "LibreOffice, German": (format_rows(NAMES, NINE, ";", ",", '"'), "utf-8"),
+    "quoted decimal commas": (format_rows(NAMES, NINE, ",", ","), "utf-8"),
+    "Excel, UTF-8": (format_rows(NAMES, NINE, ";", ","), "utf-8-sig"),
+    "Excel, Unicode text": (format_rows(NAMES, NINE, "\t", ","), "utf-16"),
+    "UTF-16 without a mark": (format_rows(NAMES, NINE, "\t"), "utf-16-be"),
+    "Excel's line of the separator": ("sep=;\r\n" + format_rows(NAMES, NINE, ";", ","), "utf-8"),
+    "a note and empty rows": (
+        "# optodrive spots of mine;;;\n" + format_rows(NAMES, NINE, ";", ",") + ";;;\r\n;;;\r\n",
+        "utf-8",
+    ),
+    "old Macintosh": (format_rows(NAMES, NINE, ",").replace("\r\n", "\r"), "utf-8"),
+    "other columns, another order": (
+        format_rows(("time", "y_m", "x_m", "x_code", "y_code"), NINE[:, [0, 3, 2, 0, 1]], ","),
+        "utf-8",
+    ),
+    "millimetres": (format_rows(MILLIMETRES, NINE * [1, 1, 1e3, 1e3], ","), "utf-8"),
+    "units in brackets": (
+        format_rows(("X_code", "Y_code", "x [mm]", "y (µm)"), NINE * [1, 1, 1e3, 1e6], "\t"),
+        "utf-8",
+    ),
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_what_spreadsheets_write_is_read(tmp_path, dialect):
+    text, encoding = DIALECTS[dialect]
+    (tmp_path / "spots.csv").write_bytes(text.encode(encoding))
+    assert np.allclose(read_spots(tmp_path / "spots.csv", "mine").to_table(), NINE, rtol=1e-9, atol=1e-12)
+
+
+def test_what_openpyxl_reads_of_a_sheet_is_the_same(tmp_path):
+    """A sheet that was typed in, saved, read again and exported."""
+    book = Workbook()
+    for row in (NAMES, *NINE.tolist()):
+        book.active.append(row)
+    book.save(tmp_path / "spots.xlsx")
+    with (tmp_path / "spots.csv").open("w", newline="") as file:
+        csv.writer(file, dialect="excel").writerows(load_workbook(tmp_path / "spots.xlsx").active.values)
+    assert np.allclose(read_spots(tmp_path / "spots.csv").to_table(), NINE)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"x_code,y_code,x_m\n1,2,3\n", "got columns 'x_code', 'y_code', 'x_m', expected a column y_m too"),
+        (b"x_code,y_code,x_m,y_metre\n1,2,3,4\n", "expected a column y_m too .nearest is 'y_m"),
+        (b"x_code,y_code,x_m,x_mm,y_m\n1,2,3,4,5\n", "got 'x_m' and 'x_mm', expected one column x_m"),
+        (b"1,2,3,4\n5,6,7,8\n", "got numbers, expected the names of the columns"),
+        (b"\n1,2,3,4\n", "got an empty line, expected a column x_code"),
+        (b"x_code,y_code,x_m,y_m\n1,5,2,5,3,5,4,5\n", "decimal commas need semicolons"),
+        (b"x_code;y_code;x_m;y_m\n1;2;1.000,5;4\n", "row 2: x_m: got '1.000,5', expected a number"),
+        (b"x_code,y_code,x_m,y_m\n\xff\xfe1,2,3,4\n", "a CSV file in UTF-8 or UTF-16"),
+        (b"", "got an empty line"),
+    ],
+)
+def test_another_table_is_refused_by_what_was_found(tmp_path, content, said):
+    (tmp_path / "spots.csv").write_bytes(content)
+    with pytest.raises(InputError, match=said) as refused:
+        read_spots(tmp_path / "spots.csv")
+    assert "\n" not in str(refused.value)
