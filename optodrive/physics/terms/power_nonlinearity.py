@@ -1,5 +1,6 @@
 """Power nonlinearity: the laser's power is not proportional to its command, by a threshold or a curve."""
 
+from optodrive.core.errors import InputError
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
@@ -14,6 +15,8 @@ def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float)
     if x <= 0.0:
         return x
     share, threshold = c[POWER_W] / c[FULL_W], v[0] / c[FULL_W]
+    if threshold >= 1.0:
+        return 0.0
     left = max(0.0, (share - threshold) / (1.0 - threshold))
     return float(x / share * left * (1.0 + v[1] * (1.0 - left)))
 
@@ -33,7 +36,13 @@ class PowerNonlinearity(Term):
     signature = "a series of powers with unchanged pulse shapes"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """Return the curve's largest gain, which it reaches at low power. A threshold only reduces power."""
+        """Return the curve's largest gain, which it reaches at low power. A threshold only reduces power.
+
+        Raises InputError for a threshold that full power does not reach.
+        """
+        if values["threshold"] >= envelope.full_w:
+            expected = f"less than the laser's full power, {envelope.full_w:g} W"
+            raise InputError(f"terms.{self.key}.threshold", values["threshold"], expected)
         return HeatGainBound(power_factor=1.0 + max(0.0, values["curvature"]))
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:

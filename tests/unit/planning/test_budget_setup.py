@@ -74,6 +74,22 @@ def test_terms_that_cannot_add_heat_change_no_bound():
                 assert np.array_equal(ours, theirs), key
 
 
+def test_a_threshold_that_full_power_does_not_reach_is_refused():
+    """Above it the formula of the term would make weak light the brightest, and at it divide by zero."""
+    laser = CONFIG.laser.model_copy(update={"max_power_w": 0.4})
+    weak, parameters = CONFIG.model_copy(update={"laser": laser}), with_term("power_nonlinearity", threshold=0.4)
+    with pytest.raises(InputError, match=r"power_nonlinearity\.threshold: got 0\.4, expected less than .* 0\.4 W"):
+        build_budget(weak, parameters, DISPLAY.pixels)
+
+
+@pytest.mark.parametrize("threshold_w", [0.4, 0.5])
+def test_a_laser_below_its_threshold_emits_nothing(threshold_w):
+    t_s = np.arange(0.0, 0.1, 1e-3)
+    scene = PixelExperiment([[0.0, 0.05, 0.2, 0]], 0, 293.15, (t_s, t_s, t_s), full_w=0.4)
+    active = ActiveTerms.from_values({"power_nonlinearity": {"threshold": threshold_w, "curvature": 0.0}})
+    assert not simulate_signals(scene, DISPLAY.pixels.elements[0], active)[0].any()
+
+
 def build_hostile_plan(power_w, seed):
     """Build pulses that stress one pixel and its neighbours at the given power."""
     generator = np.random.default_rng(seed)
