@@ -10,7 +10,7 @@ from async_reference import build_async_document, build_async_reference
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
-from rest_reference import build_rest_reference
+from rest_reference import build_openapi_text, build_rest_reference
 
 from optodrive.core.field_docstrings import read_field_docstrings
 from optodrive.device.config import VERSION, Config
@@ -127,6 +127,7 @@ PAGES = {
     "terms.md": build_terms_reference,
     "rest.md": build_rest_reference,
     "streams.md": build_async_reference,
+    "openapi.json": build_openapi_text,
     "asyncapi.json": build_async_document,
 }
 

@@ -1,5 +1,6 @@
 """The REST reference, generated from the application's own OpenAPI document. Run as a script, it prints the page."""
 
+import json
 from pathlib import Path
 
 from optodrive.core.toml_model import Section
@@ -14,12 +15,12 @@ from optodrive.planning.display_model import DisplayModel
 
 HEAD = """# REST API
 
-Generated from the daemon's OpenAPI document, which the daemon serves at `/openapi.json`. Every route except
-`/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route. Errors are problem
-documents (RFC 9457) with a stable `code`. A request whose query or body says something that its route does not read,
-such as a misspelt option, is refused with its name and the nearest known one; only STOP is never refused for that.
-[Streaming](../how-to/stream-frames.md) describes the WebSocket,
-[the client](../how-to/use-the-python-client.md) its use from Python.
+Generated from the daemon's [OpenAPI document](openapi.json), which the daemon serves at `/openapi.json`. Every route
+except `/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route. Errors are
+problem documents (RFC 9457) with a stable `code`. A request whose query or body says something that its route does not
+read, such as a misspelt option, is refused with its name and the nearest known one; only STOP is never refused for
+that. [Streaming](../how-to/stream-frames.md) describes the WebSocket, [the client](../how-to/use-the-python-client.md)
+its use from Python.
 """
 PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem):
 
@@ -36,6 +37,11 @@ def build_openapi():
     """Build the application's OpenAPI document without the other processes of the daemon."""
     folder = RuntimeFolder(Path(), Path("link.sock"), 0o600, Path())
     return build_app(DaemonClient(DisplayModel.from_config(load_config()), folder), "unused").openapi()
+
+
+def build_openapi_text():
+    """Return the OpenAPI document as JSON text."""
+    return json.dumps(build_openapi(), indent=1, ensure_ascii=False) + "\n"
 
 
 def build_rest_reference():
@@ -76,7 +82,8 @@ def format_route(title, route):
     if rows:
         lines += ["| parameter | in | type | |", "|---|---|---|---|", *rows, ""]
     if "requestBody" in route:
-        lines += [f"Body: {route['requestBody'].get('description', 'JSON')}.", ""]
+        body = route["requestBody"]
+        lines += [f"Body: {format_type(body['content']['application/json']['schema'])}, {body['description']}.", ""]
     responses = sorted(route["responses"].items())
     bodies = [f"{status} {format_content(response)}" for status, response in responses if status < "300"]
     return "\n".join([*lines, f"Response: {'; '.join(bodies)}.", ""])

@@ -18,17 +18,15 @@ from optodrive.core.types.push_options import Policy, PushOptions
 from optodrive.daemon.api.access_middleware import AUDIT_FIELDS, AccessMiddleware, read_request
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.daemon_client import NO_EPOCH, DaemonClient
-from optodrive.daemon.api.dim_request import DIM_EXAMPLE, DIM_SCHEMA, parse_dim_request
+from optodrive.daemon.api.dim_request import DIM_EXAMPLE, parse_dim_request
 from optodrive.daemon.api.error_handlers import add_error_handlers
 from optodrive.daemon.api.fingers_socket import FingersSocket
 from optodrive.daemon.api.hold_socket import HoldSocket
 from optodrive.daemon.api.live_stream import LiveStream
 from optodrive.daemon.api.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
 from optodrive.daemon.api.openapi_bodies import (
-    PARAMETERS_SCHEMA,
     PATTERN_NAME_EXAMPLES,
     SEQUENCE_EXAMPLE,
-    SEQUENCE_SCHEMA,
     build_request_body,
 )
 from optodrive.daemon.api.push_options_query import PushOptionsQuery
@@ -85,33 +83,33 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     routes = RoleRoutes(app)
     add_page_routes(routes)
 
-    @routes("GET /v1/health", None)
+    @routes("GET /v1/health", None, tags=["state"])
     async def get_health() -> HealthReport:
         """Return whether the daemon runs. This needs no token."""
         return HealthReport(version=__version__)
 
-    @routes("GET /v1/state", "viewer", response_model=StateReport)
+    @routes("GET /v1/state", "viewer", tags=["state"], response_model=StateReport)
     async def get_state() -> Response:
         """Return the state of board, link, queue and planner."""
         return _send_state(daemon)
 
-    @routes("GET /v1/me", "viewer")
+    @routes("GET /v1/me", "viewer", tags=["state"])
     async def get_me(request: Request) -> CallerReport:
         """Return name and role of the token that the request presented, and the routes that the role may not call."""
         token: Token = request.scope[CALLER]
         return CallerReport(name=token.name, role=token.role, refused=table.list_refused(token.role))
 
-    @routes("GET /metrics", "viewer", response_class=PlainTextResponse)
+    @routes("GET /metrics", "viewer", tags=["state"], response_class=PlainTextResponse)
     async def get_metrics() -> Response:
         """Return metrics for Prometheus."""
         return _relay(await daemon.planner.call("metrics"), CONTENT_TYPE)
 
-    @routes("GET /v1/config", "viewer", response_model=EffectiveConfig)
+    @routes("GET /v1/config", "viewer", tags=["state"], response_model=EffectiveConfig)
     async def get_config() -> Response:
         """Return the effective configuration, as `optodrive config show --json`."""
         return Response(config_json, media_type="application/json")
 
-    @routes("POST /v1/arm", "armer", response_model=StateReport)
+    @routes("POST /v1/arm", "armer", tags=["board"], response_model=StateReport)
     async def arm(request: Request) -> Response:
         """Arm the board. Its indicator is on for at least two seconds before it emits."""
         await daemon.link.arm(request.scope[CALLER].name)
@@ -125,8 +123,9 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     @routes(
         "PUT /v1/dim",
         "operator",
+        tags=["board"],
         response_model=StateReport,
-        openapi_extra=build_request_body("the share of full power, 0 to 1", DIM_SCHEMA, DIM_EXAMPLE, True),
+        openapi_extra=build_request_body("DimRequest", "the share of full power, 0 to 1", DIM_EXAMPLE, True),
     )
     async def dim(request: Request) -> Response:
         """Cap the power of every pulse of the plans from now on. Only an armer may raise it again."""
@@ -136,25 +135,25 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         result = await daemon.planner.call("dim", share=share, may_raise=may_raise)
         return _send_state(daemon) if result.fields["status"] == 200 else _relay(result)
 
-    @routes("POST /v1/disarm", "operator", response_model=StateReport)
+    @routes("POST /v1/disarm", "operator", tags=["board"], response_model=StateReport)
     async def disarm() -> Response:
         """Disarm the board. This also acknowledges a fault whose cause is gone."""
         await daemon.link.command("disarm")
         return _send_state(daemon)
 
-    @routes("POST /v1/pause", "operator", response_model=StateReport)
+    @routes("POST /v1/pause", "operator", tags=["board"], response_model=StateReport)
     async def pause() -> Response:
         """Switch the gate off. The board stays armed and plans wait, for five minutes at most."""
         await daemon.link.command("pause")
         return _send_state(daemon)
 
-    @routes("POST /v1/resume", "operator", response_model=StateReport)
+    @routes("POST /v1/resume", "operator", tags=["board"], response_model=StateReport)
     async def resume() -> Response:
         """Play the pulses left at the pause, limited again from the heat that is left, and the plans that wait."""
         await daemon.link.command("resume")
         return _send_state(daemon)
 
-    @routes("POST /v1/reload", "armer", response_model=ReloadReport)
+    @routes("POST /v1/reload", "armer", tags=["service"], response_model=ReloadReport)
     async def reload() -> Response:
         """Read configuration and tokens again, and apply changes that need no restart, as SIGHUP does for a service."""
         result = await daemon.reloads.request()
@@ -162,7 +161,7 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
             return Response(result.to_json(), result.status, media_type=MEDIA_TYPE)
         return Response(result.model_dump_json(), media_type="application/json")
 
-    @routes("POST /v1/stop", "viewer", response_model=StateReport)
+    @routes("POST /v1/stop", "viewer", tags=["board"], response_model=StateReport)
     async def stop() -> Response:
         """Switch the gate off, drop everything queued, disarm the board."""
         await daemon.link.command("stop")
@@ -171,10 +170,11 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     @routes(
         "POST /v1/plans",
         "operator",
+        tags=["plans"],
         status_code=201,
         response_model=PlanReport,
         responses=DRY_RUN_RESPONSES,
-        openapi_extra=build_request_body("FRAMES.json: frames and trains", SEQUENCE_SCHEMA, SEQUENCE_EXAMPLE, True),
+        openapi_extra=build_request_body("FrameSequence", "FRAMES.json: frames and trains", SEQUENCE_EXAMPLE, True),
     )
     async def submit_plan(
         request: Request,
@@ -197,23 +197,30 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Take the places of fingertips, for which standing frames are refreshed first."""
         await FingersSocket(daemon, socket).run()
 
-    @routes("GET /v1/telemetry", "viewer", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
+    @routes(
+        "GET /v1/telemetry",
+        "viewer",
+        tags=["state"],
+        status_code=200,
+        response_class=EventStream,
+        responses=EVENT_RESPONSES,
+    )
     async def stream_telemetry(rate_hz: RateQuery = DEFAULT_RATE_HZ) -> EventStream:
         """Send server-sent events until the client disconnects: state, display, pulses, budget, fault."""
         daemon.hub.require_capacity()
         return EventStream(daemon.hub.stream_events(rate_hz))
 
-    @routes("GET /v1/plans/{plan_id}", "viewer", response_model=PlanReport)
+    @routes("GET /v1/plans/{plan_id}", "viewer", tags=["plans"], response_model=PlanReport)
     async def get_plan(plan_id: PlanId, pulses: PulsesQuery = True) -> Response:
         """Return one plan with its planned, sent and executed pulses."""
         return _relay(await daemon.planner.call("get_plan", plan=plan_id, pulses=pulses))
 
-    @routes("DELETE /v1/plans/{plan_id}", "operator", response_model=PlanReport)
+    @routes("DELETE /v1/plans/{plan_id}", "operator", tags=["plans"], response_model=PlanReport)
     async def cancel_plan(plan_id: PlanId) -> Response:
         """Remove a plan from the queue, or end it if it runs. The board stays armed."""
         return _relay(await daemon.planner.call("cancel", plan=plan_id))
 
-    @routes("GET /v1/patterns", "viewer", response_model=PatternList)
+    @routes("GET /v1/patterns", "viewer", tags=["patterns"], response_model=PatternList)
     async def list_patterns() -> Response:
         """Return the named patterns and their parameters."""
         return Response(patterns_json, media_type="application/json")
@@ -221,10 +228,11 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     @routes(
         "POST /v1/patterns/{name}",
         "operator",
+        tags=["patterns"],
         status_code=201,
         response_model=PlanReport,
         responses=DRY_RUN_RESPONSES,
-        openapi_extra=build_request_body("the pattern's parameters", PARAMETERS_SCHEMA, {}, False),
+        openapi_extra=build_request_body("PatternParameters", "the pattern's parameters", {}, False),
     )
     async def play_pattern(
         name: Annotated[str, Path(max_length=80, json_schema_extra=PATTERN_NAME_EXAMPLES)],

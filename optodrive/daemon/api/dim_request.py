@@ -14,7 +14,7 @@ DIM_SCHEMA: dict[str, Any] = {
     "type": "object",
     "required": ["share"],
     "additionalProperties": False,
-    "properties": {"share": {"type": "number", "minimum": 0, "maximum": 1}},
+    "properties": {"share": {"type": "number", "minimum": 0, "maximum": 1, "description": "of full power"}},
 }
 DIM_EXAMPLE = {"share": 0.4}
 

@@ -6,6 +6,7 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from optodrive.core.json_model import JsonModel
+from optodrive.daemon.api.openapi_bodies import BODY_SCHEMAS
 from optodrive.daemon.api.route_table import RouteTable
 from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal
 from optodrive.daemon.responses.hold import HoldReport
@@ -76,7 +77,9 @@ def extend_openapi(app: FastAPI, table: RouteTable) -> None:
         document = build_document()
         components = document.setdefault("components", {})
         components["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
-        components["schemas"] = _list_extra_schemas() | components.get("schemas", {})
+        components["schemas"] = BODY_SCHEMAS | _list_extra_schemas() | components.get("schemas", {})
+        for schema in components["schemas"].values():
+            _describe_members(schema)
         for path, methods in document["paths"].items():
             for method, operation in methods.items():
                 min_role = roles[f"{method.upper()} {path}"]
@@ -87,6 +90,27 @@ def extend_openapi(app: FastAPI, table: RouteTable) -> None:
         return document
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _describe_members(schema: dict[str, Any]) -> None:
+    """Give the members of a model the descriptions that its docstring states.
+
+    Its form is "name, name: text; name: text", with one or more names to a text.
+    """
+    members, described = schema.get("properties", {}), []
+    for line in schema.get("description", "").splitlines():
+        for k, part in enumerate(line.strip().split("; ")):
+            names, _, text = part.partition(": ")
+            stated = [members.get(name) for name in names.split(", ")]
+            if text and None not in stated:
+                described = [member for member in stated if "description" not in member]
+                for member in described:
+                    member["description"] = text
+            else:
+                for member in described:
+                    member["description"] += ("; " if k else " ") + part
+        if not line.strip():
+            described = []
 
 
 def _list_extra_schemas() -> dict[str, Any]:

@@ -86,3 +86,28 @@ def test_every_operation_names_its_role_and_the_document_is_served(app, document
             assert operation["x-min-role"] == roles[f"{method.upper()} {path}"]
     assert send("GET", "/openapi.json", "viewer").json() == document
     assert send("GET", "/openapi.json", None).status_code == 401
+
+
+def test_every_operation_has_a_tag_and_every_body_is_a_named_model_with_described_members(document):
+    schemas, bodies = document["components"]["schemas"], set()
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            assert len(operation["tags"]) == 1, (method, path)
+            for content in operation.get("requestBody", {}).get("content", {}).values():
+                assert list(content["schema"]) == ["$ref"], (method, path)
+                bodies.add(content["schema"]["$ref"].rpartition("/")[2])
+    assert bodies == {"FrameSequence", "PatternParameters", "DimRequest"}
+    for name in bodies:
+        for node in list_schemas(schemas[name]):
+            for member, schema in node.get("properties", {}).items():
+                assert "description" in schema or set(schema) == {"minItems"}, (name, member)
+
+
+def test_members_have_the_descriptions_of_their_docstring(document):
+    members = document["components"]["schemas"]["FrameResult"]["properties"]
+    described = [name for name, schema in members.items() if "description" in schema]
+    assert len(described) > 10
+    fingers = document["components"]["schemas"]["FingerMessage"]["properties"]
+    assert fingers["radius_m"]["description"] == "of the contact"
+    assert fingers["x_m"]["description"] == fingers["y_m"]["description"]
+    assert fingers["x_m"]["description"].endswith("the display's pixels")
