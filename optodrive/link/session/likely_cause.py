@@ -56,7 +56,7 @@ def diagnose_port(port: str, state: PortState) -> str | None:
         found = f"; found {others} instead, possibly the same board: " if others else "; "
         return (
             f"{port} is missing: unplugged, without power, or reconnected under another name{found}"
-            "check the plug, and configure the port by its /dev/serial/by-id name"
+            "check the plug, and configure the port by the name in /dev/serial that `optodrive doctor` recommends"
         )
     if state.status == "denied":
         return f"this user may not open {port}: join its group (often dialout) and log in again"

@@ -269,3 +269,128 @@ def test_watch_runs_until_it_is_interrupted(tmp_path):
     assert process.returncode == 130
     assert errors == "optodrive: interrupted\n"
     assert "configuration" in {finding["check"] for finding in line["findings"]}
+
+
+# --- names of adapters, and BRLTTY
+
+
+def plug(tree, name, place, ids="1a86:7523", serial="", interface="1.0"):
+    """Plug in an adapter: its port, by-path and by-id names, and its folder in sysfs."""
+    (tree / f"dev/{name}").touch()
+    device = tree / f"sys/devices/usb1/{place}"
+    port = device / f"{place}:{interface}" / name
+    port.mkdir(parents=True)
+    for key, value in zip(("idVendor", "idProduct", "serial"), (*ids.split(":"), serial), strict=True):
+        if value:
+            (device / key).write_text(f"{value}\n")
+    (tree / f"sys/class/tty/{name}").mkdir()
+    (tree / f"sys/class/tty/{name}/device").symlink_to(port)
+    for folder, link in (("by-path", f"usb-{place}"), ("by-id", f"usb-{ids}{serial}-{interface}")):
+        (tree / f"dev/serial/{folder}").mkdir(exist_ok=True)
+        path = tree / f"dev/serial/{folder}/{link}"
+        path.unlink(missing_ok=True)
+        path.symlink_to(f"../../{name}")
+    return f"/dev/serial/by-id/usb-{ids}{serial}-{interface}"
+
+
+def name_finding(tree, port):
+    return find_finding(port_findings(tree, BoardSection(transport="serial", port=port))[0], "name")
+
+
+@pytest.mark.parametrize(("serial", "says"), [("", "no serial number"), ("0001", "the serial number '0001'")])
+def test_two_adapters_that_share_a_name_are_named_and_their_places_recommended(tree, serial, says):
+    by_id = plug(tree, "ttyUSB0", "1-2", serial=serial)
+    plug(tree, "ttyUSB1", "1-4", serial=serial)
+    finding = name_finding(tree, by_id)
+    assert finding.status == "problem"
+    assert "/dev/ttyUSB1, /dev/ttyUSB0 are adapters of one kind (1a86:7523)" in finding.observation
+    assert says in finding.observation
+    assert finding.remedy == 'board.port = "/dev/serial/by-path/usb-1-4", the place of its plug'
+    finding = name_finding(tree, "/dev/ttyUSB0")
+    assert finding.status == "warning"
+    assert 'board.port = "/dev/serial/by-path/usb-1-2"' in finding.remedy
+    assert name_finding(tree, "/dev/serial/by-path/usb-1-2").status == "ok"
+
+
+def test_one_adapter_without_a_serial_number_is_named_by_its_place(tree):
+    finding = name_finding(tree, plug(tree, "ttyUSB0", "1-2"))
+    assert finding.status == "warning"
+    assert "without a serial number" in finding.observation
+    assert "/dev/serial/by-path/usb-1-2" in finding.remedy
+
+
+def test_adapters_that_differ_are_named_by_id(tree):
+    by_id = plug(tree, "ttyUSB0", "1-2", serial="A1")
+    plug(tree, "ttyUSB1", "1-4", serial="B2")
+    plug(tree, "ttyUSB2", "1-5", ids="0403:6001", serial="A1")
+    assert name_finding(tree, by_id).status == "ok"
+    assert name_finding(tree, "/dev/ttyUSB0").remedy == f'board.port = "{by_id}"'
+
+
+def test_two_ports_of_one_device_share_no_name(tree):
+    by_id = plug(tree, "ttyUSB0", "1-2", serial="A1")
+    port = tree / "sys/devices/usb1/1-2/1-2:1.2/ttyUSB1"
+    port.mkdir(parents=True)
+    (tree / "dev/ttyUSB1").touch()
+    (tree / "sys/class/tty/ttyUSB1").mkdir()
+    (tree / "sys/class/tty/ttyUSB1/device").symlink_to(port)
+    assert name_finding(tree, by_id).status == "ok"
+
+
+RULES = """
+# Device: 1A86:7523
+ENV{PRODUCT}=="1a86/7523/*", ENV{BRLTTY_BRAILLE_DRIVER}="bm", GOTO="brltty_usb_run"
+ENV{PRODUCT}=="403/6001/*", ATTRS{manufacturer}=="Hedo Reha Technik GmbH", ENV{BRLTTY_BRAILLE_DRIVER}="hd"
+# ENV{PRODUCT}=="10c4/ea60/*", ENV{BRLTTY_BRAILLE_DRIVER}="sk", GOTO="brltty_usb_run"
+"""
+
+
+@pytest.fixture
+def brltty_tree(tree):
+    (tree / "usr/lib/udev/rules.d").mkdir(parents=True)
+    (tree / "usr/lib/udev/rules.d/85-brltty.rules").write_text(RULES)
+    (tree / "etc/udev/rules.d").mkdir(parents=True)
+    return tree
+
+
+def brltty_findings(tree, port="/dev/ttyUSB0"):
+    findings, _ = port_findings(tree, BoardSection(transport="serial", port=port))
+    return [finding for finding in findings if finding.check == "brltty"]
+
+
+@pytest.mark.parametrize(("ids", "count"), [("1a86:7523", 1), ("0403:6001", 0), ("10c4:ea60", 0)])
+def test_an_adapter_that_brltty_takes_by_its_ids_is_named_before_it_vanishes(brltty_tree, ids, count):
+    plug(brltty_tree, "ttyUSB0", "1-2", ids=ids)
+    findings = brltty_findings(brltty_tree)
+    assert len(findings) == count
+    for finding in findings:
+        assert finding.status == "warning"
+        assert "the port then vanishes" in finding.observation
+        assert "sudo ln -s /dev/null /etc/udev/rules.d/85-brltty.rules" in finding.remedy
+    (brltty_tree / "etc/udev/rules.d/85-brltty.rules").symlink_to("/dev/null")
+    assert not brltty_findings(brltty_tree)
+
+
+@pytest.mark.parametrize("ids", ["1a86:7523", "0403:6001"])
+def test_an_adapter_that_brltty_has_taken_is_named_where_its_port_is_missing(brltty_tree, ids):
+    plug(brltty_tree, "ttyUSB0", "1-2", ids=ids)
+    devices = brltty_tree / "sys/bus/usb/devices"
+    devices.mkdir(parents=True)
+    (devices / "1-2").symlink_to("../../../devices/usb1/1-2")
+    drivers = brltty_tree / "sys/bus/usb/drivers"
+    interface = brltty_tree / "sys/devices/usb1/1-2/1-2:1.0"
+    for driver in ("ch341", "usbfs"):
+        (drivers / driver).mkdir(parents=True)
+    (interface / "driver").symlink_to(drivers / "ch341")
+    (brltty_tree / "dev/ttyUSB0").unlink()
+    shutil.rmtree(brltty_tree / "sys/class/tty/ttyUSB0")
+    assert not brltty_findings(brltty_tree)
+    (interface / "driver").unlink()
+    (interface / "driver").symlink_to(drivers / "usbfs")
+    (finding,) = brltty_findings(brltty_tree)
+    assert finding.status == "problem"
+    assert f"({ids}) is connected and has no serial port: a program has taken it" in finding.observation
+    (brltty_tree / "proc/77/comm").write_text("brltty\n")
+    (finding,) = brltty_findings(brltty_tree)
+    assert "BRLTTY, which runs, has taken it" in finding.observation
+    assert "end BRLTTY" in finding.remedy
