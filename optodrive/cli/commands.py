@@ -2,6 +2,7 @@
 
 import os
 import sys
+import termios
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -80,7 +81,7 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
         if message:  # empty without arguments: typer has printed the help
             print(f"optodrive: {message}", file=sys.stderr)
         return 2
-    except OSError as error:
+    except (OSError, termios.error) as error:  # of a terminal, termios.error is no OSError
         # Buffered output cannot be written either; redirecting it prevents a second error at interpreter exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):

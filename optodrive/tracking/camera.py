@@ -73,7 +73,10 @@ class Camera:
     def read_pictures(self) -> Iterator[Picture]:
         """Yield pictures until the video ends. Raise LinkError if the camera gives no more."""
         while True:
-            is_read, picture = self._capture.read()
+            try:
+                is_read, picture = self._capture.read()
+            except self._cv2.error:  # of a driver that fails, or a picture that cannot be decoded
+                break
             if not is_read:
                 break
             stamp_s, now_s = 1e-3 * float(self._capture.get(self._stamp)), time.monotonic()

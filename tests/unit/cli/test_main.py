@@ -1,10 +1,12 @@
 """The command line as a whole: version, addresses, and the lists that its commands print."""
 
 import socket
+import termios
 from importlib.metadata import version
 
 import pytest
 
+from optodrive.cli import commands
 from optodrive.cli.main import run
 from optodrive.client.endpoint import Endpoint
 from optodrive.core.daemon_url import read_default_url
@@ -56,3 +58,12 @@ def test_patterns_are_listed_with_their_bounds_and_units(capsys):
     assert "height_um=100.0 (1 to 1000 µm)" in text
     assert "direction=right (left, right, up, down)" in text
     assert "None" not in text
+
+
+def test_an_error_of_a_terminal_is_one_line(monkeypatch, capfd):
+    def fail(**options):
+        raise termios.error(5, "Input/output error")
+
+    monkeypatch.setattr(commands, "build_app", lambda command: fail)
+    assert commands.run_command(["status"], None) == 1
+    assert capfd.readouterr().err == "optodrive: (5, 'Input/output error')\n"

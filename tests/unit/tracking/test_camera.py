@@ -1,9 +1,11 @@
 """Fingertips from a video, and their numbers."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, LinkError
 from optodrive.tracking.camera import BACKGROUND_PICTURES, LIFTED_S, Camera, follow_fingertips
 from optodrive.tracking.finger_numbers import MISSED_MAX_S, FingerNumbers
 from optodrive.tracking.marks import load_marks
@@ -68,3 +70,16 @@ def test_a_finger_that_is_missed_for_a_moment_keeps_its_number():
     assert numbers.assign(0.05, np.zeros((0, 2))) == []
     assert numbers.assign(0.09, place_m) == [0]
     assert numbers.assign(0.09 + 1.01 * MISSED_MAX_S, place_m) == [1]
+
+
+def test_a_picture_that_opencv_fails_to_read_is_the_end_of_the_camera(tmp_path):
+    blank = [np.full(SIZE[::-1], 90, dtype=np.uint8)] * 3
+    with Camera(str(write_video(tmp_path / "three.avi", blank, RATE_HZ))) as camera:
+        capture, camera.is_live = camera._capture, True
+
+        def fail():
+            raise camera._cv2.error("V4L2: select() failed")
+
+        camera._capture = SimpleNamespace(read=fail, release=capture.release)
+        with pytest.raises(LinkError, match="the camera is gone"):
+            list(camera.read_pictures())
