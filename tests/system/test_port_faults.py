@@ -11,6 +11,7 @@ from link_process_rig import LinkProcess
 from optodrive.link.protocol.states import BoardState
 from rig import PATIENT_LEASE_S, wait_for
 from test_link_process import await_dark, emit
+from test_stages import DRIFTING, GOES_ON, Bench, build_trains
 
 FAULTS = [
     ("write:error=ENODEV", "ENODEV", "openat:error=EPERM", "EPERM"),
@@ -57,7 +58,10 @@ class Injection:
         self._process.communicate()
 
 
-@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is missing: apt-get install strace")
+needs_strace = pytest.mark.skipif(shutil.which("strace") is None, reason="strace is missing: apt-get install strace")
+
+
+@needs_strace
 @pytest.mark.parametrize(
     ("open_fault", "shown", "opening_fault", "shown_then"),
     [FAULTS[1], *(pytest.param(*each, marks=pytest.mark.slow) for each in FAULTS if each != FAULTS[1])],
@@ -91,3 +95,31 @@ def test_stty_on_the_open_port_is_named_and_the_board_is_found_again(link, board
     link.until(lambda: link.planner.connected)
     assert Path(device).exists()
     wait_for(lambda: board.of("state")[-1]["state"] == BoardState.DISARMED, "the board")
+
+
+@needs_strace
+@pytest.mark.slow
+@pytest.mark.parametrize(("open_fault", "shown", "opening_fault", "shown_then"), FAULTS)
+def test_a_stage_whose_port_fails_and_returns_is_lost_alone(tmp_path, open_fault, shown, opening_fault, shown_then):
+    bench = Bench(tmp_path, DRIFTING, GOES_ON)
+    _, right = bench.boards
+    try:
+        bench.arm()
+        bench.begin(build_trains(30.0))
+        link = bench.daemon.find_process("link")
+        injection = Injection(link, right.port, *{open_fault, opening_fault})
+        try:
+            lost = wait_for(lambda: bench.daemon.state()["stages"][1]["lost"], "the loss")
+            assert shown in lost
+            wait_for(lambda: shown_then in (bench.daemon.state()["stages"][1]["error"] or ""), "the next opening")
+            assert bench.daemon.state()["stages"][0]["board"]["state"] in ("ARMED", "RUNNING", "HOLD")
+            await_dark(right)
+        finally:
+            injection.end()
+        wait_for(lambda: bench.daemon.state()["stages"][1]["connected"], "the port's return")
+        assert bench.daemon.find_process("link") == link
+        assert right.of("state")[-1]["state"] == "DISARMED"
+        bench.daemon.call("POST", "/v1/stop")
+        bench.arm()
+    finally:
+        bench.stop()
