@@ -79,7 +79,8 @@ class EtherDream(LaserDac):
     def find_identity(self) -> str | None:
         """Return its hardware address, which it broadcasts once per second and never tells its client."""
         if self.identity is None and self._stream is not None:
-            self.identity = self._hear(self._stream.getpeername()[0], self._clock)
+            with suppress(OSError):  # a lost link, which the next command meets
+                self.identity = self._hear(self._stream.getpeername()[0], self._clock)
             self.name = self.identity or self.name
         return self.identity
 
