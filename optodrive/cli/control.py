@@ -208,6 +208,8 @@ def _print_state(document: dict[str, Any], as_json: bool) -> None:
         print(f"paused    dark until `optodrive resume`; disarms in {queue.pause_ends_in_s:.0f} s")
     print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")
     print(f"executed  {totals.executed} pulses of {totals.sent} sent")
+    if totals.frames_shown or totals.frames_superseded:
+        print(f"frames    {totals.frames_shown} of streams shown, {totals.frames_superseded} superseded before")
     if link.state == "up":
         print(
             f"counters  {link.retransmitted} frames retransmitted, {link.naks} refused, "

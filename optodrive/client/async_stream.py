@@ -14,6 +14,7 @@ from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import RETRY_S, RETRY_TIMEOUT_MIN_S
 from optodrive.client.frame_results import (
     RESULT_TIMEOUT_S,
+    FrameCounts,
     ResultBuffer,
     build_closed_error,
     build_stream_path,
@@ -101,6 +102,11 @@ class AsyncStream:
     async def results(self) -> list[FrameResult]:
         """See `Stream.results`."""
         return self._results.drain()
+
+    @property
+    def counts(self) -> FrameCounts:
+        """See `Stream.counts`."""
+        return self._results.counts
 
     async def wait(self, frame: int | None = None, timeout_s: float = RESULT_TIMEOUT_S) -> FrameResult:
         """See `Stream.wait`."""

@@ -1,6 +1,7 @@
 """Common parts of both streams: the address, the buffer of results, and the errors of refused frames."""
 
 from collections import deque
+from typing import NamedTuple
 from urllib.parse import urlencode
 
 from optodrive.client.problems import build_error
@@ -13,10 +14,26 @@ RESULTS_MAX = 1000
 RESULT_TIMEOUT_S = 30.0
 
 
+class FrameCounts(NamedTuple):
+    """Frames of a stream whose final result has arrived, all of them, whether the results were read or not.
+
+    shown: at least one pulse was emitted, or residual heat held every pixel at its height; superseded: a newer frame
+    replaced it before its first pulse; other: refused, stopped, cancelled or failed before it
+    """
+
+    shown: int = 0
+    superseded: int = 0
+    other: int = 0
+
+
 class ResultBuffer:
-    """Results of frames for one reader. Another thread may add them."""
+    """Results of frames for one reader. Another thread may add them.
+
+    counts: of all final results so far
+    """
 
     def __init__(self) -> None:
+        self.counts = FrameCounts()
         self._unread: deque[FrameResult] = deque(maxlen=RESULTS_MAX)
         self._final: dict[int | None, FrameResult] = {}
         self._lost_before = 0
@@ -26,6 +43,8 @@ class ResultBuffer:
         result = FrameResult.model_validate_json(text, extra="ignore")
         self._unread.append(result)
         if result.is_final:
+            outcome = "shown" if result.is_shown else "superseded" if result.status == "superseded" else "other"
+            self.counts = self.counts._replace(**{outcome: getattr(self.counts, outcome) + 1})
             self._final[result.frame] = result
             while len(self._final) > RESULTS_MAX:
                 del self._final[next(iter(self._final))]

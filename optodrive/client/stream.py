@@ -5,7 +5,7 @@ from typing import Self
 
 from optodrive.client.async_stream import AsyncStream
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.frame_results import RESULT_TIMEOUT_S
+from optodrive.client.frame_results import RESULT_TIMEOUT_S, FrameCounts
 from optodrive.client.heights import HeightsLike
 from optodrive.client.loop_thread import LoopThread
 from optodrive.core.types.push_options import Policy, check_keywords
@@ -57,8 +57,16 @@ class Stream:
         return self._loop.run(self._stream.send(heights_um))
 
     def results(self) -> list[FrameResult]:
-        """Return the results since the last call, in order."""
+        """Return the results since the last call, in order.
+
+        Of results that nobody reads the newest 1,000 are kept, about 500 frames; `counts` counts all.
+        """
         return self._loop.run(self._stream.results())
+
+    @property
+    def counts(self) -> FrameCounts:
+        """Number of frames shown and superseded so far. Every final result counts, also one that `results` drops."""
+        return self._stream.counts
 
     def wait(self, frame: int | None = None, timeout_s: float = RESULT_TIMEOUT_S) -> FrameResult:
         """Wait for the final result of a frame, by default the last one sent. Raise its error if it failed."""

@@ -13,6 +13,7 @@ from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import planner as planner_module
 from optodrive.daemon.engine import queue_stream
+from optodrive.daemon.engine.active_plan import RefreshCycle
 from optodrive.daemon.engine.plan_making import make_plan
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements, build_port_settings
@@ -198,3 +199,30 @@ def test_a_frame_whose_end_came_after_the_board_had_ended_the_job_is_drawn(monke
             rig.run(0.5)
             assert (rig.records[-1].status == "done") == is_drawn
             assert rig.session.board.underruns == 0
+
+
+# --- frames that come again
+
+
+def find_worst_interval(rig, count, rate_hz):
+    """Return the largest deviation of an interval between two pulses of a pixel, in periods, by the board's log."""
+    rig.stream(choose_pixels(count), rate_hz, 12 / rate_hz).finish()
+    pulses = [event for event in rig.log if event["event"] == "pulse"]
+    places = np.array([(event["x"], event["y"]) for event in pulses])
+    on_s = rig.list_gate_times_s()[:, 0]
+    names = np.unique(places, axis=0, return_inverse=True)[1].ravel()
+    # The time reserved for planning settles in the first intervals.
+    intervals = np.concatenate([np.diff(on_s[names == name])[3:] for name in range(count)]) * rate_hz
+    return float(np.abs(intervals - 1.0).max())
+
+
+@pytest.mark.parametrize(("count", "rate_hz"), [(4, 20.0), (4, 50.0), (1, 30.0), (12, 10.0), (20, 5.0)])
+def test_a_frame_that_is_streamed_again_keeps_the_period_of_each_pixel(monkeypatch, count, rate_hz):
+    # The rig notices an arrival within a step.
+    assert find_worst_interval(StreamRig(monkeypatch), count, rate_hz) < 0.05 + STEP_S * rate_hz
+
+
+def test_a_path_that_reverses_from_frame_to_frame_is_caught(monkeypatch):
+    """Mutant: each frame follows the shortest path."""
+    monkeypatch.setattr(RefreshCycle, "find_order", lambda self, target_m: None)
+    assert find_worst_interval(StreamRig(monkeypatch), 4, 50.0) > 0.3

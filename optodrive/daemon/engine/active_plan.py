@@ -33,6 +33,17 @@ class RefreshCycle(NamedTuple):
         """Pixels that have had their turn, [p]."""
         return np.asarray(self.drawn_s >= self.begun_s, dtype=np.bool_)
 
+    def find_order(self, target_m: FloatArray) -> IntArray | None:
+        """Return the order in which a frame's pixels were drawn, None if others were drawn since the first of them.
+
+        A frame that comes again in that order gives each pixel the rhythm of the frames.
+        """
+        active = np.flatnonzero(target_m)
+        drawn_s = self.drawn_s[active]
+        if not len(active) or np.count_nonzero(self.drawn_s >= drawn_s.min()) != len(active):
+            return None
+        return np.asarray(active[np.argsort(drawn_s, kind="stable")], dtype=np.int64)
+
 
 @dataclass(eq=False)
 class ActivePlan:

@@ -309,7 +309,12 @@ class Engine:
         accounts = self._plan_queue.accounts
         return PlannerState(
             queue=build_queue_report(self._plan_queue, self._plan_store.list_recent(), self.board_s()),
-            totals=PulseTotals(**accounts.totals, timing_error=accounts.timing.worst),
+            totals=PulseTotals(
+                **accounts.totals,
+                timing_error=accounts.timing.worst,
+                frames_shown=self._plan_counters.frames_shown,
+                frames_superseded=self._plan_counters.frames_superseded,
+            ),
             planner=PlannerReport(busy=self._planner.is_busy, alive=self._planner.is_alive),
             limits=LimitsReport(power_share=self._dimmer.power_share),
         )

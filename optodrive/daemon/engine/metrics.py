@@ -7,7 +7,7 @@ from typing import Any
 from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.responses.plan_status import ENDS
+from optodrive.daemon.responses.plan_status import ENDS, PlanStatus
 from optodrive.daemon.responses.state import PlannerState
 from optodrive.device.config import Config
 from optodrive.link.protocol.states import BoardState
@@ -20,17 +20,22 @@ Labels = Mapping[str, str]
 
 
 class PlanCounters:
-    """Counters of ended plans: number by status, and latency from request to first emission."""
+    """Counters of ended plans: number by status, streamed frames, and latency from request to first emission."""
 
     def __init__(self) -> None:
         self.ended: Counter[str] = Counter(dict.fromkeys(ENDS, 0))
         self.first_light = Histogram(LATENCY_BUCKETS_S)
         self.min_headroom_k: float | None = None
+        self.frames_shown = self.frames_superseded = 0
 
     def record_end(self, plan: ActivePlan) -> None:
         """Count an ended plan. The loop's thread and the simulation thread call it, for different plans."""
         record = plan.record
         self.ended[record.status] += 1
+        if record.streamed and not record.refreshes:
+            is_shown = record.executed_count > 0 or record.status == PlanStatus.DONE
+            self.frames_shown += is_shown
+            self.frames_superseded += not is_shown and record.status == PlanStatus.SUPERSEDED
         self.min_headroom_k = float(plan.planned.plan.headroom_k.min())
         if record.first_light_after_s is not None:
             self.first_light.add(record.first_light_after_s)
@@ -64,6 +69,8 @@ def render_metrics(config: Config, session: RemoteSession, state: PlannerState, 
     page.add_gauge("link_longest_stall_seconds", "Longest iteration of the loop", _ms_to_s(link["longest_stall_ms"]))
     pulses = [({"stage": stage}, getattr(state.totals, stage)) for stage in ("planned", "sent", "executed")]
     page.add_counter("pulses_total", "Pulses planned, sent to the board, executed by it", pulses)
+    frames = [({"outcome": name}, getattr(state.totals, f"frames_{name}")) for name in ("shown", "superseded")]
+    page.add_counter("stream_frames_total", "Planned frames of streams that have ended, by outcome", frames)
     page.add_counter("plans_total", "Ended plans by status", _label_counts("status", counters.ended))
     page.add_gauge("plans_waiting", "Plans waiting for the beam", state.queue.waiting)
     page.add_gauge("planner_alive", "1 while the planner is idle or makes progress", int(state.planner.alive))

@@ -123,6 +123,10 @@ def _begin_streamed(
         sequence, orders = request.select(display, sequence, snapshot)
     elif snapshot.cycle is not None and can_split(sequence):
         sequence = stale_pixels_first(sequence, snapshot.cycle.refreshed)
+        is_beam_free = snapshot.predecessor is None or snapshot.pause_s > 0.0
+        order = snapshot.cycle.find_order(sequence.frames[0].target_m) if is_beam_free else None
+        if order is not None and len(sequence.frames) == 1:
+            orders = {0: order}
     if snapshot.pause_s and request.select is None:
         sequence = delay_frames(sequence, snapshot.pause_s)
     policy, pixels = request.push.options.get("policy", "trim"), snapshot.initial_pixels

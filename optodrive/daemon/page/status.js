@@ -20,6 +20,7 @@ export class Status {
       Underruns: board.underruns,
       "Laser on": `${board.laser_on_s.toFixed(2)} s`,
       "Pulses executed": totals.executed,
+      "Streamed frames shown": totals.frames_shown,
       "Board temperature": board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`,
       ...Object.fromEntries(state.stages.map((stage) => [`Stage ${stage.name}`, describeStage(stage)])),
     };

@@ -111,12 +111,18 @@ class QueueReport(JsonModel):
 
 
 class PulseTotals(JsonModel):
-    """Pulses since the daemon started. `timing_error` is None before the first executed pulse."""
+    """Pulses since the daemon started. `timing_error` is None before the first executed pulse.
+
+    frames_shown, frames_superseded: streamed frames that were planned and have ended, with a pulse or held at their
+    heights by residual heat, and without; frames that a newer one replaced before planning are not among them
+    """
 
     planned: int
     sent: int
     executed: int
     timing_error: TimingError | None
+    frames_shown: int = 0
+    frames_superseded: int = 0
 
 
 class PlannerReport(JsonModel):

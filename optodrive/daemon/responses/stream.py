@@ -47,6 +47,11 @@ class FrameResult(JsonModel):
         """Whether no further message follows for this frame."""
         return self.status != "planned"
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether a pulse of the frame was emitted, or residual heat held all of its pixels at their heights."""
+        return bool(self.executed) or self.status == "done"
+
     def to_json(self) -> str:
         """Encode the members that the message has."""
         return self.model_dump_json(exclude_unset=True)

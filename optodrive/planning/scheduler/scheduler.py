@@ -41,6 +41,9 @@ TRAIN_BATCH = 1000
 
 Granted = TypeVar("Granted", bound=PulsePlan)
 
+RETURN_US = 10_000
+"""Time in which the mirrors return to the begin of a path while the beam is idle: longer than any move."""
+
 
 class GalvoPause(NamedTuple):
     """A pause of a stage's mirrors after the first `rows` pulses of a batch, in which their coils cool."""
@@ -105,6 +108,7 @@ class Scheduler:
         self.lead_in_us = max(lead_ins_us) if initial_pixels is None else 0
         self.until_us = inf
         self.skipped: list[SkippedPulse] = []
+        self._orders: dict[int, list[int]] = {}  # of the last frame, by stage
         self.simultaneous: list[SimultaneousFrame] = []
         tools = []
         for stage, scan_head in enumerate(scan_heads):
@@ -247,8 +251,14 @@ class Scheduler:
             order = self._visiting_orders[source]
             given: list[int] = order[stage_of[order] == stage].tolist()
             return given
-        active = np.flatnonzero((self._sequence.frames[source].target_m > 0) & (stage_of == stage))
-        return self._tools[stage].path.compute_order(active, self._state.beams[stage].pixel)
+        frame, beam = self._sequence.frames[source], self._state.beams[stage]
+        active = np.flatnonzero((frame.target_m > 0) & (stage_of == stage))
+        before, pixels = self._orders.get(stage, []), active.tolist()
+        idle_us = self._planner.compute_requested_us(frame.show_at_s) + self._state.delay_us - beam.free_us
+        if idle_us > RETURN_US and sorted(before) == pixels:
+            return before  # a path that reverses would give the pixels at its ends pairs of pulses
+        self._orders[stage] = self._tools[stage].path.compute_order(active, beam.pixel)
+        return self._orders[stage]
 
     def _evaluate_rounds(self, source: int, rounds: list[Round], heat: ThermalState) -> CandidateSchedule:
         """Plan the rounds of a frame without the limiter, on copies of the beam state and the heat."""
