@@ -6,6 +6,8 @@ from pathlib import Path
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_bounded
 
+TEXT_SUFFIX = ".txt"
+
 
 def parse_parameters(command: str, pattern: str, values: list[str]) -> dict[str, str]:
     """Return the parameters as text, with the content of files in base64.
@@ -29,6 +31,9 @@ def parse_parameters(command: str, pattern: str, values: list[str]) -> dict[str,
         parsed[key] = content
     for parameter in known:
         if parameter.kind == "file" and parameter.name in parsed:
-            file = read_bounded(Path(parsed[parameter.name]))
+            path = Path(parsed[parameter.name])
+            file = read_bounded(path)
+            if path.suffix.lower() == TEXT_SUFFIX and any(each.name == "format" for each in known):
+                parsed.setdefault("format", "text")
             parsed[parameter.name] = base64.b64encode(file).decode("ascii")
     return parsed

@@ -24,12 +24,18 @@ def patterns(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FRAMES.json", help="Write the pattern as frames and trains.")
     ] = None,
+    tables: Annotated[
+        str | None, typer.Option("--tables", metavar="LANGUAGE", help="List liblouis' tables of this language, or all.")
+    ] = None,
     config: ConfigOption = None,
     json: JsonOption = False,
 ) -> None:
     """List the patterns and their parameters, or write one as a file for `plan`, `simulate` and `push`."""
     from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
 
+    if tables is not None:
+        _list_tables(tables, json)
+        return
     if out is not None:
         if pattern is None:
             raise InputError("PATTERN", MISSING, "the name of a pattern, for --out")
@@ -42,6 +48,19 @@ def patterns(
     name = None if pattern is None else find_pattern(pattern).name
     descriptions = [item for item in describe_patterns() if name in (None, item.name)]
     print_answer({"patterns": descriptions}, [line for item in descriptions for line in _describe(item)], json)
+
+
+def _list_tables(language: str, json: bool) -> None:
+    from optodrive.planning.stimuli.liblouis import TABLES, list_tables
+
+    found = list_tables(language)
+    if not found:
+        raise InputError("--tables", language, f"all, or the code of a language of a table in {TABLES}, such as en")
+    lines = [
+        f"{each.table:<28} {each.language:<8} {each.dots + ' dots' if each.dots else '':<7} {each.name}"
+        for each in found
+    ]
+    print_answer({"tables": [each._asdict() for each in found]}, lines, json)
 
 
 def _write_pattern(pattern: str, values: list[str], out: Path, config: str | None, json: bool) -> None:

@@ -55,6 +55,9 @@ OTHER_UNITS = {
 LARGEST = 1e300
 """Larger numbers suit no unit; an integer of thousands of digits is no float."""
 
+NEAR = 2.0
+"""Factor by which a value may exceed its range without being in another unit."""
+
 
 class PlausibleRange(NamedTuple):
     """Range of the absolute values that a quantity of this unit can have."""
@@ -101,13 +104,21 @@ def guess_unit(value: float, plausible: PlausibleRange) -> str | None:
     return " or ".join(names) or None
 
 
+def describe_likely_unit(value: float, plausible: PlausibleRange) -> str:
+    """Return the end of a message that names the units in which a value suits its range, empty if there are none.
+
+    A value just beyond the range is too small or too large in the right unit.
+    """
+    unit = guess_unit(value, plausible)
+    is_near = plausible.low / NEAR <= abs(value) <= plausible.high * NEAR and plausible.unit not in ("K", "°C")
+    return "" if unit is None or is_near else f"; this value is likely in {unit}"
+
+
 def check_plausible(where: str, value: float, plausible: PlausibleRange) -> None:
     """Raise InputError for a value outside its range whose unit is probably another one, or that no unit explains."""
     if value == 0.0 or plausible.low <= abs(value) <= plausible.high:
         return
-    unit = guess_unit(value, plausible)
-    likely = "" if unit is None else f"; this value is likely in {unit}"
-    raise InputError(where, value, f"{format_range(*plausible)}{likely}", "unit")
+    raise InputError(where, value, f"{format_range(*plausible)}{describe_likely_unit(value, plausible)}", "unit")
 
 
 def check_table(where: str, table: Mapping[str, object], ranges: Mapping[str, PlausibleRange]) -> None:

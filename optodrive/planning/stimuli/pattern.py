@@ -8,7 +8,7 @@ from math import isfinite
 from typing import Literal
 
 from optodrive.core.errors import MISSING, InputError, suggest_nearest
-from optodrive.core.plausibility import PlausibleRange, guess_unit
+from optodrive.core.plausibility import PlausibleRange, describe_likely_unit
 from optodrive.core.types.push_options import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config, build_pixel_layout
@@ -142,8 +142,7 @@ def _convert_number(value: object, parameter: PatternParameter, where: str) -> f
     low, high = parameter.min or 0.0, parameter.max or 0.0
     inside = isfinite(number) and low <= number <= high
     if not inside:
-        likely = guess_unit(number, PlausibleRange(low, high, parameter.unit)) if isfinite(number) else None
-        expected += "" if likely is None else f"; this value is likely in {likely}"
+        expected += describe_likely_unit(number, PlausibleRange(low, high, parameter.unit)) if isfinite(number) else ""
         raise InputError(where, value, expected, code="bad_parameter")
     return number
 

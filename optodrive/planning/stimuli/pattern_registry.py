@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import InputError, Unquoted, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import bring_up, experiments, images, shapes
@@ -269,12 +269,14 @@ _PATTERN_LIST = (
     ),
     Pattern(
         "braille-file",
-        "pages of braille: a BRF or PEF file",
+        "pages of braille: a BRF or PEF file, or one of text",
         (
-            PatternParameter("file", "file", None, "BRF or PEF file", required=True),
+            PatternParameter("file", "file", None, "BRF or PEF file, or one of text", required=True),
             _height_parameter(150.0, "peak height of a dot"),
             _INTENSITY_PARAMETER,
             PatternParameter("seconds", "number", 2.0, "minimum time per page", "s", min=0.0, max=600.0),
+            _choice_parameter("format", "auto", "what the file holds", ("auto", "braille", "text")),
+            PatternParameter("table", "text", None, "table of liblouis, for text"),
         ),
         build_braille_file,
     ),
@@ -337,6 +339,9 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
         sequence = pattern.build(config, where, **arguments)
     else:
         sequence = _build_by_intensity(pattern, where, given, config)
+    if not sequence.trains and not any(frame.target_m.any() for frame in sequence.frames):
+        expected = "one that raises a pixel; a picture raises bright areas, dark ones with invert=true"
+        raise InputError(where, Unquoted("a stimulus that raises nothing"), expected, code="bad_picture")
     return validate_sequence(sequence, where, config)
 
 

@@ -1,5 +1,7 @@
 """Braille text on the lattice, wrapped at words and split into pages."""
 
+import unicodedata
+
 import numpy as np
 
 from optodrive.core.errors import InputError
@@ -10,6 +12,9 @@ from optodrive.planning.stimuli.braille import SPACE, Cell, encode_lines
 from optodrive.planning.stimuli.cell_slots import CellSlot, Spacing, find_line_slots
 from optodrive.planning.stimuli.liblouis import translate_lines
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture, sequence_end_s
+
+Lines = list[list[list[Cell]]]
+"""Lines of words of cells."""
 
 
 def build_text(
@@ -28,34 +33,43 @@ def build_text(
     table: of liblouis; without one, text is uncontracted English. Raises InputError (bad_text, does_not_fit, and with a
     table bad_table, missing_library).
     """
-    lines = encode_lines(text, f"{where}: text") if table is None else translate_lines(text, table, where)
+    lines = translate(text, table, f"{where}: text")
     if not any(lines):
         raise InputError(f"{where}: text", text, "at least one character to show", code="bad_text")
-    return show_lines(config, where, lines, height_m, seconds, Spacing(dot_step, cell_gap, line_gap))
+    return show_pages(config, where, [lines], height_m, seconds, Spacing(dot_step, cell_gap, line_gap))
 
 
-def show_lines(
+def translate(text: str, table: str | None, where: str) -> Lines:
+    """Translate text into lines of words of cells, composed letters from their parts first. Raises as build_text."""
+    composed = unicodedata.normalize("NFC", text)
+    return encode_lines(composed, where) if table is None else translate_lines(composed, table, where)
+
+
+def show_pages(
     config: Config,
     where: str,
-    lines: list[list[list[Cell]]],
+    pages: list[Lines],
     height_m: float,
     seconds: float,
     spacing: Spacing,
 ) -> FrameSequence:
-    """Build lines of words in braille, wrapped into pages as by build_text. Raises InputError (does_not_fit)."""
+    """Build pages of lines of words in braille, wrapped as by build_text. Raises InputError (does_not_fit)."""
     estimator = BeamTimeEstimator(config)
     slots = find_line_slots(estimator.lattice, spacing)
     if not slots:
         raise _too_small_error(config, where, spacing)
-    rows = wrap_words(lines, [len(line) for line in slots])
+    shown: list[list[list[Cell]]] = []
+    for lines in pages:
+        rows = wrap_words(lines, [len(line) for line in slots])
+        shown += [rows[first : first + len(slots)] for first in range(0, len(rows), len(slots))]
     frames: list[TactileFrame] = []
-    for first in range(0, len(rows), len(slots)):
-        target_m = _draw_page(rows[first : first + len(slots)], slots, height_m, len(estimator.lattice.layout))
+    for number, page in enumerate(shown, start=1):
+        target_m = _draw_page(page, slots, height_m, len(estimator.lattice.layout))
         frames += hold_picture(
             estimator,
             target_m,
             seconds,
-            f"page-{first // len(slots) + 1}",
+            f"page-{number}",
             sequence_end_s(FrameSequence(tuple(frames[-1:]))),
         )
     return FrameSequence(frames=tuple(frames))

@@ -7,7 +7,7 @@ from math import ceil
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.plausibility import guess_unit
+from optodrive.core.plausibility import describe_likely_unit, guess_unit
 from optodrive.core.plausible_ranges import FRAMES
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain, Train
@@ -135,9 +135,7 @@ def _check_repeats(where: str, interval_s: float, width_s: float, duration_s: fl
 
 def _guess(name: str, value: float, high: float) -> str:
     """Return a hint at the unit in which a value would be at most `high`."""
-    plausible = PLAUSIBLE[f"trains.{name}"]
-    unit = guess_unit(value, plausible._replace(high=high))
-    return "" if unit is None else f"; this value is likely in {unit}"
+    return describe_likely_unit(value, PLAUSIBLE[f"trains.{name}"]._replace(high=high))
 
 
 def validate_train(train: Train, where: str, config: Config) -> Train:

@@ -1,13 +1,17 @@
 """BRF and PEF files: the cells that they state, on the display's lines; wrong files in one line."""
 
+import subprocess
+
 import numpy as np
 import pytest
 
+from optodrive.cli.pattern_parameters import parse_parameters
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII, build_braille_file
 from optodrive.planning.stimuli.cell_slots import Spacing, find_line_slots
 from optodrive.planning.stimuli.liblouis import TABLES
+from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.text import build_text
 
@@ -64,6 +68,65 @@ def test_a_pef_file_has_the_cells_of_its_rows():
     assert read_cells(show(PEF.format(section).encode())) == "".join([*rows, "⠠⠝⠑⠭⠞"]).replace("\u2800", "")
 
 
+def test_the_last_columns_of_ascii_stand_for_the_same_cells():
+    assert read_cells(show(b"A`{|}~")) == read_cells(show(b"a@[\\]^"))
+    assert len(read_cells(show(b"`{|}~"))) == 5
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-8"])
+def test_a_file_may_have_a_mark_or_be_utf_16(encoding):
+    expected = read_cells(show(b",HELLO\r\n_W4"))
+    assert read_cells(show(",HELLO\r\n_W4".encode(encoding))) == expected
+    cells = "".join(chr(0x2800 + BRAILLE_ASCII.index(each)) for each in ",HELLO _W4")
+    if encoding in ("utf-8", "utf-8-sig", "utf-16"):  # cells alone do not tell which of UTF-16
+        assert read_cells(show(cells.encode(encoding))) == expected
+    pef = PEF.format(f"<page><row>{cells}</row></page>")
+    declared = pef if encoding.startswith("utf-8") else pef.replace("UTF-8", "UTF-16")
+    assert read_cells(show(declared.encode(encoding))) == expected
+
+
+def count_pages(sequence):
+    return len(dict.fromkeys(frame.target_m.tobytes() for frame in sequence.frames))
+
+
+def test_a_page_of_the_file_begins_a_page_of_the_display():
+    brf = b"A\nB\n\n\n\fC\n\n\f\n\n\fD\f"
+    pef = PEF.format("".join(f"<page><row>{cell}</row><row/><row/></page>" for cell in ("⠁", "⠃", "", "⠉")))
+    assert count_pages(show(brf)) == 3
+    assert count_pages(show(pef.encode())) == 3
+    assert count_pages(show(b"A\nB\nC")) == 1
+
+
+@pytest.mark.parametrize("text", ["Hello, World.", "The end\nof it\fand More"])
+def test_text_is_translated_and_not_played_as_braille_ascii(text):
+    config = load_config("display-1511")
+    shown = read_cells(show(text.encode()))
+    assert shown == "".join(read_cells(build_text(config, "t", page, 1e-4, 1.0)) for page in text.split("\f"))
+    assert count_pages(show(text.encode())) == len(text.split("\f"))
+
+
+def test_the_name_of_a_text_file_says_what_it_holds(tmp_path):
+    path = tmp_path / "notes.TXT"
+    path.write_text("the end.")
+    parameters = parse_parameters("play", "braille-file", [str(path)])
+    assert parameters["format"] == "text"
+    assert parse_parameters("play", "braille-file", [str(path), "format=braille"])["format"] == "braille"
+    path.with_suffix(".brf").write_text("the end.")
+    assert "format" not in parse_parameters("play", "braille-file", [str(path.with_suffix(".brf"))])
+    shown = build_pattern("braille-file", parameters, load_config("display-1511"))
+    assert read_cells(shown) == read_cells(build_text(load_config("display-1511"), "t", "the end.", 1e-4, 2.0))
+
+
+@pytest.mark.skipif(not TABLES.exists(), reason="liblouis is not installed: scripts/test-packages")
+def test_a_file_that_liblouis_wrote_has_its_cells():
+    """Braille ASCII as its own program writes it, in lower case and with the last columns of ASCII."""
+    text = "The People of Zürich {1}"
+    command = ["lou_translate", "--forward", "en-us-brf.dis,en-ueb-g2.ctb"]
+    said = subprocess.run(command, input=text + "\n", capture_output=True, text=True, check=True).stdout
+    expected = build_text(load_config("display-1511"), "t", text, 1e-4, 1.0, table="en-ueb-g2")
+    assert read_cells(show(said.encode())) == read_cells(expected)
+
+
 def test_the_frames_are_those_of_the_same_text():
     config = load_config("display-437")
     shown = show(b"ABC DEF", "display-437")
@@ -76,8 +139,13 @@ def test_the_frames_are_those_of_the_same_text():
     [
         (b"", "braille with at least one raised dot"),
         (b" \r\n\x0c", "braille with at least one raised dot"),
-        ("caf\u00e9".encode("latin-1"), r"file: row 1: got 'É', expected braille ASCII"),
-        (b"A\nB`", r"file: row 2: got '`', expected braille ASCII"),
+        (
+            "a\ncaf\u00e9".encode("latin-1"),
+            r"file: row 2: got byte 0xE9, expected braille ASCII, a PEF file, or text in",
+        ),
+        (b"\xdf", "row 1: got byte 0xDF"),
+        (b"A\nB\x7f", r"file: row 2: got '\\x7f', expected braille ASCII"),
+        (b"Hello \xe6\xbc\xa2", "got '漢', expected a–z"),
         (b"<pef", "well-formed XML"),
         (b"<html></html>", "expected the root element {http://www.daisy.org/ns/2008/pef}pef"),
         *((text, "got a document type, expected a PEF file without one") for text in DOCUMENT_TYPES),

@@ -1,6 +1,7 @@
 """Text by tables of liblouis: the cells of `lou_translate`, on the pixels of the display; wrong input in one line."""
 
 import ctypes
+import unicodedata
 from pathlib import Path
 from shutil import which
 
@@ -8,13 +9,14 @@ import numpy as np
 import pytest
 
 from liblouis_judge import ALPHABETS, draw_lines, judge
+from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import liblouis
 from optodrive.planning.stimuli.cell_slots import Spacing, find_line_slots
-from optodrive.planning.stimuli.liblouis import LIBRARY, translate_lines
+from optodrive.planning.stimuli.liblouis import LIBRARY, _find_table, list_tables, translate_lines
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.text import build_text
+from optodrive.planning.stimuli.text import build_text, translate
 
 
 def has_library():
@@ -77,13 +79,42 @@ def test_the_cells_stand_on_the_display():
         ("a", "../../../etc/passwd", "expected a table in .*, such as en-ueb-g2"),
         ("a", "en-ueb-g2.ctb,de-g1.ctb", "expected a table in"),
         ("a", "", "expected a table in"),
-        ("Ä", "de-de-comp8", "expected a table of six dots, not de-de-comp8.ctb"),
+        ("Ä", "de-de-comp8", "got 'Ä', .* de-de-comp8.ctb writes in six dots; .*; de-.* has six"),
+        (
+            "x",
+            "ru",
+            r"ru.ctb writes in six dots; this is LATIN SMALL LETTER X .*; ru-litbrl \(Russian braille\) has six",
+        ),
+        ("a 😀", "en-ueb-g2", r"got '😀', .*this is GRINNING FACE \(U\+1F600\)$"),
+        ("ä漢", "de-g1", "got '漢', .*this is CJK UNIFIED IDEOGRAPH-6F22"),
+        ("a", "rus", "nearest is 'ru'; `optodrive patterns --tables all` lists them"),
     ],
 )
 def test_a_wrong_table_is_refused_in_one_line(text, table, message):
     with pytest.raises(InputError, match=message) as refused:
         translate_lines(text, table, "text")
     assert "\n" not in str(refused.value)
+
+
+@needs_library
+@pytest.mark.parametrize(("table", "text"), [("de-g1", "Grüße"), ("fr-bfu-comp6", "été"), (None, "a")])
+def test_decomposed_letters_have_the_cells_of_composed_ones(table, text):
+    cells = [translate(unicodedata.normalize(form, text), table, "t: text") for form in ("NFC", "NFD")]
+    assert cells[0] == cells[1] != [[]]
+
+
+@needs_library
+def test_tables_are_listed_by_language(capsys):
+    tables = {each.table: each for each in list_tables("ru")}
+    assert {each.language for each in tables.values()} == {"ru"}
+    assert tables["ru-litbrl"].dots == "6"
+    assert set(tables) < {each.table for each in list_tables("all")}
+    for name in tables:
+        _find_table(name, "t")
+    assert run(["patterns", "--tables", "ru"]) == 0
+    assert "ru-litbrl                    ru       6 dots  Russian braille\n" in capsys.readouterr().out
+    assert run(["patterns", "--tables", "xx"]) == 2
+    assert "expected all, or the code of a language" in capsys.readouterr().err
 
 
 def test_without_the_library_one_line_says_what_to_install(monkeypatch):

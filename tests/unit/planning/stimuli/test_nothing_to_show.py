@@ -9,6 +9,8 @@ from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.frame_json import parse_targets_m
 from optodrive.planning.stimuli.images import build_animation, build_image
+from optodrive.planning.stimuli.pattern_registry import build_pattern
+from optodrive.planning.stimuli.sequence_file import parse_sequence
 
 CONFIG = load_config("display-16")
 
@@ -32,8 +34,36 @@ def test_a_wholly_transparent_picture_is_refused_and_a_dark_one_is_not(invert):
     assert build_animation(CONFIG, "t", _encode(clear, white, black), 1e-4, None, invert).frames
 
 
+@pytest.mark.parametrize("name", ["image", "animation"])
+@pytest.mark.parametrize("invert", [False, True])
+def test_a_pattern_that_raises_nothing_is_refused_in_one_line(name, invert):
+    black, white = (_encode(Image.new("L", (8, 8), grey)) for grey in (0, 255))
+    raised, left = (black, white) if invert else (white, black)
+    assert build_pattern(name, {"file": raised, "invert": invert}, CONFIG).frames
+    with pytest.raises(InputError, match=r"a stimulus that raises nothing, expected .* dark ones with invert=true"):
+        build_pattern(name, {"file": left, "invert": invert}, CONFIG)
+
+
 @pytest.mark.parametrize("value", [5e-5, 3e-4, 0.0099])
 def test_heights_in_metres_are_refused(value):
     with pytest.raises(InputError, match="likely in m"):
         parse_targets_m({"1": 50, "3": value}, "f", {"1": 0, "3": 1})
     assert parse_targets_m([0, 0.01], "f", {"1": 0, "3": 1}).tolist() == [0.0, 1e-8]
+
+
+@pytest.mark.parametrize(
+    ("power_w", "likely"),
+    [(2.5, ""), (3.0, ""), (4.9, ""), (2450.0, "; this value is likely in mW or µW")],
+)
+def test_a_power_just_above_the_lasers_is_in_no_other_unit(power_w, likely):
+    train = {"pixel": 1, "start_s": 0, "duration_s": 1, "pulse_width_s": 0.02, "gap_s": 0.06, "power_w": power_w}
+    with pytest.raises(InputError, match=r"at most laser\.max_power_w = 2\.45 W") as refused:
+        parse_sequence({"trains": [train]}, CONFIG, "t")
+    assert str(refused.value).partition(" = 2.45 W")[2] == likely
+
+
+@pytest.mark.parametrize(("value", "likely"), [("1001", False), ("1999", False), ("200000", True)])
+def test_a_parameter_just_above_its_range_is_in_no_other_unit(value, likely):
+    with pytest.raises(InputError) as refused:
+        build_pattern("pixel", {"height_um": value}, CONFIG)
+    assert ("likely in nm" in str(refused.value)) == likely

@@ -114,7 +114,8 @@ def test_flags_are_true_or_false():
     for false in ("false", False):
         assert build_pattern("image", {"file": picture(), "invert": false}, CONFIG).frames[0].target_m.any()
     for true in ("true", True):
-        assert not build_pattern("image", {"file": picture(), "invert": true}, CONFIG).frames[0].target_m.any()
+        with pytest.raises(InputError, match="raises nothing"):
+            build_pattern("image", {"file": picture(), "invert": true}, CONFIG)
 
 
 @pytest.mark.parametrize(
