@@ -53,9 +53,13 @@ class StandingRig(PlannerRig):
         self.before_loop_action = lambda: self.pass_time(self.planning_s)
 
     def pass_time(self, duration_s):
-        """Let the link process run while the planner computes."""
-        if duration_s:
-            super(PlannerRig, self).run(duration_s)
+        """Let the link process and the loop run while the planner computes."""
+        until_s = self.clock.now_s() + duration_s
+        while self.clock.now_s() < until_s:
+            super(PlannerRig, self).run()
+            self.remote.connection.receive()
+            self.queue.update_jobs(self.remote.pop_refusal())
+            self.queue.start_next()
 
     def show(self, page_m):
         """Let a new frame stand. Return its report, None if it was refused."""

@@ -17,6 +17,10 @@ from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.planned_sequence import PlannedSequence
 
 
+CUT_MIN_S = 1e-5
+"""A pulse that is shorter than planned by more than this was cut short."""
+
+
 class RefreshCycle(NamedTuple):
     """When a stream has drawn each pixel last.
 
@@ -90,6 +94,14 @@ class ActivePlan:
         return 0 if self.executed_rows is None else len(self.executed_rows)
 
     @property
+    def is_cut_short(self) -> bool:
+        """Whether the gate went off within an executed pulse."""
+        if self.executed is None or self.executed_rows is None:
+            return False
+        planned_s = self.planned.plan.width_s[self.executed_rows]
+        return bool(np.any((self.executed.width_s > 0.0) & (self.executed.width_s < planned_s - CUT_MIN_S)))
+
+    @property
     def rest_count(self) -> int:
         """Number of rows from first_row on."""
         return len(self.planned.plan) - self.first_row
@@ -102,6 +114,16 @@ class ActivePlan:
         skipped = [pulse.pixel for pulse in self.planned.skipped]
         planned = np.concatenate([self.planned.plan.pixel, np.array(skipped, dtype=np.int64)])
         return np.setdiff1d(np.flatnonzero(self.planned.sequence_target_m), planned)
+
+    def begin_later(self, heat: ThermalState, budget: BudgetState) -> None:
+        """Let a plan that has not begun start from the heat and budget of a later time than it was made for.
+
+        The budget after it stays the bound for the earlier time.
+        """
+        self.heat_before, self.budget_before = heat, budget
+        rows, after = self.planned.plan, heat.copy()
+        after.apply_pulses(rows.pixel, rows.start_s, rows.width_s, rows.power_w)
+        self.planned = replace(self.planned, heat=after)
 
     def replace_rows(self, planned: PlannedSequence, points: StagePoints, crc: int, summary_json: bytes) -> None:
         """Replace all that follows from the rows, by those of a plan to which nothing is to be added."""

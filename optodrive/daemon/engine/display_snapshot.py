@@ -12,7 +12,6 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.progress import PlanProgress
 from optodrive.link.protocol.quantisation import WireScale
-from optodrive.link.session.plan_job import find_begin_tick
 from optodrive.physics.nominal_display import DisplayState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_executed, shift_state
@@ -61,7 +60,7 @@ class ExecutedBatch(NamedTuple):
         active, job = progress.run
         plan, reported = active.planned.plan, job.read_reported(progress.begin, progress.end, scales)
         row, tick_s = reported.row, scales[0].tick_s
-        on_tick = find_begin_tick(reported.on_tick, reported.on_ticks, row, plan, tick_s)
+        on_tick = job.find_begin_tick(reported, plan, tick_s)
         pulses = EmittedPulses(
             pixel=plan.pixel[row],
             start_s=np.asarray(on_tick * tick_s, dtype=np.float64),

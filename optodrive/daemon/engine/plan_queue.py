@@ -109,7 +109,7 @@ class PlanQueue(QueuedPlans):
                 if start_s > record.start_s:
                     if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > cooling_max_m:
                         return False
-                    plan.heat_before, plan.budget_before = snapshot.thermal.shift_to_plan(start_s)
+                    plan.begin_later(*snapshot.thermal.shift_to_plan(start_s))
                 record.start_s = start_s
                 self.waiting.append(plan)
             elif snapshot.cut is None or not self.stream.splice(plan, snapshot.predecessor, snapshot.cut):
@@ -197,6 +197,8 @@ class PlanQueue(QueuedPlans):
             is_partial = record.dropped or run.plan.growth is not None
             self.conclude(run, PlanStatus.SUPERSEDED if is_partial else PlanStatus.DONE, None)
             self.delay_all(record.delay_s)
+            if run.plan.is_cut_short and not self.is_busy:  # a pause has begun, and its last report is here first
+                self.thermal.rewind([run.plan])
             self.stream.keep_unfinished(run.plan)
 
     def end_epoch(self, reason: str, clock_shift_s: float = 0.0) -> None:

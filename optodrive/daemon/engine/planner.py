@@ -29,7 +29,7 @@ STALL_TIMEOUT_S = 2.0
 """A planner without progress for this time counts as stalled, and the lease is no longer renewed."""
 SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
-COOLING_MAX_M = 1e-6
+COOLING_MAX_M = 2e-7
 """A plan during whose delay a pixel's displacement decreases by more than this is made again, for the heat then."""
 LATE_MAX = 4
 """Number of late attempts after which a plan starts as soon as it is ready."""

@@ -95,8 +95,12 @@ class QueuePause:
                 plan.interrupt(off_s)
                 plans.delay_all(delay_s)
                 plans.waiting.appendleft(plan)
-            if streams and not plans.waiting:
+            if streams:
                 plans.thermal.rewind(streams)
+                if plans.waiting:  # they go on from the heat before the first of them, see build_restart
+                    first, estimate = plans.waiting[0], plans.thermal.estimate
+                    first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
+                    plans.thermal.append(plans.waiting[-1])
 
     @staticmethod
     def _counts_on(run: PlanRun, stage: int) -> bool:

@@ -48,13 +48,24 @@ class QueueThermal:
         """Return the estimate before a plan that waits, or before the rest of one that was interrupted."""
         return estimate_before_rest(plan, self._budget, self._on_progress)
 
+    def forget(self, plan: ActivePlan, behind: Sequence[ActivePlan]) -> None:
+        """Take back the heat of a plan that will never be executed. behind: the plans that wait behind it."""
+        estimate, end_s = self.estimate_before(plan), None
+        for each in behind:
+            heat, _ = estimate.shift_to_plan(each.record.start_s)
+            each.begin_later(heat, each.budget_before)
+            estimate = ThermalEstimate.from_plan(each.planned.heat, each.planned.budget, each.record.start_s)
+            end_s = self.end_s
+        self.set(estimate, end_s)
+
     def rewind(self, ended: Sequence[ActivePlan], clock_shift_s: float = 0.0) -> None:
         """Count only the pulses that the plans that end early may have executed.
 
         clock_shift_s: by which the board's clock has jumped since they were queued
         """
-        gate_off_s = max(self._session.board_s() - clock_shift_s + self._lease_s, self._session.dark_s)
-        estimate = rewind_estimate(EndedPlans.from_plans(ended), gate_off_s, self._budget, self._on_progress)
+        now_s = self._session.board_s() - clock_shift_s
+        gate_off_s = max(now_s + self._lease_s, self._session.dark_s)
+        estimate = rewind_estimate(EndedPlans.from_plans(ended), gate_off_s, self._budget, self._on_progress, now_s)
         self.set(estimate, max(gate_off_s, estimate.budget.at_s))
 
     def delay(self, delay_s: float) -> None:
@@ -94,5 +105,5 @@ class QueueThermal:
         gate_off_s = expected_s + self._lease_s
         estimate = saved.estimate
         if saved.ended is not None:
-            estimate = rewind_estimate(saved.ended, gate_off_s, self._budget, self._on_progress)
+            estimate = rewind_estimate(saved.ended, gate_off_s, self._budget, self._on_progress, expected_s)
         self.set(estimate.with_delay(board_s - expected_s + HOLD_MAX_S))

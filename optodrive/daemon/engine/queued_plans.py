@@ -54,11 +54,14 @@ class QueuedPlans:
         plan = next((plan for plan in self.waiting if plan.record is record), None)
         if plan is not None:
             with self.lock:
+                behind = list(self.waiting)[self.waiting.index(plan) + 1 :]
                 self.waiting.remove(plan)
-                if plan.is_interrupted and self.waiting:
+                if not plan.is_interrupted:
+                    self.thermal.forget(plan, behind)
+                elif self.waiting:
                     first, estimate = self.waiting[0], self.thermal.estimate_before(plan)
                     first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
-                elif plan.is_interrupted:
+                else:
                     self.thermal.rewind([plan])
             self.end_waiting(plan, PlanStatus.CANCELLED, reason or "removed from the queue")
         elif any(run.plan.record is record for run in self.running):

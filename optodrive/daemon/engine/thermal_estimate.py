@@ -26,9 +26,13 @@ class ThermalEstimate:
         return self.heat.copy_shifted(-start_s), shift_state(self.budget, -start_s)
 
     def compute_cooling_m(self, from_s: float, to_s: float) -> float:
-        """Return the largest decrease of a pixel's displacement between two board times, m."""
-        before_m, after_m = (self.heat.state_at(at_s).displacement_m for at_s in (from_s, to_s))
-        return float(np.max(before_m - after_m))
+        """Return the largest decrease of a pixel's displacement between two board times, m.
+
+        The heat of an absorber counts as the displacement to which it leads: shortly after a pulse only that decreases.
+        """
+        before, after = self.heat.state_at(from_s), self.heat.state_at(to_s)
+        to_come_m = 0.5 * self.heat.pixels.kappa_m_per_k * (before.absorber_k - after.absorber_k)
+        return float(np.max(np.maximum(before.displacement_m - after.displacement_m, to_come_m)))
 
     @classmethod
     def from_plan(cls, heat: ThermalState, budget: BudgetState, start_s: float) -> "ThermalEstimate":
@@ -87,12 +91,13 @@ class EndedPlans(NamedTuple):
 
 
 def rewind_estimate(
-    ended: EndedPlans, gate_off_s: float, budget: Budget, on_progress: Callable[[], None]
+    ended: EndedPlans, gate_off_s: float, budget: Budget, on_progress: Callable[[], None], dark_s: float = -inf
 ) -> ThermalEstimate:
     """Build the estimate after plans that ended early, without their dropped pulses.
 
-    The heat counts only executed pulses. The budget counts every pulse that may have started before board time
-    gate_off_s, when the gate is off for certain.
+    The heat counts the executed pulses, and those that are not reported yet but were due before board time dark_s, when
+    the gate was probably off. The budget counts every pulse that may have started before board time gate_off_s, when
+    it is off for certain.
     """
     heat, state, zero_s = ended.heat_before, ended.budget_before, ended.plans[0].start_s
     for record in ended.plans:
@@ -106,7 +111,23 @@ def rewind_estimate(
             state = commit_until(kept, until_s, state, budget, on_progress)
         if record.executed is not None:
             heat = apply_executed(heat, record.executed)
+        heat = _apply_unreported(heat, record, dark_s)
     return ThermalEstimate.from_plan(heat, state, zero_s)
+
+
+def _apply_unreported(before: ThermalState, record: EndedPlan, dark_s: float) -> ThermalState:
+    """Return the heat after the pulses of a plan for one board that have no report, but began before dark_s."""
+    plan, kept, first, late_s = record.plan, len(record.plan) - record.dropped, 0, 0.0
+    if record.executed is not None and len(record.executed):
+        first = len(record.executed)
+        late_s = max(0.0, float(record.executed.start_s[-1] - plan.start_s[first - 1]))
+    start_s = plan.start_s + late_s
+    row = first + np.flatnonzero(start_s[first:kept] < dark_s - record.start_s)
+    if plan.stage.any() or not len(row):
+        return before
+    heat, width_s = before.copy(), np.minimum(plan.width_s[row], dark_s - record.start_s - start_s[row])
+    heat.apply_pulses(plan.pixel[row], start_s[row], width_s, plan.power_w[row])
+    return heat
 
 
 def estimate_before_rest(plan: ActivePlan, budget: Budget, on_progress: Callable[[], None]) -> ThermalEstimate:

@@ -111,7 +111,7 @@ class _JournalRecorder:
                     round(on_ticks * scale.tick_s, 6),
                     round(duty / 65535.0 * scale.full_power_w, 9),
                 )
-                for row, on_tick, on_ticks, duty in zip(*(column.tolist() for column in reported), strict=True)
+                for row, on_tick, on_ticks, duty, _ in zip(*(column.tolist() for column in reported), strict=True)
             ]
         )
         self.count = self._first + done

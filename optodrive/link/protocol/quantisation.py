@@ -104,7 +104,9 @@ def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
     Raise LocalProtocolError if a pulse does not fit a point, or pulses overlap.
 
     Starts are rounded from absolute times, so rounding errors do not accumulate. Duty is rounded down. A pulse trimmed
-    to zero power becomes a gate-off point of the same length; its mirror position is that of the next pulse.
+    to zero power becomes a gate-off point; its mirror position is that of the next pulse with light. The first of such
+    points lasts until that pulse begins, because a board ends no point before the mirrors have settled; the others take
+    no time. Behind the last light they have the length of their pulses.
     """
     rows = np.flatnonzero(plan.stage == stage)
     start = np.rint(plan.start_s[rows] / scale.tick_s).astype(np.int64)
@@ -115,12 +117,14 @@ def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
         first = rows[misfits[0]]
         found = f"{plan.width_s[first]:.4g} s at {plan.power_w[first]:.4g} W"
         raise LocalProtocolError(f"a pulse of {found} does not fit a point of the wire")
-    aim_row = rows[_find_next_gate_on(duty)]
+    next_gate_on = _find_next_gate_on(duty)
+    aim_row = rows[next_gate_on]
     x, y = scale.to_outputs(scale.to_codes(plan.x_rad[aim_row]), scale.to_codes(plan.y_rad[aim_row]))
-    gate_off = start - np.concatenate([[0], (start + width)[:-1]])
-    if len(rows) and gate_off.min() < 0:
+    if len(rows) and (start - np.concatenate([[0], (start + width)[:-1]])).min() < 0:
         raise LocalProtocolError("pulses overlap, or the first begins before the plan")
-    off_ticks, on_ticks = np.where(duty == 0, gate_off + width, gate_off), np.where(duty == 0, 0, width)
+    end = np.where(next_gate_on > np.arange(len(rows)), start[next_gate_on], start + width)
+    on_ticks = np.where(duty == 0, 0, width)
+    off_ticks = end - on_ticks - np.concatenate([[0], end[:-1]])
     pauses = np.maximum(0, -(-(off_ticks - TICKS_MAX) // GATE_OFF_STEP_TICKS))  # points inserted before each pulse
     last = np.cumsum(pauses + 1) - 1
     point_row = np.repeat(np.arange(len(rows)), pauses + 1)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.types.arrays import IntArray
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses, PulsePlan
 from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.quantisation import TICKS_MAX, WirePoints
@@ -22,24 +22,25 @@ LATE_OFF_MAX_TICKS = 100
 
 
 class ReportedPulses(NamedTuple):
-    """Executed pulses, all [n]: plan row, tick of gate on, gate-on time in ticks, duty in 1/65535.
+    """Executed pulses, all [n]: plan row, tick of gate on, gate-on time in ticks, duty in 1/65535, lateness in ticks.
 
-    on_tick: without light the end of the point, see `find_begin_tick`
+    on_tick: of a point without light its end, see `find_begin_tick`
     """
 
     row: IntArray
     on_tick: IntArray
     on_ticks: IntArray
     duty: IntArray
+    late_ticks: IntArray
 
 
-def find_begin_tick(on_tick: IntArray, on_ticks: IntArray, row: IntArray, plan: PulsePlan, tick_s: float) -> IntArray:
-    """Return the tick at which each reported pulse began, [n].
+def find_begin_tick(on_tick: IntArray, on_ticks: IntArray, late_ticks: IntArray, planned_tick: FloatArray) -> IntArray:
+    """Return the tick at which each reported pulse began, all [n]. planned_tick: at which it should have begun.
 
     A pulse that was trimmed to nothing is a point without light, which the board reports at its end.
     """
-    width_ticks = np.rint(plan.width_s[row] / tick_s).astype(np.int64)
-    return np.asarray(np.where(on_ticks == 0, on_tick - width_ticks, on_tick), dtype=np.int64)
+    dark_tick = np.rint(planned_tick).astype(np.int64) + late_ticks
+    return np.asarray(np.where(on_ticks == 0, dark_tick, on_tick), dtype=np.int64)
 
 
 class PointTiming(NamedTuple):
@@ -278,7 +279,13 @@ class PlanJob:
         Any thread may call it.
         """
         points = self._pulse_points[pulses]
-        return ReportedPulses(self._row[points], self._on_tick[points], self._on_ticks[points], self._duty[points])
+        on_tick, on_ticks, duty = self._on_tick[points], self._on_ticks[points], self._duty[points]
+        return ReportedPulses(self._row[points], on_tick, on_ticks, duty, self._find_late_ticks(points))
+
+    def _find_late_ticks(self, points: IntArray) -> IntArray:
+        """Return how much later than scheduled the light of points began, or ended those that have none, [n]."""
+        scheduled = self._end_tick[points] - self._table[points, 3].astype(np.int64)
+        return np.asarray(self._on_tick[points] - scheduled, dtype=np.int64)
 
     def read_reported(self, begin: int, end: int) -> ReportedPulses:
         """Return the reports so far of pulses begin to end, in order of the points. Any thread may call it."""
@@ -296,7 +303,8 @@ class PlanJob:
         done = self._pulse_points[self._on_tick[self._pulse_points] >= 0]
         row = self.list_executed_rows()
         width_ticks = self._on_ticks[done]
-        on_tick = find_begin_tick(self._on_tick[done], width_ticks, row, plan, tick_s)
+        planned_tick = self.start_tick + plan.start_s[row] / tick_s
+        on_tick = find_begin_tick(self._on_tick[done], width_ticks, self._find_late_ticks(done), planned_tick)
         return ExecutedPulses(
             on_tick=on_tick,
             width_ticks=width_ticks,

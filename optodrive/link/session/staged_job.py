@@ -15,7 +15,7 @@ from optodrive.link.session.plan_job import PlanJob, find_begin_tick
 class StageReports(NamedTuple):
     """Executed pulses of all stages, all [n]: plan row, tick of gate on, gate-on time in ticks, power and stage.
 
-    on_tick: without light the end of the point, see `find_begin_tick`
+    on_tick, late_ticks: as in `ReportedPulses`
     """
 
     row: IntArray
@@ -23,6 +23,7 @@ class StageReports(NamedTuple):
     on_ticks: IntArray
     power_w: FloatArray
     stage: IntArray
+    late_ticks: IntArray
 
 
 class StagedJob:
@@ -100,15 +101,20 @@ class StagedJob:
         scales: of each stage
         """
         stage, pulse = self._stage[begin:end], self._pulse[begin:end]
-        row, on_tick, on_ticks, duty = (np.zeros(len(stage), dtype=np.int64) for _ in range(4))
+        row, on_tick, on_ticks, duty, late = (np.zeros(len(stage), dtype=np.int64) for _ in range(5))
         full_power_w = np.zeros(len(stage))
         for number, (part, scale) in enumerate(zip(self.parts, scales, strict=True)):
             mine = stage == number
-            row[mine], on_tick[mine], on_ticks[mine], duty[mine] = part.read_reports(pulse[mine])
+            row[mine], on_tick[mine], on_ticks[mine], duty[mine], late[mine] = part.read_reports(pulse[mine])
             full_power_w[mine] = scale.full_power_w
         done = on_tick >= 0
         power_w = np.asarray(duty / DUTY_MAX * full_power_w, dtype=np.float64)
-        return StageReports(row[done], on_tick[done], on_ticks[done], power_w[done], stage[done])
+        return StageReports(row[done], on_tick[done], on_ticks[done], power_w[done], stage[done], late[done])
+
+    def find_begin_tick(self, reported: StageReports, plan: PulsePlan, tick_s: float) -> IntArray:
+        """Return the tick at which each reported pulse of `plan` began, also of those without light, [n]."""
+        planned_tick = self.zero_tick + plan.start_s[reported.row] / tick_s
+        return find_begin_tick(reported.on_tick, reported.on_ticks, reported.late_ticks, planned_tick)
 
     def list_executed_rows(self) -> IntArray:
         """Return the plan rows reported as executed, in order."""
@@ -121,7 +127,7 @@ class StagedJob:
         scales: of each stage
         """
         reported, tick_s = self.read_reported(0, len(self._row), scales), scales[0].tick_s
-        on_tick = find_begin_tick(reported.on_tick, reported.on_ticks, reported.row, plan, tick_s)
+        on_tick = self.find_begin_tick(reported, plan, tick_s)
         return ExecutedPulses(
             on_tick=on_tick,
             width_ticks=reported.on_ticks,

@@ -101,12 +101,18 @@ def test_the_edges_of_a_long_gap(gap_us, gate_off_points):
     assert back(limited).start_s[1] == pytest.approx(0.001 + gap_us * 1e-6, abs=1e-12)
 
 
-def test_a_pulse_without_power_becomes_an_equally_long_gate_off_point():
-    limited = plan((0.001, 0.05, 0.1, 0, 0.0), (0.051, 0.05, 0.1, 0, 1e-9), (0.101, 0.05, 0.1, 0, 1.0))
+def test_the_first_of_pulses_without_power_lasts_until_the_next_light():
+    """A board ends no point before the mirrors have settled: a shorter one would delay the light."""
+    limited = plan((0.001, 0.02, 0.1, 0, 0.0), (0.021, 0.02, 0.1, 0, 1e-9), (0.0415, 0.05, 0.1, 0, 1.0))
     points = quantise(limited, SCALE)
-    assert points.table[:, 3:].tolist() == [[0, 0], [0, 0], [50_000, int(65535 / 2.45)]]
+    assert points.table[:, 2:].tolist() == [[41_500, 0, 0], [0, 0, 0], [0, 50_000, int(65535 / 2.45)]]
     assert points.row.tolist() == [0, 1, 2]
-    assert decode(payload(points), SCALE).start_s == pytest.approx([0.101], abs=1e-12)
+    assert decode(payload(points), SCALE).start_s == pytest.approx([0.0415], abs=1e-12)
+
+
+def test_pulses_without_power_behind_the_last_light_are_equally_long_gate_off_points():
+    limited = plan((0.001, 0.05, 0.1, 0, 1.0), (0.0515, 0.02, 0.1, 0, 0.0), (0.0715, 0.02, 0.1, 0, 0.0))
+    assert quantise(limited, SCALE).table[:, 2:4].tolist() == [[1000, 50_000], [20_500, 0], [20_000, 0]]
 
 
 def test_payloads_contain_whole_points():
@@ -119,9 +125,9 @@ def test_payloads_contain_whole_points():
 def test_point_ends_and_counts():
     limited = plan((0.001, 0.05, 0.1, 0, 1.0), (0.3, 0.05, 0.1, 0, 0.0), (0.4, 0.05, 0.1, 0, 1.0))
     points = quantise(limited, SCALE)
-    assert points.row.tolist() == [0, -1, -1, -1, -1, 1, 2]
-    assert points.compute_end_ticks()[[0, 5, 6]].tolist() == [51_000, 350_000, 450_000]
-    assert [points.count_before(row) for row in range(4)] == [0, 1, 6, 7]
+    assert points.row.tolist() == [0, -1, -1, -1, -1, -1, 1, 2]
+    assert points.compute_end_ticks()[[0, 6, 7]].tolist() == [51_000, 400_000, 450_000]
+    assert [points.count_before(row) for row in range(4)] == [0, 1, 7, 8]
 
 
 def test_an_empty_plan_has_no_points():
