@@ -251,11 +251,11 @@ def check_times(run, log, is_late):
     """Check the starts and the delay of a plan. Return the log's rows that belong to it."""
     plan, (part,) = run.plan, run.job.parts
     reports = part.read_reports(np.arange(part.pulse_count))
-    lit = reports.on_ticks > 0
-    points = part.first_index + part._pulse_points[lit]
+    has_light = reports.on_ticks > 0
+    points = part.first_index + part._pulse_points[has_light]
     rows = [log.of_index[int(point)] for point in points]
-    assert log.starts_s[rows] == pytest.approx(reports.on_tick[lit] * TICK_S, abs=0.1 * TICK_S)
-    late_s = log.starts_s[rows] - plan.record.start_s - plan.planned.plan.start_s[reports.row[lit]]
+    assert log.starts_s[rows] == pytest.approx(reports.on_tick[has_light] * TICK_S, abs=0.1 * TICK_S)
+    late_s = log.starts_s[rows] - plan.record.start_s - plan.planned.plan.start_s[reports.row[has_light]]
     if len(rows):
         assert (late_s >= -START_ERROR_MAX_S).all()
         assert late_s.max() <= max(plan.record.delay_s, 0.0) + START_ERROR_MAX_S

@@ -173,6 +173,7 @@ def report_planned(number: int, report: PlanReport) -> FrameResult:
         pulses=report.planned,
         skipped=len(report.summary.skipped),
         trimmed=report.summary.trimmed.pulses,
+        limited_by=sorted(report.summary.trimmed.by_reason),
         starts_in_s=report.starts_in_s,
         duration_s=report.summary.duration_s,
         latency=report.latency,

@@ -17,9 +17,11 @@ from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.stream import FrameResult, RefreshReport
 
 REFRESH_MIN_S, REFRESH_MAX_S = 0.008, 0.04
+CAPS_PERIOD_S = 1.0
+"""Time over which the caps are collected that took light from the frame. Its client is told when they are others."""
 TRIED_AGAIN = (BusyError.code,)
 """Codes of the problems after which a frame still stands."""
 
@@ -32,6 +34,9 @@ class StandingStream(LiveStream):
         self._shown: Frame | None = None
         self._began_s = -inf
         self._fingers_arrived_s: float | None = None
+        self._caps: set[str] = set()
+        self._published_caps: set[str] = set()
+        self._caps_since_s = -inf
         self._fingers_moved = asyncio.Event()
 
     async def run(self) -> None:
@@ -71,12 +76,24 @@ class StandingStream(LiveStream):
 
     def _follow(self, frame: Frame, report_json: bytes) -> None:
         if frame is self._shown:
+            self._publish_caps(frame, RefreshReport.model_validate_json(report_json).limited_by)
             return
         if self._shown is not None:
             superseded = FrameResult(frame=self._shown.number, status=PlanStatus.SUPERSEDED, superseded_by=frame.number)
             self._publish(superseded)
         self._shown, self._last_epoch = frame, frame.epoch
-        self._publish(report_planned(frame.number, PlanReport.model_validate_json(report_json)))
+        planned = report_planned(frame.number, PlanReport.model_validate_json(report_json))
+        self._published_caps, self._caps, self._caps_since_s = set(planned.limited_by or ()), set(), time.monotonic()
+        self._publish(planned)
+
+    def _publish_caps(self, frame: Frame, limited_by: list[str]) -> None:
+        """Collect the caps that took light from refreshes, and publish them when they are others than before."""
+        self._caps.update(limited_by)
+        if time.monotonic() < self._caps_since_s + CAPS_PERIOD_S:
+            return
+        if self._caps != self._published_caps:
+            self._publish(FrameResult(frame=frame.number, status=PlanStatus.PLANNED, limited_by=sorted(self._caps)))
+        self._published_caps, self._caps, self._caps_since_s = self._caps, set(), time.monotonic()
 
     def _refuse(self, frame: Frame, problem: Problem) -> None:
         if frame is self._shown:

@@ -16,7 +16,6 @@ from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.planned_sequence import PlannedSequence
 
-
 CUT_MIN_S = 1e-5
 """A pulse that is shorter than planned by more than this was cut short."""
 

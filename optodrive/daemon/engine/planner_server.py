@@ -24,6 +24,7 @@ from optodrive.daemon.push import Push
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import build_problem
+from optodrive.daemon.responses.stream import RefreshReport
 from optodrive.planning.stimuli.sequence_codec import decode_sequence
 
 STATE_PERIOD_S = 0.5
@@ -254,7 +255,7 @@ def _encode(
 ) -> tuple[int, bytes, dict[str, object]]:
     """Return status, JSON and audit fields of a report, or of the problem that kept it from being made or encoded.
 
-    is_read: whether anybody reads the report
+    is_read: whether anybody reads the report; else what is left of it is a `RefreshReport`
     """
     try:
         report = get_report()
@@ -264,7 +265,10 @@ def _encode(
             "pulses": report.planned,
             "plan_status": report.status,
         }
-        return status, b"".join(iterate_json(report)) if is_read else b"", audit
+        if not is_read:
+            limited_by = sorted(report.summary.trimmed.by_reason)
+            return status, RefreshReport(limited_by=limited_by).model_dump_json().encode(), audit
+        return status, b"".join(iterate_json(report)), audit
     except OptodriveError as error:
         problem = build_error_problem(error)
     except Exception as error:

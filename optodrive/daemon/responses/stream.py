@@ -20,6 +20,8 @@ class FrameResult(JsonModel):
     problem: why the frame was refused; error: why its plan failed, was stopped or was cancelled
     pulses, skipped, trimmed, starts_in_s, duration_s: of its plan so far, with status "planned"; the rest of a frame is
     planned only if no newer one comes
+    limited_by: caps and bounds that took light from it; with a frame that stands a further message with status
+    "planned" whenever the caps of the last second are others, empty when none is left
     planned, executed, dropped, simulated_max_um: of its plan, once that has ended
     """
 
@@ -34,6 +36,7 @@ class FrameResult(JsonModel):
     pulses: int | None = None
     skipped: int | None = None
     trimmed: int | None = None
+    limited_by: list[str] | None = None
     starts_in_s: float | None = None
     duration_s: float | None = None
     planned: int | None = None
@@ -55,3 +58,12 @@ class FrameResult(JsonModel):
     def to_json(self) -> str:
         """Encode the members that the message has."""
         return self.model_dump_json(exclude_unset=True)
+
+
+class RefreshReport(JsonModel):
+    """The planner's report of a refresh of a standing frame.
+
+    limited_by: caps that took light from it
+    """
+
+    limited_by: list[str]

@@ -11,6 +11,7 @@ from optodrive.daemon.api import standing_stream
 from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.standing_stream import StandingStream
 from optodrive.daemon.responses.error_problem import build_error_problem
+from optodrive.daemon.responses.stream import RefreshReport
 from planner_rig import PlannerRig, build_frame
 
 PLANNED, BUSY = None, BusyError("too many requests wait: 8 before this one; try again later")
@@ -33,7 +34,8 @@ class Client:
     display = SimpleNamespace(layout=range(16))
     link = SimpleNamespace(require_epoch_at=lambda earliest_s: 1)
 
-    def __init__(self, report, outcomes, send_after=(0,), end_after=6):
+    def __init__(self, report, outcomes, send_after=(0,), end_after=6, caps=()):
+        self._caps = list(caps)
         self._report, self._outcomes = report, {name: list(errors) for name, errors in outcomes.items()}
         self._send_after, self._end_after = list(send_after), end_after
         self.submitted, self.answers, self.ended_streams = [], [], 0
@@ -71,7 +73,9 @@ class Client:
         outcomes = self._outcomes.get(push.name)
         error = outcomes.pop(0) if outcomes else PLANNED
         if error is PLANNED:
-            return SimpleNamespace(fields={"status": 201}, payload=self._report)
+            limited_by = self._caps.pop(0) if self._caps and push.refreshes else []
+            refreshed = RefreshReport(limited_by=limited_by).model_dump_json().encode()
+            return SimpleNamespace(fields={"status": 201}, payload=refreshed if push.refreshes else self._report)
         if isinstance(error, LinkError):
             raise error
         problem = build_error_problem(error)
@@ -122,3 +126,16 @@ def test_a_new_frame_that_is_refused_leaves_the_older_one(report):
     assert answers == [("planned", 0), ("refused", 1)]
     assert client.submitted.count("frame 1") == 1
     assert client.submitted[-1] == "frame 0"
+
+
+def test_the_client_is_told_which_caps_take_light_from_a_frame_when_they_change(report, monkeypatch):
+    monkeypatch.setattr(standing_stream, "CAPS_PERIOD_S", 0.0)  # each refresh is told by itself
+    caps = [[], ["display_mean_power"], ["display_mean_power"], ["touch_temperature"], [], []]
+    client, answers = stand(report, {}, end_after=8, caps=caps)
+    assert answers == [("planned", 0)] * 4
+    assert [answer["limited_by"] for answer in client.answers] == [
+        [],
+        ["display_mean_power"],
+        ["touch_temperature"],
+        [],
+    ]
