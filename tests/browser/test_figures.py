@@ -89,8 +89,8 @@ def test_planned_pulses_are_dropped_executed_ones_stay(page):
         timeline.dropPlanned();
         return [before, describe()];
     }""")
-    executed = "In the last 4 s 1 pulses were executed, none trimmed. "
-    assert shown == [f"{executed}1 start within the next second.", executed]
+    executed = "In the last 4 s 1 pulse was executed, none trimmed. "
+    assert shown == [f"{executed}1 starts within the next second.", executed]
 
 
 def test_planned_pulses_are_outlines_however_dense(page):

@@ -128,7 +128,7 @@ def test_a_tracker_that_comes_and_goes_is_said_when_it_stays(page):
     assert wait_for(lambda: page.evaluate("window.flapped"), "its last state") == ["A tracker reports the fingers."]
     page.evaluate("window.again()")
     said = wait_for(lambda: page.evaluate("window.flapped.slice(1)"), "its end")
-    assert said == ["The tracker is lost: the whole page is drawn in turn."]
+    assert said == ["The tracker is lost."]
 
 
 def test_refreshes_of_a_page_are_no_waiting_plans(page, daemon, lift):

@@ -284,7 +284,7 @@ def test_a_page_whose_token_is_revoked_says_so(kept_window, bench, axe, tmp_path
     expect(control).to_have_text(re.compile(r"^Armed by anna \(this page’s token\) \d s ago\.$"))
     write_tokens(path, rig=TOKEN)
     reload(daemon, manager, str)
-    trouble = page.get_by_role("alert").filter(has_text="The token 'anna' was revoked.")
+    trouble = page.locator("#trouble").filter(has_text="The token 'anna' was revoked.")
     expect(trouble).to_be_visible()
     expect(page.locator("#board-state")).to_have_text("UNKNOWN")
     expect(page.locator("#caller")).to_have_text("token not valid")

@@ -236,7 +236,7 @@ def test_an_open_interlock_is_said_in_words_acknowledged_and_kept_in_the_history
     arm(page)
     assert page.evaluate("window.looks") == ["off", "arming"]
     failed, waiting = play_for(daemon, 8.0), play_for(daemon, 1.0)
-    trouble = page.get_by_role("alert").filter(has_text="Fault: INTERLOCK")
+    trouble = page.locator("#trouble").filter(has_text="Fault: INTERLOCK")
     expect(trouble).to_contain_text("close the enclosure")
     expect(page.locator("#board-state")).to_have_text("FAULT")
     expect(faults).to_have_text([re.compile(r"^\d.*\d INTERLOCK: the interlock opened")])

@@ -23,6 +23,7 @@ from optodrive.link.session.board_view import BoardView
 NO_LINK_PROCESS = "the link process does not run; it is being restarted"
 NO_STATS: Mapping[str, Any] = {
     "round_trip_ms": None,
+    "silence_s": None,
     "host_bad_frames": 0,
     "retransmitted": 0,
     "naks": 0,
@@ -39,7 +40,9 @@ NO_PLANNER = PlannerState(
     limits=LimitsReport(power_share=None),
 )
 UNKNOWN_BOARD: Mapping[str, Any] = {"state": "UNKNOWN", "fault": None, "hint": ""}
-"""A board without a link: its last state would be a claim."""
+"""A board without a link, or that is silent: its last state would be a claim."""
+SILENCE_MAX_S = 0.5
+"""A board reports at least every 0.2 s."""
 
 
 def merge_state(
@@ -59,7 +62,8 @@ def merge_state(
             error=status["link_error"],
             **status["stats"],
         )
-        board = status["board"] if status["connected"] else {**status["board"], **UNKNOWN_BOARD}
+        is_silent = (status["stats"]["silence_s"] or 0.0) > SILENCE_MAX_S
+        board = status["board"] if status["connected"] and not is_silent else {**status["board"], **UNKNOWN_BOARD}
     ends_in_s = status["pause"]["ends_in_s"] if status is not None and status["connected"] else None
     control = status["control"] if status is not None and status["connected"] else None
     planner = planner or NO_PLANNER

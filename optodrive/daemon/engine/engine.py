@@ -308,7 +308,9 @@ class Engine:
         """Report queue and planner."""
         accounts = self._plan_queue.accounts
         return PlannerState(
-            queue=build_queue_report(self._plan_queue, self._plan_store.list_recent(), self.board_s()),
+            queue=build_queue_report(
+                self._plan_queue, self._plan_store.list_recent(), self.board_s(), self._clock.now_s()
+            ),
             totals=PulseTotals(
                 **accounts.totals,
                 timing_error=accounts.timing.worst,

@@ -89,6 +89,7 @@ def make_plan(
         largest_target=LargestTarget.from_planned(planned),
         start_s=snapshot.start_s,
         arrived_s=request.arrived_s,
+        arrived_host_s=push.arrived_s,
         caller=push.caller,
         labels=dict(built.labels),
         parameters=dict(built.parameters),

@@ -113,7 +113,7 @@ class PlanRecord:
     pulse_count, duration_s: of the whole plan; summary_json: encoded `PlanSummary`, which is larger in memory
     pulses: None if there are too many to list
     start_s: board time of the plan's zero; folded_delay_s: by how much interruptions have shifted it
-    arrived_s: board time of the request; *_after_s: time from the request to an event
+    arrived_s, arrived_host_s: time of the request, of board and host; *_after_s: time from the request to an event
     caller: name of the token that submitted it
     labels, parameters: of the caller, and of the pattern
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
@@ -131,6 +131,7 @@ class PlanRecord:
     largest_target: LargestTarget | None
     start_s: float
     arrived_s: float
+    arrived_host_s: float = 0.0
     caller: str = ""
     labels: dict[str, str | int | float | bool] = field(default_factory=dict)
     parameters: dict[str, str | float | bool | None] = field(default_factory=dict)

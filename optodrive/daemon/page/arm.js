@@ -11,6 +11,7 @@ const TEXTS = {
   [BoardState.HOLD]: "The board waits for points, and may emit again at any time.",
   [BoardState.FAULT]: "Acknowledge the fault before you arm.",
 };
+const PAUSED_TEXT = "Paused: the laser is off. Resume plays what is left.";
 
 export class ArmControl {
   constructor(find, announce, onError) {
@@ -24,17 +25,20 @@ export class ArmControl {
     this.announce = announce;
     this.onError = onError;
     this.state = "";
+    this.isPaused = false;
     this.button.addEventListener("click", () => this.#requestConfirmation());
     this.confirmButton.addEventListener("click", () => this.#confirm());
     find("disarm").addEventListener("click", () => this.disarm());
   }
 
-  // Show the board's state; '' if it is unknown.
-  show(state) {
-    if (state !== this.state) {
+  // Show the board's state; '' if it is unknown. isPaused: whether the light is paused
+  show(state, isPaused = false) {
+    if (state !== this.state || isPaused !== this.isPaused) {
       this.state = state;
+      this.isPaused = isPaused;
       this.#setEnabled(state === BoardState.DISARMED);
-      this.status.textContent = TEXTS[state] ?? this.idleText;
+      const isDark = isPaused && state === BoardState.ARMED;
+      this.status.textContent = isDark ? PAUSED_TEXT : (TEXTS[state] ?? this.idleText);
       if (state !== BoardState.DISARMED) {
         this.#closeConfirmation();
       }

@@ -5,7 +5,7 @@ import { decodeUint16 } from "./grid.js";
 const TRACKERS = {
   none: "No tracker reports fingers.",
   seen: "A tracker reports the fingers.",
-  lost: "The tracker is lost: the whole page is drawn in turn.",
+  lost: "The tracker is lost.",
   unknown: "Unknown where fingers are: no data from the daemon.",
 };
 const TEXT_MS = 500;
@@ -17,6 +17,7 @@ export class FingersView {
   #said = "none";
   #sayTimer = null;
   #textDueMs = 0;
+  #fingers = [];
   #recent = new Map(); // number of a finger → its figures of the last MEAN_MS
 
   constructor(find, view, pitchM, announce) {
@@ -33,7 +34,7 @@ export class FingersView {
     this.view.page = values.length === this.view.grid.pixels ? values : new Uint16Array(this.view.grid.pixels);
     this.dots = this.view.page.reduce((sum, value) => sum + (value > 0), 0);
     this.view.redrawMarks();
-    this.#describePage();
+    this.#describe();
   }
 
   showFingers({ tracker, fingers }) {
@@ -46,13 +47,13 @@ export class FingersView {
     }));
     this.view.requestPaint();
     const now = performance.now();
+    this.#fingers = fingers;
     this.#remember(fingers, now);
     if (!this.#follow(tracker) && now < this.#textDueMs) {
       return;
     }
     this.#textDueMs = now + TEXT_MS;
-    this.#describePage();
-    this.find("fingers").replaceChildren(...fingers.map((finger) => this.#buildLine(finger)));
+    this.#describe();
   }
 
   // Show nothing: where fingers are and what stands is unknown.
@@ -72,7 +73,7 @@ export class FingersView {
     if (tracker !== this.#said && tracker !== "unknown") {
       this.#sayTimer = setTimeout(() => {
         this.#said = tracker;
-        this.announce(TRACKERS[tracker]);
+        this.announce(this.#describeTracker());
       }, STEADY_MS);
     }
     return true;
@@ -92,17 +93,24 @@ export class FingersView {
     const dots = `${finger.dots} ${finger.dots === 1 ? "dot" : "dots"}`;
     const recent = this.#recent.get(finger.number) ?? [];
     const mean = (name) => recent.reduce((sum, each) => sum + each[name], 0) / recent.length;
-    line.textContent = finger.dots
+    line.textContent = finger.dots && this.dots
       ? `Finger ${finger.number}: ${dots}, ${mean("rateHz").toFixed(0)} pulses/s each, ${(100 * mean("share")).toFixed(0)} % of the height`
       : `Finger ${finger.number}: no dots of the page`;
     return line;
   }
 
-  #describePage() {
+  #describeTracker() {
+    const isAllDrawn = this.#tracker === "lost" && this.dots > 0;
+    return isAllDrawn ? "The tracker is lost: the whole page is drawn in turn." : TRACKERS[this.#tracker];
+  }
+
+  // All texts at once, so that none is older than another.
+  #describe() {
+    this.find("fingers").replaceChildren(...this.#fingers.map((finger) => this.#buildLine(finger)));
     const isUsed = !["none", "unknown"].includes(this.#tracker) || this.dots > 0;
     this.find("fingers-panel").hidden &&= !isUsed; // once shown it stays, so that nothing moves
     const page = this.dots ? `A page of ${this.dots} dots stands.` : "No page stands.";
     this.find("standing").textContent = this.#tracker === "unknown" ? "" : page;
-    this.find("tracker").textContent = TRACKERS[this.#tracker];
+    this.find("tracker").textContent = this.#describeTracker();
   }
 }

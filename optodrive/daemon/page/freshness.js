@@ -12,7 +12,7 @@ export class Freshness {
     this.sources = new Map(
       Object.entries(panels).map(([source, elements]) => [source, { at: null, isStale: false, marks: elements.map(createMark) }]),
     );
-    setInterval(() => this.#check(LIMIT_MS), CHECK_MS);
+    setInterval(() => this.#check(), CHECK_MS);
   }
 
   // Note that figures of a source have arrived.
@@ -24,14 +24,24 @@ export class Freshness {
     }
   }
 
-  // Mark all sources at once: the daemon is gone.
-  lose() {
-    this.#check(-1);
+  // Mark sources at once: all if the daemon is gone.
+  lose(sources = [...this.sources.keys()]) {
+    for (const source of sources) {
+      const entry = this.sources.get(source);
+      if (!entry.isStale) {
+        this.#setStale(entry, true);
+        this.onStale(source);
+      }
+    }
   }
 
-  #check(limitMs) {
+  isStale(source) {
+    return this.sources.get(source).isStale;
+  }
+
+  #check() {
     for (const [source, entry] of this.sources) {
-      if (entry.at !== null && !entry.isStale && Date.now() - entry.at > limitMs) {
+      if (entry.at !== null && !entry.isStale && Date.now() - entry.at > LIMIT_MS) {
         this.#setStale(entry, true);
         this.onStale(source);
       }
@@ -43,7 +53,7 @@ export class Freshness {
     for (const { panel, mark } of entry.marks) {
       panel.toggleAttribute("data-stale", isStale);
       mark.hidden = !isStale;
-      mark.textContent = isStale ? `stale since ${TIME.format(entry.at)}` : "";
+      mark.textContent = !isStale ? "" : entry.at === null ? "no data" : `stale since ${TIME.format(entry.at)}`;
     }
   }
 }

@@ -33,13 +33,14 @@ const LAMPS = {
 };
 
 export class Header {
-  constructor(find, announce) {
+  // report(topic, text): says what changed
+  constructor(find, report) {
     this.bar = find("bar");
     this.sign = find("sign");
     this.word = find("board-state");
     this.meaning = find("board-means");
     this.linkPill = find("link");
-    this.announce = announce;
+    this.report = report;
     this.announced = "";
     this.darkTimer = null;
     this.lamps = INPUTS.map((input) => {
@@ -59,7 +60,7 @@ export class Header {
   showState({ board, link, queue }) {
     const look = LOOKS[board.state];
     if (link.state !== "up" || !look) {
-      this.showUnknown(link.state === "up" ? "no data yet" : "no link to the board");
+      this.showUnknown(describeUnknown(link));
       return;
     }
     if (queue.paused && board.state === BoardState.ARMED) {
@@ -103,7 +104,7 @@ export class Header {
     this.darkTimer = null;
     const isRoutine = EMITTING_STATES.includes(state) && EMITTING_STATES.includes(this.announced);
     if (this.announced && state !== this.announced && !isRoutine) {
-      this.announce(`Board: ${state}, ${meaning}`);
+      this.report("board", `Board: ${state}, ${meaning}`);
     }
     this.announced = state;
   }
@@ -115,11 +116,19 @@ export class Header {
       const kind = inputs === null ? "unknown" : value === safe ? "safe" : "unsafe";
       setText(text, `${name} ${inputs === null ? "unknown" : words[value]}`);
       if ([kind, item.dataset.kind].every((each) => ["safe", "unsafe"].includes(each)) && kind !== item.dataset.kind) {
-        this.announce(text.textContent);
+        this.report(name, text.textContent);
       }
       item.dataset.kind = kind;
     });
   }
+}
+
+// Why the state of the board is not known.
+export function describeUnknown({ state, silence_s: silenceS }) {
+  if (state !== "up") {
+    return "no link to the board";
+  }
+  return silenceS > 0.5 ? "the board does not answer" : "no data yet";
 }
 
 function formatTime(seconds) {

@@ -15,19 +15,27 @@ export class History {
     this.entries = { faults: [], plans: [] };
     this.planned = 0;
     this.leftAt = -Infinity;
+    this.isFirstFault = true;
     addEventListener("beforeunload", () => (this.leftAt = performance.now()));
     this.#restore();
     this.#show("faults");
     this.#show("plans");
   }
 
+  // Note a connection to the daemon: the fault that it reports first may have begun at any time before.
+  begin() {
+    this.isFirstFault = true;
+  }
+
   addFault(fault) {
+    const isEarlier = this.isFirstFault;
+    this.isFirstFault = false;
     if (fault.link === "down") {
-      this.#addFault("bad", `No link to the board${fault.link_error ? `: ${fault.link_error}` : ""}`);
+      this.#addFault("bad", `No link to the board${fault.link_error ? `: ${fault.link_error}` : ""}`, isEarlier);
     } else if (fault.fault) {
-      this.#addFault("bad", `${fault.fault}: ${fault.hint}`);
+      this.#addFault("bad", `${fault.fault}: ${fault.hint}`, isEarlier);
     } else if (this.entries.faults[0]?.kind === "bad") {
-      this.#addFault("good", "No fault, the link is up");
+      this.#addFault("good", "No fault, the link is up", isEarlier);
     }
   }
 
@@ -59,7 +67,7 @@ export class History {
       entry = newest; // one entry for the frames of a stream
     }
     if (!entry) {
-      entry = { at: Date.now(), kind: "", text: "", plan: plan.plan, stream: isFrame ? plan.caller : null };
+      entry = { at: Date.now() - 1000 * plan.age_s, kind: "", text: "", plan: plan.plan, stream: isFrame ? plan.caller : null };
       this.entries.plans.unshift(entry);
       this.entries.plans.splice(PLANS_MAX);
     } else if (entry.stream !== null && Number(plan.plan.slice(1)) < Number(entry.plan.slice(1))) {
@@ -73,18 +81,18 @@ export class History {
     return changed;
   }
 
-  #addFault(kind, text) {
+  #addFault(kind, text, isEarlier = false) {
     if (this.entries.faults[0]?.text !== text) {
-      this.entries.faults.unshift({ at: Date.now(), kind, text });
+      this.entries.faults.unshift({ at: Date.now(), isEarlier, kind, text });
       this.entries.faults.splice(FAULTS_MAX);
       this.#show("faults");
     }
   }
 
   #show(name) {
-    const rows = this.entries[name].map(({ at, kind, text }) => {
+    const rows = this.entries[name].map(({ at, isEarlier, kind, text }) => {
       const row = Object.assign(document.createElement("li"), { className: kind });
-      row.append(Object.assign(document.createElement("time"), { textContent: TIME.format(at) }), ` ${text}`);
+      row.append(Object.assign(document.createElement("time"), { textContent: `${isEarlier ? "before " : ""}${TIME.format(at)}` }), ` ${text}`);
       return row;
     });
     this.lists[name].replaceChildren(...(rows.length ? rows : [Object.assign(document.createElement("li"), { textContent: "None." })]));

@@ -1,9 +1,9 @@
 // The page: telemetry goes to the views, controls send requests to the daemon.
 
-import { Announcer } from "./announcer.js";
+import { Announcer, Reports } from "./announcer.js";
 import { ArmControl } from "./arm.js";
 import { call } from "./api.js";
-import { LEASED_STATES } from "./board_states.js";
+import { BoardState, LEASED_STATES } from "./board_states.js";
 import { setCapLabels } from "./caps.js";
 import { buildColourMap } from "./colours.js";
 import { DimControl } from "./dim.js";
@@ -13,7 +13,7 @@ import { FingersView } from "./fingers.js";
 import { Freshness } from "./freshness.js";
 import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
-import { Header } from "./header.js";
+import { describeUnknown, Header } from "./header.js";
 import { History } from "./history.js";
 import { HoldControl } from "./hold.js";
 import { PatternLibrary } from "./patterns.js";
@@ -21,23 +21,28 @@ import { PauseControl } from "./pause.js";
 import { Permissions } from "./permissions.js";
 import { buildFrames, PlanControl, TARGETS } from "./plans.js";
 import { QueueView } from "./queue.js";
-import { Status } from "./status.js";
+import { hasPlanner, Status } from "./status.js";
 import { StopControl } from "./stop.js";
 import { Telemetry } from "./telemetry.js";
 import { bindThemeButton } from "./theme.js";
 import { Timeline } from "./timeline.js";
-import { Trace } from "./trace.js";
+import { Peaks, Trace } from "./trace.js";
 
 const find = (id) => document.getElementById(id);
 const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const telemetry = new Telemetry(reducedMotion ? 5 : 30);
 const announcer = new Announcer(find("said"));
-const announce = (text) => announcer.say(text);
+const announce = (text) => announcer.say(text); // the answer to what was pressed
+const reports = new Reports(new Announcer(find("said-at-once")), announcer);
+
+let isOff = false;
+let isKnown = false; // whether the board reports its state
+let mayPlay = false; // whether planned pulses start
 
 // STOP first: it depends on nothing that follows.
 let plans = null;
 let mayEmit = () => true;
-new StopControl(
+const stopControl = new StopControl(
   find("stop"),
   find("stopping"),
   () => {
@@ -46,7 +51,7 @@ new StopControl(
   },
   () => telemetry.pause(document.hidden),
   () => mayEmit(),
-  new Announcer(find("said-at-once")),
+  (text) => reports.report("stop", text, true),
 );
 if (location.hash) {
   history.replaceState(null, "", location.pathname);
@@ -70,9 +75,10 @@ const view = new DisplayView(find("display"), grid);
 view.ambient = config.ambient_c;
 view.maxC = config.limits.absorber_max_c;
 const drawing = new Drawing(view);
-const fingersView = new FingersView(find, view, config.display.pitch_m, announce);
+const fingersView = new FingersView(find, view, config.display.pitch_m, (text) => reports.report("tracker", text));
 const timeline = new Timeline(find("timeline"), find("timeline-text"), config.laser.max_power_w);
 const trace = new Trace(find("trace"));
+const peaks = new Peaks(grid.pixels);
 const gauges = new Gauges(find("gauges"));
 const showError = (error) => {
   find("arming").textContent = error.message;
@@ -81,10 +87,15 @@ const showError = (error) => {
 const arm = new ArmControl(find, announce, showError);
 const hold = new HoldControl(find, announce, () => plans.playPreviewed());
 const pause = new PauseControl(find, announce, showError);
-const header = new Header(find, announce);
+const header = new Header(find, (topic, text) => reports.report(topic, text));
 const permissions = new Permissions(find);
 const dim = new DimControl(find, config.limits.power_share, () => permissions.caller, announce, showError);
-const status = new Status(find, () => arm.disarm(), () => permissions.apply());
+const status = new Status(
+  find,
+  () => arm.disarm(),
+  () => permissions.apply(),
+  (text) => reports.report("trouble", text, true),
+);
 const panelOf = (id) => find(id).closest(".panel");
 const freshness = new Freshness(
   {
@@ -123,7 +134,7 @@ async function buildRequest() {
   return { path: "/v1/plans", query: { name: "drawing" }, body: buildFrames(readTarget(), drawing.heights, readNumber("rate"), readNumber("seconds") || 1) };
 }
 
-plans = new PlanControl(find, buildRequest, announce);
+plans = new PlanControl(find, buildRequest, announce, (text) => reports.report("plan", text));
 const onStimulusChange = () => {
   plans.invalidate();
   find("drawn").textContent = drawing.count ? `${drawing.count} drawn` : "nothing drawn";
@@ -145,6 +156,7 @@ drawing.addEventListener("changed", onStimulusChange);
 library.addEventListener("changed", onStimulusChange);
 drawing.addEventListener("selected", () => {
   trace.clear();
+  trace.add(timeline.nowS(), ...peaks.of(view.cursor));
   describeSelected();
   announce(`${find("picked").textContent}, ${grid.describePlace(view.cursor)}`);
 });
@@ -213,18 +225,20 @@ function describeSelected() {
   const target = TARGETS[readTarget()];
   const drawn = view.drawn[pixel] > 0 ? `, drawn ${Number(view.drawn[pixel].toFixed(target.decimals))}${target.unit}` : "";
   const predicted = view.values.preview[pixel] > 0 ? `, predicted ${view.values.preview[pixel].toFixed(1)} µm` : "";
-  const peak = trace.peakUm > 0 ? `, peak ${trace.peakUm.toFixed(1)} µm` : "";
-  find("picked").textContent = `Pixel ${pixel}: ${height.toFixed(1)} µm${peak}, ${absorber.toFixed(1)} °C${drawn}${predicted}`;
+  const [peakUm, peakC] = trace.peaks ?? [height, absorber];
+  const now = `now ${height.toFixed(1)} µm, ${absorber.toFixed(1)} °C`;
+  const values = isKnown ? `${now}; peak ${peakUm.toFixed(1)} µm, ${peakC.toFixed(1)} °C in 10 s` : "unknown";
+  find("picked").textContent = `Pixel ${pixel}: ${values}${drawn}${predicted}`;
 }
 
 function describeDisplay() {
-  const { height, absorber } = view.values;
+  const { height, absorber } = peaks.take();
   const argmax = (values) => values.reduce((best, value, pixel) => (value > values[best] ? pixel : best), 0);
   const [highest, hottest] = [argmax(height), argmax(absorber)];
   const raised = height.reduce((sum, value) => sum + (value > 1), 0);
   const text = raised
-    ? `${raised} ${raised === 1 ? "pixel" : "pixels"} above 1 µm, highest ${height[highest].toFixed(1)} µm at ${highest}; hottest absorber ${absorber[hottest].toFixed(0)} °C at ${hottest}.`
-    : "No pixel is above 1 µm.";
+    ? `${raised} ${raised === 1 ? "pixel" : "pixels"} above 1 µm, highest ${height[highest].toFixed(1)} µm at ${highest}; hottest absorber ${absorber[hottest].toFixed(1)} °C at ${hottest}: peaks of the last second.`
+    : "No pixel was above 1 µm in the last second.";
   find("summary").textContent = text;
   find("frame-rate").textContent = `${view.rate} frames/s`;
 }
@@ -253,15 +267,23 @@ applyColourMap();
 onStimulusChange();
 view.canvas.toggleAttribute("data-editing", true);
 
-let isOff = false;
-let hasLink = false;
+const describePulses = () => timeline.describe(mayPlay);
 mayEmit = () => !(telemetry.live && isOff);
 const showTitle = () => (document.title = `${header.state} · ${config.name} · optodrive`);
 showTitle();
 
+// What the board executes is not known: no figure of now is shown.
+function showNoValues(reason) {
+  find("summary").textContent = find("timeline-text").textContent = `Unknown: ${reason}.`;
+  find("stale").hidden = false;
+  describeSelected();
+}
+
 // The state is old: nothing on the page claims that the laser runs, or that it does not.
 function showNothingKnown(reason) {
-  isOff = false;
+  isOff = isKnown = mayPlay = false;
+  plans.showQueue(null);
+  showNoValues(reason);
   header.showUnknown(reason);
   queue.clear(`Unknown: ${reason}.`);
   arm.show("");
@@ -282,6 +304,7 @@ function showInvalidToken() {
 telemetry.addEventListener("up", () => {
   permissions.load();
   timeline.clear();
+  pastEvents.begin();
 });
 telemetry.addEventListener("down", () => {
   freshness.lose();
@@ -301,31 +324,51 @@ telemetry.addEventListener("down", () => {
 });
 telemetry.addEventListener("unauthorized", showInvalidToken);
 telemetry.addEventListener("state", ({ detail }) => {
-  const isLinked = detail.link.state === "up";
-  isOff = isLinked && !LEASED_STATES.includes(detail.board.state);
+  const { board, link, queue: plansOfDaemon } = detail;
+  isKnown = link.state === "up" && board.state in BoardState;
+  isOff = isKnown && !LEASED_STATES.includes(board.state);
+  mayPlay = isKnown && !isOff && !plansOfDaemon.paused;
   if (detail.display !== config.name || detail.pixels !== grid.pixels) {
     location.reload(); // the restarted daemon has another display
   }
   header.showConnection("live", "good");
   header.showState(detail);
-  if (isOff) {
+  if (!isKnown || isOff) {
     timeline.dropPlanned();
   }
   showTitle();
-  status.showState(detail);
-  queue.show(detail.queue);
-  pastEvents.showPlans(detail);
-  arm.show(isLinked ? detail.board.state : "");
+  status.showState(detail, isKnown);
+  showPlans(detail);
+  const state = isKnown ? board.state : "";
+  arm.show(state, plansOfDaemon.paused);
+  hold.show(state);
+  pause.show(state, plansOfDaemon);
   dim.show(detail.limits.power_share);
-  hold.show(isLinked ? detail.board.state : "");
-  pause.show(isLinked ? detail.board.state : "", detail.queue);
-  arm.showControl(isLinked ? detail.control : null, permissions.caller?.name);
-  hasLink = isLinked;
+  arm.showControl(isKnown ? detail.control : null, permissions.caller?.name);
   freshness.see("state");
-  if (isLinked) {
+  if (isKnown) {
+    stopControl.noteLink();
     freshness.see("board");
+    describePulses();
+  } else {
+    freshness.lose(["board", "budget", "display"]);
+    showNoValues(describeUnknown(link));
   }
 });
+
+function showPlans(state) {
+  const { board, link } = state;
+  if (!isKnown || !hasPlanner(state)) {
+    queue.clear(`Unknown: ${isKnown ? "the planner is restarted" : describeUnknown(link)}.`);
+    plans.showQueue(null);
+    return;
+  }
+  const light = isOff ? "off" : [BoardState.RUNNING, BoardState.HOLD].includes(board.state) ? "emits" : "may";
+  queue.show(state.queue, light);
+  plans.showQueue(state.queue);
+  pastEvents.showPlans(state);
+}
+
 telemetry.addEventListener("fault", ({ detail }) => {
   status.showFault(detail);
   pastEvents.addFault(detail);
@@ -333,8 +376,9 @@ telemetry.addEventListener("fault", ({ detail }) => {
 telemetry.addEventListener("budget", ({ detail }) => {
   gauges.show(detail.caps);
   find("panel").textContent = `Panel: up to ${detail.panel_c.toFixed(1)} °C.`;
-  if (hasLink) {
-    freshness.see("budget"); // without a link nobody knows what the board executes
+  timeline.setTime(detail.board_s);
+  if (isKnown) {
+    freshness.see("budget");
   }
 });
 telemetry.addEventListener("fingers", ({ detail }) => {
@@ -342,16 +386,29 @@ telemetry.addEventListener("fingers", ({ detail }) => {
   freshness.see("fingers");
 });
 telemetry.addEventListener("page", ({ detail }) => fingersView.showPage(detail));
-telemetry.addEventListener("pulses", ({ detail }) => timeline.addPulses(detail));
+telemetry.addEventListener("pulses", ({ detail }) => {
+  const wasEmpty = timeline.beamPath(4).length === 0; // with the first pulse the text is wrong
+  timeline.addPulses(detail);
+  if (isKnown && wasEmpty) {
+    describePulses();
+  }
+});
 telemetry.addEventListener("display", ({ detail }) => {
-  find("stale").hidden = true;
-  freshness.see("display");
+  timeline.setTime(detail.board_s);
+  find("stale").hidden = isKnown;
+  if (isKnown) {
+    freshness.see("display");
+  }
   const fromTenths = (values) => Float32Array.from(values, (value) => value / 10);
   const read = (column) => fromTenths(decodeUint16(column));
   const [height, absorber] = [read(detail.height), read(detail.absorber)];
   view.beamPath = find("beam").checked ? timeline.beamPath() : [];
   view.setValues(height, absorber);
-  trace.add(detail.board_s, read(detail.height_peak)[view.cursor], read(detail.absorber_peak)[view.cursor]);
+  peaks.add(read(detail.height_peak), read(detail.absorber_peak));
+  if (!isKnown) {
+    peaks.take(); // they are not of the second in which the board reports again
+  }
+  trace.add(detail.board_s, ...peaks.newestOf(view.cursor));
 });
 telemetry.run();
 
@@ -370,7 +427,9 @@ setInterval(() => {
     const now = performance.now();
     view.rate = Math.round(((view.frames - lastCount.frames) * 1000) / (now - lastCount.at));
     lastCount = { frames: view.frames, at: now };
-    describeDisplay();
-    timeline.describe();
+    if (isKnown && !freshness.isStale("display")) {
+      describeDisplay();
+      describePulses();
+    }
   }
 }, updateMs);

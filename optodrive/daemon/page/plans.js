@@ -5,8 +5,8 @@ import { labelCap } from "./caps.js";
 import { describeStatus } from "./plan_end.js";
 import { formatQuantity } from "./quantities.js";
 
-const POLL_MS = 400;
 const FRAMES_MAX = 500;
+const VERBS = { planned: "waits", queued: "waits", running: "plays", paused: "is paused" };
 const FINAL_STATUSES = ["done", "superseded", "stopped", "failed", "cancelled"];
 
 // Quantities that a drawing may state, by their keys in a frame: name, unit, decimals, default and bounds.
@@ -38,8 +38,11 @@ const readPolicy = () => document.querySelector('input[name="policy"]:checked').
 
 export class PlanControl extends EventTarget {
   // buildRequest(): returns path and body of the present stimulus
-  constructor(find, buildRequest, announce) {
+  // announce(text): says the answer to what was pressed; report(text): says how a plan ended
+  constructor(find, buildRequest, announce, report) {
     super();
+    this.report = report;
+    this.followed = null; // the plan that was played here, until its end
     this.buildRequest = buildRequest;
     this.announce = announce;
     this.previewButton = find("preview");
@@ -105,9 +108,13 @@ export class PlanControl extends EventTarget {
       lines.push(["warn", `${delay.source} is delayed by ${delay.wait_s.toFixed(2)} s: ${labelCap(delay.cap)}.`]);
     }
     if (summary.skipped.length) {
-      lines.push(["", `${summary.skipped.length} pixels need no pulse: their residual heat is sufficient.`]);
+      // A pixel may need none for some frames, and pulses for the others.
+      const [targets, pixels] = [summary.skipped.length, new Set(summary.skipped.map(({ pixel }) => pixel)).size];
+      const where = `${targets} ${targets === 1 ? "target" : "targets"} on ${pixels} ${pixels === 1 ? "pixel" : "pixels"}`;
+      lines.push(["", `${where} ${targets === 1 ? "needs" : "need"} no pulse: the heat left there is sufficient.`]);
     }
     this.#showLines(...lines);
+    this.announce(lines.map(([, text]) => text).join(" "));
   }
 
   // Play what was previewed, if anything was; also while the end of what it has played before is not known yet.
@@ -123,29 +130,51 @@ export class PlanControl extends EventTarget {
     try {
       const query = new URLSearchParams({ ...stimulus.query, policy: stimulus.policy });
       const plan = await call("POST", `${stimulus.path}?${query}`, { body: stimulus.body });
-      this.announce(`Playing ${plan.plan}`);
+      this.announce(`Sent: ${plan.plan}`);
       this.dispatchEvent(new Event("played"));
-      await this.#follow(plan);
+      this.followed = plan.plan;
+      this.#showLines(["", `${plan.plan} waits.`]);
     } catch (error) {
       this.#showError(error);
+      setEnabled(this.playButton, this.previewed !== null);
     }
-    setEnabled(this.playButton, this.previewed !== null);
   }
 
-  // Show the result once the plan has ended. The panel Playing shows its progress.
-  async #follow(plan) {
-    this.followed = plan.plan;
-    this.#showLines(["", `${plan.plan} plays.`]);
-    while (!FINAL_STATUSES.includes(plan.status)) {
-      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
-      plan = await call("GET", `/v1/plans/${plan.plan}?pulses=false`);
-      if (this.followed !== plan.plan) {
-        return;
+  // Show how the plan goes that was played here. queue: as the daemon reports it, null if it is unknown
+  async showQueue(queue) {
+    const { followed } = this;
+    if (followed === null) {
+      return;
+    }
+    if (queue === null) {
+      this.#showLines(["soft", `Unknown: how ${followed} goes on.`]);
+      return;
+    }
+    const reported = [...queue.active, ...queue.plans].find(({ plan }) => plan === followed);
+    if (reported && !FINAL_STATUSES.includes(reported.status)) {
+      this.#showLines(["", `${followed} ${VERBS[reported.status]}.`]);
+      return;
+    }
+    try {
+      const plan = await call("GET", `/v1/plans/${followed}?pulses=false`);
+      if (this.followed === followed && FINAL_STATUSES.includes(plan.status)) {
+        this.followed = null;
+        this.#showEnd(plan);
+      }
+    } catch (error) {
+      if (error.status && this.followed === followed) {
+        this.followed = null; // a restarted daemon does not know it
+        this.#showError(error);
       }
     }
+    setEnabled(this.playButton, this.followed === null && this.previewed !== null);
+  }
+
+  #showEnd(plan) {
     const height = plan.simulated_max_um === null ? "" : `; highest ${plan.simulated_max_um.toFixed(1)} µm, simulated from the executed pulses`;
     const { text, kind } = describeStatus(plan);
     this.#showLines([kind, `${plan.plan} ${text}.`], ["", `${plan.executed} of ${plan.planned} pulses executed${height}.`]);
+    this.report(`${plan.plan} ${text}. ${plan.executed} of ${plan.planned} pulses executed${height}.`);
   }
 
   #showError(error) {
@@ -154,7 +183,9 @@ export class PlanControl extends EventTarget {
       return;
     }
     const where = error.problem?.where ? `${error.problem.where}: ` : "";
-    this.#showLines(["bad", error.message.startsWith(where) ? error.message : where + error.message]);
+    const text = error.message.startsWith(where) ? error.message : where + error.message;
+    this.#showLines(["bad", text]);
+    this.announce(text);
   }
 
   #showLines(...lines) {

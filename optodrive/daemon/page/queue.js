@@ -28,16 +28,18 @@ export class QueueView {
     this.#showWaiting([]);
   }
 
-  show(queue) {
-    const [first, ...others] = queue.active;
+  // light: "off" while the board is not armed, "emits" while it says that it emits, "may" otherwise
+  show(queue, light) {
+    const [first, ...others] = light === "off" ? [] : queue.active; // what is still listed has ended
     const isRunning = first !== undefined && (first.plan === queue.running || isFrame(first));
-    this.idle.textContent = first ? "The next plan starts." : "Nothing plays.";
+    const nothing = light === "emits" ? "Not reported yet: what plays." : "Nothing plays.";
+    this.idle.textContent = first ? "The next plan starts." : nothing;
     this.#showWhether(isRunning ? first : null);
     this.at = performance.now();
     if (isRunning) {
       this.#showRunning(first);
     }
-    const waiting = isRunning ? others : queue.active;
+    const waiting = isRunning ? others : [first, ...others].filter(Boolean);
     this.#showWaiting(waiting.filter((plan) => !isFrame(plan))); // the next frame replaces one that waits
   }
 

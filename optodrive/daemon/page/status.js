@@ -1,27 +1,30 @@
 // What to do about a fault, and the figures of the board and the link.
 
 export class Status {
-  // onControlAdded: called after a control has been added to the page
-  constructor(find, acknowledge, onControlAdded) {
+  // onControlAdded: called after a control has been added to the page; report(text): says an alert, "" its end
+  constructor(find, acknowledge, onControlAdded, report) {
     this.alert = find("trouble");
     this.nextPlace = find("laser-title");
     this.stats = find("figures");
     this.acknowledge = acknowledge;
     this.onControlAdded = onControlAdded;
+    this.report = report;
     this.alertText = "";
   }
 
-  showState(state) {
+  // isKnown: whether the board reports; what it reported last is no figure of now
+  showState(state, isKnown) {
     const { board, link, totals } = state;
+    const ofBoard = (text) => (isKnown ? text : "–");
     const rows = {
       Port: link.port,
       "Round trip": link.round_trip_ms === null ? "–" : `${link.round_trip_ms.toFixed(1)} ms`,
       Retransmitted: link.retransmitted,
-      Underruns: board.underruns,
-      "Laser on": `${board.laser_on_s.toFixed(2)} s`,
-      "Pulses executed": totals.executed,
-      "Streamed frames shown": totals.frames_shown,
-      "Board temperature": board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`,
+      Underruns: ofBoard(board.underruns),
+      "Laser on": ofBoard(`${board.laser_on_s.toFixed(2)} s`),
+      "Pulses executed": hasPlanner(state) ? totals.executed : "–",
+      "Streamed frames shown": hasPlanner(state) ? totals.frames_shown : "–",
+      "Board temperature": ofBoard(board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`),
       ...Object.fromEntries(state.stages.map((stage) => [`Stage ${stage.name}`, describeStage(stage)])),
     };
     this.stats.replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [createElement("dt", name), createElement("dd", value)]));
@@ -54,14 +57,17 @@ export class Status {
   showInvalidToken(reason) {
     const login = Object.assign(createElement("a", "Enter another one"), { href: "./" });
     const text = reason ? `${reason[0].toUpperCase()}${reason.slice(1)}` : "The daemon does not know this page’s token: it was revoked, or the daemon was restarted";
-    this.#showAlert([createElement("strong", `${text}.`), createElement("span", "The display is not live, and STOP of this page is refused: in doubt use the emergency stop or the key."), login]);
+    const advice = "In doubt use the emergency stop or the key: STOP of this page is refused, and the display is not live.";
+    this.#showAlert([createElement("strong", advice), createElement("span", `${text}.`), login]);
   }
 
   #showAlert(items) {
     const text = items.map((item) => item.textContent).join();
+    const sentences = items.filter((item) => item.matches("strong, span")).map((item) => item.textContent);
     if (text !== this.alertText) {
       const hadFocus = this.alert.contains(document.activeElement);
       this.alertText = text;
+      this.report(sentences.map((each) => (each.endsWith(".") ? each : `${each}.`)).join(" "));
       this.alert.replaceChildren(...items);
       this.alert.hidden = items.length === 0;
       if (hadFocus) {
@@ -71,6 +77,9 @@ export class Status {
     }
   }
 }
+
+// Whether the planner process runs, without which nothing is known of plans.
+export const hasPlanner = ({ limits }) => limits.power_share !== null;
 
 // One of several stages: the state of its board, and its clock against the host's; lost or without a link its cause.
 function describeStage({ board, connected, error: cause, lost, clock_error_us: error, clock_drift_ppm: drift }) {

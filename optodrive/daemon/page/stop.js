@@ -11,10 +11,11 @@ const FREE_MS = 100; // without an answer by then, the connections of other wind
 export class StopControl {
   // freeConnection: closes connections that may block the request; onAnswered: the daemon has answered
   // mayEmit(): returns whether the laser may emit; true if that is unknown
-  // announcer: says at once that STOP was answered, when nothing shows it any more
-  constructor(button, status, freeConnection, onAnswered, mayEmit, announcer) {
+  // report(text): says how it goes
+  constructor(button, status, freeConnection, onAnswered, mayEmit, report) {
     this.status = status;
-    this.announcer = announcer;
+    this.report = report;
+    this.needsLink = false; // whether what is shown is that there is no link to the board
     this.freeConnection = freeConnection;
     this.onAnswered = onAnswered;
     this.running = false;
@@ -40,7 +41,8 @@ export class StopControl {
     this.running = true;
     this.#show("STOP sent …");
     for (let attempts = 1; !(await this.#attempt()); attempts++) {
-      this.#show(`STOP is not answered yet after ${attempts} attempts; it is sent again. In doubt use the emergency stop or the key.`);
+      const count = `${attempts} ${attempts === 1 ? "attempt" : "attempts"}`;
+      this.#say(`In doubt use the emergency stop or the key. STOP is not answered yet after ${count}; it is sent again.`);
       await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
     }
     this.running = false;
@@ -54,15 +56,16 @@ export class StopControl {
       const response = await request("POST", "/v1/stop", { signal: AbortSignal.timeout(TIMEOUT_MS) });
       if (response.ok) {
         this.#show("");
-        this.announcer.say("STOP is done: the laser is off, and the board is not armed.");
+        this.report("STOP is done: the laser is off, and the board is not armed.");
         return true;
       }
       if (response.status === 401) {
-        this.#show("STOP was refused: this page’s token was revoked, or the daemon was restarted and is not armed. In doubt use the emergency stop or the key.");
+        this.#say("In doubt use the emergency stop or the key. STOP was refused: this page’s token was revoked, or the daemon was restarted and is not armed.");
         return true;
       }
       if (response.status === 503) {
-        this.#show("The daemon has no link to the board. Without a link the board switches the gate off; in doubt use the emergency stop.");
+        this.#say("In doubt use the emergency stop. The daemon has no link to the board, which switches the gate off by itself without one.");
+        this.needsLink = true;
         return true;
       }
     } catch {
@@ -73,7 +76,20 @@ export class StopControl {
     return false;
   }
 
+  // Note that the link to the board is up: what was said without it is past.
+  noteLink() {
+    if (this.needsLink) {
+      this.#show("");
+    }
+  }
+
+  #say(text) {
+    this.#show(text);
+    this.report(text);
+  }
+
   #show(text) {
+    this.needsLink = false;
     this.status.hidden = !text;
     this.status.textContent = text;
   }

@@ -6,6 +6,7 @@ import { readThemeColour } from "./colours.js";
 const HISTORY_S = 4;
 const AHEAD_S = 1;
 const RETENTION_S = 6;
+const RESTART_S = 0.5; // a time that much before the last one is of a clock that began anew
 const BEAM_PULSES_MAX = 400;
 const OUTLINE_MIN_PX = 5; // a narrower pulse has only the upper edge of its outline, because the sides would fill it
 
@@ -16,7 +17,7 @@ export class Timeline {
     this.maxPowerW = maxPowerW;
     this.pulses = new Map();
     this.beamPulses = [];
-    this.board = { s: 0, at: performance.now() };
+    this.board = { s: -Infinity, at: performance.now() };
     this.applyTheme();
     new ResizeObserver(() => this.#fit()).observe(canvas);
   }
@@ -30,8 +31,19 @@ export class Timeline {
     return this.board.s + (performance.now() - this.board.at) / 1000;
   }
 
+  // Take the present time of the board. Pulses of a clock that began anew since are no longer in time.
+  setTime(boardS) {
+    if (boardS < this.board.s - RESTART_S) {
+      this.clear();
+    }
+    this.board = { s: boardS, at: performance.now() };
+  }
+
+  // board_s: time of the newest pulses, which may be long past for a new reader
   addPulses({ board_s, planned, executed }) {
-    this.board = { s: board_s, at: performance.now() };
+    if (board_s > this.nowS()) {
+      this.setTime(board_s);
+    }
     for (const [isExecuted, batches] of [[false, planned], [true, executed]]) {
       for (const batch of batches) {
         batch.row.forEach((row, k) => {
@@ -69,6 +81,7 @@ export class Timeline {
   clear() {
     this.pulses.clear();
     this.beamPulses = [];
+    this.board = { s: -Infinity, at: performance.now() };
   }
 
   // Remove the pulses that were planned and will not come.
@@ -147,15 +160,18 @@ export class Timeline {
     context.strokeRect(x(now), 0, 0, base);
   }
 
-  describe() {
+  // mayPlay: whether planned pulses are going to start
+  describe(mayPlay = true) {
     const now = this.nowS();
     const pulses = [...this.pulses.values()];
-    const executed = pulses.filter((pulse) => pulse.isExecuted && pulse.startS > now - HISTORY_S && pulse.startS <= now);
+    const executed = pulses.filter((pulse) => pulse.isExecuted && pulse.startS > now - HISTORY_S);
     const trimmed = executed.filter((pulse) => pulse.trimmedW > 0);
     const reasons = [...new Set(trimmed.map((pulse) => labelCap(pulse.reason)))];
     const trimming = trimmed.length ? `, ${trimmed.length} of them trimmed (${reasons.join(", ")})` : ", none trimmed";
-    const upcoming = pulses.filter((pulse) => pulse.startS > now).length;
-    const text = executed.length ? `In the last ${HISTORY_S} s ${executed.length} pulses were executed${trimming}. ` : "No recent pulses. ";
-    this.text.textContent = text + (upcoming ? `${upcoming} start within the next second.` : "");
+    const isUpcoming = ({ isExecuted, startS }) => !isExecuted && startS > now && startS <= now + AHEAD_S;
+    const upcoming = mayPlay ? pulses.filter(isUpcoming).length : 0;
+    const count = executed.length === 1 ? "1 pulse was" : `${executed.length} pulses were`;
+    const text = executed.length ? `In the last ${HISTORY_S} s ${count} executed${trimming}. ` : `No pulse in the last ${HISTORY_S} s. `;
+    this.text.textContent = text + (upcoming ? `${upcoming} ${upcoming === 1 ? "starts" : "start"} within the next second.` : "");
   }
 }

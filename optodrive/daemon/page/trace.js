@@ -49,9 +49,9 @@ export class Trace {
     this.plot = new uPlot(options, [[], [], []], this.container);
   }
 
-  // The highest displacement of the last ten seconds, µm; 0 without any.
-  get peakUm() {
-    return Math.max(0, ...this.height);
+  // The highest displacement and temperature of the last ten seconds, µm and °C; null without any.
+  get peaks() {
+    return this.t.length ? [Math.max(...this.height), Math.max(...this.absorber)] : null;
   }
 
   // heightUm, absorberC: the highest since the last call
@@ -71,5 +71,37 @@ export class Trace {
   paint() {
     const now = this.t.at(-1) ?? 0;
     this.plot.setData([this.t.map((s) => s - now), this.height, this.absorber]);
+  }
+}
+
+// Peaks of every pixel between two updates of the texts: a bump may be over between two messages.
+export class Peaks {
+  constructor(pixels) {
+    const none = () => ({ height: new Float32Array(pixels), absorber: new Float32Array(pixels) });
+    [this.newest, this.shown, this.next] = [none(), none(), null];
+  }
+
+  // height, absorber: the highest since the last call, µm and °C
+  add(height, absorber) {
+    this.newest = { height, absorber };
+    const max = (name) => this.next?.[name].map((value, pixel) => Math.max(value, this.newest[name][pixel])) ?? this.newest[name];
+    this.next = { height: max("height"), absorber: max("absorber") };
+  }
+
+  // Return the peaks since the last call, or the last ones if none have come since.
+  take() {
+    this.shown = this.next ?? this.shown;
+    this.next = null;
+    return this.shown;
+  }
+
+  newestOf(pixel) {
+    return [this.newest.height[pixel], this.newest.absorber[pixel]];
+  }
+
+  // Return the highest of a pixel since the update before the last one, µm and °C.
+  of(pixel) {
+    const since = [this.shown, this.next ?? this.shown];
+    return ["height", "absorber"].map((name) => Math.max(...since.map((each) => each[name][pixel])));
   }
 }

@@ -9,12 +9,16 @@ from optodrive.link.session.timing_error import TimingError
 
 
 class LinkReport(JsonModel):
-    """The link to the board: its error counters, and the likely cause of the last problem."""
+    """The link to the board: its error counters, and the likely cause of the last problem.
+
+    silence_s: since the board's last message, null without a link; beyond 0.5 s the board's state is unknown
+    """
 
     port: str
     state: Literal["up", "down"]
     error: str | None
     round_trip_ms: float | None
+    silence_s: float | None
     host_bad_frames: int
     retransmitted: int
     naks: int
@@ -77,7 +81,10 @@ class ControlReport(JsonModel):
 
 
 class RecentPlan(JsonModel):
-    """One of the latest plans: its caller (the name of a token), and how many of its planned pulses were executed."""
+    """One of the latest plans: its caller (the name of a token), and how many of its planned pulses were executed.
+
+    age_s: since its request arrived
+    """
 
     plan: str
     name: str
@@ -86,6 +93,7 @@ class RecentPlan(JsonModel):
     planned: int
     executed: int
     error: str | None
+    age_s: float
 
 
 class QueuedPlan(RecentPlan):

@@ -370,6 +370,7 @@ class BoardLink:
         counts, round_trip_s, cause = self._count_errors(), self._clock_sync.round_trip_s, self._watch.cause
         return {
             "round_trip_ms": None if round_trip_s is None else round_trip_s * 1e3,
+            "silence_s": self._clock.now_s() - self._last_received_s if self.connected else None,
             "host_bad_frames": counts.host_bad_frames,
             "retransmitted": counts.retransmitted,
             "naks": counts.naks,

@@ -221,7 +221,7 @@ class GroupState:
         merged = dict(min(stats, key=lambda each: each["likely_cause_age_s"] or inf))
         for name in ("host_bad_frames", "retransmitted", "naks", "board_bad_frames", "underruns"):
             merged[name] = sum(each[name] for each in stats)
-        for name in ("round_trip_ms", "longest_stall_ms"):
+        for name in ("round_trip_ms", "silence_s", "longest_stall_ms"):
             merged[name] = max((each[name] for each in stats if each[name] is not None), default=None)
         return merged
 

@@ -40,6 +40,14 @@ def test_a_board_without_a_link_has_no_known_state():
     assert state.control is None
 
 
+@pytest.mark.parametrize(
+    ("silence_s", "state"), [(0.0, "RUNNING"), (0.5, "RUNNING"), (0.51, "UNKNOWN"), (9.0, "UNKNOWN")]
+)
+def test_a_board_that_is_silent_has_no_known_state(silence_s, state):
+    merged = merge({**STATUS, "stats": {**NO_STATS, "silence_s": silence_s}})
+    assert (merged.board.state, merged.link.state, merged.link.silence_s) == (state, "up", silence_s)
+
+
 def test_every_stage_is_listed_without_a_link_process_or_a_link():
     config = build_stages("display-16", 2).config
     unknown = merge(None, config=config).stages
@@ -65,7 +73,7 @@ def test_a_process_that_does_not_run_is_reported(status, planner):
 
 @pytest.mark.parametrize("ends_in_s", [None, 120.0])
 def test_a_pause_is_reported_before_the_planner_knows_of_it(ends_in_s):
-    plan = {"plan": "p1", "name": "push", "caller": "ann", "planned": 9, "executed": 3, "error": None}
+    plan = {"plan": "p1", "name": "push", "caller": "ann", "planned": 9, "executed": 3, "error": None, "age_s": 1.0}
     plan |= {"duration_s": 2.0, "starts_in_s": -1.0, "ends_in_s": 1.0}
     active = [plan | {"status": "running"}, plan | {"status": "queued"}]
     queue = {**NO_PLANNER.queue.model_dump(), "active": active, "running": "p1", "paused": ends_in_s is None}

@@ -19,7 +19,13 @@ from optodrive.physics.nominal_display import DisplayState
 BOARD = dict.fromkeys(("inputs", "done_index", "queued", "free_points", "underruns", "crc_errors"), 0)
 BOARD |= {"format_errors": 0, "seq_errors": 0, "laser_on_s": 0.0, "temperature_c": None, "uid": "", "firmware": 1}
 LINK = dict.fromkeys(("host_bad_frames", "retransmitted", "naks", "board_bad_frames", "underruns"), 0)
-LINK |= {"round_trip_ms": None, "longest_stall_ms": 0.0, "likely_cause": None, "likely_cause_age_s": None}
+LINK |= {
+    "round_trip_ms": None,
+    "silence_s": None,
+    "longest_stall_ms": 0.0,
+    "likely_cause": None,
+    "likely_cause_age_s": None,
+}
 
 
 def build_state(board="DISARMED", fault=None, error=None):
