@@ -15,6 +15,9 @@ RootOption = Annotated[
     Path, typer.Option("--root", metavar="DIR", help="Install below this folder instead of /, for packages and tests.")
 ]
 
+NameOption = Annotated[
+    str, typer.Option("--name", metavar="NAME", help="Of a further service on this host, the unit optodrive@NAME.")
+]
 
 GROUP = typer.Typer(help="Manage the files of the systemd service; no command starts it.", no_args_is_help=True)
 
@@ -22,6 +25,7 @@ GROUP = typer.Typer(help="Manage the files of the systemd service; no command st
 @GROUP.command()
 def install(
     config: ConfigOption = None,
+    name: NameOption = "",
     root: RootOption = Path("/"),
     program: Annotated[
         Path | None,
@@ -30,52 +34,67 @@ def install(
     json: JsonOption = False,
 ) -> None:
     """Write unit, user, udev rules and configuration. Edited files are never overwritten."""
-    from optodrive.cli.service_files import CONFIG_PATH, DEVICE_LINK, Installation, build_service_files
+    from optodrive.cli.service_files import (
+        Installation,
+        ServicePaths,
+        build_service_files,
+        check_other_services,
+        find_device_class,
+        list_serial_ports,
+    )
 
-    installation = Installation(root)
-    installed_config = installation.resolve(CONFIG_PATH)
+    paths = ServicePaths(name)
+    installation = Installation(root, paths)
+    installed_config = installation.resolve(paths.config)
     # An upgrade keeps the installed configuration.
     source = installed_config if config is None and installed_config.exists() else config
     started = program or Path(sys.executable).with_name("optodrive")
     if root.resolve() == Path("/") and not (started.is_file() and os.access(started, os.X_OK)):
         raise InputError("--program", str(started), "an executable file; without --root the service starts it here")
-    loaded, files = build_service_files(source, started)
+    loaded, files = build_service_files(source, started, paths)
+    check_other_services(root, paths, loaded, config is not None)
     actions = installation.install(files)
     if _print_files("action", actions, json):
         return
+    for key, port in list_serial_ports(loaded):
+        if find_device_class(port) is None:
+            print(f"warning: {key} = {port} is not present: the unit allows it only if it is on USB")
     if loaded.board.vendor_id is None and loaded.board.transport == "serial":
-        print(f"no udev rules: set [board] vendor_id and product_id to get {DEVICE_LINK} and keep ModemManager away")
-    elif loaded.board.transport == "serial" and loaded.board.port != DEVICE_LINK:
-        print(f"[board] port is {loaded.board.port}; {DEVICE_LINK} is its persistent name")
-    print(f"next, as root, once {CONFIG_PATH} is correct:")
+        print(
+            f"no udev rules: set [board] vendor_id and product_id to get {paths.device_link} and keep ModemManager away"
+        )
+    elif loaded.board.transport == "serial" and loaded.board.port != paths.device_link:
+        print(f"[board] port is {loaded.board.port}; {paths.device_link} is its persistent name")
+    print(f"next, as root, once {paths.config} is correct:")
     for line in (
-        "systemd-sysusers optodrive.conf",
+        f"systemd-sysusers {paths.users.name}",
         "udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=usb",
-        "systemctl daemon-reload && systemctl enable --now optodrive",
+        f"systemctl daemon-reload && systemctl enable --now {paths.unit_name}",
     ):
         print(f"    {line}")
     print("The laser stays off: only `optodrive arm` arms the board, the daemon never does.")
 
 
 @GROUP.command()
-def remove(root: RootOption = Path("/"), json: JsonOption = False) -> None:
+def remove(name: NameOption = "", root: RootOption = Path("/"), json: JsonOption = False) -> None:
     """Remove the installed files, except edited ones."""
-    from optodrive.cli.service_files import Installation
+    from optodrive.cli.service_files import Installation, ServicePaths
 
-    actions = Installation(root).remove()
+    paths = ServicePaths(name)
+    actions = Installation(root, paths).remove()
     if not _print_files("action", actions, json) and actions:
-        print("stop the service if it is running: systemctl disable --now optodrive; then systemctl daemon-reload")
-        print(
-            "kept: /var/lib/optodrive (tokens, audit file), /var/cache/optodrive (compiled kernels), the user optodrive"
-        )
+        unit = paths.unit_name
+        print(f"stop the service if it is running: systemctl disable --now {unit}; then systemctl daemon-reload")
+        kept = f"/var/lib/{paths.program} (tokens, audit file), /var/cache/optodrive (compiled kernels)"
+        print(f"kept: {kept}, the user optodrive")
 
 
 @GROUP.command()
-def show(root: RootOption = Path("/"), json: JsonOption = False) -> None:
+def show(name: NameOption = "", root: RootOption = Path("/"), json: JsonOption = False) -> None:
     """List the installed files, and whether they were edited."""
-    from optodrive.cli.service_files import Installation
+    from optodrive.cli.service_files import Installation, ServicePaths
 
-    installation = Installation(root)
+    installation = Installation(root, ServicePaths(name))
     statuses = [(path, str(installation.file_status(path))) for path in installation.installed_files()]
     _print_files("status", statuses, json)
 

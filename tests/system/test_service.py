@@ -121,7 +121,7 @@ def test_sighup_with_a_wrong_configuration_changes_nothing(manager, board, make_
 def run_unit_reload(daemon):
     """Run the unit's ExecReload= commands one after the other until one fails, as systemd does. Return its result."""
     unit = locate_shipped("systemd", "optodrive.service").read_text()
-    names = {"@PROGRAM@": OPTODRIVE, "/etc/optodrive/config.toml": daemon.config, "$MAINPID": daemon.process.pid}
+    names = {"@PROGRAM@": OPTODRIVE, "@CONFIG@": daemon.config, "$MAINPID": daemon.process.pid}
     for command in re.findall(r"^ExecReload=(.+)$", unit, re.MULTILINE):
         words = [str(names.get(word, word)) for word in command.split()]
         done = run_process(words, capture_output=True, text=True)

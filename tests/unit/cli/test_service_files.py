@@ -12,18 +12,17 @@ import pytest
 from optodrive.cli.main import run
 from optodrive.cli.service_files import (
     CONFIG_PATH,
-    MANIFEST_PATH,
-    RULES_PATH,
     UNIT_PATH,
-    USERS_PATH,
     Installation,
     ServiceFile,
+    ServicePaths,
 )
 from optodrive.core.errors import RefusedError
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.pixel_map import PixelMap, write_pixel_map
 from optodrive.planning.display_model import DisplayModel
 
+MANIFEST_PATH, RULES_PATH, USERS_PATH = ServicePaths().manifest, ServicePaths().rules, ServicePaths().users
 PROGRAM = "/opt/optodrive/bin/optodrive"
 USB_BOARD = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n'
 
@@ -54,7 +53,7 @@ def test_what_is_written_is_in_order(install, at):
     output = install().out
     assert all(at(path).is_file() for path in (UNIT_PATH, USERS_PATH, CONFIG_PATH, MANIFEST_PATH))
     assert f"ExecStart={PROGRAM} serve --config {CONFIG_PATH}\n" in at(UNIT_PATH).read_text()
-    assert "@" not in at(UNIT_PATH).read_text().replace("~@", "").replace("=@", "").replace(" @", "")
+    assert not re.search(r"@[A-Z]+@", at(UNIT_PATH).read_text())
     daemon = load_config(at(CONFIG_PATH)).daemon
     assert (daemon.socket, daemon.tokens, daemon.audit) == (
         "/run/optodrive/optodrive.sock",
@@ -264,6 +263,108 @@ def test_only_a_board_on_usb_gets_usb_devices(install, at, tmp_path):
     assert "usb_device" not in at(UNIT_PATH).read_text()
     install("--config", board_config(tmp_path, USB_BOARD.replace('"serial"', '"usb"')))
     assert "DeviceAllow=char-usb_device rw\n" in at(UNIT_PATH).read_text()
+
+
+STAGES = """
+[[stages]]
+name = "left"
+board.transport = "serial"
+board.port = "/dev/optodrive-board-left"
+board.vendor_id = 0x2e8a
+board.product_id = 0x000a
+board.serial_number = "A"
+[[stages]]
+name = "right"
+board.transport = "usb"
+board.vendor_id = 0x1209
+board.product_id = 0x0001
+"""
+
+
+def test_unit_and_rules_are_made_from_all_ports(install, at, tmp_path, monkeypatch):
+    path = tmp_path / "mine.toml"
+    path.write_text(f'{locate_shipped("display-437.toml").read_text()}{STAGES}[sensor]\nport = "/dev/serial0"\n')
+    targets = {"/dev/serial0": "/dev/ttyAMA0"}
+    realpath = os.path.realpath
+    monkeypatch.setattr("os.path.realpath", lambda path, **options: targets.get(path) or realpath(path, **options))
+    assert "warning" not in install("--config", path).out
+    unit, rules = at(UNIT_PATH).read_text(), at(RULES_PATH).read_text()
+    allowed = {line.split("=")[1] for line in unit.splitlines() if line.startswith("DeviceAllow=")}
+    assert allowed == {f"char-{each} rw" for each in ("ttyACM", "ttyUSB", "ttyAMA", "usb_device")}
+    assert re.search(r"^After=.*modprobe@cdc_acm.service modprobe@usbserial.service$", unit, re.MULTILINE)
+    left, _, right, _ = [line for line in rules.splitlines() if "idVendor" in line]
+    assert 'ATTRS{serial}=="A"' in left
+    assert 'SYMLINK+="optodrive-board-left"' in left
+    assert 'SYMLINK+="optodrive-board-right"' in right
+
+
+@pytest.mark.parametrize(
+    ("port", "allowed"),
+    [
+        ("/dev/ttyS0", "ttyS"),
+        ("/dev/ttyAMA1", "ttyAMA"),
+        ("/dev/ttyTHS1", "ttyTHS"),
+        ("/dev/ttyACM3", None),
+        ("/dev/serial/by-id/usb-x", None),
+    ],
+)
+def test_a_port_that_is_not_on_usb_is_allowed(install, at, tmp_path, port, allowed):
+    assert "warning" not in install("--config", board_config(tmp_path, f'transport = "serial"\nport = "{port}"\n')).out
+    assert at(UNIT_PATH).read_text().count("DeviceAllow=") == 2 + (allowed is not None)
+    assert (f"DeviceAllow=char-{allowed} rw\n" in at(UNIT_PATH).read_text()) is (allowed is not None)
+
+
+def test_a_port_of_an_unknown_class_is_named(install, tmp_path):
+    output = install("--config", board_config(tmp_path, 'transport = "serial"\nport = "/dev/my-board"\n')).out
+    assert "warning: board.port = /dev/my-board is not present" in output
+
+
+def test_a_service_of_another_display_is_not_replaced(install, at, tmp_path):
+    install()
+    other = tmp_path / "other.toml"
+    other.write_text(locate_shipped("display-16.toml").read_text())
+    before = at(CONFIG_PATH).read_text()
+    refused = install("--config", other, status=1).err
+    assert "this service drives display-437, the configuration is of display-16" in refused
+    assert at(CONFIG_PATH).read_text() == before
+    install(command="remove")
+    install("--config", other)
+    assert load_config(at(CONFIG_PATH)).name == "display-16"
+
+
+def test_two_displays_have_a_service_each(install, at, tmp_path):
+    other = board_config(tmp_path, USB_BOARD)
+    text = other.read_text().replace('name = "display-437"', 'name = "second"')
+    other.write_text(text)
+    install()
+    refused = install("--config", other, "--name", "second", status=1).err
+    assert "this service has daemon.port 8450, too" in refused
+    other.write_text(text + "[daemon]\nport = 8001\n")
+    output = install("--config", other, "--name", "second").out
+    assert "systemctl enable --now optodrive@second" in output
+    paths = ServicePaths("second")
+    one, two = at(UNIT_PATH).read_text(), at(paths.unit).read_text()
+    assert paths.unit.name == "optodrive@second.service"
+    for key in ("RuntimeDirectory", "StateDirectory", "ExecStart"):
+        values = {re.search(rf"^{key}=(.*)$", unit, re.MULTILINE)[1] for unit in (one, two)}
+        assert len(values) == 2, key
+    daemons = [load_config(at(path)).daemon for path in (CONFIG_PATH, paths.config)]
+    for key in ("socket", "tokens", "audit", "port"):
+        assert getattr(daemons[0], key) != getattr(daemons[1], key)
+    assert 'SYMLINK+="optodrive-board-second"' in at(paths.rules).read_text()
+    third = install("--config", other, "--name", "third", status=1).err
+    assert "daemon.port 8001" in third
+    other.write_text(other.read_text().replace("port = 8001", "port = 8002"))
+    assert "has the board serial /dev/optodrive-board" in install("--config", other, "--name", "third", status=1).err
+    install("--name", "second", command="remove")
+    assert at(UNIT_PATH).read_text() == one
+    assert not at(paths.unit).exists()
+    assert not at(paths.rules).exists()
+
+
+@pytest.mark.parametrize("name", ["a b", "../x", "A", "-x", "x\n", "a" * 33])
+def test_a_name_that_is_no_part_of_a_path_is_refused(install, name):
+    assert "--name" in install(f"--name={name}", status=2).err
 
 
 def test_a_root_that_may_not_be_written_is_one_line(install, tmp_path):
