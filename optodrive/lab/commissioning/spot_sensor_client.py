@@ -49,7 +49,7 @@ class SpotSensorClient:
         try:
             self._transport.write(request.encode("ascii") + b"\n")
         except LinkError as error:
-            raise LinkError(f"sensor: {error}") from None
+            raise self._build_lost_error(error) from None
 
     def poll_answer(self) -> str | None:
         """Return the answer line, None if it has not arrived yet."""
@@ -65,7 +65,11 @@ class SpotSensorClient:
         try:
             return self._transport.read(0.0)
         except LinkError as error:
-            raise LinkError(f"sensor: {error}") from None
+            raise self._build_lost_error(error) from None
+
+    def _build_lost_error(self, error: LinkError) -> LinkError:
+        fault = self._transport.describe_fault()
+        return LinkError(f"sensor: {error}{f'; {fault}' if fault else ''}")
 
     def parse_spot(self, line: str) -> SpotReading | None:
         """Parse the answer to `spot`. Return None if the sensor detected no spot."""

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import serial
+from serial.tools import list_ports
 
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.transport.base import TransportKind, guard_opening, guard_port
-from optodrive.link.transport.port_state import describe_replug, list_serial_ports
+from optodrive.link.transport.port_state import describe_replug
 
 WRITE_TIMEOUT_S = 0.5
 WRITE_RETRY_S = 0.001
@@ -39,7 +40,7 @@ class SerialPort:
         """
         with guard_opening(self.name, self._config_key):
             if not Path(self.name).exists():
-                present = ", ".join(list_serial_ports()) or "none found"
+                present = ", ".join(port.device for port in list_ports.comports()) or "none found"
                 raise InputError(self._config_key, self.name, f"a serial port that exists ({present})", "no_port")
             self._serial = serial.Serial(
                 self.name, self._baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
