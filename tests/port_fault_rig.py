@@ -20,6 +20,7 @@ NUMBERS = tuple(sorted(set(errno.errorcode) - {errno.EINTR}))
 ABSENT = errno.ENOENT, errno.ENOTDIR
 FIRST_DESCRIPTOR = 1_000_000
 OPENING = ("exists", "open", "settings", "node")
+NO_ROOM = "accepts no bytes"
 RUNNING = ("timeout", "read", "in_waiting", "rest", "fileno", "write")
 """Calls in which a fault keeps the port closed, or ends its link."""
 
@@ -84,7 +85,7 @@ def draw_fault(rng, calls):
         return Fault(call, error, type(error).__name__)
     number = rng.choice(NUMBERS)
     if call == "write" and number in (errno.EAGAIN, errno.EWOULDBLOCK):  # the transport waits for room
-        return Fault(call, OSError(number, "full"), "accepts no bytes")
+        return Fault(call, OSError(number, "full"), NO_ROOM)
     shown = "exists" if number in ABSENT and call in OPENING else errno.errorcode[number]
     return Fault(call, rng.choice(NUMBERED)(number), shown)
 
