@@ -24,6 +24,7 @@ from measuring import LEASE_S, Row, build_display, build_frames, measure_times_s
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
+from optodrive.client import Display
 from process_memory import list_processes  # of the tests
 from rig import TOKEN, read_role_tokens  # of the tests
 from stop_rig import FloodProcess
@@ -31,6 +32,7 @@ from stop_rig import FloodProcess
 RUNS, SUPERSEDING = 50, 200
 HORIZON_S = 0.1
 PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
+SHOWN_PIXELS, SHOWN_RATES_HZ, SHOWN_S = (1, 4), (5.0, 20.0, 30.0, 60.0, 100.0, 200.0), 3.0
 LOAD_HZ = 1250.0
 """Requests of the other clients per second. At 0, the load is what server and clients can do."""
 LOAD = "kept alive GETs"
@@ -42,7 +44,7 @@ OPTIONS = {
     "--hours": {"type": float, "help": "the same in hours"},
     "--load-hz": {"type": float, "default": LOAD_HZ, "help": "requests per second of other clients, 0: no bound"},
     "--lead-s": {"type": float, "default": LEAD_S, "help": "board.stream_lead_s, for the latency"},
-    "--only": {"choices": ("planning", "latency", "websocket", "frames"), "help": "one part"},
+    "--only": {"choices": ("planning", "latency", "websocket", "rates", "frames"), "help": "one part"},
 }
 UNLIMITED_RATES = "[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000"
 """The daemon must serve the load; its rate limit must not reject it."""
@@ -280,6 +282,23 @@ def measure_websocket(load_hz=LOAD_HZ, lead_s=LEAD_S):
     yield "WebSocket: underruns", underruns, "1"
 
 
+def measure_rates():
+    """Stream frames of a few pixels at rising rates. Yield the frames shown per second, of those sent."""
+    for count in SHOWN_PIXELS:
+        for rate_hz in SHOWN_RATES_HZ:
+            with running_daemon("display-437", LEASE_S, UNLIMITED_RATES) as (_, daemon):
+                daemon.arm()
+                with Display(daemon.url, token=TOKEN) as display, display.stream() as stream:
+                    heights_um = {200 + pixel: 60.0 for pixel in range(count)}
+                    begin_s = time.monotonic()
+                    for number in range(int(rate_hz * SHOWN_S)):
+                        stream.send(heights_um)
+                        time.sleep(max(0.0, begin_s + (number + 1) / rate_hz - time.monotonic()))
+                    time.sleep(ENDING_S)
+                    shown = stream.counts.shown
+            yield f"frames of {count} pixels shown per second of {rate_hz:g} sent", shown / SHOWN_S, "1/s"
+
+
 def stream_under_load(load_hz=LOAD_HZ, lead_s=LEAD_S, seconds=SECONDS):
     """Push frames over REST under load, to a bare FastAPI and to the daemon. load_hz: None for no load."""
     with bare_server(8459) as url:
@@ -324,5 +343,7 @@ def measure(minutes=1.0, hours=None, load_hz=LOAD_HZ, lead_s=LEAD_S, only=None):
         yield from measure_latency(load_hz, lead_s)
     if only in (None, "websocket"):
         yield from measure_websocket(load_hz, lead_s)
+    if only in (None, "rates"):
+        yield from measure_rates()
     if only in (None, "frames"):
         yield from measure_full_frames(60.0 * minutes if hours is None else 3600.0 * hours)
