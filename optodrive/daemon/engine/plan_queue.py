@@ -104,6 +104,7 @@ class PlanQueue(QueuedPlans):
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
             if self.thermal.estimate is not snapshot.thermal:
                 return False
+            record.planned_after_s = self._session.board_s() - record.arrived_s  # link may send at once
             if snapshot.predecessor is None:
                 start_s = max(record.start_s, self._earliest_start_s(record.streamed))
                 if start_s > record.start_s:
@@ -118,7 +119,6 @@ class PlanQueue(QueuedPlans):
             self.stream.record_accepted(plan)
             self.accounts.totals["planned"] += record.pulse_count
             record.change_status(PlanStatus.QUEUED if snapshot.predecessor is None else PlanStatus.RUNNING)
-            record.planned_after_s = self._session.board_s() - record.arrived_s
             self.stream.follow_withdrawn(plan, snapshot)
             self._plan_store.add(plan)
             if snapshot.predecessor is not None and not record.pulse_count:

@@ -3,7 +3,7 @@
 A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed plan
 leave only `lead_s` before they are due; a newer plan cuts the running one at the first point that has not left
 (`build_cut_snapshot`) and is spliced behind it, one job for the board. If all points have left it follows them, with
-a pause if it comes early, as long as the light of the last one is not about to end (decision 79). Its first point is
+a pause if it comes early, as long as the light of the last one is not about to end (decision 80). Its first point is
 held back if yet another plan is expected before it must leave, and always for a refresh of a standing page: that one
 then withdraws the plan as a whole and begins where it would have begun. The lead is longer without real-time priority,
 because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is refused
