@@ -226,7 +226,7 @@ def test_the_files_of_the_page_and_no_others_are_served(daemon):
     index = daemon.client.get("/")
     assert index.headers["content-type"].startswith("text/html")
     assert "default-src 'self'" in index.headers["content-security-policy"]
-    parts = [part.split('"')[0] for part in index.text.split('="/page/')[1:]]
+    parts = [part.split('"')[0] for part in index.text.split('="page/')[1:]]
     assert "main.js" in parts
     for part in parts:
         answer = daemon.client.get(f"/page/{part}")
