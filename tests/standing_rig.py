@@ -6,6 +6,7 @@ from link_service_rig import OPERATOR, WEB
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.api.standing_stream import REFRESH_MAX_S, REFRESH_MIN_S
+from optodrive.daemon.engine import plan_making, planner
 from optodrive.daemon.engine.page_refresh import PageRefresh
 from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.request_body import BuiltRequest
@@ -50,7 +51,14 @@ class StandingRig(PlannerRig):
         self.page = PageRefresh(display.layout, self.clock, self.remote.board_s, lambda: self.queue.stream.lead_s)
         self.page_m, self.refusals, self.fingers_moved = None, [], False
         self._began_s = -np.inf
-        self.before_loop_action = lambda: self.pass_time(self.planning_s)
+        make_plan = plan_making.make_plan
+
+        def make_plan_in_time(*arguments):
+            plan = make_plan(*arguments)
+            self.pass_time(self.planning_s)
+            return plan
+
+        monkeypatch.setattr(planner, "make_plan", make_plan_in_time)
 
     def pass_time(self, duration_s):
         """Let the link process and the loop run while the planner computes."""
