@@ -405,7 +405,6 @@ def test_stop_without_an_answer_is_heard_once_at_once_and_then_every_few_seconds
 
 
 MUTANTS = {
-    "RUNNING from memory": ("header.js", 'if (link.state !== "up" || !look) {', "if (!look && false) {"),
     "figures of a lost board": ("status.js", '(isKnown ? text : "–")', "text"),
     "executed without a planner": ("status.js", 'hasPlanner(state) ? totals.executed : "–"', "totals.executed"),
     "not hatched": ("main.js", 'freshness.lose(["board", "budget", "display"]);', ""),
@@ -443,4 +442,6 @@ IN_GATE = ("figures of a lost board", "heights of now as the highest", "plays af
 
 @pytest.mark.parametrize("name", [*IN_GATE, *mark_slow(name for name in MUTANTS if name not in IN_GATE)])
 def test_the_judge_finds_a_page_with_one_sentence_changed(open_page, name):
-    assert any(run_world(open_page(MUTANTS[name]), seed) for seed in range(60))
+    assert any(
+        run_world(open_page(MUTANTS[name]), seed) for seed in (27, *range(60))
+    )  # 27: a loss while pixels are warm
