@@ -1,7 +1,7 @@
 """A port fails with any exception of its libraries, at any call: that is a lost link, and ends no process.
 
 The faults stand below the real serial transport. The light is judged by the board's own log, the message by the error
-that was injected. `tests/system/test_port_faults.py` shows the same with a real terminal.
+that was injected. `tests/system/test_terminal_faults.py` shows the same with a real terminal.
 """
 
 import random
