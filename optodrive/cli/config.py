@@ -25,13 +25,11 @@ def new(
     columns: Annotated[int | None, typer.Option("--columns", min=1, max=200, help="Columns of pixels.")] = None,
     pitch_mm: Annotated[
         float | None,
-        typer.Option("--pitch-mm", min=0.01, max=1000.0, metavar="MM", help="Distance of neighbouring pixels."),
+        typer.Option("--pitch-mm", metavar="MM", help="Distance of neighbouring pixels."),
     ] = None,
     power_w: Annotated[
         float | None,
-        typer.Option(
-            "--power-w", min=1e-3, max=1000.0, metavar="W", help="Power of the laser on the pixels at full duty."
-        ),
+        typer.Option("--power-w", metavar="W", help="Power of the laser on the pixels at full duty."),
     ] = None,
     lens_mm: Annotated[
         float | None,

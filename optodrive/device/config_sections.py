@@ -125,6 +125,12 @@ class LaserSection(Section):
     focus_height_m: FocusSide
     """Height of the focus on the absorber in y, m."""
 
+    @model_validator(mode="after")
+    def _check_threshold(self) -> Self:
+        if self.threshold_w >= self.max_power_w:
+            raise ConflictError("threshold_w", self.threshold_w, f"less than max_power_w, {self.max_power_w:g}")
+        return self
+
 
 class ServoSection(Section):
     """The servo of either mirror: a delay, a slew-limited target, and two underdamped poles."""

@@ -93,7 +93,7 @@ def test_a_sweep_states_the_pitch_that_it_needs(tmp_path, capsys):
         ({"rows": 0}, "'--rows'"),
         ({"power_w": 1200}, "laser.max_power_w: got 1200"),
         ({"pitch_mm": 0.004}, "display.pitch_m: got 4e-06"),
-        ({"port": ""}, "board.port: got ''"),
+        ({"port": ""}, "--port: got ''"),
     ],
     ids=str,
 )

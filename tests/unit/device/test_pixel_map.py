@@ -82,7 +82,7 @@ def test_a_changed_file_is_read_again(tmp_path):
         ((b"optodrive-pixels", b"optodrive-field"), "format: got 'optodrive-field'"),
         ((b"version = 1", b"version = 2"), "version: got 2"),
         ((b"gain = 0.6", b"gain = -1.0"), "map.pixels.0.gain: got -1.0"),
-        ((b"gain = 0.6", b"gane = 0.6"), "map.pixels.0.gane: got 'gane', expected no such key"),
+        ((b"gain = 0.6", b"gane = 0.6"), "map.pixels.0.gane: got 'gane', expected a known key, nearest is 'gain'"),
         ((b"index = 3,", b"index = 4,"), "one entry per pixel, 0 to 15 in order"),
         ((b'parameters = "surroundings"', b'parameters = "other"'), "model.parameters: got 'other'"),
     ],

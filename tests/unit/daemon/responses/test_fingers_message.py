@@ -14,7 +14,10 @@ FINGER = {"number": 1, "x_m": 0.0, "y_m": 0.0, "radius_m": 0.004}
         ({"fingers": [FINGER, FINGER | {"x_m": 2.0}]}, "fingers.1.x_m: got 2.0, expected less than or equal to 1"),
         ({"fingers": [FINGER | {"number": 1.5}]}, "fingers.0.number: got 1.5, expected a valid integer"),
         ({"fingers": [FINGER | {"radius_m": 0.0}]}, "fingers.0.radius_m: got 0.0, expected greater than 0"),
-        ({"fingers": [FINGER | {"speed": 1.0}]}, "fingers.0.speed: got 'speed', expected no such key"),
+        (
+            {"fingers": [FINGER | {"speed": 1.0}]},
+            "fingers.0.speed: got 'speed', expected a known key, one of number, x_m, y_m, radius_m",
+        ),
         ({"fingers": [{"number": 1}]}, "fingers.0.x_m: missing, expected this key"),
         ({"fingers": [FINGER] * (FINGERS_MAX + 1)}, "fingers: got 21 of them, expected at most 20"),
         ({"fingers": [], "age_s": 3.0}, "age_s: got 3.0, expected less than or equal to 1"),
