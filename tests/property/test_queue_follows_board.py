@@ -85,7 +85,7 @@ class Scene:
         for name in self.rng.choice(names, int(self.rng.integers(4, 12)), p=weights):
             with suppress(OptodriveError):  # refused, as during a pause
                 getattr(self, f"do_{name}")()
-            self.wait(self.rng.choice(SECONDS))
+            self.wait(float(self.rng.choice(SECONDS)))
         self.rig.page_m = None
         self.rig.until(lambda: not self.rig.queue.is_busy or self.rig.core.state in ("FAULT", "DISARMED"), 60.0)
         self.rig.run(0.1)
@@ -112,7 +112,7 @@ class Scene:
 
     def do_send_again(self):
         if self.rig.page_m is not None:
-            period_s = self.rng.choice([0.05, 0.1, 0.3])
+            period_s = float(self.rng.choice([0.05, 0.1, 0.3]))
             self.rig.stand(self.rig.page_m, 3 * period_s, period_s, self.places)
 
     def do_end_page(self):
@@ -123,7 +123,7 @@ class Scene:
         for _ in range(int(self.rng.integers(1, 8))):
             frame = TactileFrame("f", 0.0, 3600.0, self.build())
             self.submit(FrameSequence((frame,)), streamed=True, lists_pulses=False)
-            self.wait(self.rng.choice([0.01, 0.02, 0.05, 0.1]))
+            self.wait(float(self.rng.choice([0.01, 0.02, 0.05, 0.1])))
 
     def do_newest(self):
         self.submit(FrameSequence((TactileFrame("f", 0.0, 3600.0, self.build()),)), streamed=True)
@@ -145,7 +145,7 @@ class Scene:
     def do_pause(self):
         for command in ("pause", "resume"):
             self.rig.await_result(WEB, self.rig.request(WEB, command))
-            self.wait(self.rng.choice(SECONDS))
+            self.wait(float(self.rng.choice(SECONDS)))
 
     def do_dim(self):
         self.rig.dimmer.set_share(self.rng.choice([0.3, 0.7, 1.0]))
@@ -155,13 +155,13 @@ class Scene:
         self.places = (FingerPlace(1, float(layout.x_m[pixel]), float(layout.y_m[pixel]), 4e-3),) if pixel >= 0 else ()
 
     def do_planning(self):
-        self.rig.planning_s = self.rng.choice([0.0, 0.002, 0.008, 0.02])
+        self.rig.planning_s = float(self.rng.choice([0.0, 0.002, 0.008, 0.02]))
 
     def do_stall(self):
         """Neither link process nor planner runs for a while."""
         if self.may_stall:
             self.stalls += 1
-            self.rig.clock.sleep(self.rng.choice([0.01, 0.03, 0.06]))
+            self.rig.clock.sleep(float(self.rng.choice([0.01, 0.03, 0.06])))
 
 
 def check_no_report_is_refused(rig):
