@@ -66,7 +66,7 @@ def study(
     Every trial is on the disk before the next begins: the same command after an interruption goes on where it ended.
     """
     from optodrive.core.files import check_output
-    from optodrive.study.dataset import SIMULATED_PREFIX, check_participant, write_dataset
+    from optodrive.study.dataset import SIMULATED_PREFIX, check_new_participant, check_participant, write_dataset
     from optodrive.study.study_file import load_study
 
     design = load_study(source)
@@ -82,6 +82,7 @@ def study(
         sessions = _simulate(design, out, participants, display_config)
     else:
         check_participant("--participant", participant)
+        check_new_participant("--participant", out, participant)
         if participant.startswith(SIMULATED_PREFIX):
             raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
         sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page, display_config)}

@@ -10,8 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from optodrive.core.errors import InputError
-from optodrive.core.files import create_folder, lock_folder, write_text
+from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.files import create_folder, lock_folder, read_regular_file, write_text
 from optodrive.core.numeric_tables import escape_formula
 from optodrive.study.study_file import MATCHED_PARAMETERS, Study
 from optodrive.study.trial_log import read_log
@@ -19,6 +19,7 @@ from optodrive.study.trial_log import read_log
 BIDS_VERSION = "1.10.0"
 LOG_SUFFIX = "_trials.jsonl"
 ID_MAX = 20
+TABLE_BYTES_MAX = 1_000_000
 SIMULATED_PREFIX = "sim"
 """Beginning of the identifiers of simulated participants."""
 
@@ -67,6 +68,14 @@ def check_participant(option: str, participant: str) -> None:
         raise InputError(option, participant, f"1 to {ID_MAX} letters and digits, a code and not a name")
 
 
+def check_new_participant(option: str, folder: Path, participant: str) -> None:
+    """Raise InputError for an identifier that a dataset has in other letters: file systems and BIDS confuse them."""
+    for path in folder.glob("sourcedata/sub-*"):
+        known = path.name.removeprefix("sub-")
+        if known != participant and known.casefold() == participant.casefold():
+            raise InputError(option, participant, f"{known}, as the dataset spells it, or another identifier")
+
+
 def build_log_path(folder: Path, study: Study, participant: str) -> Path:
     """Return the path of a session's log in a dataset, and create its folder."""
     sub = f"sub-{participant}"
@@ -85,11 +94,34 @@ def write_dataset(folder: Path) -> None:
         ):
             if not (folder / name).exists():
                 write_text(folder / name, text)
-        participants = sorted({path.parent.name for path in logs})
-        rows = [[one, "simulated" if one.startswith(f"sub-{SIMULATED_PREFIX}") else "person"] for one in participants]
-        write_text(folder / "participants.tsv", _format_table(["participant_id", "kind"], rows))
+        table = folder / "participants.tsv"
+        write_text(table, _list_participants(table, sorted({path.parent.name for path in logs})))
         for path in logs:
             _write_task(folder, path)
+
+
+def _list_participants(table: Path, participants: list[str]) -> str:
+    """Return participants.tsv with a row per participant, and every column and row that others have added.
+
+    Raise InputError for a table that has no row per participant.
+    """
+    head, kept = ["participant_id", "kind"], {}
+    if table.exists():
+        try:
+            lines = read_regular_file(table, TABLE_BYTES_MAX).decode("utf-8-sig").splitlines()
+        except UnicodeDecodeError:
+            raise InputError(str(table), Unquoted("another encoding"), "UTF-8") from None
+        rows = [line.split("\t") for line in lines if line.strip()]
+        if not rows or "participant_id" not in rows[0] or any(len(row) != len(rows[0]) for row in rows):
+            raise InputError(str(table), Unquoted("another table"), "tab-separated rows, with a column participant_id")
+        head = rows[0] if "kind" in rows[0] else [*rows[0], "kind"]
+        kept = {row[rows[0].index("participant_id")]: dict(zip(rows[0], row, strict=True)) for row in rows[1:]}
+    for one in participants:
+        kind = "simulated" if one.startswith(f"sub-{SIMULATED_PREFIX}") else "person"
+        kept[one] = {**kept.get(one, {}), "participant_id": one, "kind": kind}
+    return "".join(
+        "\t".join(cells) + "\n" for cells in [head, *([row.get(name, "n/a") for name in head] for row in kept.values())]
+    )
 
 
 def _write_task(folder: Path, path: Path) -> None:

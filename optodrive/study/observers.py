@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config import PixelLayout
 from optodrive.physics.sensation import PERSISTENCE_S, ChannelSignals, compute_pulse_excitations, compute_signals
@@ -105,7 +106,13 @@ class Observer:
         if rng.random() < self._participant.lapse:
             answers = self._study.response.answers
             return answers[int(rng.integers(len(answers)))] if answers else float(rng.uniform(*MAGNITUDE_BOUNDS))
-        return self._perceive(shown, rng)
+        answer = self._perceive(shown, rng)
+        possible = self._study.response.answers
+        if (answer not in possible) if possible else isinstance(answer, str):
+            key = f"study {self._study.name}: simulation.observer"
+            expected = f"an observer whose answers are {', '.join(possible) or 'magnitudes'}; this one answers {answer}"
+            raise InputError(key, self._study.simulation.observer if self._study.simulation else None, expected)
+        return answer
 
     def list_visits(self, shown: Presentation) -> Visits:
         """Return the places of a presentation, with the time for which each is felt alone."""
