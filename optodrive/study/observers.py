@@ -106,12 +106,15 @@ class Observer:
         if rng.random() < self._participant.lapse:
             answers = self._study.response.answers
             return answers[int(rng.integers(len(answers)))] if answers else float(rng.uniform(*MAGNITUDE_BOUNDS))
-        answer = self._perceive(shown, rng)
-        possible = self._study.response.answers
+        observer = "" if self._study.simulation is None else self._study.simulation.observer
+        key, possible = f"study {self._study.name}: simulation.observer", self._study.response.answers
+        try:
+            answer = self._perceive(shown, rng)
+        except (ValueError, IndexError):  # the stimulus has other parts than those that the observer compares
+            raise InputError(key, observer, f"an observer of {self._study.stimulus.pattern}") from None
         if (answer not in possible) if possible else isinstance(answer, str):
-            key = f"study {self._study.name}: simulation.observer"
             expected = f"an observer whose answers are {', '.join(possible) or 'magnitudes'}; this one answers {answer}"
-            raise InputError(key, self._study.simulation.observer if self._study.simulation else None, expected)
+            raise InputError(key, observer, expected)
         return answer
 
     def list_visits(self, shown: Presentation) -> Visits:

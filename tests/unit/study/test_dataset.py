@@ -21,13 +21,19 @@ def begin_session(folder, participant):
     write_dataset(folder)
 
 
-@pytest.mark.parametrize(("observer", "answers"), [("intensity", "cw, ccw"), ("linear-motion", "cw, ccw")])
-def test_a_simulated_participant_gives_only_answers_of_the_study(tmp_path, capsys, observer, answers):
+@pytest.mark.parametrize(
+    ("observer", "expected"),
+    [
+        ("intensity", "an observer whose answers are cw, ccw; this one"),
+        ("linear-motion", "an observer of experiment-2"),
+    ],
+)
+def test_a_simulated_participant_gives_only_answers_of_the_study(tmp_path, capsys, observer, expected):
     text = files("optodrive.study.experiments").joinpath("experiment-2.toml").read_text()
     (tmp_path / "wrong.toml").write_text(text.replace('observer = "rotation"', f'observer = "{observer}"'))
     assert run(["study", str(tmp_path / "wrong.toml"), "--out", str(tmp_path / "dataset")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert f"simulation.observer: got '{observer}', expected an observer whose answers are {answers}; this one" in error
+    assert f"simulation.observer: got '{observer}', expected {expected}" in error
 
 
 def test_columns_and_rows_of_the_laboratory_are_kept(tmp_path):
