@@ -318,6 +318,7 @@ def _format_report(report: dict[str, Any]) -> Iterator[str]:
     for name, found in report.get("thresholds", {}).items():
         interval = f"95 % interval {found['low']:.3g} to {found['high']:.3g}"
         yield f"threshold        {name}: {report['threshold_of']} {found['threshold']:.3g} ({interval})"
+        yield from (f"doubtful         {name}: {doubt}" for doubt in found["doubts"])
     for name, found in report.get("sensitivity", {}).items():
         yield (
             f"sensitivity      {name}: {found['low']:.2f} to {found['high']:.2f}, "

@@ -1,12 +1,13 @@
 """Results of a study: accuracy with its binomial interval, and the line of magnitude estimates."""
 
 from collections.abc import Callable, Sequence
-from math import exp, lgamma, log
+from math import log
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from optodrive.study.study_file import Study, Value
+from optodrive.study.threshold import sum_binomial
 
 CONFIDENCE = 0.95
 BISECTIONS = 60
@@ -38,8 +39,8 @@ class Accuracy(NamedTuple):
     def interval(self) -> Interval:
         """Exact 95 % interval of the probability of a correct answer (Clopper and Pearson 1934)."""
         tail, k, n = (1.0 - CONFIDENCE) / 2.0, self.correct, self.trials
-        low = 0.0 if k == 0 else _bisect(lambda p: 1.0 - _sum_binomial(k - 1, n, p) - tail)
-        high = 1.0 if k == n else _bisect(lambda p: tail - _sum_binomial(k, n, p))
+        low = 0.0 if k == 0 else _bisect(lambda p: 1.0 - sum_binomial(k - 1, n, p) - tail)
+        high = 1.0 if k == n else _bisect(lambda p: tail - sum_binomial(k, n, p))
         return Interval(low, high)
 
 
@@ -78,20 +79,6 @@ def _geometric_mean(records: Sequence[dict[str, Any]], factor: str, level: Value
 
 def _explained(values: Any, fitted: Any) -> float:
     return 1.0 - float(np.sum((values - fitted) ** 2) / np.sum((values - values.mean()) ** 2))
-
-
-def _sum_binomial(successes: int, trials: int, probability: float) -> float:
-    """Return the probability of at most this number of successes."""
-    return sum(
-        exp(
-            lgamma(trials + 1)
-            - lgamma(k + 1)
-            - lgamma(trials - k + 1)
-            + k * log(probability)
-            + (trials - k) * log(1.0 - probability)
-        )
-        for k in range(successes + 1)
-    )
 
 
 def _bisect(function: Callable[[float], float]) -> float:

@@ -45,7 +45,7 @@ def select(procedure, model, answered, order):
     if procedure == "constant":
         return order[len(answered)]
     if procedure == "staircase":
-        return select_staircase_level(len(LEVELS), answered)
+        return select_staircase_level(len(model.levels), answered)
     return model.select_informative_level(answered)
 
 
@@ -78,6 +78,55 @@ def test_thresholds_are_unbiased_and_their_intervals_cover(procedure, seed):
 @pytest.mark.parametrize("procedure", ["staircase", "constant"])
 def test_the_check_finds_a_model_of_another_task(procedure):
     assert not judge(procedure, 0, chance=0.25).are_met
+
+
+def estimate(answer, trials=40, procedure="quest-plus", levels=LEVELS):
+    """Return the estimate of a participant that answers by a rule."""
+    model, answered = ThresholdModel(levels, CHANCE), []
+    for _ in range(trials):
+        level = select(procedure, model, answered, None)
+        answered.append((level, bool(answer(levels[level]))))
+    return model.estimate(answered)
+
+
+def draw_answers(seed, threshold, slope=3.0, lapse=0.02, exchanged=False):
+    rng = np.random.default_rng(seed)
+
+    def answer(level):
+        share = CHANCE + (1 - CHANCE - lapse) * (1 - np.exp(-((level / threshold) ** slope)))
+        return bool(rng.random() < share) != exchanged
+
+    return answer
+
+
+@pytest.mark.parametrize("procedure", ["quest-plus", "staircase"])
+def test_a_threshold_outside_the_levels_is_said_to_be_outside(procedure):
+    levels = tuple(np.geomspace(1000.0, 4000.0, 9))
+    below = estimate(lambda level: True, procedure=procedure, levels=levels)
+    assert below.low < 500.0
+    assert below.doubts == ("it may lie below the lowest level, 1000; the study does not measure it there",)
+    for seed in range(10):
+        above = estimate(draw_answers(seed, 12_000.0), procedure=procedure, levels=levels)
+        assert above.high > 8_000.0
+        assert any("above the highest level, 4000" in doubt for doubt in above.doubts)
+
+
+def test_exchanged_keys_and_guesses_are_doubted_and_good_answers_are_not():
+    doubts = [
+        [estimate(draw_answers(seed, 200.0, **options), 60).doubts for seed in range(40)]
+        for options in ({}, {"exchanged": True}, {"lapse": 0.15})
+    ]
+    good, exchanged, lapsing = doubts
+    assert sum(bool(each) for each in good) <= 2
+    assert all(any("exchanged keys?" in doubt for doubt in each) for each in exchanged)
+    assert sum(bool(each) for each in lapsing) >= 10
+
+
+def test_with_lapses_of_a_fifth_most_estimates_hold_the_threshold_or_are_doubted():
+    found = [estimate(draw_answers(seed, 200.0, lapse=0.2), 60) for seed in range(100)]
+    holds = [each.low <= 200.0 <= each.high for each in found]
+    assert sum(holds) >= 80
+    assert sum(not held and not each.doubts for held, each in zip(holds, found, strict=True)) <= 15
 
 
 def test_the_grid_is_bounded_and_the_next_level_does_not_depend_on_the_order_of_answers():
