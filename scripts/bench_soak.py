@@ -130,7 +130,8 @@ class ReportChecker:
 
     def check_plan(self, job, count):
         """Check a finished plan of `count` pulses."""
-        done = job.build_executed(SimpleNamespace(pixel=np.arange(count)), self._scale.full_power_w, self._scale.tick_s)
+        plan = SimpleNamespace(pixel=np.arange(count), start_s=np.zeros(count))  # the starts of dark points alone count
+        done = job.build_executed(plan, self._scale.full_power_w, self._scale.tick_s)
         on_us, width_us = done.on_tick, done.width_ticks
         ends_us = np.concatenate([[self._last_us], (on_us + width_us)[:-1]])
         wrong = (on_us < ends_us) | (width_us != WIDTH_US + (job.first_index + done.pixel) % WIDTHS)

@@ -93,7 +93,7 @@ SCENARIOS = {
 }
 DRAWINGS = {
     "docs/explanation/architecture.md": ("FrameSequence →", "core < device"),
-    "docs/how-to/reach-it-from-the-network.md": ("lab.example {", "server {"),
+    "docs/how-to/reach-it-from-the-network.md": ("lab.example {", "server {", "location /lab/"),
     "docs/how-to/wire-a-board.md": ("PC ── USB",),
     "docs/how-to/discover-a-term.md": (
         "from optodrive.lab.discovery import ",
