@@ -56,7 +56,7 @@ LARGEST = 1e300
 """Larger numbers suit no unit; an integer of thousands of digits is no float."""
 
 NEAR = 2.0
-"""Factor by which a value may exceed its range without being in another unit."""
+"""Factor by which a value may exceed its range and still be in its unit as likely as in another one."""
 
 
 class PlausibleRange(NamedTuple):
@@ -107,11 +107,13 @@ def guess_unit(value: float, plausible: PlausibleRange) -> str | None:
 def describe_likely_unit(value: float, plausible: PlausibleRange) -> str:
     """Return the end of a message that names the units in which a value suits its range, empty if there are none.
 
-    A value just beyond the range is too small or too large in the right unit.
+    A value just beyond the range may be too small or too large in the right unit.
     """
     unit = guess_unit(value, plausible)
     is_near = plausible.low / NEAR <= abs(value) <= plausible.high * NEAR and plausible.unit not in ("K", "°C")
-    return "" if unit is None or is_near else f"; this value is likely in {unit}"
+    if unit is None:
+        return ""
+    return f"; this value is just beyond it, or in {unit}" if is_near else f"; this value is likely in {unit}"
 
 
 def check_plausible(where: str, value: float, plausible: PlausibleRange) -> None:

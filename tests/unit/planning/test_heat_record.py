@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import time
 from dataclasses import fields
 
 import numpy as np
@@ -110,13 +111,24 @@ def damage(kind):
     return do
 
 
+def await_tick(path):
+    """Wait until the file system's clock, which has ticks of milliseconds, is past the last change of a file."""
+    other = path.parent.parent / "tick"
+    other.touch()
+    while other.stat().st_ctime_ns <= path.stat().st_ctime_ns:
+        time.sleep(0.001)
+        other.touch()
+
+
 def restore_a_copy(desk):
+    await_tick(desk.path)
     shutil.copy2(desk.path, desk.folder.parent / "copy")
     desk.path.unlink()
     shutil.copy2(desk.folder.parent / "copy", desk.path)
 
 
 def change_mode_and_back(desk):
+    await_tick(desk.path)
     desk.path.chmod(0o600)
     desk.path.chmod(0o666)
 

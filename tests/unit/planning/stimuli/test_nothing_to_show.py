@@ -53,9 +53,13 @@ def test_heights_in_metres_are_refused(value):
 
 @pytest.mark.parametrize(
     ("power_w", "likely"),
-    [(2.5, ""), (3.0, ""), (4.9, ""), (2450.0, "; this value is likely in mW or µW")],
+    [
+        (2.5, "; this value is just beyond it, or in mW"),
+        (4.9, "; this value is just beyond it, or in mW"),
+        (2450.0, "; this value is likely in mW or µW"),
+    ],
 )
-def test_a_power_just_above_the_lasers_is_in_no_other_unit(power_w, likely):
+def test_a_power_just_above_the_lasers_may_be_too_large(power_w, likely):
     train = {"pixel": 1, "start_s": 0, "duration_s": 1, "pulse_width_s": 0.02, "gap_s": 0.06, "power_w": power_w}
     with pytest.raises(InputError, match=r"at most laser\.max_power_w = 2\.45 W") as refused:
         parse_sequence({"trains": [train]}, CONFIG, "t")
@@ -63,7 +67,7 @@ def test_a_power_just_above_the_lasers_is_in_no_other_unit(power_w, likely):
 
 
 @pytest.mark.parametrize(("value", "likely"), [("1001", False), ("1999", False), ("200000", True)])
-def test_a_parameter_just_above_its_range_is_in_no_other_unit(value, likely):
+def test_a_parameter_just_above_its_range_may_be_too_large(value, likely):
     with pytest.raises(InputError) as refused:
         build_pattern("pixel", {"height_um": value}, CONFIG)
     assert ("likely in nm" in str(refused.value)) == likely
