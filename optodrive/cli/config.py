@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -13,6 +14,9 @@ from optodrive.core.errors import MISSING, InputError
 
 EXCHANGE_REMEDY = "state the uid of each stage's board, or its port's name below /dev/serial/by-id"
 Answer = TypeVar("Answer", int, float, str)
+COUNT_MAX = 200
+"""Largest number of rows or columns of a new configuration."""
+PITCH, POWER = "display.pitch_m", "laser.max_power_w"
 
 
 GROUP = typer.Typer(help="Write, show, check or migrate a configuration.", no_args_is_help=True)
@@ -21,8 +25,8 @@ GROUP = typer.Typer(help="Write, show, check or migrate a configuration.", no_ar
 @GROUP.command()
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="Configuration to write; no file is overwritten.")],
-    rows: Annotated[int | None, typer.Option("--rows", min=1, max=200, help="Rows of pixels.")] = None,
-    columns: Annotated[int | None, typer.Option("--columns", min=1, max=200, help="Columns of pixels.")] = None,
+    rows: Annotated[int | None, typer.Option("--rows", min=1, max=COUNT_MAX, help="Rows of pixels.")] = None,
+    columns: Annotated[int | None, typer.Option("--columns", min=1, max=COUNT_MAX, help="Columns of pixels.")] = None,
     pitch_mm: Annotated[
         float | None,
         typer.Option("--pitch-mm", metavar="MM", help="Distance of neighbouring pixels."),
@@ -33,7 +37,7 @@ def new(
     ] = None,
     lens_mm: Annotated[
         float | None,
-        typer.Option("--lens-mm", min=1.0, max=10_000.0, metavar="MM", help="Focal length of the f-theta lens."),
+        typer.Option("--lens-mm", metavar="MM", help="Focal length of the f-theta lens."),
     ] = None,
     port: Annotated[
         str | None, typer.Option("--port", metavar="DEVICE", help="Serial device of the board, or: simulated.")
@@ -41,19 +45,21 @@ def new(
 ) -> None:
     """Write a configuration. Ask on the terminal for each value that no option states."""
     from optodrive.core.files import check_output, write_text
-    from optodrive.device.config_template import NewDisplay, write_template
+    from optodrive.device.config_template import NewDisplay, check_lens, check_number, check_port, write_template
     from optodrive.planning.display_model import DisplayModel
 
     check_output("FILE", file, ".toml")
-    display = NewDisplay(
-        name=file.stem,
-        rows=_ask("--rows", rows, "Rows of pixels", 4),
-        columns=_ask("--columns", columns, "Columns of pixels", 4),
-        pitch_m=1e-3 * _ask("--pitch-mm", pitch_mm, "Distance of neighbouring pixels, mm", 4.0),
-        power_w=_ask("--power-w", power_w, "Power of the laser on the pixels at full duty, W", 2.45),
-        focal_length_m=1e-3 * _ask("--lens-mm", lens_mm, "Focal length of the f-theta lens, mm", 220.0),
-        port=_ask("--port", port, "Serial device of the board, or: simulated", "simulated"),
-    )
+    rows = _ask("--rows", rows, "Rows of pixels", 4, _check_count)
+    columns = _ask("--columns", columns, "Columns of pixels", 4, _check_count)
+    question = "Distance of neighbouring pixels, mm"
+    pitch_mm = _ask("--pitch-mm", pitch_mm, question, 4.0, lambda option, mm: check_number(option, mm, PITCH, "mm"))
+    question = "Power of the laser on the pixels at full duty, W"
+    power_w = _ask("--power-w", power_w, question, 2.45, lambda option, w: check_number(option, w, POWER, "W"))
+    farthest_m = 0.5e-3 * (max(rows, columns) - 1) * pitch_mm
+    question = "Focal length of the f-theta lens, mm"
+    lens_mm = _ask("--lens-mm", lens_mm, question, 220.0, lambda option, mm: check_lens(option, mm, farthest_m))
+    port = _ask("--port", port, "Serial device of the board, or: simulated", "simulated", check_port)
+    display = NewDisplay(file.stem, rows, columns, 1e-3 * pitch_mm, power_w, 1e-3 * lens_mm, port)
     text, config = write_template(display, file)
     DisplayModel.from_config(config)
     write_text(file, text)
@@ -61,14 +67,40 @@ def new(
     print(f"next             optodrive serve --config {file}")
 
 
-def _ask(option: str, value: Answer | None, question: str, default: Answer) -> Answer:
-    """Return the option's value, or the answer on the terminal. Raise InputError without a terminal."""
+def _check_count(option: str, count: int) -> None:
+    if not 1 <= count <= COUNT_MAX:
+        raise InputError(option, count, f"1 to {COUNT_MAX}")
+
+
+def _ask(
+    option: str, value: Answer | None, question: str, default: Answer, check: Callable[[str, Answer], None]
+) -> Answer:
+    """Return the option's value, or the first answer on the terminal that passes the check. Raise InputError.
+
+    check: raises InputError for a value that no display has. Without a terminal nobody can answer, which is refused.
+    """
     if value is not None:
+        check(option, value)
         return value
     if not sys.stdin.isatty():
         raise InputError(option, MISSING, f"{option}, because without a terminal nobody can answer: {question}")
-    answer: Answer = typer.prompt(question, default=default, type=type(default), err=True)
-    return answer
+    while True:
+        text = typer.prompt(question, default=str(default), err=True)
+        try:
+            answer = _convert(option, text, default)
+            check(option, answer)
+        except InputError as error:  # one wrong answer does not cost the earlier ones
+            print(f"optodrive: {error}", file=sys.stderr)
+        else:
+            return answer
+
+
+def _convert(option: str, text: str, default: Answer) -> Answer:
+    """Return an answer as a value of the default's type."""
+    try:
+        return type(default)(text)
+    except ValueError:
+        raise InputError(option, text, f"a number without its unit, such as {default}") from None
 
 
 @GROUP.command()

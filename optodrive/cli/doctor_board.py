@@ -47,12 +47,14 @@ def _check_identity(session: BoardSession, config: Config) -> list[Finding]:
     limits = report_ok("limits", "the board's limits allow the configuration")
     if board.fault:
         return [report_warning("board", f"{observation} {board.fault}", get_fault_hint(board.fault)), limits]
+    if config.board.transport == "simulated":  # with a new one in every run, of the same uid
+        return [report_ok("board", f"{observation}; the board is simulated"), limits]
     if not config.board.uid:
         return [
             report_warning(
                 "board",
                 f"{observation}; the configuration accepts any board",
-                f'to accept this board only: board.uid = "{board.uid}"',
+                f'to accept this board only: uid = "{board.uid}" in section [board]',
             ),
             limits,
         ]

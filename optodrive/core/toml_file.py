@@ -17,6 +17,13 @@ KEY_MAX = 255
 INTEGER_MIN, INTEGER_MAX = -(2**63), 2**64 - 1
 """Integers of 64 bits, with or without a sign: an attribute in HDF5 may be either."""
 MESSAGE_MAX = 100
+REMEDIES = {
+    "Invalid value": "a number with a decimal point and without unit, true, false, or text in quotation marks",
+    "Expected newline": "a number with a decimal point and without unit, true, false, or text in quotation marks",
+    "Cannot overwrite": "each key once",
+    "Cannot declare": "each section once",
+}
+"""What a writer most likely meant to state, by the beginning of the parser's message."""
 LONG_DOTTED_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){128}""", re.ASCII)
 """A key, or text, of more parts than any file has; the parser's time is quadratic in their number."""
 
@@ -44,7 +51,9 @@ def parse_toml(content: bytes, where: str) -> dict[str, Any]:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         message, _, place = str(error).rpartition(" (at ")
-        raise InputError(f"{where}, {place.rstrip(')')}", Unquoted(message[:MESSAGE_MAX]), "valid TOML") from None
+        remedy = next((f": {text}" for start, text in REMEDIES.items() if message.startswith(start)), "")
+        found = Unquoted(message[:MESSAGE_MAX])
+        raise InputError(f"{where}, {place.rstrip(')')}", found, f"valid TOML{remedy}") from None
     except RecursionError:
         raise _build_depth_error(where) from None
     except ValueError:  # of int()

@@ -102,9 +102,11 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
     place = ".".join(str(part) for part in first["loc"])
     label = f"{where}: {place}" if place else where
     if first["type"] == "extra_forbidden":
+        key = str(first["loc"][-1])
         known = _list_known_keys(model, first["loc"][:-1]) if model else []
-        expected = f"a known key, {suggest_nearest(str(first['loc'][-1]), known)}" if known else "no such key"
-        return InputError(label, str(first["loc"][-1]), expected, code="unknown_key")
+        places = _find_places(model, key) if model else ""
+        expected = f"a known key, {suggest_nearest(key, known)}" if known else "no such key"
+        return InputError(label, key, f"this key {places}" if places else expected, code="unknown_key")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if first["type"] == "model_type":
         message = "a table with keys, as in { value = … }" if isinstance(first["input"], int | float) else "a table"
@@ -131,6 +133,15 @@ def _list_known_keys(model: type[BaseModel], path: tuple[str | int, ...]) -> lis
         if fields:
             models = [found for field in fields for found in _find_models(field)]
     return list(dict.fromkeys(key for each in models for key in each.model_fields))
+
+
+def _find_places(model: type[BaseModel], key: str) -> str:
+    """Return a phrase with the places of a file where a key is known that stands elsewhere by mistake, or nothing."""
+    places = ["at the top level"] if key in model.model_fields else []
+    for name, field in model.model_fields.items():
+        if any(key in each.model_fields for each in _find_models(field.annotation)):
+            places.append(f"in '{name}'")
+    return " or ".join(places)
 
 
 def _find_models(annotation: Any) -> list[type[BaseModel]]:

@@ -44,7 +44,8 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
     path = Path(source)
     if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises for a path that is too long
         if str(source) not in list_shipped_configs():
-            raise InputError("--config", str(source), "a file, or " + ", ".join(list_shipped_configs()))
+            expected = "a file, which `optodrive config new` writes, or " + ", ".join(list_shipped_configs())
+            raise InputError("--config", str(source), expected)
         path = locate_shipped(f"{source}.toml")
     config = build_config(path, read_toml(path))
     return _apply_measured_servos(config) if measured_servo else config

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from optodrive.core.errors import InputError
+from optodrive.core.plausibility import PlausibleRange, collect_ranges, describe_likely_unit
 from optodrive.core.toml_file import parse_toml
 from optodrive.device.config import Config
-from optodrive.device.config_file import build_config, locate_shipped
+from optodrive.device.config_file import build_config, load_config, locate_shipped
 
 TEMPLATE = "display-16"
 SIMULATED = "simulated"
@@ -44,17 +45,6 @@ def write_template(display: NewDisplay, path: Path) -> tuple[str, Config]:
     """
     template = locate_shipped(f"{TEMPLATE}.toml").read_text(encoding="utf-8")
     config = build_config(path, parse_toml(template.encode(), TEMPLATE))
-    if display.port != SIMULATED and not display.port.startswith("/"):
-        expected = (
-            f"a serial device such as /dev/serial/by-id/..., or {SIMULATED}; how-to/use-a-laser-dac writes others"
-        )
-        raise InputError("--port", display.port, expected)
-    half_field_m = 2.0 * config.scanner.range_rad * display.focal_length_m
-    farthest_m = 0.5 * (max(display.rows, display.columns) - 1) * display.pitch_m
-    if farthest_m > half_field_m:
-        needed_mm = 1e3 * display.focal_length_m * farthest_m / half_field_m
-        expected = f"at least {needed_mm:.4g} mm: mirrors of ±{config.scanner.range_rad:g} rad must reach every pixel"
-        raise InputError("--lens-mm", 1e3 * display.focal_length_m, expected)
     lines, section = template.splitlines()[HEAD_LINES:], ""
     values = _list_values(display, config)
     head = f"{display.rows * display.columns} pixels, {display.rows} x {display.columns}"
@@ -71,6 +61,38 @@ def write_template(display: NewDisplay, path: Path) -> tuple[str, Config]:
             written.append(f"port = {json.dumps(display.port)}")
     text = "\n".join(written) + "\n"
     return text, build_config(path, parse_toml(text.encode(), str(path)))
+
+
+def check_number(option: str, value: float, key: str, unit: str) -> None:
+    """Raise InputError for a number that the configuration's key cannot hold.
+
+    unit: of value: the key's, or mm for one in m
+    """
+    plausible = collect_ranges(Config)[key]
+    if unit != plausible.unit:
+        plausible = PlausibleRange(plausible.low * 1e3, plausible.high * 1e3, unit)
+    if not plausible.low <= value <= plausible.high:
+        likely = describe_likely_unit(value, plausible) if value > 0.0 else ""
+        raise InputError(option, value, f"{plausible.low:g} to {plausible.high:g} {unit}{likely}")
+
+
+def check_lens(option: str, lens_mm: float, farthest_m: float) -> None:
+    """Raise InputError for a lens with which the template's mirrors reach no pixel this far from the middle."""
+    check_number(option, lens_mm, "scanner.focal_length_m", "mm")
+    range_rad = load_config(TEMPLATE).scanner.range_rad
+    needed_mm = 1e3 * farthest_m / (2.0 * range_rad)
+    if lens_mm < needed_mm:
+        expected = f"at least {needed_mm:.4g} mm: mirrors of ±{range_rad:g} rad must reach every pixel"
+        raise InputError(option, lens_mm, expected)
+
+
+def check_port(option: str, port: str) -> None:
+    """Raise InputError for text that names neither a serial device nor the simulated board."""
+    if port != SIMULATED and not port.startswith("/"):
+        expected = (
+            f"a serial device such as /dev/serial/by-id/..., or {SIMULATED}; how-to/use-a-laser-dac writes others"
+        )
+        raise InputError(option, port, expected)
 
 
 def _list_values(display: NewDisplay, template: Config) -> dict[tuple[str, str], str]:

@@ -91,8 +91,12 @@ def test_a_sweep_states_the_pitch_that_it_needs(tmp_path, capsys):
         ({"lens_mm": 10}, "--lens-mm: got 10.0, expected at least 28.65 mm"),
         ({"rows": None}, "--rows: missing, expected --rows, because without a terminal nobody can answer"),
         ({"rows": 0}, "'--rows'"),
-        ({"power_w": 1200}, "laser.max_power_w: got 1200"),
-        ({"pitch_mm": 0.004}, "display.pitch_m: got 4e-06"),
+        ({"power_w": 1200}, "--power-w: got 1200.0, expected 0.001 to 60 W; this value is likely in mW"),
+        ({"power_w": -1}, "--power-w: got -1.0, expected 0.001 to 60 W\n"),
+        ({"power_w": "nan"}, "--power-w: got nan, expected 0.001 to 60 W\n"),
+        ({"pitch_mm": 0.004}, "--pitch-mm: got 0.004, expected 0.1 to 100 mm; this value is likely in m\n"),
+        ({"lens_mm": 0.22}, "--lens-mm: got 0.22, expected 5 to 3000 mm; this value is likely in m\n"),
+        ({"port": "COM3"}, "--port: got 'COM3', expected a serial device"),
         ({"port": ""}, "--port: got ''"),
     ],
     ids=str,
@@ -145,3 +149,47 @@ def test_a_terminal_is_asked_for_what_no_option_states(tmp_path):
     config = load_config(path)
     assert (config.display.rows, config.display.columns, config.laser.max_power_w) == (5, 3, 1.2)
     assert config.board.transport == "simulated"
+
+
+def test_a_wrong_answer_is_asked_again_and_costs_none_of_the_others(tmp_path):
+    path, (terminal, theirs) = tmp_path / "mine.toml", os.openpty()
+    answers = [
+        "0",
+        "2.5",
+        "6",
+        "7",
+        "0.003",
+        "3",
+        "1.6 W",
+        "-3",
+        "1600",
+        "1.6",
+        "abc",
+        "20",
+        "100",
+        "COM3",
+        "/dev/ttyACM0",
+    ]
+    command = [sys.executable, "-m", "optodrive.cli.main", "config", "new", str(path)]
+    with subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as asking:
+        os.close(theirs)
+        os.write(terminal, "".join(f"{answer}\n" for answer in answers).encode())
+        _, questions = asking.communicate()
+    os.close(terminal)
+    assert asking.returncode == 0, questions
+    refused = questions.split("optodrive: ")[1:]
+    assert [line.partition(", expected")[0] for line in refused] == [
+        "--rows: got 0",
+        "--rows: got '2.5'",
+        "--pitch-mm: got 0.003",
+        "--power-w: got '1.6 W'",
+        "--power-w: got -3.0",
+        "--power-w: got 1600.0",
+        "--lens-mm: got 'abc'",
+        "--lens-mm: got 20.0",
+        "--port: got 'COM3'",
+    ]
+    config = load_config(path)
+    assert (config.display.rows, config.display.columns, config.display.pitch_m) == (6, 7, 3e-3)
+    assert (config.laser.max_power_w, config.scanner.focal_length_m) == (1.6, 0.1)
+    assert config.board.port == "/dev/ttyACM0"

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,8 @@ from optodrive.cli.main import run
 from optodrive.core.clock import ManualClock, MonotonicClock
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.config_sections import BoardSection
+from optodrive.link.board_setup import build_port_settings
+from optodrive.link.transport.simulated import SimulatedBoard
 
 
 @pytest.fixture
@@ -201,12 +204,25 @@ def simulated(**changes):
 
 def test_the_simulated_board_is_greeted_and_not_armed():
     findings = check_board(simulated(), MonotonicClock())
-    assert find_finding(findings, "board").status == "warning", "no uid is configured"
-    uid = find_finding(findings, "board").remedy.split('"')[1]
-    assert "DISARMED" in find_finding(findings, "board").observation
-    assert {find_finding(findings, check).status for check in ("limits", "inputs")} == {"ok"}
-    findings = check_board(simulated(uid=uid), MonotonicClock())
-    assert find_finding(findings, "board").status == "ok"
+    assert "DISARMED; the board is simulated" in find_finding(findings, "board").observation
+    assert {find_finding(findings, check).status for check in ("board", "limits", "inputs")} == {"ok"}
+
+
+def test_a_configuration_that_accepts_any_board_is_told_the_key_that_accepts_one(tmp_path):
+    transport = SimulatedBoard(build_port_settings(load_config("display-16")))
+    transport.open()
+    transport.close()
+    try:
+        findings = check_board(simulated(transport="serial", port=transport.name), MonotonicClock())
+        assert find_finding(findings, "board").status == "warning"
+        key, section = (
+            find_finding(findings, "board").remedy.removeprefix("to accept this board only: ").split(" in section ")
+        )
+        uid = tomllib.loads(f"{section}\n{key}")["board"]["uid"]
+        findings = check_board(simulated(transport="serial", port=transport.name, uid=uid), MonotonicClock())
+        assert find_finding(findings, "board").status == "ok"
+    finally:
+        transport.release()
 
 
 def test_another_board_than_the_configured_one_is_a_problem():

@@ -65,6 +65,13 @@ CASES = {
     "a dotted table": (f"[{' . '.join(['x', chr(34) + 'y' + chr(34)] * 500)}]", ", line 1: got deeper nesting"),
     "a long key": (f"{'k' * 5000} = 1", "a key: got 'kkk.*printable characters"),
     "a key of several lines": ('"a\\n\\u001bb" = 1', r"a key: got 'a\\n\\x1bb', expected"),
+    "a word": ("a = serial", "valid TOML: .*text in quotation marks"),
+    "a path": ("a = /dev/ttyACM0", "valid TOML: .*text in quotation marks"),
+    "a unit": ("a = 3 mm", "valid TOML: a number .*without unit"),
+    "a decimal comma": ("a = 0,003", "valid TOML: a number with a decimal point"),
+    "a capital": ("a = True", "valid TOML: .*, true, false"),
+    "a key twice": ("a = 1\na = 2\nb = 3", ", line 2, column 6: .*valid TOML: each key once"),
+    "a section twice": ("[a]\n[a]\n", ", line 2, column 3: .*valid TOML: each section once"),
     "a date": ("a = 2026-13-45T25:00:00Z", "valid TOML"),
 }
 

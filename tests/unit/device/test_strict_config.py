@@ -98,3 +98,21 @@ def test_no_number_lies_outside_the_range_that_it_can_have(tmp_path, value):
 def test_what_was_accepted_is_refused_by_name(tmp_path, place, value, message):
     with pytest.raises(InputError, match=message):
         load_with(tmp_path, place, value)
+
+
+def test_a_key_in_another_section_is_told_its_own(tmp_path):
+    sections = {name: table for name, table in SHIPPED.items() if isinstance(table, dict)}
+    places = [("", key) for key in ("ambient_c", "name")]
+    places += [(name, key) for name, table in sections.items() for key in table if key != "parameters"]
+    moved = 0
+    for home, key in places:
+        for other in sections:
+            if other == home or key == other:
+                continue
+            with pytest.raises(InputError) as refused:
+                load_with(tmp_path, (other, key), 1)
+            message = str(refused.value)
+            assert f"{other}.{key}: got '{key}', expected this key " in message
+            assert (f"in '{home}'" if home else "at the top level") in message
+            moved += 1
+    assert moved > 150
