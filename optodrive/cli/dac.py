@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 import typer
 
+from optodrive.cli.exit_status import exit_unless_fits
 from optodrive.cli.options import (
     ConfigOption,
     JsonOption,
@@ -138,6 +139,7 @@ def play(
     playback_summary = _summarize_playback(dac, display, planned_sequence, verified, playback)
     document = {**summary.model_dump(mode="json"), "dac": playback_summary}
     print_answer(document, [*format_plan_summary(summary), *_format_playback(playback_summary)], json)
+    exit_unless_fits(feasibility)
 
 
 @contextmanager

@@ -5,6 +5,8 @@ from difflib import get_close_matches
 
 MESSAGE_MAX = 1000
 """Longest message about invalid input, characters."""
+UNQUOTED_MAX = 200
+"""Longest description that stands in place of a value, characters."""
 
 
 class OptodriveError(Exception):
@@ -125,6 +127,8 @@ def escape_unprintable(text: str) -> str:
 
 def abbreviate(value: object, limit: int = 60) -> str:
     """Return `repr` of a value, cut to `limit` characters. A value may nest deeper than Python's stack."""
+    if isinstance(value, Unquoted):
+        limit = max(limit, UNQUOTED_MAX)
     try:
         text = repr(value)
     except RecursionError:
@@ -149,6 +153,11 @@ def suggest_near_name(name: str, known: list[str]) -> str:
 def _simplify(name: str) -> str:
     """Return a name as names are compared: DRY-RUN is dry_run."""
     return name.casefold().replace("-", "_")
+
+
+def build_nothing_raised_error(where: str, reason: str, expected: str) -> InputError:
+    """Build the error (raises_nothing) of a stimulus that raises no pixel, with the reason."""
+    return InputError(where, Unquoted(f"a stimulus that raises nothing: {reason}"), expected, code="raises_nothing")
 
 
 class Unquoted:

@@ -117,6 +117,22 @@ class PlannedSequence:
         return float(late.max()) if len(late) else 0.0
 
 
+def explain_nothing_raised(planned: PlannedSequence) -> str:
+    """Say why a plan raises no pixel, or return an empty text if it raises one or the heat left in one does."""
+    plan = planned.plan
+    emitting = int(np.count_nonzero((plan.power_w > 0.0) & (plan.width_s > 0.0)))
+    if planned.skipped or emitting > planned.below_threshold:
+        return ""
+    if emitting:
+        return "no pixel is raised: every pulse is weaker than laser.threshold_w"
+    if len(plan):
+        caps = ", ".join(sorted(set(plan.reason[plan.reason != ""].tolist())))
+        return f"no pixel is raised: the caps leave no light ({caps})"
+    if planned.dead_pixels:
+        return "no pixel is raised: every requested pixel is dead"
+    return "no pixel is raised: every target is 0"
+
+
 def describe_lateness(timing: FrameTiming) -> str:
     """Return a sentence that gives the numbers of a frame that misses its deadline."""
     return (

@@ -23,6 +23,7 @@ from dac.bench import Bench, build_display, build_train, record_cold
 from dac.device_process import DeviceProcess, serve_ether_dream
 from dac.emulated_helios import CLOCK_HZ, EmulatedHelios
 from dac.judge import read_light
+from optodrive.cli.exit_status import DOES_NOT_FIT
 from optodrive.cli.main import run
 from optodrive.device.config_file import locate_shipped
 from optodrive.link.dac.devices.ether_dream import EtherDream
@@ -195,7 +196,7 @@ def _loaded():
         patch.setattr(usb.backend.libusb1, "get_backend", lambda: bench.emulated)
         patch.setattr("optodrive.core.clock.MonotonicClock", lambda: bench.clock)
         for _ in range(2):
-            assert run(["dac", "play", str(room.frames), "--config", str(room.config)]) == 0
+            assert run(["dac", "play", str(room.frames), "--config", str(room.config)]) == DOES_NOT_FIT
             room.do("lose")
 
 

@@ -55,6 +55,7 @@ BODIES = {
     "bad JSON": ('{"frames": [', "bad_json"),
     "unknown key": ({"frames": [frame(target_nm={})]}, "unknown_key"),
     "nothing": ({}, None),
+    "blank frames": ({"frames": [frame(target_um={"17": 0}), frame(show_at_s=1.0, target_um={})]}, "raises_nothing"),
     "not an object": ([1, 2], None),
 }
 

@@ -23,7 +23,7 @@ from optodrive.planning.feasibility.report_builder import (
 from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence
 from optodrive.planning.feasibility.violation import Violation, deadlines_s, find_first_violation
 from optodrive.planning.pipeline import Progress, plan_sequence
-from optodrive.planning.planned_sequence import PlannedSequence
+from optodrive.planning.planned_sequence import PlannedSequence, explain_nothing_raised
 from optodrive.planning.sequence_checks import first_unreachable, remove_dead_pixels
 
 PLANS_MAX = 1_000
@@ -92,7 +92,7 @@ def check_feasibility(
     If the planner's order does not fit and the sequence has at most ORDERS_MAX orders, all orders are tried and the
     first that fits is planned. If none fits, `fit` decides: "as_is" applies the policy to the whole sequence, "even"
     scales all heights by one factor, "priority" omits the pixels and trains of lowest priority. Dead pixels are removed
-    from the frames beforehand.
+    from the frames beforehand. A plan that raises no pixel does not fit.
 
     Returns the plan and the report. Raises as `plan_sequence` does, and RefusedError with the report if the policy is
     "refuse" or if no variant of the requested kind fits.
@@ -100,7 +100,15 @@ def check_feasibility(
     living, dead = remove_dead_pixels(display, sequence)
     query = _FeasibilityQuery(display, living, heat, budget, fit, on_progress or (lambda _share: None))
     planned, report = _check_query(query, policy)
-    return replace(planned, dead_pixels=dead), report
+    planned = replace(planned, dead_pixels=dead)
+    nothing = explain_nothing_raised(planned)
+    if nothing and report.fits:
+        report = replace(report, fits=False, message=nothing, reason="nothing_raised")
+        if policy == "refuse":
+            raise _attach_report(RefusedError(nothing), report)
+    elif nothing:
+        report = replace(report, message=f"{nothing}; {report.message}")
+    return planned, report
 
 
 def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSequence, FeasibilityReport]:

@@ -56,8 +56,8 @@ class FeasibilityReport:
     proof: "planned": the planner's order fits; "searched": all orders were tried, or another order fits and is planned;
     "bound": a lower bound excludes every order; "not found": the search ended without a proof
     message: the verdict in one line
-    reason: "deadline", the name of a cap, or "unreachable"; name, pixel: frame or train and pixel of the first
-    violation
+    reason: "deadline", the name of a cap, "unreachable", or "nothing_raised"; name, pixel: frame or train and pixel of
+    the first violation
     beam_required_s, beam_available_s: for a frame, from its earliest start to the planned end of its last pulse and to
     its deadline; for a train's pulse, from its requested start; for a feasible sequence, of the whole; None if
     unreachable

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, ParseError
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
-from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.errors import InputError, Unquoted, build_nothing_raised_error
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.braille import Cell
@@ -58,7 +58,7 @@ def build_braille_file(
             pages = [[_split_words(row) for row in page] for page in _read_brf(text, place)]
     shown = [page for page in map(_strip_rows, pages) if page]
     if not shown:
-        raise InputError(place, Unquoted("no cell"), "braille with at least one raised dot", code="bad_text")
+        raise build_nothing_raised_error(place, "all its pages are blank", "braille with at least one raised dot")
     return show_pages(config, where, shown, height_m, seconds, SPACING)
 
 

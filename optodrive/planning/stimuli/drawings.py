@@ -22,7 +22,7 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 from numpy.typing import NDArray
 
-from optodrive.core.errors import MISSING, InputError, Unquoted
+from optodrive.core.errors import MISSING, InputError, Unquoted, build_nothing_raised_error
 from optodrive.core.extras import import_extra
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.stimuli import FrameSequence
@@ -84,7 +84,7 @@ class _Cost(NamedTuple):
 def build_drawing(config: Config, where: str, file: bytes, height_m: float, seconds: float) -> FrameSequence:
     """Build frames that show an SVG drawing for `seconds`, class `curve` at height_m.
 
-    Raises InputError (bad_picture, too_many, and without resvg_py missing_extra).
+    Raises InputError (bad_picture, too_many, raises_nothing, and without resvg_py missing_extra).
     """
     lattice = Lattice.from_config(config)
     target_m = height_m * compute_lattice_heights(file, lattice, f"{where}: file")
@@ -111,8 +111,12 @@ def compute_lattice_heights(file: bytes, lattice: Lattice, where: str) -> FloatA
         heights[raised & _find_lines(_render(picture, shape, where))] = HEIGHT_BY_CLASS[name]
     values: FloatArray = heights[::-1][lattice.layout.row, lattice.layout.column]
     if not values.any():
+        if raised.any():
+            reason = "its lines lie where the display has no pixel"
+        else:
+            reason = "every shape is white, hidden or outside its viewBox" if shapes else "it has no shape"
         expected = "a drawing with lines that differ from white; text and pictures are not shown"
-        raise InputError(where, Unquoted("no line on the display"), expected, code="bad_picture")
+        raise build_nothing_raised_error(where, reason, expected)
     return values
 
 

@@ -6,12 +6,12 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, build_nothing_raised_error
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
@@ -43,12 +43,13 @@ def build_image(
 ) -> FrameSequence:
     """Build frames that show an image (the first of several) for `seconds`, white at height_m.
 
-    Raises InputError (bad_picture, too_many).
+    Raises InputError (bad_picture, too_many, raises_nothing).
     """
     lattice = Lattice.from_config(config)
     with _open_image(file, f"{where}: file") as image:
-        _check_opaque([_is_transparent(image)], f"{where}: file")
-        target_m = height_m * compute_lattice_brightness(image, lattice, invert)
+        brightness = compute_lattice_brightness(image, lattice, invert)
+    _check_raised([brightness], invert, f"{where}: file")
+    target_m = height_m * brightness.driven
     return FrameSequence(frames=tuple(hold_picture(BeamTimeEstimator(config), target_m, seconds, "image")))
 
 
@@ -58,11 +59,11 @@ def build_animation(
     """Build frames that show the images of an animated GIF or PNG once each.
 
     An image lasts 1 / rate_hz. If rate_hz is None it lasts as long as the file states, at least 20 ms and its beam
-    time. Raises InputError (bad_picture, too_many).
+    time. Raises InputError (bad_picture, too_many, raises_nothing).
     """
     beam, start_s, pixels = BeamTimeEstimator(config), 0.0, 0
     frames: list[TactileFrame] = []
-    is_transparent: list[bool] = []
+    pictures: list[LatticeBrightness] = []
     with _open_image(file, f"{where}: file") as image:
         for position in _select_positions(image, f"{where}: file"):
             image.seek(position)
@@ -70,38 +71,59 @@ def build_animation(
             pixels += image.width * image.height
             if pixels > ANIMATION_PIXELS_MAX:
                 raise _too_many_pixels_error(f"{where}: file", f"{len(frames) + 1} pictures of {pixels} pixels")
-            is_transparent.append(_is_transparent(image))
-            target_m = height_m * compute_lattice_brightness(image, beam.lattice, invert)
+            pictures.append(compute_lattice_brightness(image, beam.lattice, invert))
+            target_m = height_m * pictures[-1].driven
             duration_s = 1.0 / rate_hz if rate_hz else max(_duration_s(image), beam.beam_time_s(target_m))
             frames.append(TactileFrame(f"animation-{len(frames)}", start_s, duration_s, target_m))
             start_s += duration_s
-    _check_opaque(is_transparent, f"{where}: file")
+    _check_raised(pictures, invert, f"{where}: file")
     return FrameSequence(frames=tuple(frames))
 
 
-def _check_opaque(is_transparent: list[bool], where: str) -> None:
-    """Raise InputError (bad_picture) for pictures all of which are wholly transparent, so that nothing is shown."""
-    if all(is_transparent):
-        raise InputError(where, "a wholly transparent picture", "an opaque pixel", code="bad_picture")
+class LatticeBrightness(NamedTuple):
+    """Brightness of a picture on the lattice, all 0…1.
+
+    driven: [p] of each pixel, 0 below BRIGHTNESS_MIN; brightest: of all samples, all places and all pixels
+    opacity: of the most opaque sample
+    """
+
+    driven: FloatArray
+    brightest: tuple[float, float, float]
+    opacity: float
 
 
-def _is_transparent(image: "Image") -> bool:
-    """Return whether every pixel of an image is wholly transparent."""
-    if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
-        return False
-    return image.convert("RGBA").getchannel("A").getextrema()[1] == 0
+def _check_raised(pictures: list[LatticeBrightness], invert: bool, where: str) -> None:
+    """Raise InputError (raises_nothing) for pictures that raise no pixel, with the reason."""
+    if any(each.driven.any() for each in pictures):
+        return
+    sample, place, pixel = np.max([each.brightest for each in pictures], axis=0).tolist()
+    raised, left = ("dark", "white") if invert else ("bright", "black")
+    other = "" if invert else ", or invert=true, which raises dark ones"
+    expected = f"a picture with {raised} areas on the display's pixels{other}"
+    if not any(each.opacity for each in pictures):
+        reason, expected = "it is wholly transparent", "an opaque pixel"
+    elif sample == 0.0:
+        reason = f"it is {left} everywhere"
+    elif place >= BRIGHTNESS_MIN:
+        reason = f"its {raised} areas lie where the display has no pixel"
+    else:
+        reason = (
+            f"no pixel's area reaches {100 * BRIGHTNESS_MIN:g} % of full height, the highest is {100 * pixel:.2g} %"
+        )
+    raise build_nothing_raised_error(where, reason, expected)
 
 
-def compute_lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -> FloatArray:
-    """Compute the brightness 0…1 of each pixel [p] from the whole image, fitted into the lattice and centred."""
-    brightness = _compute_brightness(image, invert)
+def compute_lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -> LatticeBrightness:
+    """Compute the brightness of each pixel from the whole image, fitted into the lattice and centred."""
+    brightness, opacity = _compute_brightness(image, invert)
     rows, columns = lattice.index.shape
     height, width = brightness.shape
     scale = max(height / rows, width / columns)
     down, across = _compute_overlap(rows, height, scale), _compute_overlap(columns, width, scale)
     fitted = (down @ brightness @ across.T)[::-1]
     values = np.asarray(fitted[lattice.layout.row, lattice.layout.column], dtype=np.float64)
-    return np.where(values < BRIGHTNESS_MIN, 0.0, np.minimum(values, 1.0))
+    brightest = float(brightness.max()), float(fitted.max()), float(values.max())
+    return LatticeBrightness(np.where(values < BRIGHTNESS_MIN, 0.0, np.minimum(values, 1.0)), brightest, opacity)
 
 
 def _compute_overlap(place_count: int, pixel_count: int, scale: float) -> NDArray[np.float32]:
@@ -115,18 +137,21 @@ def _compute_overlap(place_count: int, pixel_count: int, scale: float) -> NDArra
     return np.asarray(covered / scale, dtype=np.float32)
 
 
-def _compute_brightness(image: "Image", invert: bool) -> NDArray[np.float32]:
-    """Compute brightness 0…1, [rows from the top, columns]. Transparency is dark, inverted or not."""
+def _compute_brightness(image: "Image", invert: bool) -> tuple[NDArray[np.float32], float]:
+    """Compute brightness 0…1, [rows from the top, columns], and the highest opacity.
+
+    Transparency is dark, inverted or not.
+    """
     from PIL import ImageOps
 
     image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I"):
         grey = np.clip(np.asarray(image, dtype=np.float32) / np.float32(65535.0), 0.0, 1.0)
-        return np.asarray(1.0 - grey if invert else grey, dtype=np.float32)
+        return np.asarray(1.0 - grey if invert else grey, dtype=np.float32), 1.0
     rgba = image.convert("RGBA")
     grey = np.asarray(rgba.convert("RGB").convert("L"), dtype=np.float32) / 255.0
     alpha = np.asarray(rgba.getchannel("A"), dtype=np.float32) / 255.0
-    return np.asarray((1.0 - grey if invert else grey) * alpha, dtype=np.float32)
+    return np.asarray((1.0 - grey if invert else grey) * alpha, dtype=np.float32), float(alpha.max())
 
 
 def _duration_s(image: "Image") -> float:

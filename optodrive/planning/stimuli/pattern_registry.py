@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optodrive.core.errors import InputError, Unquoted, suggest_nearest
+from optodrive.core.errors import InputError, build_nothing_raised_error, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import bring_up, experiments, images, shapes
@@ -14,7 +14,7 @@ from optodrive.planning.stimuli.comparison import build_comparison
 from optodrive.planning.stimuli.drawings import build_drawing
 from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
-from optodrive.planning.stimuli.sequence_file import validate_sequence
+from optodrive.planning.stimuli.sequence_file import raises_nothing, validate_sequence
 from optodrive.planning.stimuli.showcase import build_showcase
 from optodrive.planning.stimuli.text import build_text
 
@@ -331,7 +331,7 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
     A value may be text, as from a command line; a file is its bytes, or these in base64.
 
     Raises InputError: unknown_pattern, unknown_parameter, missing_parameter, bad_parameter, unknown_pixel,
-    does_not_fit, bad_text, bad_picture, too_many, bad_train.
+    does_not_fit, bad_text, bad_picture, too_many, bad_train, raises_nothing.
     """
     pattern, where = find_pattern(name), f"pattern {name}"
     arguments = pattern.resolve_arguments(given, config)
@@ -339,9 +339,8 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
         sequence = pattern.build(config, where, **arguments)
     else:
         sequence = _build_by_intensity(pattern, where, given, config)
-    if not sequence.trains and not any(frame.target_m.any() for frame in sequence.frames):
-        expected = "one that raises a pixel; a picture raises bright areas, dark ones with invert=true"
-        raise InputError(where, Unquoted("a stimulus that raises nothing"), expected, code="bad_picture")
+    if raises_nothing(sequence):
+        raise build_nothing_raised_error(where, "it meets no pixel of the display", "one that meets a pixel")
     return validate_sequence(sequence, where, config)
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, build_nothing_raised_error
 from optodrive.core.files import read_bounded
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.core.units import m_to_um
@@ -32,7 +32,7 @@ def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
     """Parse a sequence for a display from JSON text or decoded JSON. `where` names the source in errors.
 
     Raises InputError with the place, and a code: bad_json, unknown_key, missing_key, unknown_pixel, bad_target,
-    bad_time, bad_train, bad_priority, overlapping_trains, bad_label, too_many.
+    bad_time, bad_train, bad_priority, overlapping_trains, bad_label, too_many, raises_nothing.
     """
     return parse_request(body, config, where)[0]
 
@@ -52,7 +52,15 @@ def parse_request(body: object, config: Config, where: str) -> tuple[FrameSequen
         frames=parse_frames(frame_list, f"{where}: frames", pixel_count, intensity_model),
         trains=_parse_trains(train_list, f"{where}: trains", config, pixel_count, intensity_model),
     )
+    if raises_nothing(sequence):
+        reason = "every target is 0"
+        raise build_nothing_raised_error(f"{where}: frames", reason, "a frame with a height above 0, or a train")
     return sequence, labels
+
+
+def raises_nothing(sequence: FrameSequence) -> bool:
+    """Return whether a sequence has no train, and frames without a target above 0."""
+    return not sequence.trains and not any(frame.target_m.any() for frame in sequence.frames)
 
 
 def validate_sequence(sequence: FrameSequence, where: str, config: Config) -> FrameSequence:

@@ -4,7 +4,7 @@ import unicodedata
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, build_nothing_raised_error
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
@@ -35,7 +35,7 @@ def build_text(
     """
     lines = translate(text, table, f"{where}: text")
     if not any(lines):
-        raise InputError(f"{where}: text", text, "at least one character to show", code="bad_text")
+        raise build_nothing_raised_error(f"{where}: text", "it is blank", "text with at least one raised dot")
     return show_pages(config, where, [lines], height_m, seconds, Spacing(dot_step, cell_gap, line_gap))
 
 

@@ -6,8 +6,11 @@ import pytest
 
 from optodrive.cli.exit_status import DOES_NOT_FIT, SUMMARY
 from optodrive.cli.main import run
+from optodrive.device.config_file import locate_shipped
 
 LATE = {"frames": [{"show_at_s": 0.0, "duration_s": 0.01, "target_um": {"3": 100, "4": 100, "5": 100}}]}
+BLANK = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"3": 0}}]}
+WEAK = {"pixel": 3, "start_s": 0.0, "duration_s": 0.1, "pulse_width_s": 0.02, "gap_s": 0.06, "power_w": 0.5}
 EASY = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"3": 50}}]}
 
 
@@ -34,6 +37,18 @@ def test_does_not_fit_is_a_status_of_its_own(frames, command, capsys):
             assert summary.get("summary", summary)["feasibility"]["fits"] is False
         else:
             assert shown.out.startswith("fits: no, ")
+
+
+@pytest.mark.parametrize("command", ["plan", "simulate"])
+def test_nothing_raised_is_bad_input_or_does_not_fit(frames, command, capsys, tmp_path):
+    assert run([command, frames(BLANK), "--config", "display-16"]) == 2
+    assert "a stimulus that raises nothing: every target is 0" in capsys.readouterr().err
+    config = tmp_path / "weak.toml"
+    shipped = locate_shipped("display-16.toml").read_text()
+    config.write_text(shipped.replace("[laser]\n", "[laser]\nthreshold_w = 1.0\n"))
+    assert run([command, frames({"trains": [WEAK]}), "--config", str(config)]) == DOES_NOT_FIT
+    said = "fits: no, no pixel is raised: every pulse is weaker than laser.threshold_w\n"
+    assert capsys.readouterr().out.startswith(said)
 
 
 def test_the_files_are_written_all_the_same(frames, tmp_path, capsys):

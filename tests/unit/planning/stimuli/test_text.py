@@ -97,7 +97,7 @@ def test_dots_are_arranged_as_in_a_cell():
 
 @pytest.mark.parametrize("text", [" ", "\n\n"])
 def test_blank_text_is_refused(text):
-    with pytest.raises(InputError, match="at least one character"):
+    with pytest.raises(InputError, match="raises nothing: it is blank"):
         build_text(CONFIG, "t", text, 1e-4, 1.0)
 
 
