@@ -1,12 +1,15 @@
 """Random height trains against solve_ivp of the pixel's two equations."""
 
+from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config_file import load_config
@@ -85,6 +88,61 @@ def test_steady_cycles_reach_the_target_height_and_peak_to_peak(count, data):
     assert cycles_um.max(axis=1) == pytest.approx(np.full(3, 1e6 * target_m), rel=0.03)
     if peak_to_peak_m is not None:
         assert np.ptp(cycles_um, axis=1) == pytest.approx(np.full(3, 1e6 * peak_to_peak_m), rel=0.03)
+
+
+def judge_cycles_um(display, result, trains):
+    """Return the peak of every cycle of the trains, in order of time on one pixel, by solve_ivp, µm."""
+    plan, pixel = result.plan, display.pixels.elements[trains[0].pixel]
+    starts_s = np.concatenate([train.pulse_starts_s() for train in trains]) + result.lead_in_s
+    edges_s = [*starts_s, starts_s[-1] + trains[-1].period_s]
+    t_s = np.concatenate([np.linspace(a, b, 120, endpoint=False) for a, b in pairwise(edges_s)])
+    heights_um = height_um(pixel, np.column_stack([plan.start_s, plan.width_s, plan.power_w]), t_s).reshape(-1, 120)
+    return np.maximum(heights_um.max(axis=1), [*heights_um[1:, 0], heights_um[-1, -1]])
+
+
+def is_long_enough(display, train):
+    """Return whether one pulse raises the cold pixel to the height, and it peaks, within one cycle, by solve_ivp."""
+    drive, pixel = display.scan_head.drive, display.pixels.elements[train.pixel]
+    t_s = np.linspace(0.0, train.period_s, 400)
+    longest_s = train.period_s - display.scan_head.pulse_gap_s
+    low_s, high_s = 0.0, longest_s
+    for _ in range(7):
+        width_s = 0.5 * (low_s + high_s)
+        trace_um = height_um(pixel, np.array([[0.0, width_s, drive.max_power_w]]), t_s)
+        low_s, high_s = (width_s, high_s) if trace_um.max() < 1e6 * train.target_m else (low_s, width_s)
+    trace_um = height_um(pixel, np.array([[0.0, high_s, drive.max_power_w]]), t_s)
+    return high_s < longest_s and trace_um.argmax() < len(t_s) - 1
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "height_um", "peak_to_peak_um"), [(60, 200, None), (60, 200, 40), (40, 300, None), (80, 100, None)]
+)
+def test_every_peak_from_the_first_has_the_height(rate_hz, height_um, peak_to_peak_um):
+    display = DISPLAYS["display-437"]
+    train = HeightTrain(200, 0.0, 0.25, 1 / rate_hz, 1e-6 * height_um, peak_to_peak_um and 1e-6 * peak_to_peak_um)
+    result = plan_sequence(display, FrameSequence(trains=(train,)), *display.build_cold_state())
+    peaks_um = judge_cycles_um(display, result, [train])
+    assert peaks_um == pytest.approx(np.full(len(peaks_um), height_um), rel=0.012)
+
+
+@settings(max_examples=24 * settings.default.max_examples // 100)
+@given(data=st.data())
+def test_every_peak_of_any_train_has_the_height_where_one_cycle_can_reach_it(data):
+    """Also after a step from another height up to the train's."""
+    display = DISPLAYS[data.draw(st.sampled_from(sorted(DISPLAYS)))]
+    pixel = data.draw(st.integers(0, len(display.layout) - 1))
+    period_s = round(1.0 / data.draw(st.floats(8.0, 150.0)), 6)
+    train = HeightTrain(pixel, 0.0, 10 * period_s, period_s, 1e-6 * data.draw(st.floats(5.0, 400.0)))
+    assume(is_long_enough(display, train))
+    trains = [train]
+    if data.draw(st.booleans()):
+        lower_m = train.target_m * data.draw(st.floats(0.2, 1.0))
+        trains.insert(0, replace(train, start_s=0.0, target_m=lower_m))
+        trains[1] = replace(train, start_s=10 * period_s)
+    result = plan_sequence(display, FrameSequence(trains=tuple(trains)), *display.build_cold_state())
+    assume(not result.plan.trimmed_j.any())
+    peaks_um = judge_cycles_um(display, result, trains)
+    assert peaks_um == pytest.approx(np.repeat([1e6 * each.target_m for each in trains], 10), rel=0.02)
 
 
 def test_pulse_widths_do_not_alternate_near_full_power():

@@ -2,9 +2,10 @@
 
 A pulse is normally planned for the peak of its cycle. In short cycles the membrane still rises from one pulse when the
 next one starts, so the peak belongs to the previous pulse; planned for it, every other pulse would be omitted for good.
-Such pulses are planned for the displacement after the peak of the steady cycle. Pulses of free width are planned for
-the displacement midway between that peak and the next pulse, because planning for the peak itself would make wide and
-narrow pulses alternate.
+Such pulses are planned for a later displacement of the steady cycle: pulses of fixed width from its peak on, pulses of
+free width at the start of the next pulse, because planning for an earlier one makes wide and narrow pulses alternate.
+Cycles that are not steady, the first ones above all, then have other peaks. A pulse whose peak would differ by more
+than `PEAK_DEVIATION` is planned for a peak that differs by so much, if the next cycles do not pay for it.
 
 Widths are whole PWM periods. If the gate-off time between pulses is short, one more period changes the peak-to-peak
 value considerably. A lead period, one weaker PWM period before the pulse, provides values between two widths.
@@ -29,6 +30,14 @@ SAMPLES = 400
 """Samples per steady cycle."""
 EARLY_PEAK_FRACTION = 0.8
 """A pulse on a cold pixel that peaks before this fraction of the period can be planned for its peak."""
+PEAK_DEVIATION = 0.01
+"""Relative deviation of a cycle's peak from its target up to which a pulse is planned for the steady cycle alone."""
+FORESEEN_CYCLES = 3
+"""Cycles after a pulse whose peaks decide between two pulses."""
+CORRECTIONS = (1.0, 0.5)
+"""Fractions of the way from the steady cycle's pulse to the one with the largest permitted deviation."""
+MIN_IMPROVEMENT = 0.9
+"""A pulse replaces that of the steady cycle if it reduces the largest deviation to this fraction."""
 MAX_POWER_CORRECTIONS, PEAK_TOLERANCE = 6, 1e-4
 """Number of corrections of a steady pulse's power, and the relative error of the peak at which they stop."""
 PEAK_TO_PEAK_TOLERANCE = 0.01
@@ -39,6 +48,8 @@ BISECTIONS = 8
 """Bisections of the lead period's relative duty."""
 MIN_REFERENCE_S = 1e-9
 """Smallest time after a pulse's start at which its displacement is taken."""
+Shape = tuple[int, float]
+"""Width in PWM periods and duty of a pulse."""
 
 
 @dataclass(frozen=True)
@@ -101,18 +112,83 @@ def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: Drive
 
 def compute_next_pulse(
     train: HeightTrain, recipe: PulseRecipe, heat: ThermalState, start_s: float, drive: DriveRange
-) -> tuple[int, float] | None:
+) -> Shape | None:
     """Compute width (PWM periods) and duty of the train's next pulse at `start_s` from the residual heat.
 
     Returns None if the target is already reached. The width stays fixed for a given peak-to-peak value; adapting it per
     pulse would cause a period-2 limit cycle.
     """
+    shapes = _solve_alternatives(train, recipe, heat, start_s, drive)
+    if len(shapes) == 1:
+        return shapes[0]
+    deviations = [_foresee_deviation(train, recipe, heat, start_s, drive, each, FORESEEN_CYCLES) for each in shapes]
+    best = int(np.argmin(deviations))
+    return shapes[best] if deviations[best] < MIN_IMPROVEMENT * deviations[0] else shapes[0]
+
+
+def _solve_alternatives(
+    train: HeightTrain, recipe: PulseRecipe, heat: ThermalState, start_s: float, drive: DriveRange
+) -> list[Shape | None]:
+    """Solve for the steady cycle's pulse and, if its peak deviates too far, for pulses whose peaks deviate less."""
+    pulse = _solve_pulse(train, recipe, heat, start_s, drive)
+    if recipe.from_s == 0.0:
+        return [pulse]
+    steady_width = bounded_width = _compute_full_power_width(pulse)
+    for sign in (-1.0, 1.0):
+        bound = PulseRecipe(train.target_m * (1.0 + sign * PEAK_DEVIATION), recipe.min_periods)
+        width = _compute_full_power_width(_solve_pulse(train, bound, heat, start_s, drive))
+        bounded_width = max(bounded_width, width) if sign < 0.0 else min(bounded_width, width)
+    shapes = [pulse]
+    for fraction in CORRECTIONS if bounded_width != steady_width else ():
+        width = steady_width + fraction * (bounded_width - steady_width)
+        periods = max(recipe.min_periods, ceil(width))
+        shapes.append((periods, width / periods) if width > 0.0 else None)
+    return shapes
+
+
+def _solve_pulse(
+    train: HeightTrain, recipe: PulseRecipe, heat: ThermalState, start_s: float, drive: DriveRange
+) -> Shape | None:
+    """Solve for the pulse of a recipe, without regard to the peaks of other cycles."""
     shape = (drive, recipe.min_periods, recipe.from_s)
     pulse = heat.solve_pulse(train.pixel, start_s, recipe.target_m, *shape)
     if train.peak_to_peak_m is None or pulse is None or pulse[0] <= recipe.min_periods:
         return pulse
     lower_pulse = heat.solve_pulse(train.pixel, start_s, WIDENING_THRESHOLD * recipe.target_m, *shape)
     return pulse if lower_pulse is not None and lower_pulse[0] > recipe.min_periods else (recipe.min_periods, 1.0)
+
+
+def _compute_full_power_width(pulse: Shape | None) -> float:
+    """Return the width at full power that has a pulse's energy, PWM periods."""
+    return 0.0 if pulse is None else pulse[0] * pulse[1]
+
+
+def _foresee_deviation(
+    train: HeightTrain,
+    recipe: PulseRecipe,
+    heat: ThermalState,
+    start_s: float,
+    drive: DriveRange,
+    pulse: Shape | None,
+    cycles: int,
+) -> float:
+    """Return the largest relative deviation of the peak of a cycle that begins with `pulse`, and of further `cycles`.
+
+    The next pulse is the best of its alternatives, and those after it are the steady cycle's.
+    """
+    heat, next_s = heat.copy(), start_s + train.period_s
+    periods, duty = pulse or (1, 0.0)
+    pulses = [(start_s, periods * drive.period_s, duty * drive.max_power_w)]
+    if recipe.lead_period_w:
+        pulses.append((next_s - drive.period_s, drive.period_s, recipe.lead_period_w))
+    start, width, power = np.array([*pulses, (next_s, 0.0, 0.0)]).T
+    peaks_m = heat.apply_pulses(np.full(len(start), train.pixel), start, width, power).displacement_m
+    deviation = abs(float(peaks_m[:-1].max()) / train.target_m - 1.0)
+    if not cycles:
+        return deviation
+    given = (train, recipe, heat, next_s, drive)
+    shapes = _solve_alternatives(*given)[: None if cycles == FORESEEN_CYCLES else 1]
+    return max(deviation, min(_foresee_deviation(*given, each, cycles - 1) for each in shapes))
 
 
 def compute_steady_state(
@@ -134,13 +210,14 @@ def compute_steady_state(
     earlier, last = pulses[:-1].reshape(-1, 4), pulses[-1]
     heat = cold_heat.copy()
     heat.apply_pulses(np.full(len(earlier), train.pixel), earlier[:, 0], earlier[:, 1], earlier[:, 2])
-    t_s = last[0, 0] + train.period_s * np.linspace(0.0, 1.0, SAMPLES + 1)
+    t_s = last[0, 0] + train.period_s * np.linspace(0.0, 2.0, 2 * SAMPLES + 1)  # after the cycle, no further pulse
     height_m = heat.simulate_displacement_m(last, train.pixel, t_s)
-    peak = int(height_m.argmax())
-    reference = peak if train.peak_to_peak_m is not None else (peak + SAMPLES) // 2
+    cycle_m = height_m[: SAMPLES + 1]
+    reference = int(cycle_m.argmax()) if train.peak_to_peak_m is not None else SAMPLES
     reference_s = max(MIN_REFERENCE_S, float(t_s[reference] - t_s[0]) - lead_s)
+    reference_m = float(height_m[reference:].max())
     return PeriodicSteadyState(
-        periods, duty, lead_duty, float(height_m.max()), float(height_m.min()), float(height_m[reference]), reference_s
+        periods, duty, lead_duty, float(cycle_m.max()), float(cycle_m.min()), reference_m, reference_s
     )
 
 
