@@ -38,7 +38,8 @@ def describe_failure(error: LinkError | InputError) -> Finding:
     """Return the finding on a board that does not answer, or that answers something else than expected."""
     if isinstance(error, LinkError):
         return report_problem("board", str(error), UNANSWERED)
-    return report_problem("board", f"{error.where} is {error.value}", f"expected: {error.expected}")
+    observation = f"does not fit the configuration: {error.where} is {error.value}"
+    return report_problem("board", observation, f"expected: {error.expected}")
 
 
 def _check_identity(session: BoardSession, config: Config) -> list[Finding]:

@@ -37,7 +37,7 @@ def check_dac(config: Config, clock: Clock) -> list[Finding]:
 def _check_identity(dac: LaserDac, config: Config) -> Finding:
     observation = f"{dac.name}, firmware {dac.firmware}, stopped, its light off"
     if not config.board.uid:
-        remedy = f'to accept this one only: board.uid = "{dac.name}"'
+        remedy = f'to accept this one only: uid = "{dac.name}" in section [board]'
         return report_warning("board", f"{observation}; the configuration accepts any {dac.format.label}", remedy)
     return report_ok("board", observation)
 

@@ -42,7 +42,7 @@ def test_any_device_and_no_interlock_are_warnings(examine):
     assert findings["heat"].observation == (
         "the display counts as hot, because this machine has no record of its heat; it cools within 786 s"
     )
-    assert 'board.uid = "Helios 1163021877"' in findings["board"].remedy
+    assert 'uid = "Helios 1163021877"' in findings["board"].remedy
     assert "nothing is emitted before" in findings["interlock"].remedy
 
 

@@ -373,7 +373,8 @@ def test_an_ether_dream_that_is_not_heard_is_hot_and_ends_all_records_of_its_kin
 def test_the_hardware_address_of_an_ether_dream_is_its_uid(desk):
     assert desk.ask(desk.device.address, MAC)["name"] == MAC
     error = desk.ask(desk.device.address, "00:04:a3:ff:ff:ff", status=2)
-    assert f"board.uid: got '{MAC}', expected 00:04:a3:ff:ff:ff" in error
+    assert "board.uid: got '00:04:a3:ff:ff:ff', expected the Ether Dream of this hardware address; the one" in error
+    assert f"has '{MAC}'" in error
     silent = DeviceProcess(serve_ether_dream, desk.folder)
-    assert "got 'no broadcast of it on UDP 7654'" in desk.ask(silent.address, MAC, status=2)
+    assert "tells none, for it is not heard on UDP 7654" in desk.ask(silent.address, MAC, status=2)
     silent.finish()

@@ -269,7 +269,7 @@ def test_a_device_out_of_order_is_one_line(status, words):
 def test_another_unit_than_the_configured_one_is_rejected():
     desk = Desk()
     desk.dac.board = build_config(transport="idn", port="dac", uid="IDN 01").board
-    with pytest.raises(InputError, match=r"board\.uid: got 'IDN 01020304050607', expected IDN 01"):
+    with pytest.raises(InputError, match=r"board\.uid: got 'IDN 01', expected the .* is 'IDN 01020304050607\'"):
         desk.dac.open()
     assert not desk.radio.is_open
 

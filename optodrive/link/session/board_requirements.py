@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import RTO_S
 from optodrive.link.protocol.quantisation import WireScale
 
 PROTOCOL_MAJOR = 1
+BOARDS_OWN = "the limit of the board's firmware"
 TICK_HZ = 1_000_000
 FRAME_BYTES = 254
 MAX_IN_FLIGHT_S = 0.01
@@ -62,9 +63,13 @@ class BoardRequirements:
         """Raise InputError with key and value if the board cannot execute plans of this configuration."""
         values = self.values
         if peer.major != PROTOCOL_MAJOR:
-            raise InputError("board protocol", f"{peer.major}.{peer.minor}", f"major version {PROTOCOL_MAJOR}", "board")
+            expected = (
+                f"{PROTOCOL_MAJOR}.x, of firmware that fits this release; flash it (`optodrive docs --out folder`)"
+            )
+            raise InputError("board protocol", Unquoted(f"{peer.major}.{peer.minor}"), expected, "board")
         if self.uid and peer.uid.hex() != self.uid.lower():
-            raise InputError("board.uid", peer.uid.hex(), f"{self.uid}, the configured board", "board")
+            expected = f"the board of this uid; the connected one has '{peer.uid.hex()}'"
+            raise InputError("board.uid", self.uid, expected, "board")
         if peer.tick_hz != TICK_HZ:
             raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
         limits, requested = peer.limits, self.limits
@@ -79,7 +84,12 @@ class BoardRequirements:
             raise InputError("scanner.slew_rad_per_s", values.slew_rad_per_s, expected, "board")
         if limits.max_on_us < requested.max_on_us:
             max_s = limits.max_on_us * 1e-6
-            raise InputError("limits.pulse_width_max_s", values.pulse_width_max_s, f"at most {max_s:g}", "board")
+            raise InputError(
+                "limits.pulse_width_max_s",
+                values.pulse_width_max_s,
+                f"at most {max_s:g}, {BOARDS_OWN} (max_on_us)",
+                "board",
+            )
         if abs(limits.full_power_uw - requested.full_power_uw) > 0.01 * requested.full_power_uw:
             # Neither number is known to be true: to follow the lower one would count less light than the diode emits.
             expected = (
@@ -90,11 +100,18 @@ class BoardRequirements:
             raise InputError("laser.max_power_w", values.max_power_w, expected, "board")
         if limits.spot_uj < values.pulse_energy_max_j * 1e6:
             max_j = limits.spot_uj * 1e-6
-            raise InputError("limits.pulse_energy_max_j", values.pulse_energy_max_j, f"at most {max_j:g}", "board")
+            raise InputError(
+                "limits.pulse_energy_max_j",
+                values.pulse_energy_max_j,
+                f"at most {max_j:g}, {BOARDS_OWN} (spot_uj)",
+                "board",
+            )
         if limits.spot_leak_uw < values.pixel_mean_power_max_w * 1e6:
             max_w = limits.spot_leak_uw * 1e-6
             key = "limits.pixel_mean_power_max_w"
-            raise InputError(key, values.pixel_mean_power_max_w, f"at most {max_w:g}", "board")
+            raise InputError(
+                key, values.pixel_mean_power_max_w, f"at most {max_w:g}, {BOARDS_OWN} (spot_leak_uw)", "board"
+            )
         if peer.cell_codes > self.cell_max_codes:
             distance = f"{self.cell_max_codes}, the distance of neighbouring pixels"
             expected = f"a board whose cell_codes are at most {distance}; this one's are {peer.cell_codes}"
@@ -105,6 +122,6 @@ class BoardRequirements:
         for axis in ("x", "y"):
             low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
             if getattr(requested, f"{axis}_min") < low or getattr(requested, f"{axis}_max") > high:
-                raise InputError(
-                    f"display {axis}", "the lattice", f"to lie within the board's codes {low} to {high}", "board"
-                )
+                expected = f"codes within {low} to {high}, {BOARDS_OWN} ({axis}_min, {axis}_max)"
+                stated = f"{getattr(requested, f'{axis}_min')} to {getattr(requested, f'{axis}_max')}"
+                raise InputError(f"display {axis}", Unquoted(stated), expected, "board")

@@ -69,8 +69,9 @@ class EtherDream(LaserDac):
             self._read_answer(wire.PING)  # sent by the device itself
             self.firmware = f"protocol {self._protocol}"
             if self.board.uid and self.board.uid != (self.find_identity() or ""):
-                heard = "no broadcast of it on UDP 7654" if self.identity is None else self.identity
-                raise InputError("board.uid", heard, f"{self.board.uid}, the configured Ether Dream", "board")
+                heard = f"has '{self.identity}'" if self.identity else "tells none, for it is not heard on UDP 7654"
+                expected = f"the Ether Dream of this hardware address; the one at {self.board.port} {heard}"
+                raise InputError("board.uid", self.board.uid, expected, "board")
             self.stop()
         except BaseException:
             self._release()

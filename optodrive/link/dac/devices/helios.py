@@ -66,7 +66,8 @@ class Helios(LaserDac):
         self._claim(device)
         if self.board.uid not in ("", self.name):
             self._release()
-            raise InputError("board.uid", self.name, f"{self.board.uid}, the configured Helios", "board")
+            expected = f"the Helios of this name; the connected one is '{self.name}'"
+            raise InputError("board.uid", self.board.uid, expected, "board")
 
     def _choose(self, devices: list[Any]) -> Any:
         """Return the device of several that has the configured name. Ask and stop all, for only they know it."""

@@ -74,7 +74,8 @@ class Idn(LaserDac):
         self.identity = unit[1 : 1 + unit[0]].hex() if any(unit[1 : 1 + unit[0]]) else None
         self.firmware = f"protocol {version >> 4}.{version & 15} of {escape_unprintable(wire.decode_name(host))}"
         if self.board.uid and self.board.uid != self.name:
-            raise InputError("board.uid", self.name, f"{self.board.uid}, the configured IDN device", "board")
+            expected = f"the IDN device of this unit; the one at {self.board.port} is '{self.name}'"
+            raise InputError("board.uid", self.board.uid, expected, "board")
         if status & (wire.MALFUNCTION | wire.OFFLINE):
             raise LinkError(f"the IDN device is out of order or in an emergency stop (status {status:#04x})")
 

@@ -349,7 +349,7 @@ def test_a_board_that_contradicts_the_configuration_is_said_and_retried():
     rig.run(0.3)
     status = rig.of_kind(WEB, "status")[-1].fields
     assert status["link_error_code"] == "board"
-    assert "the configured board" in status["link_error"]
+    assert "expected the board of this uid; the connected one has" in status["link_error"]
     rig.session._requirements = accepts
     rig.until(lambda: rig.session.connected)
 

@@ -165,10 +165,18 @@ def changed(section, **values):
 @pytest.mark.parametrize(
     ("settings", "config", "says"),
     [
-        (BoardSettings(uid="00" * 12), changed("board", uid="11" * 12), "board.uid: got '0000"),
+        (
+            BoardSettings(uid="00" * 12),
+            changed("board", uid="11" * 12),
+            "board.uid: got '1111.*', expected the board of .* has '0000",
+        ),
         (BoardSettings(replace(DEFAULT_LIMITS, settle_us=310)), CONFIG, "scanner.bandwidth_hz: got 1700.0"),
         (BoardSettings(replace(DEFAULT_LIMITS, settle_ns_per_code=500)), CONFIG, "scanner.slew_rad_per_s: got 100.0"),
-        (BoardSettings(replace(DEFAULT_LIMITS, max_on_us=49_999)), CONFIG, "limits.pulse_width_max_s: got 0.05"),
+        (
+            BoardSettings(replace(DEFAULT_LIMITS, max_on_us=49_999)),
+            CONFIG,
+            "limits.pulse_width_max_s: got 0.05, expected at most 0.049999, the .* .max_on_us",
+        ),
         (BoardSettings(replace(DEFAULT_LIMITS, full_power_uw=2_000_000)), CONFIG, "laser.max_power_w: got 2.45"),
         (BoardSettings(replace(DEFAULT_LIMITS, spot_uj=100_000)), CONFIG, "limits.pulse_energy_max_j: got 0.125"),
         (
@@ -176,8 +184,16 @@ def changed(section, **values):
             CONFIG,
             "limits.pixel_mean_power_max_w: got 1.3",
         ),
-        (BoardSettings(replace(DEFAULT_LIMITS, x_min=31_000)), CONFIG, "display x"),
-        (BoardSettings(replace(DEFAULT_LIMITS, y_max=33_000)), CONFIG, "display y"),
+        (
+            BoardSettings(replace(DEFAULT_LIMITS, x_min=31_000)),
+            CONFIG,
+            "display x: got 3.* to .*, expected codes within 31000 to 65535, the limit of",
+        ),
+        (
+            BoardSettings(replace(DEFAULT_LIMITS, y_max=33_000)),
+            CONFIG,
+            "display y: got .*, expected codes within 0 to 33000, the limit of the board's firmware",
+        ),
         (
             BoardSettings(),
             changed("display", pitch_m=2.5e-3),
