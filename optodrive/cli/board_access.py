@@ -1,6 +1,5 @@
 """Exclusive access to the configured board and its spot sensor, for `home` and the calibrations on the board."""
 
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 from optodrive.cli.output import announce_compilation
+from optodrive.cli.signals import defer_interruption, end_as_interrupted
 from optodrive.core.errors import MISSING, InputError, LinkError
 
 if TYPE_CHECKING:
@@ -63,9 +63,12 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
     announce_compilation()
     clock = MonotonicClock()
     transport, sensor_port = build_bench_transport(build_port_settings(loaded), config or DEFAULT_CONFIG, stage)
-    for signal_number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(signal_number, signal.default_int_handler)
-    with loaded.name_file(), ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:
+    with (
+        end_as_interrupted(),
+        loaded.name_file(),
+        defer_interruption() as defer,
+        ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board,
+    ):
         spot_reader = None
         if loaded.sensor is not None or sensor_port:
             port, baud = (loaded.sensor.port, loaded.sensor.baud) if loaded.sensor else (sensor_port, SENSOR_BAUD)
@@ -77,7 +80,6 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
                 raise LinkError(f"{error} A running `optodrive serve` holds the port: stop it first") from None
             raise
         finally:
-            for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(signal_number, signal.SIG_IGN)  # no signal may interrupt the ABORT
+            defer()  # no signal may interrupt the ABORT
             if spot_reader is not None:
                 spot_reader.close()

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from optodrive.cli.exit_status import INTERRUPTED, SUMMARY
+from optodrive.cli.exit_status import SUMMARY
 from optodrive.cli.invocation import Invocation
+from optodrive.cli.signals import INTERRUPTED, report_interruption
 from optodrive.core.daemon_url import check_environment
 from optodrive.core.errors import OptodriveError
 
@@ -74,8 +75,7 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
         print(f"optodrive: {error}", file=sys.stderr)
         return error.exit_status
     except (typer.Abort, KeyboardInterrupt):
-        print("optodrive: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return report_interruption()
     except UsageError as error:
         message = " ".join(error.format_message().split())
         if message:  # empty without arguments: typer has printed the help

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
 
 DOES_NOT_FIT = 3
 """The command was carried out, but the stimulus does not fit as requested: it is late, trimmed or reduced."""
-INTERRUPTED = 130
 SUMMARY = (
     "Exit status: 0 done, 1 failed or refused, 2 bad input, 3 done but does not fit as requested, 130 interrupted."
 )

@@ -12,6 +12,7 @@ import sys
 from typing import Any
 
 from optodrive.cli.direct_stop import stop_directly
+from optodrive.cli.signals import end_by_ctrl_c, leave, report_interruption, was_interrupted
 from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
 from optodrive.core.garbage import collect_seldom, skip_last_collection
@@ -19,13 +20,21 @@ from optodrive.core.garbage import collect_seldom, skip_last_collection
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its status."""
-    open_closed_streams()
-    collect_seldom()
-    # No command needs a multithreaded BLAS; starting its threads takes 0.1 s.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Nor plugins of pydantic, for which it reads the entry points of everything that is installed.
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    status = run(sys.argv[1:] if arguments is None else arguments)
+    try:
+        end_by_ctrl_c()
+        open_closed_streams()
+        collect_seldom()
+        # No command needs a multithreaded BLAS; starting its threads takes 0.1 s.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        # Nor plugins of pydantic, for which it reads the entry points of everything that is installed.
+        os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+        status = run(sys.argv[1:] if arguments is None else arguments)
+        leave()
+    except BaseException as error:
+        # An extension module whose import is interrupted raises an error of its own.
+        if not isinstance(error, KeyboardInterrupt) and not was_interrupted():
+            raise
+        status = report_interruption()
     skip_last_collection()
     sys.exit(status)
 

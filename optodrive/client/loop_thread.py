@@ -7,8 +7,11 @@ handshake or a message.
 
 import asyncio
 from collections.abc import Coroutine
+from concurrent.futures import CancelledError
+from contextlib import suppress
+from queue import SimpleQueue
 from threading import Thread
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from optodrive.client.exchange import run_blocking
 
@@ -28,12 +31,17 @@ class LoopThread:
         """Run a coroutine in the loop, and return its result. After `close`, one that waits for nothing."""
         if self._loop.is_closed():
             return run_blocking(coroutine)
-        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        call = _Call(coroutine)
         try:
-            return future.result()
+            self._loop.call_soon_threadsafe(call.start)
+            answer = call.answers.get()
         except BaseException:  # of the caller's thread, such as KeyboardInterrupt
-            future.cancel()
+            with suppress(RuntimeError):  # another thread has closed the loop
+                self._loop.call_soon_threadsafe(call.cancel)
             raise
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer[0]
 
     def close(self) -> None:
         """End the loop once the coroutines of other callers have ended."""
@@ -42,6 +50,44 @@ class LoopThread:
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
             self._loop.close()
+
+
+class _Call(Generic[T]):
+    """A coroutine that a loop runs for a caller in another thread.
+
+    Ctrl-C may interrupt that thread anywhere. It therefore takes no lock that is written in Python, as that of a
+    concurrent.futures.Future is: an interruption would leave it taken. Nor does it free a task, because asyncio is told
+    of that by a callback, which would drop the exception.
+
+    answers: of one entry, the result as a tuple or the exception
+    """
+
+    def __init__(self, coroutine: Coroutine[Any, Any, T]) -> None:
+        self.answers: SimpleQueue[tuple[T] | BaseException] = SimpleQueue()
+        self._coroutine = coroutine
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Start the coroutine, in the thread of the loop."""
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def cancel(self) -> None:
+        """Cancel the coroutine, in the thread of the loop, if it has not ended."""
+        if self._task is not None:
+            self._task.cancel()
+        else:
+            self._coroutine.close()
+
+    async def _run(self) -> None:
+        answer: tuple[T] | BaseException
+        try:
+            answer = (await self._coroutine,)
+        except asyncio.CancelledError:
+            answer = CancelledError()
+        except BaseException as error:  # of any kind, for the caller
+            answer = error
+        self._task = None
+        self.answers.put(answer)
 
 
 async def _end_others() -> None:

@@ -57,6 +57,7 @@ def run_to_end(program):
     """Run a program as an interpreter does, and end at once: to free every object would take longer than to start."""
     status = 0
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         status = program()
     except SystemExit as end:
         status = end.code
@@ -98,6 +99,7 @@ def serve(control):
                     os.kill(pid, signal.SIGTERM)
                 return None
             request, (*standard, status) = json.loads(packet), descriptors
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # for the fork, until it no longer ignores it
             pid = os.fork()
             if pid == 0:
                 control.close()
@@ -106,7 +108,9 @@ def serve(control):
                     os.close(its_status)
                 os.close(status)
                 become(request, standard)
+                signal.signal(signal.SIGINT, signal.default_int_handler)
                 return PROGRAMS[request["program"]]
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
             for number in standard:
                 os.close(number)
             os.write(status, f"{pid}\n".encode())
@@ -148,5 +152,4 @@ if __name__ == "__main__":
     gc.freeze()
     program = serve(control)
     if program is not None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
         run_to_end(program)

@@ -69,12 +69,21 @@ class _Server:
             self._process.wait()
 
 
+class Process(subprocess.Popen):
+    """A Popen whose block waits for the end of the process only if it succeeds, and else kills it."""
+
+    def __exit__(self, kind, error, trace):
+        if kind is not None:
+            self.kill()
+        super().__exit__(kind, error, trace)
+
+
 def start_process(command, **options):
     """Start a command as subprocess.Popen does: as a fork if the server runs and knows the program."""
     command = list(map(str, command))
     program, arguments = _find_program(command)
     if program is None or not _is_forkable(options):
-        return subprocess.Popen(command, **options)
+        return Process(command, **options)
     return ForkedProcess(program, arguments, **options)
 
 
@@ -85,12 +94,7 @@ def run_process(command, input=None, timeout=None, check=False, capture_output=F
     if input is not None:
         options["stdin"] = subprocess.PIPE
     with start_process(command, **options) as process:
-        try:
-            out, errors = process.communicate(input, timeout)
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
+        out, errors = process.communicate(input, timeout)
     done = subprocess.CompletedProcess(command, process.returncode, out, errors)
     if check:
         done.check_returncode()
@@ -115,8 +119,8 @@ def _is_forkable(options):
     )
 
 
-class ForkedProcess(subprocess.Popen):
-    """A Popen whose process is a child of the fork server, which reports its end."""
+class ForkedProcess(Process):
+    """A Process that is a child of the fork server, which reports its end."""
 
     def __init__(self, program, arguments, **options):
         self._status, self._received = None, b""

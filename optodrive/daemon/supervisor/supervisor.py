@@ -82,11 +82,11 @@ class Supervisor:
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, number: int, frame: object) -> None:
+        self._signals.add(number)  # for the loop, in case that what is being loaded drops the exception
         if self._is_loading and number == signal.SIGINT:
             raise KeyboardInterrupt
         if self._is_loading:
             raise SystemExit(0)
-        self._signals.add(number)
 
     def start_link(self) -> None:
         """Start the link process, which needs none of the data that the others share."""

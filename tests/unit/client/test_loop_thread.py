@@ -1,10 +1,15 @@
 """A blocking stream over TLS: threads that send and wait leave its OpenSSL to the thread of its loop."""
 
 import asyncio
+import itertools
 import json
+import os
+import signal
 import ssl
 import subprocess
+import sys
 import threading
+import weakref
 
 import numpy as np
 import pytest
@@ -17,6 +22,7 @@ from optodrive.core.errors import LinkError, NotReadyError
 from optodrive.device.config import PixelLayout
 
 FRAMES, SENDERS = 40, 3
+CALLS = 2000
 PIXEL = np.zeros(1)
 
 
@@ -116,25 +122,57 @@ def test_a_wait_in_another_thread_ends_with_the_stream(stream):
 def test_an_interrupted_caller_cancels_its_coroutine():
     loop, cancelled = LoopThread("test"), threading.Event()
 
-    class Interrupted(BaseException):
-        pass
-
-    async def sleep():
+    async def interrupt():
         try:
+            os.kill(os.getpid(), signal.SIGINT)
             await asyncio.Event().wait()
         finally:
             cancelled.set()
 
-    with pytest.MonkeyPatch.context() as patch:
-        submit = asyncio.run_coroutine_threadsafe
-
-        def interrupt(coroutine, target):
-            future = submit(coroutine, target)
-            future.result = lambda: (_ for _ in ()).throw(Interrupted)
-            return future
-
-        patch.setattr(asyncio, "run_coroutine_threadsafe", interrupt)
-        with pytest.raises(Interrupted):
-            loop.run(sleep())
+    with pytest.raises(KeyboardInterrupt):
+        loop.run(interrupt())
     loop.close()
     assert cancelled.is_set()
+
+
+def test_no_task_ends_in_the_thread_of_a_caller():
+    """The callback with which asyncio learns of a task's end would drop the exception of Ctrl-C there."""
+    loop, ends, references = LoopThread("test"), set(), []
+
+    async def note_end():
+        references.append(weakref.ref(asyncio.current_task(), lambda _: ends.add(threading.current_thread().name)))
+
+    for _ in range(CALLS):
+        loop.run(note_end())
+    loop.close()
+    assert ends == {"test"}
+
+
+def test_ctrl_c_anywhere_in_a_caller_leaves_a_loop_that_works_and_ends():
+    """Interrupt each operation of a call in turn, in Python's own modules, too."""
+    loop = LoopThread("test")
+
+    async def answer():
+        return 42
+
+    for at in itertools.count():
+        operations, coroutine = itertools.count(), answer()
+
+        def interrupt(frame, event, argument, at=at, operations=operations):
+            frame.f_trace_opcodes = True
+            if event == "opcode" and next(operations) == at:
+                raise KeyboardInterrupt
+            return interrupt
+
+        sys.settrace(interrupt)
+        try:
+            loop.run(coroutine)
+            break
+        except KeyboardInterrupt:
+            pass
+        finally:
+            sys.settrace(None)
+        assert loop.run(answer()) == 42
+        coroutine.close()  # which one that came too early has not started
+    assert at > 100
+    loop.close()
