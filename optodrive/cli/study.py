@@ -12,7 +12,7 @@ import typer
 from optodrive.cli.options import ConfigOption, HoldOption, JsonOption, UrlOption
 from optodrive.cli.output import announce_compilation, print_answer, show_progress
 from optodrive.core.daemon_url import DEFAULT_URL
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, NotReadyError, Unquoted
 
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import FloatArray
@@ -25,10 +25,11 @@ if TYPE_CHECKING:
     from optodrive.study.trial_log import TrialLog
 
 PARTICIPANTS_MAX = 1000
+STUDY_HELP = "A study file, or a shipped one: detection, equalisation, experiment-1 to experiment-6."
 
 
 def study(
-    source: Annotated[str, typer.Argument(metavar="STUDY", help="A study file, or experiment-1 to experiment-6.")],
+    source: Annotated[str, typer.Argument(metavar="STUDY", help=STUDY_HELP)],
     out: Annotated[
         Path, typer.Option("--out", metavar="FOLDER", help="Dataset (BIDS); a session begun in it goes on.")
     ],
@@ -66,27 +67,39 @@ def study(
     Every trial is on the disk before the next begins: the same command after an interruption goes on where it ended.
     """
     from optodrive.core.files import check_output
-    from optodrive.study.dataset import SIMULATED_PREFIX, check_new_participant, check_participant, write_dataset
-    from optodrive.study.study_file import load_study
+    from optodrive.study.dataset import check_new_participant, check_participant, read_participants, write_dataset
+    from optodrive.study.study_file import SIMULATED_PREFIX, load_study
 
     design = load_study(source)
     check_output("--out", out, folder=True, may_exist=True)
     if not 1 <= participants <= PARTICIPANTS_MAX:
         raise InputError("--participants", participants, f"1 to {PARTICIPANTS_MAX}")
-    if participant is None and page is not None:
-        raise InputError("--page", page, "--participant: a simulated participant needs no page")
-    if participant is None and lsl:
-        raise InputError("--lsl", True, "--participant: a simulated board has no time of this computer")
-    display_config = _load_display_config(design, participant, url, config)
+    read_participants(out)  # refuses a damaged table before anybody takes part
     if participant is None:
-        sessions = _simulate(design, out, participants, display_config)
+        if page is not None:
+            raise InputError("--page", page, "--participant: a simulated participant needs no page")
+        if lsl:
+            raise InputError("--lsl", True, "--participant: a simulated board has no time of this computer")
+        if hold:
+            raise InputError("--hold", True, "--participant: a simulated participant arms no board")
     else:
+        if participants != 1:
+            raise InputError("--participants", participants, "none beside --participant, which is one person")
+        if config is not None:
+            raise InputError("--config", config, "none beside --participant: the daemon has its own")
         check_participant("--participant", participant)
         check_new_participant("--participant", out, participant)
         if participant.startswith(SIMULATED_PREFIX):
             raise InputError("--participant", participant, f"a code that does not begin with {SIMULATED_PREFIX!r}")
-        sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page, display_config)}
-    write_dataset(out)
+    display_config = _load_display_config(design, participant, url, config)
+    try:
+        if participant is None:
+            sessions = _simulate(design, out, participants, display_config)
+        else:
+            sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page, display_config)}
+    finally:  # also of a session that has not ended
+        if (out / "sourcedata").is_dir():
+            write_dataset(out)
     report = _build_report(design, sessions, out)
     if design.matching is not None and display_config is not None:
         report["sensitivity"] = _write_sensitivity(design, design.matching, sessions, out, display_config)
@@ -112,14 +125,16 @@ def _simulate(
 ) -> dict[str, list[dict[str, Any]]]:
     """Run the sessions of simulated participants and return the records of their trials."""
     from optodrive.planning.display_model import DisplayModel
-    from optodrive.study.dataset import SIMULATED_PREFIX, build_log_path
+    from optodrive.study.dataset import build_log_path
     from optodrive.study.observers import Observer, Participant
-    from optodrive.study.presenter import VirtualPresenter
+    from optodrive.study.presenter import VirtualPresenter, check_stimuli
     from optodrive.study.session import SimulatedRespondent, build_matching_model, draw_order, run_session
+    from optodrive.study.study_file import SIMULATED_PREFIX
     from optodrive.study.trial_log import TrialLog
 
     if design.simulation is None or config is None:
         raise InputError(f"study {design.name}: simulation", None, "an observer, to simulate a participant")
+    check_stimuli(design, config)
     display, sessions = DisplayModel.from_config(config), {}
     announce_compilation()
     with show_progress("simulating") as on_progress:
@@ -160,8 +175,8 @@ def _write_sensitivity(
 ) -> dict[str, dict[str, Any]]:
     """Write the sensitivity map of each participant and return its figures."""
     from optodrive.device.config import build_pixel_layout
-    from optodrive.study.dataset import SIMULATED_PREFIX
     from optodrive.study.sensitivity_results import compute_variation, write_sensitivity
+    from optodrive.study.study_file import SIMULATED_PREFIX
 
     found: dict[str, dict[str, Any]] = {}
     for name, records in sessions.items():
@@ -197,6 +212,7 @@ def _run_person(
     from optodrive.study.dataset import build_log_path
     from optodrive.study.lab_streams import LabStreams, PublishingPresenter
     from optodrive.study.page_address import parse_page_address
+    from optodrive.study.presenter import check_stimuli
     from optodrive.study.session import build_matching_model, draw_order, run_session
     from optodrive.study.terminal import TerminalRespondent
     from optodrive.study.trial_log import TrialLog
@@ -209,10 +225,13 @@ def _run_person(
         if log.next_trial is None:
             return list(log.trials.values())
         display = stack.enter_context(Display(url))  # stops what was started, also after an error
+        check_stimuli(design, display.config())
         if hold:
             display.arm(hold=True)
+        elif not (board := display.state().board).is_armed:
+            raise NotReadyError(f"the board is {board.state}; arm it first (`optodrive arm`), or add --hold")
         presenter: Presenter = DaemonPresenter(display, {"study": design.name, "participant": participant})
-        respondent: Respondent = TerminalRespondent(design)
+        respondent: Respondent = TerminalRespondent(design, _read_line, _say)
         on_trial: list[Callable[[dict[str, Any]], None]] = []
         streams = LabStreams(design.name, participant) if lsl else None
         if streams is not None:
@@ -232,7 +251,8 @@ def _run_person(
             if streams is not None:
                 streams.finish()
         except EOFError:
-            raise InputError("answer", None, "a line; the session goes on with the same command") from None
+            found = Unquoted("the end of the input")
+            raise InputError("answer", found, "a line; the session goes on with the same command") from None
         return list(log.trials.values())
 
 
@@ -262,6 +282,15 @@ def _stop_display(url: str) -> None:
     if stop_directly(url) is None:
         with Display(url) as display:
             display.stop()
+
+
+def _say(text: str) -> None:
+    print(text, end="", file=sys.stderr, flush=True)  # stdout has the report
+
+
+def _read_line(prompt: str) -> str:
+    _say(prompt)
+    return input()
 
 
 def _call_all(listeners: Sequence[Callable[[dict[str, Any]], None]], record: dict[str, Any]) -> None:

@@ -20,6 +20,18 @@ from optodrive.core.field_docstrings import read_field_docstrings
 from optodrive.core.plausibility import check_table, collect_ranges
 
 Model = TypeVar("Model", bound=BaseModel)
+TYPE_NAMES = {
+    "tuple_type": "an array",
+    "dict_type": "a table",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+}
+"""What a complaint of pydantic about a type expects, in the words of TOML."""
+UNION_BRANCHES = frozenset({"str", "int", "float", "bool"})
+"""Last part of the place of a complaint about a value that may have several types."""
 
 
 class ConflictError(ValueError):
@@ -101,28 +113,51 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
     first = next((item for item in complaints if item["type"] == "extra_forbidden"), complaints[0])
     place = ".".join(str(part) for part in first["loc"])
     label = f"{where}: {place}" if place else where
-    if first["type"] == "extra_forbidden":
+    kind, value = first["type"], _thaw(first["input"])
+    if kind == "extra_forbidden":
         key = str(first["loc"][-1])
         known = _list_known_keys(model, first["loc"][:-1]) if model else []
         places = _find_places(model, key) if model else ""
         expected = f"a known key, {suggest_nearest(key, known)}" if known else "no such key"
         return InputError(label, key, f"this key {places}" if places else expected, code="unknown_key")
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    if first["type"] == "model_type":
-        message = "a table with keys, as in { value = … }" if isinstance(first["input"], int | float) else "a table"
-    if first["type"] == "too_long":
-        return InputError(
-            label, Unquoted(f"{first['ctx']['actual_length']} of them"), f"at most {first['ctx']['max_length']}"
-        )
-    if first["type"] == "missing":
-        return InputError(label, MISSING, "this key")
-    if first["type"] == "value_error" and not isinstance(first["input"], str):
+    if kind == "missing":
+        return InputError(label, MISSING, "this element" if isinstance(first["loc"][-1], int) else "this key")
+    if kind == "value_error" and not isinstance(value, str):
         conflict = first["ctx"]["error"]
         if isinstance(conflict, ConflictError):
             label = f"{where}: {f'{place}.' if place else ''}{conflict.place}"
-            return InputError(label, conflict.value, conflict.expected)
-        return InputError(label, "inconsistent values", message)
-    return InputError(label, first["input"], message)
+            return InputError(label, _thaw(conflict.value), conflict.expected)
+        return InputError(label, "inconsistent values", _read_message(first))
+    if kind in TYPE_NAMES and len(first["loc"]) > 1 and first["loc"][-1] in UNION_BRANCHES:
+        label = label.rpartition(".")[0]
+        accepted = {TYPE_NAMES.get(each["type"]): None for each in complaints if each["loc"][:-1] == first["loc"][:-1]}
+        return InputError(label, value, " or ".join(filter(None, accepted)))
+    if kind == "model_type":
+        expected = "a table with keys, as in { value = … }" if isinstance(value, int | float) else "a table"
+        return InputError(label, value, expected)
+    if kind in ("too_long", "too_short") and value:
+        value = Unquoted(f"{len(value)} of them")
+    return InputError(label, value, TYPE_NAMES.get(kind) or _read_message(first))
+
+
+def _read_message(complaint: Any) -> str:
+    """Return the expectation of a complaint as a phrase."""
+    kind, context = complaint["type"], complaint.get("ctx", {})
+    unit = " characters" if kind.startswith("string") else ""
+    if kind.endswith("too_short"):
+        return f"at least {context['min_length']}{unit}"
+    if kind.endswith("too_long"):
+        return f"at most {context['max_length']}{unit}"
+    if kind == "string_pattern_mismatch":
+        return f"text of the form {context['pattern']}"
+    return str(complaint["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
+
+
+def _thaw(value: Any) -> Any:
+    """Return a value as the file states it, whose arrays were made tuples."""
+    if isinstance(value, dict):
+        return {key: _thaw(item) for key, item in value.items()}
+    return list(map(_thaw, value)) if isinstance(value, tuple | list) else value
 
 
 def _list_known_keys(model: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:

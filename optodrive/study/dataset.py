@@ -13,15 +13,14 @@ from typing import Any
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.files import create_folder, lock_folder, read_regular_file, write_text
 from optodrive.core.numeric_tables import escape_formula
-from optodrive.study.study_file import MATCHED_PARAMETERS, Study
-from optodrive.study.trial_log import read_log
+from optodrive.study.study_file import MATCHED_PARAMETERS, SIMULATED_PREFIX, Study
+from optodrive.study.trial_log import has_stimuli, read_log
 
 BIDS_VERSION = "1.10.0"
 LOG_SUFFIX = "_trials.jsonl"
 ID_MAX = 20
+PARTICIPANTS = "participants.tsv"
 TABLE_BYTES_MAX = 1_000_000
-SIMULATED_PREFIX = "sim"
-"""Beginning of the identifiers of simulated participants."""
 
 README = """# Tactile studies
 
@@ -84,9 +83,9 @@ def build_log_path(folder: Path, study: Study, participant: str) -> Path:
 
 
 def write_dataset(folder: Path) -> None:
-    """Write the tables of all logs of a dataset. A description and a README that exist are kept."""
+    """Write the tables of all logs of a dataset with a stimulus. A description and a README that exist are kept."""
     with lock_folder(folder):
-        logs = sorted((folder / "sourcedata").glob(f"sub-*/*{LOG_SUFFIX}"))
+        logs = [path for path in sorted((folder / "sourcedata").glob(f"sub-*/*{LOG_SUFFIX}")) if has_stimuli(path)]
         for name, text in (
             ("dataset_description.json", _dump(_describe_dataset())),
             ("README.md", README),
@@ -94,28 +93,44 @@ def write_dataset(folder: Path) -> None:
         ):
             if not (folder / name).exists():
                 write_text(folder / name, text)
-        table = folder / "participants.tsv"
-        write_text(table, _list_participants(table, sorted({path.parent.name for path in logs})))
+        write_text(folder / PARTICIPANTS, _list_participants(folder, sorted({path.parent.name for path in logs})))
         for path in logs:
             _write_task(folder, path)
 
 
-def _list_participants(table: Path, participants: list[str]) -> str:
-    """Return participants.tsv with a row per participant, and every column and row that others have added.
+def read_participants(folder: Path) -> tuple[list[str], dict[str, dict[str, str]]]:
+    """Return the columns of a dataset's participants.tsv and its rows by participant, none if there is no such file.
 
-    Raise InputError for a table that has no row per participant.
+    Raise InputError, with the line, for a table in which a participant has not one row with every column.
     """
-    head, kept = ["participant_id", "kind"], {}
-    if table.exists():
-        try:
-            lines = read_regular_file(table, TABLE_BYTES_MAX).decode("utf-8-sig").splitlines()
-        except UnicodeDecodeError:
-            raise InputError(str(table), Unquoted("another encoding"), "UTF-8") from None
-        rows = [line.split("\t") for line in lines if line.strip()]
-        if not rows or "participant_id" not in rows[0] or any(len(row) != len(rows[0]) for row in rows):
-            raise InputError(str(table), Unquoted("another table"), "tab-separated rows, with a column participant_id")
-        head = rows[0] if "kind" in rows[0] else [*rows[0], "kind"]
-        kept = {row[rows[0].index("participant_id")]: dict(zip(rows[0], row, strict=True)) for row in rows[1:]}
+    table = folder / PARTICIPANTS
+    if not table.exists():
+        return ["participant_id"], {}
+    try:
+        lines = read_regular_file(table, TABLE_BYTES_MAX).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise InputError(str(table), Unquoted("another encoding"), "UTF-8") from None
+    rows = [(number, line.split("\t")) for number, line in enumerate(lines, start=1) if line.strip()]
+    head = rows[0][1] if rows else []
+    if "participant_id" not in head or len(set(head)) < len(head):
+        expected = "tab-separated columns that differ, one of them participant_id"
+        raise InputError(f"{table}, line 1", lines[0] if lines else Unquoted("an empty file"), expected)
+    kept: dict[str, dict[str, str]] = {}
+    for number, cells in rows[1:]:
+        if len(cells) != len(head):
+            found = Unquoted(f"{len(cells)} of {len(head)} cells")
+            raise InputError(f"{table}, line {number}", found, "a cell per column, separated by tabs")
+        row = dict(zip(head, cells, strict=True))
+        if row["participant_id"] in kept:
+            raise InputError(f"{table}, line {number}", row["participant_id"], "one row per participant")
+        kept[row["participant_id"]] = row
+    return head, kept
+
+
+def _list_participants(folder: Path, participants: list[str]) -> str:
+    """Return participants.tsv with a row per participant, and every column and row that others have added."""
+    head, kept = read_participants(folder)
+    head = head if "kind" in head else [*head, "kind"]
     for one in participants:
         kind = "simulated" if one.startswith(f"sub-{SIMULATED_PREFIX}") else "person"
         kept[one] = {**kept.get(one, {}), "participant_id": one, "kind": kind}

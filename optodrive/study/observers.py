@@ -135,9 +135,8 @@ class Observer:
         visits = self.list_visits(shown)
         passes = self._perceive_places(visits, rng).reshape(-1, 3, 2)
         x_m, y_m = (passes[:, 2] - passes[:, 0]).mean(axis=0)
-        if abs(x_m) > abs(y_m):
-            return "right" if x_m > 0.0 else "left"
-        return "up" if y_m > 0.0 else "down"
+        moved_m = {"right": x_m, "left": -x_m, "up": y_m, "down": -y_m}
+        return max(self._study.response.answers, key=moved_m.__getitem__)
 
     def _judge_rotation(self, shown: Presentation, rng: np.random.Generator) -> str:
         x_m, y_m = self._perceive_places(self.list_visits(shown), rng).T
@@ -150,8 +149,9 @@ class Observer:
         if len(visits.pixel) == 1:  # the target is the reference, twice
             last_s = shown.start_s[np.argmax(np.diff(shown.start_s)) + 1]
             visits = Visits(visits.pixel, visits.position_m, np.array([shown.duration_s - last_s + PERSISTENCE_S]))
-        right, up = np.clip(np.rint((self._perceive_places(visits, rng)[-1] - centre_m) / self._pitch_m), -1, 1)
-        return str(int(3 * (1 - up) + right + 2))
+        right, up = (self._perceive_places(visits, rng)[-1] - centre_m) / self._pitch_m
+        places = {answer: divmod(int(answer) - 1, 3) for answer in self._study.response.answers}
+        return min(places, key=lambda answer: (right - places[answer][1] + 1) ** 2 + (up + places[answer][0] - 1) ** 2)
 
     def _rate(self, shown: Presentation, rng: np.random.Generator) -> float:
         intensity = self.feel(shown)[0].intensity

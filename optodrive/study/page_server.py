@@ -66,7 +66,8 @@ class StudyPages:
         try:
             self._listener = socket.create_server((address.host, address.port))
         except OSError as error:
-            raise InputError("--page", f"{address.host}:{address.port}", f"a free address ({error.strerror})") from None
+            reason = str(error.strerror).partition(" (while")[0]  # the socket module repeats the address there
+            raise InputError("--page", f"{address.host}:{address.port}", f"a free address ({reason})") from None
         self._respondent, self._stop = respondent, stop
         self._participant_token, self._operator_token = secrets.token_urlsafe(16), secrets.token_urlsafe(16)
         base = f"http://{address.host}:{self._listener.getsockname()[1]}"

@@ -6,15 +6,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from optodrive.core.errors import RefusedError
+from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.device.config import Config
 from optodrive.link.simulator.virtual_run import START_LEAD_S, VirtualBoards
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.limiter.limiter import shift_state
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
-from optodrive.study.study_file import Value
+from optodrive.study.study_file import Study, Value
 
 TIME_TOLERANCE_S = 2e-6
 """Rounding of a start to ticks of the board, twice."""
@@ -110,6 +111,27 @@ class VirtualPresenter:
     def close(self) -> None:
         """Disarm the simulated boards."""
         self._boards.close()
+
+
+def check_stimuli(study: Study, config: Config) -> None:
+    """Raise InputError with the parameter unless a display has the stimuli of all conditions.
+
+    Those of a procedure are tried at its lowest and highest level; a matching chooses its own.
+    """
+    levels: list[dict[str, Value]] = [{}]
+    if study.matching is not None:
+        return
+    if study.procedure is not None:
+        levels = [
+            {study.procedure.parameter: level} for level in (study.procedure.levels[0], study.procedure.levels[-1])
+        ]
+    for condition in study.conditions:
+        for level in levels:
+            try:
+                build_pattern(study.stimulus.pattern, {**study.stimulus.parameters, **condition, **level}, config)
+            except InputError as error:
+                where = f"study {study.name}: {error.where}"
+                raise InputError(where, error.value, error.expected, error.code) from None
 
 
 def find_fault(planned: PlannedSequence, shown: Presentation) -> str | None:

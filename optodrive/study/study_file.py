@@ -1,12 +1,13 @@
 """Study files: the design of an experiment with people, as TOML of a stated version."""
 
+import re
 from collections.abc import Mapping
 from itertools import pairwise, product
 from math import isclose
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from optodrive.core.errors import InputError
 from optodrive.core.toml_file import read_toml
@@ -15,15 +16,31 @@ from optodrive.study.threshold import Procedure
 
 FORMAT, VERSION = "optodrive-study", 1
 EXPERIMENTS = Path(__file__).with_name("experiments")
+SIMULATED_PREFIX = "sim"
+"""Beginning of the identifiers of simulated participants."""
 TRIALS_MAX = 10_000
 CHANCE_TOLERANCE = 1e-3
 MATCHING_ANSWERS = ("first", "second")
+OBSERVER_ANSWERS: dict[str, tuple[str, ...]] = {
+    "linear-motion": ("left", "right", "up", "down"),
+    "rotation": ("cw", "ccw"),
+    "localisation": tuple("123456789"),
+    "detection": ("left", "right"),
+}
+"""All answers of the observers that name what they feel. The others number the parts of a stimulus, or rate it."""
+MAGNITUDE_OBSERVER = "intensity"
 MATCHED_PARAMETERS = ("first", "second", "first_intensity", "second_intensity")
 """Parameters of the stimulus of a matching, which vary between trials."""
 
 Value = str | int | float
 Condition = Mapping[str, Value]
 """One value of each factor."""
+
+
+def _require_task_name(text: str) -> str:
+    if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", text):
+        raise ValueError("small letters and digits, with single hyphens between them")
+    return text
 
 
 class StimulusSection(Section):
@@ -125,8 +142,8 @@ class Study(Section):
 
     format: Literal["optodrive-study"]
     version: Literal[1]
-    name: Annotated[str, Field(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$", max_length=60)]
-    """Letters, digits and hyphens; the task of the dataset is the name without hyphens."""
+    name: Annotated[str, Field(max_length=60), AfterValidator(_require_task_name)]
+    """Small letters, digits and hyphens; the task of the dataset is the name without hyphens."""
     title: Name
     seed: Annotated[int, Field(ge=0)]
     """Seed of the orders of trials; each participant's is recorded in the session's log."""
@@ -172,7 +189,23 @@ class Study(Section):
                 raise ConflictError("repetitions", self.repetitions, "none: the procedure states the number of trials")
         if self.trial_count > TRIALS_MAX:
             raise ConflictError("repetitions", self.repetitions, f"at most {TRIALS_MAX} trials in all")
+        self._check_observer()
         return self
+
+    def _check_observer(self) -> None:
+        """Raise ConflictError for a simulated participant that cannot give the study's answers."""
+        if self.simulation is None:
+            return
+        observer, answers = self.simulation.observer, self.response.answers
+        if (observer == MAGNITUDE_OBSERVER) != (self.response.kind == "magnitude"):
+            given = "magnitudes" if self.response.kind == "magnitude" else ", ".join(answers)
+            raise ConflictError("simulation.observer", observer, f"an observer whose answers are {given}")
+        possible = OBSERVER_ANSWERS.get(observer, answers)
+        if not set(answers) <= set(possible):
+            expected = (
+                f"an observer whose answers are {', '.join(answers)}; those of this one are {', '.join(possible)}"
+            )
+            raise ConflictError("simulation.observer", observer, expected)
 
     def _check_matching(self) -> None:
         if self.factors:

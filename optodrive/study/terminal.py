@@ -7,17 +7,25 @@ from optodrive.study.presenter import Presentation
 from optodrive.study.session import RepeatReason, Respondent, Response
 from optodrive.study.study_file import Study
 
-REPEAT = "r"
+REPEAT, REPEAT_WORD = "0", "again"
+"""Answers that ask for the stimulus once more; the second one where an answer of the study begins with the first."""
 
 
 class TerminalRespondent(Respondent):
     """A person who types answers.
 
-    read: returns the line that answers a prompt, as `input` does; raises EOFError at the end
+    read: returns the line that answers a prompt; raises EOFError at the end
+    say: shows a text
     """
 
-    def __init__(self, study: Study, read: Callable[[str], str] = input) -> None:
-        self._study, self._read = study, read
+    def __init__(self, study: Study, read: Callable[[str], str], say: Callable[[str], None]) -> None:
+        self._study, self._read, self._say = study, read, say
+        clashes = any(answer.startswith(REPEAT) for answer in study.response.answers)
+        self._repeat = REPEAT_WORD if clashes else REPEAT
+
+    def announce_example(self, number: int, count: int) -> None:
+        """Tell that a stimulus without a question comes."""
+        self._say(f"Example {number} of {count}. No answer is needed.\n")
 
     def respond(self, shown: Presentation, trial: int, attempt: int) -> Response | RepeatReason:
         """Ask until there is a valid answer, and return it, or that the stimulus is to be repeated."""
@@ -27,17 +35,22 @@ class TerminalRespondent(Respondent):
             raise ValueError("a presentation in virtual time is not for a person")
         response = self._study.response
         choices = ", ".join(response.answers) if response.answers else "a number between 0 and 1"
-        prompt = f"{trial + 1} of {self._study.trial_count}. {response.question} {choices}; {REPEAT}: again > "
-        while (text := self._read(prompt).strip()) != REPEAT:
+        prompt = f"{trial + 1} of {self._study.trial_count}. {response.question} {choices}; {self._repeat}: again > "
+        while (text := self._read(prompt).strip()) != self._repeat:
             answer = self._parse(text)
             if answer is not None:
                 return Response(answer, round(time.monotonic() - ended_s, 6))
-            prompt = f"{text!r} is no answer. {choices}; {REPEAT}: again > "
+            prompt = f"{text!r} is no answer. {choices}; {self._repeat}: again > "
         return RepeatReason.REQUESTED
 
     def _parse(self, text: str) -> str | float | None:
-        if self._study.response.answers:
-            return text if text in self._study.response.answers else None
+        """Return the answer that a line states, or the only one that begins with it, None if there is none."""
+        answers = self._study.response.answers
+        if answers:
+            if text in answers:
+                return text
+            found = [answer for answer in answers if text and answer.casefold().startswith(text.casefold())]
+            return found[0] if len(found) == 1 else None
         try:
             value = float(text)
         except ValueError:

@@ -23,10 +23,12 @@ from types import TracebackType
 from typing import Any, Self
 
 from optodrive.core.errors import BusyError, InputError, Unquoted
-from optodrive.study.study_file import Study, Value
+from optodrive.study.study_file import SIMULATED_PREFIX, Study, Value
 
 FORMAT, VERSION = "optodrive-trials", 1
 LOG_BYTES_MAX = 500_000_000
+SHOWN = frozenset({"familiarised", "begun"})
+"""Kinds of records after which a participant may have felt something."""
 
 
 class TrialLog:
@@ -39,6 +41,7 @@ class TrialLog:
     def __init__(self, path: Path, study: Study, participant: str, order: Sequence[Mapping[str, Value]]) -> None:
         """Open or create the log. `order` is recorded in a new log, and ignored for one that exists.
 
+        A log of a changed study begins anew before the first stimulus, or a simulated participant's first answer.
         Raise InputError for a log of another study or participant, or one that is damaged; BusyError if another process
         has it open.
         """
@@ -53,6 +56,9 @@ class TrialLog:
         self._file = _open_locked(path)
         try:
             records = self._read_records()
+            if records and _can_begin_anew(records, study, participant):
+                self._file.truncate(0)
+                records = []
             if not records:
                 records = [_build_head(study, participant, order)]
                 self._append(records[0])
@@ -178,6 +184,18 @@ def read_log(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return records[0], sorted(trials, key=lambda record: int(record["trial"]))
 
 
+def has_stimuli(path: Path) -> bool:
+    """Return whether a log has a stimulus that was or may have been shown. Raise InputError as `read_log`."""
+    try:
+        with path.open("rb") as file:
+            lines = enumerate(file, start=1)
+            return any(
+                _parse_line(f"{path}: line {k}", line)["record"] in SHOWN for k, line in lines if line[-1:] == b"\n"
+            )
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+
+
 def _open_locked(path: Path) -> Any:
     try:
         file = path.open("a+b")
@@ -197,13 +215,28 @@ def _build_head(study: Study, participant: str, order: Sequence[Mapping[str, Val
     return {**head, "study": design, "order": [dict(condition) for condition in order]}
 
 
+def _can_begin_anew(records: Sequence[Mapping[str, Any]], study: Study, participant: str) -> bool:
+    """Return whether a log is of this participant and another version of the study, and holds nothing to be kept."""
+    counts = {"trial"} if participant.startswith(SIMULATED_PREFIX) else SHOWN
+    if any(record.get("record") in counts for record in records):
+        return False
+    head = records[0]
+    mine = {"format": FORMAT, "version": VERSION, "participant": participant}
+    return all(head.get(key) == value for key, value in mine.items()) and bool(_list_changes(head, study))
+
+
+def _list_changes(head: Mapping[str, Any], study: Study) -> list[str]:
+    """Return the keys in which a study differs from that of a log."""
+    design = study.model_dump(mode="json")
+    return [key for key in design if head["study"].get(key) != design[key]]
+
+
 def _check_head(path: Path, head: dict[str, Any], study: Study, participant: str) -> None:
     if head.get("format") != FORMAT or head.get("version") != VERSION:
         raise InputError(str(path), Unquoted("another format or version"), f"{FORMAT}, version {VERSION}")
     if head["participant"] != participant:
         raise InputError(f"{path}: participant", head["participant"], f"{participant!r}")
-    design = study.model_dump(mode="json")
-    changed = [key for key in design if head["study"].get(key) != design[key]]
+    changed = _list_changes(head, study)
     if changed:
         expected = "the study with which the session began; a changed one needs another folder"
         raise InputError(f"{path}: study", Unquoted(f"another {', '.join(changed)}"), expected)

@@ -96,7 +96,7 @@ function show(phase, state, hint) {
 function say(phase, state, hint) {
   const { trial, trials } = view;
   const parts = { stimulus: `Trial ${trial} of ${trials}. ${state}.`, question: `${state}. ${view.is_early ? `${hint} ` : ""}${view.question}` };
-  const text = parts[phase] ?? `${state}. ${hint}`;
+  const text = parts[phase] ?? `${/[.?!]$/.test(state) ? state : `${state}.`} ${hint}`;
   if (`${trial} ${text}` !== said) {
     said = `${trial} ${text}`;
     announcer.say(text);

@@ -70,7 +70,13 @@ def test_the_order_has_every_condition_as_often_and_differs_between_participants
             "factors.direction: got 'north', expected one of the answers",
         ),
         ('direction = ["left",', 'direction = ["right",', "factors.direction"),
-        ('name = "experiment-1"', 'name = "Experiment 1"', "name: got 'Experiment 1'"),
+        (
+            'name = "experiment-1"',
+            'name = "Experiment 1"',
+            "name: got 'Experiment 1', expected small letters and digits",
+        ),
+        ('direction = ["left",', 'direction = [true, "left",', "factors.direction.0: got True, expected text or a"),
+        ('observer = "linear-motion"', 'observer = "intensity"', "an observer whose answers are left, right, up, down"),
         ("seed = 1", 'seed = "1"', "seed: got '1'"),
     ],
 )

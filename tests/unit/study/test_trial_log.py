@@ -137,3 +137,28 @@ def test_every_line_is_on_the_disk_before_the_session_goes_on(tmp_path, monkeypa
         log.complete(ANSWER)
         assert synced[-1] == path.stat().st_size
         assert len(synced) == 4
+
+
+@pytest.mark.parametrize(("participant", "can_begin_anew"), [("01", False), ("sim01", True)])
+def test_a_changed_study_begins_anew_before_the_first_stimulus(tmp_path, participant, can_begin_anew):
+    path, changed = tmp_path / "log.jsonl", STUDY.model_copy(update={"title": "Corrected", "pause_s": 2.0})
+    open_log(path, participant=participant).__exit__(None, None, None)
+    with open_log(path, changed, participant, ORDER[:5]) as log:
+        assert log.order == ORDER[:5]
+        log.begin(0)
+    assert kinds(path) == ["session", "begun"]
+    if can_begin_anew:  # nobody felt the stimulus of a simulated participant
+        with open_log(path, STUDY, participant) as log:
+            assert log.order == ORDER
+            run_trials(log, 1)
+    content = path.read_bytes()
+    with pytest.raises(InputError, match="a changed one needs another folder"):
+        open_log(path, STUDY.model_copy(update={"title": "Other"}), participant)
+    assert path.read_bytes() == content
+
+
+def test_a_log_of_another_participant_does_not_begin_anew(tmp_path):
+    path = tmp_path / "log.jsonl"
+    open_log(path).__exit__(None, None, None)
+    with pytest.raises(InputError, match="participant: got '01'"):
+        open_log(path, STUDY.model_copy(update={"title": "Other"}), "02")

@@ -12,7 +12,7 @@ FINGER = {"number": 1, "x_m": 0.0, "y_m": 0.0, "radius_m": 0.004}
     ("message", "line"),
     [
         ({"fingers": [FINGER, FINGER | {"x_m": 2.0}]}, "fingers.1.x_m: got 2.0, expected less than or equal to 1"),
-        ({"fingers": [FINGER | {"number": 1.5}]}, "fingers.0.number: got 1.5, expected a valid integer"),
+        ({"fingers": [FINGER | {"number": 1.5}]}, "fingers.0.number: got 1.5, expected a whole number"),
         ({"fingers": [FINGER | {"radius_m": 0.0}]}, "fingers.0.radius_m: got 0.0, expected greater than 0"),
         (
             {"fingers": [FINGER | {"speed": 1.0}]},
