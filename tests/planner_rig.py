@@ -11,6 +11,7 @@ from link_service_rig import PLANNER, ServiceRig
 from optodrive.core.ipc import MessageDecoder, encode_message
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine.dimmer import Dimmer
+from optodrive.daemon.engine.kept_heat import KeptHeat
 from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
@@ -87,8 +88,15 @@ class PlannerRig(ServiceRig):
         self.queue = queue_type(display, self.remote, self.store, InlineExecutor())
         self.before_loop_action = lambda: None
         self.dimmer = Dimmer(display, ThermalMemory())
+        self.heat = KeptHeat(display, self.remote, self.queue, self.clock, InlineExecutor(), "a daemon")
         self.planner = Planner(
-            self.dimmer, self.remote, self.queue, self.clock, InlineExecutor(), self._run_in_loop, lambda: None
+            self.dimmer,
+            self.remote,
+            self.queue,
+            self.clock,
+            InlineExecutor(),
+            self._run_in_loop,
+            lambda: self.heat.require_known(),
         )
         self._seen_epoch = None
 
@@ -111,7 +119,9 @@ class PlannerRig(ServiceRig):
             self.queue.on_board_restarted(shift_s)
         self.queue.update_jobs(self.remote.pop_refusal())
         self.planner.follow_queue()
-        self.queue.start_next()
+        self.heat.follow(False)
+        if self.heat.may_emit:
+            self.queue.start_next()
 
     def submit(
         self,

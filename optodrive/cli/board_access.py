@@ -37,6 +37,10 @@ class BoardAccess(NamedTuple):
     spot_reader: "SpotReader | None"
 
 
+def _report_heat(text: str) -> None:
+    print(f"optodrive: {text}; until then it waits before light that would be too much", file=sys.stderr)
+
+
 @contextmanager
 def open_board(config: str | None, calibrated_field: bool = False, stage: str | None = None) -> Iterator[BoardAccess]:
     """Open the configured board and sensor. On exit, send ABORT and close both.
@@ -57,17 +61,19 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
     from optodrive.link.transport.serial_port import SerialPort
     from optodrive.planning.display_model import DisplayModel
 
-    loaded = load_config(config).select_stage(stage)
+    loaded = load_config(config)
+    is_part, loaded = len(loaded.stages) > 1, loaded.select_stage(stage)
     if not calibrated_field:
         loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()
     clock = MonotonicClock()
     transport, sensor_port = build_bench_transport(build_port_settings(loaded), config or DEFAULT_CONFIG, stage)
+    display = DisplayModel.from_config(loaded)
     with (
         end_as_interrupted(),
         loaded.name_file(),
         defer_interruption() as defer,
-        ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board,
+        ExclusiveBoard(display, transport, clock, is_part, _report_heat) as exclusive_board,
     ):
         spot_reader = None
         if loaded.sensor is not None or sensor_port:

@@ -204,6 +204,11 @@ def _print_state(document: dict[str, Any], as_json: bool) -> None:
         print(f"control   armed by {state.control.caller} {state.control.armed_for_s:.0f} s ago{held}")
     if state.limits.power_share is not None and state.limits.power_share < 1.0:
         print(f"dim       pulses have at most {state.limits.power_share:g} of full power")
+    limits = state.limits
+    if limits.hot_for_s is not None:
+        print(
+            f"heat      counts as hot, because {limits.hot_reason}; plans get less light for {limits.hot_for_s:.0f} s"
+        )
     if queue.pause_ends_in_s is not None:
         print(f"paused    dark until `optodrive resume`; disarms in {queue.pause_ends_in_s:.0f} s")
     print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")

@@ -108,7 +108,7 @@ def examine(config: str | None, root: Path = Path("/"), stage: str | None = None
     if exchangeable is not None:
         findings.append(report_warning("stages", exchangeable, EXCHANGE_REMEDY))
     for one in stages:
-        found = _examine_board(one, clock, root)
+        found = _examine_board(one, clock, root, len(loaded.stages) > 1)
         if len(loaded.stages) > 1:
             found = [item._replace(check=f"{one.stages[0].name} {item.check}") for item in found]
         findings += found
@@ -130,8 +130,8 @@ def examine_port(port: str, baud: int = BAUD, root: Path = Path("/")) -> list["F
     return [*findings, *(check_bare_board(SerialPort(port, baud, "--board"), MonotonicClock()) if free else [])]
 
 
-def _examine_board(config: "Config", clock: "Clock", root: Path) -> list["Finding"]:
-    """Return the findings on mirrors, port and board of one stage."""
+def _examine_board(config: "Config", clock: "Clock", root: Path, is_part: bool) -> list["Finding"]:
+    """Return the findings on mirrors, port and board of one stage. is_part: whether there are others."""
     from optodrive.cli.doctor_board import check_board
     from optodrive.cli.doctor_mirrors import check_mirrors
     from optodrive.cli.doctor_port import check_port
@@ -142,4 +142,4 @@ def _examine_board(config: "Config", clock: "Clock", root: Path) -> list["Findin
 
         return [mirrors, *check_dac(config, clock)]
     port, free = check_port(config.board, root)
-    return [mirrors, *port, *(check_board(config, clock) if free else [])]
+    return [mirrors, *port, *(check_board(config, clock, is_part) if free else [])]

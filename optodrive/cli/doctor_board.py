@@ -9,6 +9,8 @@ from optodrive.link.protocol.messages import INPUTS
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.registry import find_transport_factory
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.heat_record import BOARDS, join_uids, read_heat
 
 ROUND_TRIP_WARNING_S = 0.01
 UNANSWERED = "check power, port and baud rate"
@@ -20,14 +22,21 @@ UNSAFE_REASONS = {
 }
 
 
-def check_board(config: Config, clock: Clock) -> list[Finding]:
-    """Connect to the board, compare its limits with the configuration, measure the round trip, and stay DISARMED."""
+def check_board(config: Config, clock: Clock, is_part: bool = False) -> list[Finding]:
+    """Connect to the board, compare its limits with the configuration, measure the round trip, and stay DISARMED.
+
+    is_part: whether other boards draw on the same display
+    """
     transport = find_transport_factory(build_port_settings(config))()
     session = BoardSession(transport, clock, build_board_requirements(config))
     try:
         session.connect()
         trip_s = session.collect_link_stats()["round_trip_ms"] * 1e-3
-        return [*_check_identity(session, config), check_inputs(session.board.inputs), check_trip(trip_s)]
+        findings = [*_check_identity(session, config), check_inputs(session.board.inputs), check_trip(trip_s)]
+        identity = join_uids([session.board.uid])
+        if identity and not is_part:
+            findings.append(check_heat(BOARDS, identity, config, clock))
+        return findings
     except (LinkError, InputError) as error:
         return [describe_failure(error)]
     finally:
@@ -60,6 +69,15 @@ def _check_identity(session: BoardSession, config: Config) -> list[Finding]:
             limits,
         ]
     return [report_ok("board", observation), limits]
+
+
+def check_heat(kind: str, identity: str | None, config: Config, clock: Clock) -> Finding:
+    """Return the finding on the record of the display's heat. Arguments as for `HeatRecord`."""
+    is_recorded, observation = read_heat(kind, identity, DisplayModel.from_config(config), clock)
+    if is_recorded:
+        return report_ok("heat", "the display's heat after the last run is recorded on this machine")
+    remedy = "wait, or use less light; for every run alike: let all users write the record"
+    return report_warning("heat", f"the display counts as {observation}", remedy)
 
 
 def check_inputs(inputs: int) -> Finding:

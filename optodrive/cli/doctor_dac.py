@@ -3,6 +3,7 @@
 The DAC is stopped, and its light switched off.
 """
 
+from optodrive.cli.doctor_board import check_heat
 from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
@@ -11,8 +12,6 @@ from optodrive.device.config import Config
 from optodrive.link.dac.encoding import PointScale
 from optodrive.link.dac.laser_dac import LaserDac
 from optodrive.link.dac.registry import build_dac
-from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.heat_record import read_heat
 
 READY_TRIES = 3
 NOT_REPORTED = "interlock, key, emergency stop, laser and executed pulses"
@@ -26,7 +25,7 @@ def check_dac(config: Config, clock: Clock) -> list[Finding]:
         with dac:
             identity = dac.find_identity()
             findings = [_check_identity(dac, config), _check_readiness(dac)]
-        findings.append(_check_heat(dac, identity, config, clock))
+        findings.append(check_heat(dac.transport, identity, config, clock))
     except InputError as error:
         return [report_problem("port", f"{error.where} is {error.value}", f"expected: {error.expected}")]
     except LinkError as error:
@@ -40,14 +39,6 @@ def _check_identity(dac: LaserDac, config: Config) -> Finding:
         remedy = f'to accept this one only: uid = "{dac.name}" in section [board]'
         return report_warning("board", f"{observation}; the configuration accepts any {dac.format.label}", remedy)
     return report_ok("board", observation)
-
-
-def _check_heat(dac: LaserDac, identity: str | None, config: Config, clock: Clock) -> Finding:
-    is_recorded, observation = read_heat(dac.transport, identity, DisplayModel.from_config(config), clock)
-    if is_recorded:
-        return report_ok("heat", "the display's heat after the last play is recorded on this machine")
-    remedy = "wait, or play with less light; for every play alike: let all users write the record"
-    return report_warning("heat", f"the display counts as {observation}", remedy)
 
 
 def _check_readiness(dac: LaserDac) -> Finding:

@@ -1,4 +1,4 @@
-"""Record of a display's heat between runs of the program: one per machine and device, shared by all users.
+"""Record of a display's heat between runs of the program: one per machine and display, shared by all users.
 
 Theory of operation
 
@@ -10,6 +10,10 @@ Trust. A record counts only if everybody could have written it: a file of mode 0
 display, and leaves no false record behind, because what one user cannot write counts for no other user either. A file
 whose status changed after its last write (chmod and back, or a copy from a backup) counts no more. Where others may
 trust a file that this process cannot write, it emits nothing.
+
+Identity. A display is known by the laser DAC, or by the uids of all boards, that draw it. A use of a board ends
+every other record that names it: a record of a part of the stages, or of more. What draws a part alone never counts as
+recorded, because another part may have warmed the display since.
 
 Hot. Without a record the display is as warm as its caps permit, and cools by the model from then on.
 
@@ -27,12 +31,12 @@ import os
 import re
 import stat
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import fields, replace
 from hashlib import sha256
+from math import inf
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 from zipfile import BadZipFile
 
@@ -48,7 +52,7 @@ from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import build_cold_budget_state, shift_state
 
 FOLDER = Path("/var/tmp/optodrive-heat")  # noqa: S108 - shared on purpose: see "Trust"
-MAGIC = b"optodrive-heat 6\n"
+MAGIC = b"optodrive-heat 7\n"
 BYTES_MAX = 64_000_000
 SHARED_FOLDER, SHARED_FILE = 0o1777, 0o666
 FILE_FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -57,6 +61,11 @@ LOCK_TIMEOUT_S, LOCK_POLL_S = 5.0, 0.05
 RECENT = tuple(item.name for item in fields(BudgetState) if item.name.startswith("recent_"))
 """Columns whose length is not that of the display."""
 COOLING_TAUS = 3.0
+BOARDS = "board"
+"""Kind of a display that boards draw. Its identity is that of `join_uids`."""
+LIGHTLESS = frozenset(name.encode("ascii").hex() for name in ("simulated001", "host board 1"))
+"""Uids of boards that are programs: they heat nothing, so that each of their starts is cold."""
+PART = "part"
 
 
 class _UncountedError(Exception):
@@ -71,12 +80,23 @@ def read_boot() -> tuple[str, float]:
     return boot, time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
+def join_uids(uids: Iterable[str], is_part: bool = False) -> str:
+    """Return the identity of a display by the uids of its boards, '' for one that nothing heats.
+
+    is_part: whether further boards draw on the same display
+    """
+    joined = "-".join(sorted(set(uids)))
+    return "" if LIGHTLESS.issuperset(uids) else f"{joined}-{PART}" if is_part else joined
+
+
 class HeatRecord:
-    """The record of one device, locked as long as it is open.
+    """The record of one display, locked as long as it is open.
 
     kind: of device; identity: what the device says it is, None if it cannot be known: then no device of this kind has a
-    record any more, because it may be each of them
+    record any more, because it may be each of them; '' if nothing heats it: then nothing is recorded
+    owner: mark of a run of the program, which is_own compares
     hot_reason: why the display counts as hot, '' if the record says how warm it is
+    is_own: whether this owner wrote the record last, known after load()
     """
 
     def __init__(
@@ -86,9 +106,12 @@ class HeatRecord:
         display: DisplayModel,
         clock: Clock,
         on_wait: Callable[[], None] = lambda: None,
+        owner: str = "",
     ) -> None:
-        self.hot_reason = ""
-        self._kind, self._identity = kind, identity
+        self.hot_reason = self._cooling_reason = ""
+        self.is_own = False
+        self._cooled_s = -inf
+        self._kind, self._identity, self._owner = kind, identity, owner
         self._name = f"{kind}-{re.sub('[^0-9A-Za-z._]+', '-', identity or '')}"
         self._budget = display.budget
         self._cold = build_cold_budget_state(len(display.pixels), stage_count=len(display.scan_heads))
@@ -103,24 +126,32 @@ class HeatRecord:
         return FOLDER / self._name
 
     def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *details: object) -> None:
+        self.close()
+
+    def open(self) -> Self:
         """Open and lock the record. Raise InputError where others may trust a record that cannot be written."""
+        if self._identity == "":
+            return self
         try:
             with self._exit_stack:
                 folder = self._open_folder()
                 if self._identity is None:
-                    self._forget_all(folder, f"{self._kind}-")
+                    self._forget_all(folder, lambda name: name.startswith(f"{self._kind}-"))
                     raise _UncountedError("the device does not say which one it is")
                 self._file = self._open_file(folder, self._name)
                 self._exit_stack.callback(os.close, self._file)
                 self._judge(self._file)
+                if self._kind == BOARDS:
+                    self._forget_all(folder, self._shares_board)
                 self._exit_stack = self._exit_stack.pop_all()
         except _UncountedError as error:
             self.hot_reason = str(error)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Release the record."""
         self._exit_stack.close()
         self._file = None
@@ -144,13 +175,18 @@ class HeatRecord:
             except OSError:
                 mode = stat.S_IMODE(os.fstat(folder).st_mode)
                 raise _UncountedError(f"{FOLDER} has mode {mode:04o}; it needs {SHARED_FOLDER:04o}") from None
-            self._forget_all(folder, "")  # others may have played meanwhile
+            self._forget_all(folder, lambda name: True)  # others may have played meanwhile
         return folder
 
-    def _forget_all(self, folder: int, prefix: str) -> None:
-        """Let no record count any more whose name begins so. Wait for those that use one."""
+    def _shares_board(self, name: str) -> bool:
+        """Return whether another record names a board of this one."""
+        boards, others = ({*each.split("-")} - {BOARDS, PART} for each in (self._name, name))
+        return name != self._name and name.startswith(f"{BOARDS}-") and not boards.isdisjoint(others)
+
+    def _forget_all(self, folder: int, is_meant: Callable[[str], bool]) -> None:
+        """Let no record count any more whose name is meant. Wait for those that use one."""
         for name in os.listdir(folder):
-            if name.startswith(prefix):
+            if is_meant(name):
                 with suppress(_UncountedError), os.fdopen(self._open_file(folder, name), "rb+") as file:
                     file.truncate(0)
 
@@ -171,7 +207,7 @@ class HeatRecord:
                 if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
                     self._remove(folder, name, OSError(errno.EINVAL, "no file of its own"))
                     continue
-                self._lock(file)
+                self._lock(file, FOLDER / name)
                 with suppress(FileNotFoundError):
                     named = os.stat(name, dir_fd=folder, follow_symlinks=False)
                     if os.path.samestat(status, named):
@@ -213,7 +249,7 @@ class HeatRecord:
         ):
             raise InputError(str(path), error.strerror, "permission to record the display's heat; nothing is emitted")
 
-    def _lock(self, file: int) -> None:
+    def _lock(self, file: int, path: Path) -> None:
         until_s = self._clock.now_s() + LOCK_TIMEOUT_S
         while True:
             try:
@@ -221,7 +257,7 @@ class HeatRecord:
             except BlockingIOError:
                 if self._clock.now_s() > until_s:
                     expected = "no other process that uses the display; end it"
-                    raise InputError(str(self.path), "in use", expected, "busy") from None
+                    raise InputError(str(path), "in use", expected, "busy") from None
                 self._on_wait()
                 self._clock.sleep(LOCK_POLL_S)
             else:
@@ -235,6 +271,8 @@ class HeatRecord:
             self.hot_reason = "not every user could write the record of its heat"
         elif status.st_ctime_ns != status.st_mtime_ns:
             self.hot_reason = "the record of its heat was changed after it was written"
+        elif self._name.endswith(f"-{PART}"):
+            self.hot_reason = "the boards of its other stages may have warmed it since"
         with suppress(OSError):  # another user's: it goes on to count for nobody
             if not _has_mode(status, SHARED_FILE):
                 os.fchmod(file, SHARED_FILE)
@@ -246,6 +284,8 @@ class HeatRecord:
 
         A hot display is recorded, so that it cools from now on. hot_reason is known afterwards.
         """
+        if self._identity == "":
+            return self._cold
         boot, now_s = read_boot()
         if not self.hot_reason and self._file is not None:
             try:
@@ -255,6 +295,8 @@ class HeatRecord:
                     str(error) if isinstance(error, _UncountedError) else "the record of its heat is damaged"
                 )
         hot = build_hot_budget_state(self._cold, self._budget)
+        self._cooling_reason = self.hot_reason
+        self._cooled_s = now_s + COOLING_TAUS * float(self._budget.heat.panel_tau_s.max())
         self.save(hot)
         return hot
 
@@ -266,6 +308,8 @@ class HeatRecord:
             raise _UncountedError("the record of its heat is damaged")
         with np.load(io.BytesIO(data[digest_end:])) as table:
             arrays = {key: table[key] for key in table.files}
+        self._recall_cooling(arrays, boot, now_s)
+        self.is_own = bool(self._owner) and str(arrays["owner"]) == self._owner
         if "at_s" not in arrays:
             raise _UncountedError("the process that used it last was killed")
         if str(arrays["model"]) != self._model:
@@ -279,6 +323,12 @@ class HeatRecord:
         if not zero_s <= now_s:
             raise _UncountedError("the record of its heat is of a time to come")
         return shift_state(state, zero_s - now_s)
+
+    def _recall_cooling(self, arrays: dict[str, Any], boot: str, now_s: float) -> None:
+        """Keep why the display counted as hot, and until when it cools from that."""
+        is_same = bool(boot) and str(arrays["boot"]) == boot
+        since_s = float(arrays["written_s"]) if is_same else 0.0
+        self._cooled_s, self._cooling_reason = since_s + float(arrays["cooling_s"]), str(arrays["cooling_reason"])
 
     def _read_column(self, arrays: dict[str, Any], name: str) -> Any:
         """Return numbers of the type and shape of another state's: NaN would pass every comparison of the limiter."""
@@ -300,9 +350,13 @@ class HeatRecord:
     def _write(self, budget: BudgetState | None, zero_s: float) -> None:
         if self._file is None:
             return
-        columns = {} if budget is None else {item.name: getattr(budget, item.name) for item in fields(BudgetState)}
-        buffer = io.BytesIO()
-        np.savez(buffer, boot=read_boot()[0], zero_s=zero_s, model=self._model, **columns)
+        columns: dict[str, Any] = {}
+        if budget is not None:
+            columns = {item.name: getattr(budget, item.name) for item in fields(BudgetState)}
+        buffer, (boot, now_s) = io.BytesIO(), read_boot()
+        columns |= {"cooling_s": max(0.0, self._cooled_s - now_s), "cooling_reason": self._cooling_reason}
+        columns |= {"boot": boot, "written_s": now_s, "zero_s": zero_s, "model": self._model, "owner": self._owner}
+        np.savez(buffer, **columns)
         payload = buffer.getvalue()
         data = MAGIC + sha256(payload).digest() + payload
         try:
@@ -316,17 +370,23 @@ class HeatRecord:
 
     def describe(self) -> str:
         """Return how warm the display counts, and why, in one line, after load()."""
-        if not self.hot_reason:
+        reason, cooling_s = self.read_cooling()
+        if not cooling_s:
             return "recorded"
-        cools = format_quantity(COOLING_TAUS * float(self._budget.heat.panel_tau_s.max()), "s")
-        return f"hot, because {self.hot_reason}; it cools within {cools}"
+        word = "hot" if self.hot_reason else "still warm"
+        return f"{word}, because {reason}; it cools within {format_quantity(cooling_s, 's')}"
+
+    def read_cooling(self) -> tuple[str, float]:
+        """Return why the display counted as hot, and for how long it still cools from that, s, after load()."""
+        cooling_s = max(0.0, self._cooled_s - read_boot()[1])
+        return (self._cooling_reason, cooling_s) if cooling_s else ("", 0.0)
 
 
 def read_heat(kind: str, identity: str | None, display: DisplayModel, clock: Clock) -> tuple[bool, str]:
-    """Return whether a display has a record, and how warm it counts, in one line. One without cools from now on."""
+    """Return whether a display has a record and is not hot, and how warm it counts. One without cools from now on."""
     with HeatRecord(kind, identity, display, clock) as record:
         record.load()
-        return not record.hot_reason, record.describe()
+        return not record.read_cooling()[1], record.describe()
 
 
 def _has_mode(status: os.stat_result, mode: int) -> bool:

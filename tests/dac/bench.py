@@ -73,5 +73,4 @@ class Bench:
 def record_cold(display, kind, identity):
     """Record that a device's display is cold, as after a play long ago."""
     with HeatRecord(kind, identity, display, ManualClock()) as record:
-        record.load()
         record.save(display.build_cold_state()[1])

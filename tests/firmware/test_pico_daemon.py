@@ -19,7 +19,7 @@ from rig import Daemon, wait_for
 
 BEGIN_NS = 1_000_000_000_000
 LEASE_S = 0.1
-UID = b"rp2040-00001"
+UID = b"simulated001"
 OFTEN = "\n[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000\n"
 """A second of the daemon is ten or more of the computer, in which a test polls it."""
 

@@ -43,7 +43,9 @@ class PicoProcess:
         self._log = options.log.open("w", buffering=1)
         with options.time.open("r+b") as file:
             self._time = mmap.mmap(file.fileno(), 8)
-        self._pico = EmulatedUsbPico(PicoImage(options.build), None, self._write_log)
+        image = PicoImage(options.build)
+        image.flash = image.flash.replace(b"rp2040-00001", b"simulated001")  # it heats nothing
+        self._pico = EmulatedUsbPico(image, None, self._write_log)
         self._now_us, self._is_open, self._stopping = 0, False, False
         self._next_s = time.monotonic()
         self._terminal = open_pty(options.pty)

@@ -38,9 +38,9 @@ def kill_planner(daemon):
 
 
 def test_an_operator_lowers_the_power_an_armer_raises_it_and_a_restart_keeps_it(bright, board):
-    assert bright.state()["limits"] == {"power_share": 1.0}
+    assert bright.state()["limits"]["power_share"] == 1.0
     dim(bright, 0.2, "viewer", 403)
-    assert dim(bright, 0.2, "operator")["limits"] == {"power_share": 0.2}
+    assert dim(bright, 0.2, "operator")["limits"]["power_share"] == 0.2
     problem = dim(bright, 0.3, "operator", 403)
     assert (problem["code"], problem["required_role"]) == ("insufficient_role", "armer")
     assert "raise the power above 0.2" in problem["detail"]
@@ -69,4 +69,4 @@ def test_an_operator_lowers_the_power_an_armer_raises_it_and_a_restart_keeps_it(
 def test_other_bodies_are_refused(bright, body):
     problem = bright.call("PUT", "/v1/dim", 422, content=body)
     assert problem["where"] in ("body", "body: share")
-    assert bright.state()["limits"] == {"power_share": 1.0}
+    assert bright.state()["limits"]["power_share"] == 1.0

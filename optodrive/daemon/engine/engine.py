@@ -18,6 +18,7 @@ from optodrive.core.scheduling import use_usual_priority
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
+from optodrive.daemon.engine.kept_heat import KeptHeat
 from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
 from optodrive.daemon.engine.page_refresh import PageRefresh
@@ -86,6 +87,16 @@ class Engine:
         self._plan_queue = PlanQueue(display, session, self._plan_store, self._simulation_executor)
         self.page = PageRefresh(display.layout, clock, self.board_s, lambda: self._plan_queue.stream.lead_s)
         self._memory = ThermalMemory() if memory is None else memory
+        self._heat = KeptHeat(
+            display,
+            session,
+            self._plan_queue,
+            clock,
+            ThreadPoolExecutor(1, "heat", use_usual_priority),
+            self._memory.owner,
+            lambda: self.commands.post(lambda: None),
+        )
+        self._heat.on_warm = lambda text: self.on_warning(text)
         self._dimmer = Dimmer(display, self._memory)
         self._planner = Planner(
             self._dimmer,
@@ -98,7 +109,7 @@ class Engine:
         )
         self._plan_queue.on_progress = self._beat
         self._epoch = session.epoch
-        self._restored = False
+        self._restored = self._continues = False
         self._saved_key: object = None
         self._published_cause: LinkCause | None = None
         self._published_loss: LostStage | None = None
@@ -130,7 +141,8 @@ class Engine:
         self._plan_queue.update_jobs(self._session.pop_refusal())
         self._planner.follow_queue()
         self._save_thermal_state()  # before a plan starts, so that a successor of this process knows its heat
-        self._plan_queue.start_next()
+        if self._heat.may_emit:
+            self._plan_queue.start_next()
         self._beat()
         self._publish_cause()
 
@@ -145,13 +157,16 @@ class Engine:
 
     def _save_thermal_state(self) -> None:
         """Continue from the state of an earlier planner once the board's time is known, then save every new state."""
-        if not self._session.connected:
-            return
-        if not self._restored:
+        if self._session.connected and not self._restored:
             self._restored = True
             saved = self._memory.load()
             if saved is not None:
+                self._continues = True
                 self._plan_queue.restore(saved, self._clock.now_s())
+        if self._restored:
+            self._heat.follow(self._continues)
+        if not self._session.connected:
+            return
         key = self._plan_queue.saved_key
         if key != self._saved_key:
             self._saved_key = key
@@ -182,6 +197,7 @@ class Engine:
         """End the threads and close the loop, after run()."""
         self._planning_executor.shutdown(wait=False, cancel_futures=True)
         self._simulation_executor.shutdown(wait=False, cancel_futures=True)
+        self._heat.close()
         self.commands.close()
 
     def _run_in_loop(self, action: Callable[[], T]) -> T:
@@ -221,6 +237,7 @@ class Engine:
             raise NotReadyError(
                 f"{QUEUED_PULSES_MAX} pulses are already waiting; wait for a plan to end, or cancel one"
             )
+        self._heat.require_known()
 
     def end_stream(self, epoch: int, caller: str) -> "Future[PlanReport]":
         """Drop the unsent rest of a stream's last plan after its client has disconnected."""
@@ -301,7 +318,8 @@ class Engine:
     def compute_state_key(self) -> object:
         """Return a value that changes with everything in the planner's state but the totals."""
         plans = tuple((record.plan_id, record.status) for record in self._plan_store.list_recent())
-        planner = self._planner.is_busy, self._planner.is_alive, self._dimmer.power_share
+        heat = bool(self._heat.read_cooling()[1])
+        planner = self._planner.is_busy, self._planner.is_alive, self._dimmer.power_share, heat
         return plans, len(self._plan_queue.waiting), self._plan_queue.pause.is_held, planner
 
     def build_planner_state(self) -> PlannerState:
@@ -318,7 +336,13 @@ class Engine:
                 frames_superseded=self._plan_counters.frames_superseded,
             ),
             planner=PlannerReport(busy=self._planner.is_busy, alive=self._planner.is_alive),
-            limits=LimitsReport(power_share=self._dimmer.power_share),
+            limits=self._build_limits(),
+        )
+
+    def _build_limits(self) -> LimitsReport:
+        reason, cooling_s = self._heat.read_cooling()
+        return LimitsReport(
+            power_share=self._dimmer.power_share, hot_reason=reason, hot_for_s=cooling_s if reason else None
         )
 
     def render_metrics(self) -> str:

@@ -58,13 +58,14 @@ class QueueThermal:
             end_s = self.end_s
         self.set(estimate, end_s)
 
-    def rewind(self, ended: Sequence[ActivePlan], clock_shift_s: float = 0.0) -> None:
+    def rewind(self, ended: Sequence[ActivePlan], clock_shift_s: float = 0.0, notice_s: float = 0.0) -> None:
         """Count only the pulses that the plans that end early may have executed.
 
         clock_shift_s: by which the board's clock has jumped since they were queued
+        notice_s: time until the link process renews the lease no more
         """
         now_s = self._session.board_s() - clock_shift_s
-        gate_off_s = max(now_s + self._lease_s, self._session.dark_s)
+        gate_off_s = max(now_s + notice_s + self._lease_s, self._session.dark_s)
         estimate = rewind_estimate(EndedPlans.from_plans(ended), gate_off_s, self._budget, self._on_progress, now_s)
         self.set(estimate, max(gate_off_s, estimate.budget.at_s))
 

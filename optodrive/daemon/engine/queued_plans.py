@@ -10,8 +10,10 @@ from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.plan_simulation import simulate_plan
 from optodrive.daemon.engine.progress import PlanRun
 from optodrive.daemon.engine.pulse_accounts import PulseAccounts
-from optodrive.daemon.engine.queue_thermal import QueueThermal
+from optodrive.daemon.engine.queue_thermal import HOLD_MAX_S, QueueThermal
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.link.service.clients import BEAT_AGE_MAX_S
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
 
@@ -93,6 +95,18 @@ class QueuedPlans:
                 self.thermal.rewind(waiting[:1], clock_shift_s)
         for plan in waiting:
             self.end_waiting(plan, status, reason)
+
+    def build_final_estimate(self) -> ThermalEstimate:
+        """Return the estimate after the end of this process, with which the link process ends all plans.
+
+        Each pulse that may have started by then counts, up to the longest time late that the board permits.
+        """
+        with self.lock:
+            active = self.list_active()
+            if active:
+                self.thermal.rewind(active, notice_s=BEAT_AGE_MAX_S)
+                self.thermal.delay(HOLD_MAX_S + max(plan.record.delay_s for plan in active))
+            return self.thermal.estimate
 
     def end_waiting(self, plan: ActivePlan, status: PlanStatus, error: str | None) -> None:
         """End a plan that does not run and was removed from the queue."""

@@ -4,6 +4,7 @@ import mmap
 import pickle
 import struct
 from typing import NamedTuple
+from uuid import uuid4
 
 from optodrive.daemon.engine.thermal_estimate import EndedPlans, ThermalEstimate
 
@@ -32,11 +33,13 @@ class ThermalMemory:
 
     A slot gets its number once it is whole. No checksum is needed: the stores of a process that was killed are those of
     its instructions up to there. The supervisor creates it before it forks the planner. One process at a time uses it.
+    owner: mark of the daemon, the same for all its planners
     """
 
     def __init__(self) -> None:
         self._map = mmap.mmap(-1, 2 * SLOT_BYTES + SHARE.size)
         self._sequence = 0
+        self.owner = uuid4().hex
         self.power_share = 1.0
 
     @property

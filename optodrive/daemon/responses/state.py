@@ -144,9 +144,13 @@ class LimitsReport(JsonModel):
     """Limits that may change while the daemon runs.
 
     power_share: largest power of a pulse as a share of the laser's, None while the planner process does not run
+    hot_reason: why the display counted as hot when this or an earlier daemon began to use it, '' once it has cooled
+    hot_for_s: time until it has cooled from that, and plans get all light again; None if it has
     """
 
     power_share: float | None
+    hot_reason: str = ""
+    hot_for_s: float | None = None
 
 
 class PlannerState(JsonModel):

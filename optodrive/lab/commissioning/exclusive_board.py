@@ -1,7 +1,8 @@
 """Exclusive access to a board for one task: it is armed once and executes points and plans that the limiter has passed.
 
 Points are limited as those of the daemon are: accounted to one timeline of heat, encoded, decoded and proven again. A
-point whose pixel is unknown counts for the one that it would heat most.
+point whose pixel is unknown counts for the one that it would heat most. The timeline begins with the heat that the
+display's record states, and the record gets what is left of it at the end.
 """
 
 from collections.abc import Callable
@@ -15,12 +16,13 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config, build_pixel_layout
-from optodrive.lab.commissioning.armed_board import FIELD_MARGIN_M, ArmedBoard, ignore_reports
+from optodrive.lab.commissioning.armed_board import FIELD_MARGIN_M, LOOP_STEP_S, ArmedBoard, ignore_reports
 from optodrive.lab.commissioning.spot_bounds import check_spot_power, max_settling_s, spot_width_s
 from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX, WirePoints, decode, quantise
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.transport.base import Transport
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.heat_record import BOARDS, HeatRecord, join_uids
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
 
@@ -32,15 +34,26 @@ START_LEAD_S = 0.03
 class ExclusiveBoard(ArmedBoard):
     """A board that executes only points and plans that fit all caps of its display.
 
-    display: that the limiter computes with
+    display: that the limiter computes with; is_part: whether other boards draw on the same display
+    on_warm: called with one sentence if the display counts as hot, or as not yet cooled from that
     """
 
-    def __init__(self, display: DisplayModel, transport: Transport, clock: Clock) -> None:
+    def __init__(
+        self,
+        display: DisplayModel,
+        transport: Transport,
+        clock: Clock,
+        is_part: bool = False,
+        on_warm: Callable[[str], None] = lambda text: None,
+    ) -> None:
         config = display.config
         super().__init__(config, transport, clock)
         self.display = display
         self._state = display.build_cold_state()[1]
         self._timeline_zero_s: float | None = None
+        self._is_part, self._on_warm = is_part, on_warm
+        self._record: HeatRecord | None = None
+        self._is_interrupted, self._is_known = False, True
         self._accounted_pixel = find_weakest_pixel(display)
         self._settling_s, self._width_s = max_settling_s(config), spot_width_s(config)
         # The mirrors leave for a single point when it begins, which is earlier than the lead-in of a plan.
@@ -56,6 +69,43 @@ class ExclusiveBoard(ArmedBoard):
         """Load the kernels first, because compilation would delay the lease, then connect."""
         limit(self._plan(0.0, 0.0, self.zero_duty_power_w), self._state, self.display.budget)
         super().connect()
+        if self._record is None:
+            self._recall_heat()
+
+    def _recall_heat(self) -> None:
+        """Take the display as warm as its record states, once its last pulse is over."""
+
+        def keep_link() -> None:
+            self.session.step(LOOP_STEP_S, renew_lease=False)
+
+        identity = join_uids([self.session.board.uid], self._is_part)
+        record = HeatRecord(BOARDS, identity, self.display, self._clock, keep_link).open()
+        self._state, self._record = record.load(), record
+        self._timeline_zero_s = self.session.board_s()
+        if record.read_cooling()[1]:
+            self._on_warm(f"the display counts as {record.describe()}")
+        while self.session.board_s() < self._timeline_zero_s + self._state.at_s:
+            keep_link()
+
+    def arm(self) -> float:
+        """Record that the display is in use, then arm. Raise InputError, and arm nothing, if that is impossible."""
+        if self._record is not None:
+            self._record.begin_use()
+        return super().arm()
+
+    def close(self) -> None:
+        """Send ABORT, close the link, and record the heat."""
+        try:
+            super().close()
+        finally:
+            record, self._record = self._record, None
+            if record is not None and self._timeline_zero_s is not None:
+                age_s = self.session.board_s() - self._timeline_zero_s
+                if self._is_interrupted:  # it counts as if all of it came now: when it came is not known
+                    age_s = min(age_s, -self.config.lease_s)
+                if self._is_known:
+                    record.save(self._state, age_s)
+                record.close()
 
     def move_to(self, x_code: int, y_code: int) -> None:
         """Move the mirrors with the gate off and wait until they have settled."""
@@ -193,14 +243,17 @@ class ExclusiveBoard(ArmedBoard):
         """
         self._require_ready()
         limited, points, start_s = self._account(plan, budget, len(plan) if gate_on else 0)
+        self._is_interrupted = True  # until its delay is accounted for
         job = self._run_job(points, start_s, on_reported)
         executed = job.build_executed(limited, self.session.scale.full_power_w, self.session.scale.tick_s)
         if gate_on and not np.allclose(executed.width_s, limited.width_s):
+            self._is_known = False
             raise BoardFaultError(
                 f"the board kept the gate on for {executed.width_s.sum():g} s; expected {limited.width_s.sum():g} s"
             )
         ended_s = float(executed.start_s[-1] + executed.width_s[-1])
         self._timeline_zero_s = start_s + max(0.0, ended_s - float(limited.start_s[-1] + limited.width_s[-1]))
+        self._is_interrupted = False
 
 
 def find_weakest_pixel(display: DisplayModel) -> int:

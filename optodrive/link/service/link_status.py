@@ -98,6 +98,10 @@ class LinkStatus:
             self._clock_shift_s = board_s + (now_s - midpoint_s) - self.board_s()
         self._clock_sample = midpoint_s, board_s
 
+    def list_uids(self) -> list[str]:
+        """Return the uid of the board of each stage, '' for one that was never reached."""
+        return [stage["board"]["uid"] for stage in self.stages] or [self.board.uid]
+
     def read_clocks(self) -> ClockReading | None:
         """Return the present time on all clocks, None before the first status with a synchronised clock."""
         sample, now_s = self._clock_sample, self._clock.now_s()

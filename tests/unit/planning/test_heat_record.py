@@ -1,10 +1,12 @@
 """Record of a display's heat: what counts, what makes a display hot, and that a hot one is a bound."""
 
 import os
+import re
 import shutil
 import subprocess
 import time
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +15,10 @@ from dac.bench import build_config, build_display, build_train
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState
+from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.planning import heat_record
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.heat_record import HeatRecord, build_hot_budget_state
+from optodrive.planning.heat_record import BOARDS, LIGHTLESS, HeatRecord, build_hot_budget_state, join_uids
 from optodrive.planning.limiter.limiter import shift_state
 from optodrive.planning.pipeline import plan_sequence
 
@@ -272,3 +275,86 @@ def test_a_hot_display_is_warmer_than_any_play_leaves_one(desk):
         state = plan_sequence(display, sequence, display.build_cold_heat(), shift_state(state, -state.at_s)).budget
         for name in ("rise_k", "wall_k", "touch_k", "panel_k", "bucket_j", "inflow_w", "merged_width_s"):
             assert (getattr(state, name) <= getattr(hot, name) * (1 + 1e-9)).all(), name
+
+
+BOARD_A, BOARD_B, BOARD_C = ("0a" * 12, "0b" * 12, "0c" * 12)
+
+
+def use_boards(desk, uids, is_part=False):
+    """Use a display of boards. Return why it counted as hot."""
+    with HeatRecord(BOARDS, join_uids(uids, is_part), desk.display, ManualClock()) as record:
+        record.load()
+        record.begin_use()
+        record.save(desk.budget)
+    return record.hot_reason
+
+
+def test_a_use_of_a_board_ends_all_other_records_that_name_it(desk):
+    for uids in ((BOARD_A, BOARD_B), (BOARD_C,)):
+        assert "no record" in use_boards(desk, uids)
+    assert not use_boards(desk, (BOARD_B, BOARD_A))
+    assert "no record" in use_boards(desk, (BOARD_A,))
+    assert "no record" in use_boards(desk, (BOARD_A, BOARD_B))
+    assert "no record" in use_boards(desk, (BOARD_B, BOARD_C))
+    assert "no record" in use_boards(desk, (BOARD_C,))
+
+
+def test_a_board_that_draws_a_part_is_always_hot_and_ends_the_record_of_the_whole(desk):
+    use_boards(desk, (BOARD_A, BOARD_B))
+    for _ in range(3):
+        for board in (BOARD_A, BOARD_B):
+            assert use_boards(desk, (board,), is_part=True)
+    assert "no record" in use_boards(desk, (BOARD_A, BOARD_B))
+
+
+def test_one_process_at_a_time_uses_a_board(desk):
+    with HeatRecord(BOARDS, join_uids((BOARD_A, BOARD_B)), desk.display, ManualClock()) as record:
+        record.load()
+        for uids, is_part in (((BOARD_A,), True), ((BOARD_B,), False), ((BOARD_B, BOARD_C), False)):
+            with pytest.raises(InputError, match=r"-.*got 'in use', expected no other process"):
+                use_boards(desk, uids, is_part)
+
+
+def test_a_board_that_is_a_program_is_cold_and_leaves_no_record(desk):
+    """Simulated boards, and the protocol's core as a process: their uids are in both places."""
+    core = Path("firmware_protocol/ports/host/settings.c").read_text()
+    host = re.search(r'memcpy\(config->uid, "([^"]{12})"', core)[1].encode().hex()
+    assert {BoardSettings().uid, host} == LIGHTLESS
+    for uids in ((BoardSettings().uid,), (host, BoardSettings().uid)):
+        with HeatRecord(BOARDS, join_uids(uids), desk.display, ManualClock()) as record:
+            record.begin_use()
+            assert record.load().panel_k.max() == 0.0
+            record.save(desk.budget)
+    assert not desk.folder.exists()
+    assert "no record" in use_boards(desk, (BoardSettings().uid, BOARD_A))
+
+
+def test_a_hot_display_says_why_until_it_has_cooled(desk):
+    reason = "this machine has no record of its heat"
+    with desk.open() as record:
+        record.load()
+        why, cooling_s = record.read_cooling()
+        assert (why, record.describe()) == (reason, f"hot, because {reason}; it cools within {cooling_s:.0f} s")
+        record.begin_use()
+        desk.up_s += 100.0
+        record.save(desk.budget)
+    for boot, up_s, passed_s in (("a run", UP_S + 300.0, 300.0), ("the next", 50.0, 150.0)):
+        desk.boot, desk.up_s = boot, up_s
+        with desk.open() as record:
+            record.load()
+            assert record.read_cooling() == (reason, pytest.approx(cooling_s - passed_s))
+            assert record.describe().startswith(f"still warm, because {reason}; ")
+    desk.up_s += cooling_s
+    with desk.open() as record:
+        record.load()
+        assert (record.describe(), record.read_cooling()) == ("recorded", ("", 0.0))
+
+
+def test_a_record_knows_its_owner(desk):
+    for owner, other, expected in (("me", "me", True), ("me", "you", False), ("", "", False)):
+        with HeatRecord("helios", "any", desk.display, ManualClock(), owner=owner) as record:
+            record.load()
+            record.begin_use()
+        with HeatRecord("helios", "any", desk.display, ManualClock(), owner=other) as record:
+            record.load()
+            assert record.is_own is expected
