@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 OMITTED_LISTED_MAX = 5
 PIXELS_LISTED_MAX = 20
 LATE_LISTED_MAX = 5
+TRAINS_LISTED_MAX = 5
 
 
 def format_plan_summary(summary: "PlanSummary") -> list[str]:
@@ -40,6 +41,10 @@ def format_plan_summary(summary: "PlanSummary") -> list[str]:
             lines.append(f"                 {_format_shortfall(summary.shortfall)}")
     else:
         lines.append("trimmed          nothing")
+    lines += [f"peaks            {train.message}" for train in summary.off_target.trains[:TRAINS_LISTED_MAX]]
+    more = summary.off_target.count - TRAINS_LISTED_MAX
+    if more > 0:
+        lines.append(f"peaks            and those of {more} more trains")
     if summary.delays:
         lines.append(f"delayed          {_format_delays(summary.delays)}")
     lines += [f"late             {message}" for message in summary.late_messages[:LATE_LISTED_MAX]]

@@ -6,14 +6,15 @@ The engine, `optodrive plan` and `optodrive simulate` use this pipeline.
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import inf
+from typing import TypeGuard
 
 import numpy as np
 
 from optodrive.core.errors import RefusedError
-from optodrive.core.types.arrays import IntArray
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.core.types.push_options import Policy
-from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
+from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame, Train
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.batch_limiter import BatchLimiter
 from optodrive.planning.display_model import DisplayModel
@@ -25,6 +26,7 @@ from optodrive.planning.planned_sequence import (
     Delay,
     FrameTiming,
     PlannedSequence,
+    TrainPeaks,
     describe_lateness,
 )
 from optodrive.planning.scheduler.scheduler import TRAIN_BATCH, Scheduler
@@ -33,6 +35,9 @@ from optodrive.planning.sequence_checks import check_targets_reachable, remove_d
 
 CONCATENATE_EVERY = 256
 """Number of batches after which they are concatenated: each holds the headroom of every pixel, even for one pulse."""
+
+ROUNDING_S = 1e-6
+"""Largest difference of a pulse's start from the exact one: half a microsecond, and rounding errors."""
 
 Progress = Callable[[float], None]
 """Receives the completed fraction, 0 to 1."""
@@ -160,6 +165,7 @@ class SequencePlanner:
             skipped=tuple(self._scheduler.skipped),
             frames=_compute_frame_timings(self._sequence, plan, lead_in_s, self._report_progress),
             simultaneous=tuple(self._scheduler.simultaneous),
+            train_peaks=_compute_train_peaks(self._sequence, plan, self._heat.copy(), lead_in_s, self._report_progress),
             shortfall=self._limiter.build_shortfall(),
             delays=_merge_delays(self._limiter.delays),
             galvo_pause_s=self._limiter.galvo_pause_s,
@@ -217,6 +223,76 @@ def _compute_frame_timings(
             )
         )
     return tuple(timings)
+
+
+def _compute_train_peaks(
+    sequence: FrameSequence,
+    plan: LimitedPlan,
+    heat: ThermalState,
+    lead_in_s: float,
+    on_progress: Callable[[], None],
+) -> tuple[TrainPeaks, ...]:
+    """Compute the peaks of all cycles of the trains by height. Changes `heat`, which is that before the plan."""
+    sources = range(len(sequence.frames), len(sequence.frames) + len(sequence.trains))
+    trains = {source: train for source, train in zip(sources, sequence.trains, strict=True) if _is_by_height(train)}
+    if not trains:
+        return ()
+    edges_s = {source: _find_cycle_edges_s(source, train, plan, lead_in_s) for source, train in trains.items()}
+    # A pulse's peak counts until the next pulse on its pixel. Dark pulses at the edges of the cycles separate them.
+    is_one_beam = not plan.stage.any()
+    edge_s = np.concatenate(
+        [
+            _move_behind_pulses(edges_s[source], plan, is_one_beam | (plan.pixel == train.pixel))
+            for source, train in trains.items()
+        ]
+    )
+    edge_pixel = np.repeat([train.pixel for train in trains.values()], [len(each) for each in edges_s.values()])
+    pixel, dark = np.append(edge_pixel, plan.pixel), np.zeros(len(edge_s))
+    start_s = np.append(edge_s, plan.start_s)
+    order = np.argsort(start_s, kind="stable")
+    pixel, start_s = pixel[order], start_s[order]
+    width_s, power_w = np.append(dark, plan.width_s)[order], np.append(dark, plan.power_w)[order]
+    peak_m = heat.apply_pulses(pixel, start_s, width_s, power_w, on_progress).displacement_m
+    result = []
+    for source, train in trains.items():
+        on_progress()
+        rows = np.flatnonzero(pixel == train.pixel)
+        cycle = np.searchsorted(edges_s[source] - ROUNDING_S, start_s[rows], side="right") - 1
+        is_inside = (cycle >= 0) & (cycle < len(edges_s[source]) - 1)
+        train_peak_m = np.zeros(len(edges_s[source]) - 1)
+        np.maximum.at(train_peak_m, cycle[is_inside], peak_m[rows[is_inside]])
+        result.append(TrainPeaks(source, train.pixel, train.target_m, train_peak_m))
+    return tuple(result)
+
+
+def _is_by_height(train: Train) -> TypeGuard[HeightTrain]:
+    return isinstance(train, HeightTrain)
+
+
+def _find_cycle_edges_s(source: int, train: HeightTrain, plan: LimitedPlan, lead_in_s: float) -> FloatArray:
+    """Return the starts of a train's cycles as planned, and the end of the last one, [c + 1]."""
+    starts_s = train.pulse_starts_s()
+    edges_s = lead_in_s + np.append(starts_s, starts_s[-1] + train.period_s)
+    rows = np.flatnonzero(plan.source == source)[::-1]  # of the rows of a cycle, the first one is assigned last
+    cycle = np.searchsorted(edges_s[:-1] - ROUNDING_S, plan.requested_start_s[rows], side="right") - 1
+    late_s = np.full(len(edges_s), np.nan)
+    late_s[cycle] = plan.start_s[rows] - edges_s[cycle]
+    known = np.flatnonzero(np.isfinite(late_s))
+    if len(known):  # a cycle without a pulse is as late as the one before it
+        before = np.searchsorted(known, np.arange(len(late_s)), side="right") - 1
+        edges_s = edges_s + late_s[known[np.maximum(before, 0)]]
+        edges_s[cycle] = plan.start_s[rows]
+    return np.asarray(np.minimum.accumulate(edges_s[::-1])[::-1], dtype=np.float64)
+
+
+def _move_behind_pulses(edges_s: FloatArray, plan: LimitedPlan, rows: BoolArray) -> FloatArray:
+    """Move times that fall into a pulse of some rows to its end: heat cannot be asked about the time before that."""
+    start_s, end_s = plan.start_s[rows], (plan.start_s + plan.width_s)[rows]
+    ends_s = np.maximum.accumulate(np.append(-inf, end_s))
+    behind_s = np.maximum(edges_s, ends_s[np.searchsorted(start_s, edges_s, side="right")])
+    next_s = np.append(start_s, inf)[np.searchsorted(start_s, behind_s - TIME_TOLERANCE_S)]
+    # Of pulses that abut, the later may begin before the end by rounding.
+    return np.asarray(np.minimum(behind_s, next_s), dtype=np.float64)
 
 
 def _refuse_late(planned: PlannedSequence) -> None:

@@ -6,14 +6,18 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.files import atomic_write
+from optodrive.core.types.arrays import IntArray
 from optodrive.core.units import m_to_um
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FeasibilityReport
-from optodrive.planning.planned_sequence import PlannedSequence, Shortfall, describe_lateness
+from optodrive.planning.planned_sequence import PlannedSequence, Shortfall, TrainPeaks, describe_lateness
 from optodrive.planning.summary_schema import (
+    CyclePeak,
     DeadPixelSummary,
     DelaySummary,
     FrameSummary,
+    OffTargetSummary,
+    OffTargetTrain,
     PlanSummary,
     ShortfallSummary,
     SimultaneitySummary,
@@ -24,6 +28,9 @@ from optodrive.planning.summary_schema import (
 
 DEAD_LISTED_MAX = 20
 TRIMMED_LISTED_MAX = 20
+TRAINS_LISTED_MAX, PEAKS_LISTED_MAX, PEAKS_NAMED_MAX = 20, 20, 4
+PEAK_TOLERANCE = 0.02
+"""Relative difference between a peak and the target of its train above which a plan reports it."""
 SKIP_REASON = "the residual heat of the pixel reaches the target without a pulse"
 
 
@@ -52,6 +59,7 @@ def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | No
         below_threshold=planned.below_threshold,
         trimmed=_summarize_trimming(planned),
         shortfall=None if planned.shortfall is None else _summarize_shortfall(planned.shortfall),
+        off_target=_summarize_train_peaks(planned),
         delays=[DelaySummary.from_object(each, source=_name_source(planned, each.source)) for each in planned.delays],
         dead=DeadPixelSummary(
             pixels=list(planned.dead_pixels),
@@ -126,6 +134,45 @@ def _summarize_trimming(planned: PlannedSequence) -> TrimmingSummary:
             )
             for row in worst
         ],
+    )
+
+
+def _summarize_train_peaks(planned: PlannedSequence) -> OffTargetSummary:
+    off_target = [
+        (each, cycles)
+        for each in planned.train_peaks
+        if len(cycles := np.flatnonzero(np.abs(each.peak_m / each.target_m - 1.0) > PEAK_TOLERANCE))
+    ]
+    return OffTargetSummary(
+        count=len(off_target),
+        trains=[
+            _summarize_off_target(each, cycles, _name_source(planned, each.source))
+            for each, cycles in off_target[:TRAINS_LISTED_MAX]
+        ],
+    )
+
+
+def _summarize_off_target(train: TrainPeaks, cycles: IntArray, name: str) -> OffTargetTrain:
+    peaks_um, target_um = m_to_um(train.peak_m[cycles]), m_to_um(train.target_m)
+    min_um, max_um = float(peaks_um.min()), float(peaks_um.max())
+    verb = "differs" if len(cycles) == 1 else "differ"
+    named = [f"{peak_um:.1f} µm in cycle {cycle + 1}" for peak_um, cycle in zip(peaks_um, cycles, strict=True)]
+    if len(named) > PEAKS_NAMED_MAX:
+        named = [*named[: PEAKS_NAMED_MAX - 1], f"… {min_um:.1f} to {max_um:.1f} µm in all"]
+    return OffTargetTrain(
+        train=name,
+        pixel=train.pixel,
+        target_um=target_um,
+        cycles=len(train.peak_m),
+        off_target=len(cycles),
+        min_um=min_um,
+        max_um=max_um,
+        peaks=[
+            CyclePeak(cycle=int(cycle) + 1, peak_um=float(peak_um))
+            for cycle, peak_um in zip(cycles[:PEAKS_LISTED_MAX], peaks_um, strict=False)
+        ],
+        message=f"{len(cycles)} of {len(train.peak_m)} peaks of {name} {verb} from {target_um:.4g} µm by more than "
+        f"{100 * PEAK_TOLERANCE:.0f} %: {', '.join(named)}",
     )
 
 

@@ -62,11 +62,22 @@ class Delay:
 
 
 @dataclass(frozen=True, eq=False)
+class TrainPeaks:
+    """Predicted peaks of a train by height: `peak_m` [c], the largest displacement of each of its cycles, m."""
+
+    source: int
+    pixel: int
+    target_m: float
+    peak_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class PlannedSequence:
     """A limited plan with its prediction. Heat and budget are those after the plan, on the plan's time line.
 
     predicted_m: [n] largest displacement from each pulse's start to the pixel's next pulse
     simultaneous: frames split into interleaved rounds
+    train_peaks: of the trains by height
     shortfall: under policy "trim", None if no pulse was trimmed; delays: under policy "delay"
     galvo_pause_s: total of the pauses in which the mirrors' coils cool
     early_step_s: time by which steps precede the end of the light on a pixel where the mirrors have come to rest
@@ -80,6 +91,7 @@ class PlannedSequence:
     skipped: tuple[SkippedPulse, ...]
     frames: tuple[FrameTiming, ...]
     simultaneous: tuple[SimultaneousFrame, ...]
+    train_peaks: tuple[TrainPeaks, ...]
     shortfall: Shortfall | None
     delays: tuple[Delay, ...]
     galvo_pause_s: float

@@ -59,6 +59,38 @@ class SkippedTarget(JsonModel):
     reason: str
 
 
+class CyclePeak(JsonModel):
+    """Predicted peak of one cycle of a train, counted from 1."""
+
+    cycle: int
+    peak_um: float
+
+
+class OffTargetTrain(JsonModel):
+    """A train by height whose predicted peaks differ from its target by more than 2 %.
+
+    cycles, off_target: number of its cycles, and of those whose peak differs; min_um, max_um: smallest and largest of
+    these peaks; peaks: the first 20 of them; message: all of this in a sentence
+    """
+
+    train: str
+    pixel: int
+    target_um: float
+    cycles: int
+    off_target: int
+    min_um: float
+    max_um: float
+    peaks: list[CyclePeak]
+    message: str
+
+
+class OffTargetSummary(JsonModel):
+    """Trains by height with predicted peaks more than 2 % off their target: number, and the first 20."""
+
+    count: int
+    trains: list[OffTargetTrain]
+
+
 class SimultaneitySummary(JsonModel):
     """How the pulses of a simultaneous frame were interleaved.
 
@@ -114,6 +146,7 @@ class PlanSummary(JsonModel):
     below_threshold: int
     trimmed: TrimmingSummary
     shortfall: ShortfallSummary | None
+    off_target: OffTargetSummary
     delays: list[DelaySummary]
     dead: DeadPixelSummary
     skipped: list[SkippedTarget]

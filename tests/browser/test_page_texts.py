@@ -9,6 +9,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from displays import DISPLAYS
+from optodrive.core.types.stimuli import FrameSequence, HeightTrain
+from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.plan_summary import summarize_plan
 from text_world import PIXELS, TextPage, World
 
 STEPS = 25
@@ -371,6 +375,7 @@ SUMMARY = {
     "predicted_max_um": 99.0,
     "delays": [],
     "trimmed": {"pulses": 0, "by_reason": {}, "energy_j": 0.0},
+    "off_target": {"count": 0, "trains": []},
     "skipped": [
         {"frame": f"f{k}", "pixel": pixel, "target_um": 100.0, "reason": ""} for pixel in range(12) for k in range(9)
     ],
@@ -390,6 +395,27 @@ def test_pixels_that_get_some_pulses_are_not_said_to_need_none(desk):
     page.locator("#result .good").wait_for()
     text = page.locator("#result").inner_text()
     assert "108 targets on 12 pixels need no pulse: the heat left there is sufficient." in text
+
+
+def test_the_preview_names_peaks_that_differ_from_the_height_of_their_train(desk):
+    display = DISPLAYS["display-437"]
+    trains = tuple(HeightTrain(200 + k, 0.2 * k, 0.1, 0.01, 380e-6) for k in range(5))
+    plan = plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state())
+    summary = summarize_plan(plan).model_dump(mode="json")
+    page = desk.page.page
+    desk.run()
+    page.evaluate(
+        "preview => (feed.preview = preview)", {"summary": summary, "pulses": {"pixel": [], "predicted_um": []}}
+    )
+    page.locator("#display").press("Space")
+    page.get_by_role("button", name="Preview").click()
+    page.locator("#result .warn").first.wait_for()
+    text = page.locator("#result").inner_text()
+    for number, train in enumerate(plan.train_peaks[:3]):
+        first, second = 1e6 * train.peak_m[:2]
+        begin = f" of 10 peaks of train {number} differ from 380 µm by more than 2 %: "
+        assert f"{begin}{first:.1f} µm in cycle 1, {second:.1f} µm in cycle 2" in text
+    assert "And peaks of 2 more trains differ." in text
 
 
 def test_stop_without_an_answer_is_heard_once_at_once_and_then_every_few_seconds(desk):

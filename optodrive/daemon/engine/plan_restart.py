@@ -171,7 +171,7 @@ def _find_origin_s(plan: ActivePlan) -> float:
 
 
 def _summarize_again(planned: PlannedSequence, before_json: bytes) -> bytes:
-    """Summarize a plan again. Its feasibility, and the first trimmed pulse, are those of its request."""
+    """Summarize a plan again. Feasibility, first trimmed pulse and peaks of trains are its request's."""
     before = PlanSummary.model_validate_json(before_json)
     summary = summarize_plan(planned)
     return summary.model_copy(update={"feasibility": before.feasibility}).model_dump_json().encode()

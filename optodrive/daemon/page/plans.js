@@ -104,6 +104,13 @@ export class PlanControl extends EventTarget {
       const caps = Object.entries(summary.trimmed.by_reason).map(([cap, count]) => `${count} by ${labelCap(cap)}`);
       lines.push(["warn", `Trimmed: ${summary.trimmed.pulses} pulses (${caps.join(", ")}), ${formatQuantity(summary.trimmed.energy_j, "J")}.`]);
     }
+    const { count, trains } = summary.off_target;
+    for (const train of trains.slice(0, 3)) {
+      lines.push(["warn", `${train.message}.`]);
+    }
+    if (count > 3) {
+      lines.push(["warn", `And peaks of ${count - 3} more ${count === 4 ? "train" : "trains"} differ.`]);
+    }
     for (const delay of summary.delays.slice(0, 3)) {
       lines.push(["warn", `${delay.source} is delayed by ${delay.wait_s.toFixed(2)} s: ${labelCap(delay.cap)}.`]);
     }
