@@ -27,7 +27,7 @@ class Endpoint:
         self.address = address.rstrip("/")
         self.unix_path = parts.path if parts.scheme == "unix" and not parts.netloc and parts.path != "/" else None
         if not self.unix_path and (parts.scheme not in ("http", "https") or not parts.hostname):
-            raise InputError("--url", address, f"an address like {DEFAULT_URL} or unix:/run/optodrive/optodrive.sock")
+            raise InputError("url", address, f"an address like {DEFAULT_URL} or unix:/run/optodrive/optodrive.sock")
         self.url = "http://localhost" if self.unix_path else self.address
         self._port = None if self.unix_path else parts.port or (443 if parts.scheme == "https" else 80)
         self._has_certificate = parts.scheme == "https"  # loading what verifies it takes as long as many requests

@@ -35,7 +35,7 @@ def convert_to_pixels(values: HeightsLike, layout: PixelLayout, name: str = "hei
         return _check_values(array[layout.row, layout.column], name)
     if array.shape != (len(layout),):
         expected = f"{{pixel: value}}, an array of {len(layout)}, or one of {rows} rows and {columns} columns"
-        raise InputError(name, array.shape, expected, "bad_target")
+        raise InputError(name, array.shape or values, expected, "bad_target")
     return _check_values(array, name)
 
 

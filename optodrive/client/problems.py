@@ -59,8 +59,9 @@ def build_error(problem: Problem) -> OptodriveError:
 def _build_typed_error(problem: Problem) -> OptodriveError:
     detail = problem.detail
     if problem.status == 401:
-        expected = f"the daemon's own ({ENVIRONMENT_VARIABLE}, or the file it wrote): {detail}"
-        return InputError("token", "the one given", expected)
+        reason = "" if problem.code == "bad_token" else f": {detail}"
+        expected = f"one of this daemon's ({ENVIRONMENT_VARIABLE}, or the file that it names at its start){reason}"
+        return InputError("token", Unquoted("another one"), expected)
     if problem.status in INPUT_ERROR_STATUSES:
         if problem.where is not None and problem.expected is not None:
             return InputError(problem.where, Unquoted(str(problem.value)), problem.expected)

@@ -297,7 +297,7 @@ class Config(Section):
         return margin_m[0] / (2.0 * scanner.focal_length_m), margin_m[1] / (2.0 * scanner.focal_length_m)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PixelLayout:
     """Pixel positions [p], m, from the optical axis, x to the right, y up. Indices count by rows from the bottom."""
 
@@ -311,6 +311,11 @@ class PixelLayout:
 
     def __len__(self) -> int:
         return len(self.x_m)
+
+    def __repr__(self) -> str:
+        return (
+            f"<PixelLayout: {len(self)} pixels, {int(self.row.max()) + 1} rows × {int(self.column.max()) + 1} columns>"
+        )
 
 
 def build_pixel_layout(display: DisplaySection) -> PixelLayout:

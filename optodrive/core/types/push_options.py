@@ -54,11 +54,11 @@ def check_keywords(kind: type[Class]) -> type[Class]:
     """
     for name, method in list(vars(kind).items()):
         if isfunction(method) and (name == "__init__" or not name.startswith("_")):
-            setattr(kind, name, _check_keywords_of(method))
+            setattr(kind, name, _check_keywords_of(method, kind.__name__ if name == "__init__" else name))
     return kind
 
 
-def _check_keywords_of(method: Callable[..., Any]) -> Callable[..., Any]:
+def _check_keywords_of(method: Callable[..., Any], called: str) -> Callable[..., Any]:
     parameters = signature(method).parameters.values()
     named = {each.name: each.annotation for each in parameters if each.kind in _NAMED and each.name != "self"}
     others = next((each.annotation for each in parameters if each.kind is Parameter.VAR_KEYWORD), None)
@@ -70,9 +70,9 @@ def _check_keywords_of(method: Callable[..., Any]) -> Callable[..., Any]:
         for name, value in keywords.items():
             if name not in named and not is_open:
                 expected = f"a known keyword, {suggest_nearest(name[:60], list(named))}" if named else "no keyword"
-                raise InputError(method.__name__, name, expected, code="unknown_keyword")
+                raise InputError(called, name, expected, code="unknown_keyword")
             if named.get(name) is bool and not isinstance(value, bool):
-                raise InputError(f"{method.__name__}: {name}", value, "True or False")
+                raise InputError(f"{called}: {name}", value, "True or False")
 
     if iscoroutinefunction(method):
 

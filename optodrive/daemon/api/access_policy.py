@@ -24,6 +24,8 @@ from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.problem import Problem, build_problem
 from optodrive.device.config_sections import DaemonSection
 
+PLACE_OF_FILE = "the daemon names the file of its tokens at its start"
+
 
 @dataclass
 class RequestContext:
@@ -96,9 +98,7 @@ class AccessPolicy:
             token = self.find_token(request)
             if token is None:
                 rate_problem = None if is_stop else self._check_rate(request)
-                return rate_problem or build_problem(
-                    401, "bad_token", "Not authorised", "a bearer token is required; the daemon wrote it to a file"
-                )
+                return rate_problem or _build_token_problem(_read_presented_token(request))
             request.token = token
         request.route = route
         if is_stop:
@@ -137,7 +137,8 @@ class AccessPolicy:
                 return build_problem(
                     405, "method_not_allowed", "Method Not Allowed", method_and_path, allow=", ".join(methods)
                 )
-            return build_problem(404, "route_not_found", "Not Found", method_and_path)
+            detail = f"{method_and_path}: {table.suggest_path(request.path)}"
+            return build_problem(404, "route_not_found", "Not Found", detail)
         token, min_role = request.token, request.route.min_role
         if min_role is not None and not is_role_sufficient(token.role, min_role):
             detail = (
@@ -153,6 +154,14 @@ class AccessPolicy:
             return None
         detail = f"content-length: got {length[:20]}, expected at most {limit} bytes"
         return build_problem(413, "body_too_large", "Body too large", detail)
+
+
+def _build_token_problem(presented: str) -> Problem:
+    """Build the problem document of a request without a valid token."""
+    detail = "a token is required, in the header `Authorization: Bearer TOKEN`"
+    if presented:
+        detail = "the token of this request is not one of the daemon's"
+    return build_problem(401, "bad_token", "Not authorised", f"{detail}; {PLACE_OF_FILE}")
 
 
 def _check_options(request: RequestContext) -> Problem | None:

@@ -14,6 +14,7 @@ from fastapi.routing import APIRoute, APIWebSocketRoute
 from starlette.routing import BaseRoute, WebSocketRoute, compile_path
 from starlette.routing import Route as HttpRoute
 
+from optodrive.core.errors import suggest_near_name
 from optodrive.daemon.api.roles import Role, is_role_sufficient
 
 STOP = "POST /v1/stop"
@@ -95,6 +96,11 @@ class RouteTable:
     def find_methods(self, path: str) -> tuple[str, ...]:
         """Return the methods that a path accepts, none for an unknown path."""
         return tuple(route.method for route in self._routes if route.path.fullmatch(path))
+
+    def suggest_path(self, path: str) -> str:
+        """Return a phrase with the paths nearest to one that no route has, for a caller who misspelt it."""
+        nearest = suggest_near_name(path[:60], sorted({route.key.partition(" ")[2] for route in self._routes}))
+        return f"no such route, {nearest or '/openapi.json lists all'}"
 
 
 def _build_entries(route: BaseRoute) -> Iterator[Route]:

@@ -68,20 +68,22 @@ def test_an_unknown_keyword_is_refused_by_name(kind, name, method):
 
 @pytest.mark.parametrize(("kind", "name", "method"), METHODS)
 def test_a_misspelt_keyword_is_refused_with_the_nearest(kind, name, method):
+    place = kind.__name__ if name == "__init__" else name
     for keyword, _ in list_keywords(method):
         if name not in OPEN and kind is not client.Plan:
             for wrong in (keyword[:-1] + "x", keyword.upper(), keyword + "_"):
-                with pytest.raises(InputError, match=f"{name}: got '{wrong}', expected .* nearest is '{keyword}'"):
+                with pytest.raises(InputError, match=f"^{place}: got '{wrong}', expected .* nearest is '{keyword}'"):
                     call(kind, method, **{wrong: True})
 
 
 @pytest.mark.parametrize(("kind", "name", "method"), METHODS)
 def test_a_flag_is_true_or_false(kind, name, method):
     """Text is true, so that "false" would be, and in a query it is false, so that a dry run would emit."""
+    place = kind.__name__ if name == "__init__" else name
     for keyword, annotation in list_keywords(method):
         if annotation is bool:
             for value in ("false", "true", 0, None):
-                with pytest.raises(InputError, match=f"{name}: {keyword}: got {value!r}, expected True or False"):
+                with pytest.raises(InputError, match=f"^{place}: {keyword}: got {value!r}, expected True or False"):
                     call(kind, method, **{keyword: value})
 
 

@@ -103,6 +103,31 @@ def test_a_page_from_elsewhere_is_refused(check, host, origin):
     assert check(host=host, origin=origin) == "origin_not_allowed"
 
 
+@pytest.mark.parametrize(
+    ("path", "token", "status", "title", "says"),
+    [
+        (
+            "/v1/state",
+            None,
+            401,
+            "Not authorised",
+            "a token is required, in the header `Authorization: Bearer TOKEN`; the",
+        ),
+        ("/v1/state", "guessed", 401, "Not authorised", "the token of this request is not one of the daemon's; the"),
+        ("/v1/plan", "eve", 404, "Not Found", "GET /v1/plan: no such route, nearest is '/v1/plans"),
+        ("/openapi", "eve", 404, "Not Found", "GET /openapi: no such route, nearest is '/openapi.json'"),
+        ("/x9z", "eve", 404, "Not Found", "GET /x9z: no such route, /openapi.json lists all"),
+    ],
+)
+def test_a_refusal_tells_a_missing_token_from_another_and_the_nearest_route(app, path, token, status, title, says):
+    policy, headers = AccessPolicy(TOKENS, DaemonSection()), {"host": "localhost"}
+    if token is not None:
+        headers["authorization"] = f"Bearer {token}"
+    problem = policy.check(RequestContext("GET", path, headers, "127.0.0.1"), RouteTable(app.routes))
+    assert (problem.status, problem.title) == (status, title)
+    assert problem.detail.startswith(says)
+
+
 @pytest.fixture
 def audited(app, tmp_path):
     """Function that sends one request through the middleware. It returns the audit's entries after all requests."""
