@@ -125,7 +125,7 @@ def test_the_command(tmp_path, capsys):
     assert "held-out error" in output
     record.write_text("t_s,flow\n0,1\n")
     assert run(["discover", str(model), str(record)]) == 2
-    assert capsys.readouterr().err.strip().endswith("expected a column measured")
+    assert capsys.readouterr().err.strip().endswith("expected a column measured too")
 
 
 def test_a_record_that_does_not_fit_is_refused(tmp_path):
@@ -133,6 +133,8 @@ def test_a_record_that_does_not_fit_is_refused(tmp_path):
         Record(np.zeros(10), np.zeros((10, 1)), np.zeros((10, 1)))
     with pytest.raises(InputError, match="1 columns: voltage"):
         discover(motor_model(), [Record(np.arange(100.0), np.zeros((100, 2)), np.zeros((100, 1)))])
-    (tmp_path / "record.csv").write_text("t_s,voltage,encoder\n0,0," + "1" * 200_000)
-    with pytest.raises(InputError, match=r"record\.csv: got 'field larger than field limit .*expected a CSV file"):
+    (tmp_path / "record.csv").write_text("t_s,voltage,angle_measured\n0,0," + "1" * 200_000)
+    with pytest.raises(
+        InputError, match=r"record\.csv: row 2: got field larger than field limit .*expected a CSV file"
+    ):
         read_record(tmp_path / "record.csv", motor_model())

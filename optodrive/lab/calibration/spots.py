@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.numeric_tables import read_columns, split_comments, write_columns
+from optodrive.core.numeric_tables import read_columns, read_comments, write_columns
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.field_geometry import CODE_MAX
 
@@ -48,7 +48,7 @@ def read_spots(path: Path, display: str = "") -> MeasuredSpots:
     display: name of the display, of which the spots must be if they name theirs; empty: any
     """
     table = read_columns(path, COLUMNS)
-    comments, _ = split_comments(path)
+    comments = read_comments(path)
     named = next((line.removeprefix(ORIGIN) for line in comments if line.startswith(ORIGIN)), "")
     if display and named and named != display:
         raise InputError(f"{path}: spots", f"those of {named}", f"those of {display}, the configured display")
@@ -83,7 +83,7 @@ def read_spots(path: Path, display: str = "") -> MeasuredSpots:
 
 def find_first_line(path: Path) -> int:
     """Return the line number of the first spot in a file."""
-    return len(split_comments(path)[0]) + 2
+    return len(read_comments(path)) + 2
 
 
 def write_spots(path: Path, spots: MeasuredSpots, display: str) -> None:

@@ -1,18 +1,17 @@
 """Recording as a folder: `recording.toml`, and per run a subfolder with `pulses.csv` and one CSV file per signal."""
 
-import csv
 import json
 import shutil
 import tempfile
-from array import array
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.numeric_tables import CsvTable, open_table
 from optodrive.core.toml_file import read_toml
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run, Signal
@@ -75,18 +74,17 @@ class CsvTree(RecordingTree):
 
     def read_table(self, run: str, name: str) -> FloatArray:
         """Return a table of a run, [n, columns]."""
-        return self._read_csv(run, name, TABLE_COLUMNS[name], missing=False)
+        return self._read_csv(run, name, TABLE_COLUMNS[name], ())
 
     def read_samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
         """Return the times and values of a signal."""
-        columns = self._read_csv(run, signal, SAMPLE_COLUMNS, missing=True)
+        columns = self._read_csv(run, signal, SAMPLE_COLUMNS, ("value",))
         return columns[:, 0].copy(), columns[:, 1].copy()
 
     def count_samples(self, run: str, signal: str) -> int:
-        """Return the number of samples of a signal by counting lines."""
-        path = self._find_file(run, signal)
-        with convert_errors(str(path), "a readable CSV file"), path.open("rb") as file:
-            return max(0, sum(1 for line in file if line.strip()) - 1)
+        """Return the number of samples of a signal by counting rows."""
+        with self._open_table(run, signal, SAMPLE_COLUMNS) as table:
+            return sum(1 for _ in table.rows())
 
     def _get_run_table(self, run: str) -> dict[str, Any]:
         return self._get_run_tables().get(run, {})
@@ -110,48 +108,26 @@ class CsvTree(RecordingTree):
                 raise InputError(self.format_place(run, name), None, f"the file {run}/{name}.csv")
         return path
 
-    def _read_csv(self, run: str, name: str, columns: tuple[str, ...], missing: bool) -> FloatArray:
-        path = self._find_file(run, name)
+    @contextmanager
+    def _open_table(self, run: str, name: str, columns: tuple[str, ...]) -> Iterator[CsvTable]:
+        """Open a table or a signal, whose value may also have the signal's name."""
+        path, place = self._find_file(run, name), self.format_place(run, name)
+        with (
+            convert_errors(place, f"CSV: {','.join(columns)}"),
+            open_table(path, columns, place, {"value": name} if columns == SAMPLE_COLUMNS else {}) as table,
+        ):
+            yield table
+
+    def _read_csv(self, run: str, name: str, columns: tuple[str, ...], missing: tuple[str, ...]) -> FloatArray:
         place = self.format_place(run, name)
-        numbers = array("d")
-        with convert_errors(place, f"CSV: {','.join(columns)}"), path.open(newline="", encoding="utf-8-sig") as file:
-            lines = csv.reader(file)
-            _check_header(place, next(lines, []), columns)
-            for row in lines:
-                if not row:
-                    continue
-                self._budget.reserve(place, len(columns))
-                if len(row) == len(columns):
-                    with suppress(ValueError):  # rows with other than numbers are parsed per cell
-                        numbers.extend([float(cell) for cell in row])
-                        continue
-                numbers.extend(_parse_row(f"{place}, line {lines.line_num}", row, columns, missing))
-        return np.array(numbers, dtype=np.float64).reshape(-1, len(columns))
+        with self._open_table(run, name, columns) as table:
+            return table.read_numbers(missing, lambda: self._budget.reserve(place, len(columns)))
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(str(path), Unquoted("no file of this name"), "a TOML file that describes the recording")
     return read_toml(path, TOML_BYTES_MAX)
-
-
-def _check_header(place: str, header: list[str], columns: tuple[str, ...]) -> None:
-    if tuple(cell.strip() for cell in header) != columns:
-        raise InputError(f"{place}, line 1", ",".join(header), f"the header {','.join(columns)}")
-
-
-def _parse_row(place: str, row: list[str], columns: tuple[str, ...], missing: bool) -> list[float]:
-    if len(row) != len(columns):
-        raise InputError(place, Unquoted(f"{len(row)} cells"), f"{len(columns)}: {','.join(columns)}")
-    numbers = []
-    for cell, column in zip(row, columns, strict=True):
-        # Only a sample's value may be missing.
-        blank = missing and column == "value" and not cell.strip()
-        try:
-            numbers.append(float("nan" if blank else cell))
-        except ValueError:
-            raise InputError(f"{place}: {column}", cell, "a number") from None
-    return numbers
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """Reader of pictures.toml, which describes the pictures of a folder and the codes of the beam in each."""
 
-import csv
 import os
 import re
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pydantic import Field as Item
 from pydantic import model_validator
 
 from optodrive.core.errors import InputError
+from optodrive.core.numeric_tables import open_table
 from optodrive.core.plausibility import PlausibleRange, check_plausible
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format, parse_table
@@ -139,7 +139,7 @@ def _list_by_name(folder: Path, path: Path, section: SpotsSection) -> tuple[Spot
         codes = CODES_IN_NAME.search(picture.name)
         if codes is None:
             raise InputError(where, picture.name, "a name that ends with both codes, such as spot_32768_17404.png")
-        x_code, y_code = (_parse_code(f"{where}: {picture.name}", each) for each in codes.groups())
+        x_code, y_code = (_check_code(f"{where}: {picture.name}", float(each)) for each in codes.groups())
         pictures.append(SpotPicture(picture, x_code, y_code))
     if not pictures:
         raise InputError(where, pattern, f"a pattern that matches pictures in {folder}")
@@ -147,31 +147,20 @@ def _list_by_name(folder: Path, path: Path, section: SpotsSection) -> tuple[Spot
 
 
 def _list_by_table(folder: Path, name: str) -> tuple[SpotPicture, ...]:
-    path = folder / name
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [[cell.strip() for cell in row] for row in csv.reader(file)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(str(path), str(error), "a readable CSV file") from None
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise InputError(f"{path}: first line", ",".join(rows[0]) if rows else "", f"'{','.join(COLUMNS)}'")
-    pictures = []
-    for number, row in enumerate(rows[1:], start=2):
-        where = f"{path}: row {number}"
-        if not row:
-            continue
-        if len(row) != len(COLUMNS):
-            raise InputError(where, ",".join(row), ", ".join(COLUMNS))
-        codes = [_parse_code(f"{where}: {column}", cell) for column, cell in zip(COLUMNS[1:], row[1:], strict=True)]
-        pictures.append(SpotPicture(_require_picture(folder, row[0], f"{where}: file"), codes[0], codes[1]))
+    path, pictures = folder / name, []
+    with open_table(path, COLUMNS) as table:
+        for line, (picture, *cells) in table.rows():
+            codes = [table.parse_number(line, column, cell) for column, cell in zip(COLUMNS[1:], cells, strict=True)]
+            where = f"{path}: row {line}"
+            for column, code in zip(COLUMNS[1:], codes, strict=True):
+                _check_code(f"{where}: {column}", code)
+            pictures.append(
+                SpotPicture(_require_picture(folder, picture.strip(), f"{where}: file"), codes[0], codes[1])
+            )
     return tuple(pictures)
 
 
-def _parse_code(where: str, text: str) -> float:
-    try:
-        code = float(text)
-    except ValueError:
-        raise InputError(where, text, "a number") from None
+def _check_code(where: str, code: float) -> float:
     if not 0.0 <= code <= CODE_MAX:
-        raise InputError(where, text, f"a code, 0 to {CODE_MAX}")
+        raise InputError(where, code, f"a code, 0 to {CODE_MAX}")
     return code
