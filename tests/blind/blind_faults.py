@@ -354,7 +354,7 @@ STAMPS: dict[str, Callable[[datetime], object]] = {
     "labview": lambda at: (at - datetime(1904, 1, 1, tzinfo=UTC)).total_seconds(),
     "clock_only": lambda at: at.strftime("%H:%M:%S"),
 }
-"""Start times as spreadsheets and loggers write them. From `american` on, nobody can read them without asking."""
+"""Start times as spreadsheets and loggers write them. From `american` on, nobody can read them without a question."""
 
 
 def _draw_stamps(rng: Rng, scales: Scales) -> Fault:
@@ -363,9 +363,9 @@ def _draw_stamps(rng: Rng, scales: Scales) -> Fault:
     start = datetime(2025, 1 + int(rng.integers(12)), 1 + int(rng.integers(12)), 9, 7, tzinfo=UTC)
     if form == "autumn":  # the clock goes from 3:00 to 2:00 at 1:00 UTC, in the middle of the session
         start = datetime(2025, 10, 26, 1, 0, tzinfo=UTC) - timedelta(seconds=0.5 * scales.case.runs[-1].session_s)
-    if form in ("american", "british") and rng.random() < 0.4:  # past midnight into a day that is no month
-        start = start.replace(day=12, hour=23, minute=50)
     is_unclear = list(STAMPS).index(form) >= list(STAMPS).index("american")
+    if form in ("american", "british") and rng.random() < 0.4:  # past midnight into a day that is no month
+        start, is_unclear = start.replace(day=12, hour=23, minute=58), False
 
     def files(_: Rng, session: Session) -> None:
         for run in scales.case.runs:

@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 import zlib
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from datetime import timedelta
@@ -164,13 +165,33 @@ def diagnose(path: Path) -> Said:
     return Said(answer, done.stderr.strip() if done.returncode else "", time.monotonic() - began)
 
 
-def run_case(kind: str, seed: int, cause: str) -> dict[str, object]:
+def diagnose_quickly(path: Path) -> Said:
+    """Return the answer of the library: that of the command line without a search for terms outside the catalogue."""
+    from optodrive.core.errors import OptodriveError
+    from optodrive.lab.diagnosis.diagnose import diagnose as study
+    from optodrive.lab.diagnosis.narrative import build_answer
+    from optodrive.lab.diagnosis.priors import build_prior
+    from optodrive.lab.recording import read_recording
+
+    began = time.monotonic()
+    try:
+        measurement = read_recording(path)
+        prior, epsilon, _ = build_prior(measurement, None)
+        answer, message = json.loads(json.dumps(build_answer(study(measurement, 0, prior, epsilon)))), ""
+    except OptodriveError as error:
+        answer, message = {}, f"optodrive: {error}"
+    except Exception:
+        answer, message = {}, traceback.format_exc()
+    return Said(answer, message, time.monotonic() - began)
+
+
+def run_case(kind: str, seed: int, cause: str, *, quick: bool = False) -> dict[str, object]:
     """Draw, record, diagnose and judge one case, and return its row."""
     with tempfile.TemporaryDirectory(prefix="blind-") as name:
         folder = Path(name)
         case = draw_hidden(kind, seed, cause, folder)
         faults = draw_faults(kind, seed, case)
-        said = diagnose(record(case, faults, folder / "recording.h5"))
+        said = (diagnose_quickly if quick else diagnose)(record(case, faults, folder / "recording.h5"))
     outcome = judge(case, faults, said, weak=kind == "weak")
     answer = said.answer
     omitted = said.omissions
@@ -261,6 +282,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=parse_seeds, default=range(3), help="0:3; from 100 on for judging only")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, help="JSON lines: rows are added, and those there are not run again")
+    parser.add_argument("--quick", action="store_true", help="call the library, without the search for new terms")
     parser.add_argument("--table", action="store_true", help="only print the table of --out")
     options = parser.parse_args()
     kinds = list(KINDS) if options.kinds == "all" else options.kinds.split(",")
@@ -277,7 +299,7 @@ def main() -> None:
     done = {(r["kind"], r["seed"], "weak" if r["kind"] == "weak" else r["cause"]) for r in rows}
     tasks = [] if options.table else [task for task in tasks if task not in done]
     with ProcessPoolExecutor(options.processes) as pool:
-        for future in as_completed([pool.submit(run_case, *task) for task in tasks]):
+        for future in as_completed([pool.submit(run_case, *task, quick=options.quick) for task in tasks]):
             row = json.loads(json.dumps(future.result()))
             rows.append(row)
             print(format_row(row), flush=True)

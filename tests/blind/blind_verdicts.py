@@ -21,6 +21,8 @@ INSTRUMENT_TERMS = frozenset(
 )
 """Terms of the catalogue that are not in the pixel."""
 LAGS = frozenset(("sensor_lag", "clock_offset", "smoothing"))
+FEW_RUNS = 4
+"""Largest number of touched runs of which a text must name one, rather than the signal."""
 HEIGHTS_OFF = 0.02
 """Error of heights that an answer need not state, relative."""
 
@@ -48,29 +50,33 @@ def _set(*keys: str) -> frozenset[str]:
 
 ALLOWED: dict[str, Allowed] = {
     # Verdict as without these runs, which are left out by name.
-    "flat": Allowed(words=r"flat|dead|constant|loose|noise only|no response|does not (follow|respond)|stuck|left out"),
+    "flat": Allowed(
+        words=r"flat|dead|constant|loose|stuck|noise only|no response|does not (?:follow|respond)|left out"
+    ),
     # Verdict as without the clipped samples, which are left out by name.
-    "ceiling": Allowed(words=r"clip|ceiling|floor|saturat|range|limit|plateau", refusal=True),
+    "ceiling": Allowed(words=r"clip|ceiling|floor|saturat|plateau|end of (?:its|the) range", refusal=True),
     "time_rate": Allowed(_set("time_rate"), _set("clock_offset"), refusal=True),
     # A trailing mean is a delay and a symmetrical mean; a lag of the sensor has this form, too.
     "moving_mean": Allowed(_set("smoothing", "sensor_lag"), LAGS, refusal=True),
     "zero_phase": Allowed(_set("smoothing"), LAGS, refusal=True),
     # Held values are late by half their period and smoothed.
-    "hold": Allowed(_set(), LAGS, words=r"held|hold|repeat|interpolat|rate|resampl", refusal=True),
+    "hold": Allowed(_set(), LAGS, words=r"\bheld\b|repeated|interpolat|lines between|resampl|\bhold", refusal=True),
     "high_pass": Allowed(_set("high_pass"), twins=_set("gas_leak", "wall_heating", "membrane_creep"), refusal=True),
     "signal_clock": Allowed(_set("clock_offset"), _set("sensor_lag", "smoothing")),
-    "outliers": Allowed(words=r"outlier|single sample|sample.* off|spike|left out"),
+    "outliers": Allowed(words=r"outlier|deviat|spike|off by|left out"),
     "slow_drift": Allowed(_set(), _set("ambient_drift")),
     "quantised": Allowed(refusal=True),
     "coloured": Allowed(),
     "free_running": Allowed(),
     # Start times that can be read are read; what is ambiguous is refused or said.
     "stamps": Allowed(words=r"started_at|start time|time ?stamp|zone|month", refusal=True),
-    "sentinel": Allowed(words=r"impossible|sentinel|missing|range|between|outlier|left out|likely", refusal=True),
-    "exchanged": Allowed(words=r"exchang|resembl|swap|command|other run|fits|left out|better", refusal=True),
-    "trigger": Allowed(words=r"trigger|late|early|start|ms|left out|shift|time", refusal=True),
-    "sign": Allowed(words=r"sign|invert|negativ|revers|turned", refusal=True),
-    "gain_run": Allowed(words=r"gain|scale|power|run|left out"),
+    "sentinel": Allowed(words=r"impossible|sentinel|no measured|cannot|outlier|left out|likely|expected", refusal=True),
+    "exchanged": Allowed(words=r"exchang|resembl|swap|each other|left out|better", refusal=True),
+    "trigger": Allowed(
+        words=r"trigger|\blate\b|\bearly\b|clock|shift|(?:after|before) the light|left out", refusal=True
+    ),
+    "sign": Allowed(words=r"\bsign\b|invert|negativ|revers|turned|−1|falls while", refusal=True),
+    "gain_run": Allowed(words=r"gain|scale|power|left out"),
     "gap": Allowed(_set(), _set("clock_offset")),
 }
 """Kind of fault → truthful answers, beside nothing and beside every cause."""
@@ -92,19 +98,19 @@ class Said:
     @property
     def omissions(self) -> list[Any]:
         """What the answer did not use."""
-        return list(self.answer.get("left_out") or self.answer.get("omitted") or ())
+        return list(self.answer.get("left_out") or ())
 
     @property
     def texts(self) -> list[str]:
         """Every statement about the data, each as one text."""
         if self.message:
             return [self.message]
-        keys = ("disturbances", "doubts", "failures", "remarks")
+        keys = ("data", "disturbances", "doubts", "failures", "remarks")
         parts: list[Any] = [*self.omissions]
         for key in keys:
             held = self.answer.get(key) or ()
             parts += [held] if isinstance(held, str) else list(held.items() if isinstance(held, dict) else held)
-        return [part if isinstance(part, str) else json.dumps(part) for part in parts]
+        return [part if isinstance(part, str) else json.dumps(part, ensure_ascii=False) for part in parts]
 
 
 @dataclass(frozen=True)
@@ -123,10 +129,17 @@ class Outcome:
 
 
 def is_named(fault: Any, said: Said) -> bool:
-    """Return whether some text names a touched run or signal, with a word for the fault."""
-    places = [*fault.runs, *fault.signals] or ["started_at", "start time", "timestamp"]
+    """Return whether some text names a touched run, or the signal of many runs, with a word for the fault."""
+    places = list_places(fault)
     word = re.compile(ALLOWED[fault.kind].words, re.IGNORECASE)
     return any(word.search(text) and any(place in text for place in places) for text in said.texts)
+
+
+def list_places(fault: Any) -> list[str]:
+    """Return the names of which a truthful text holds one."""
+    if not fault.signals:
+        return ["started_at"]
+    return list(fault.runs) if 0 < len(fault.runs) <= FEW_RUNS else [*fault.runs, *fault.signals]
 
 
 def compute_heights(case: Any, answer: dict[str, Any]) -> tuple[float, float] | None:
@@ -193,7 +206,7 @@ def _judge_refusal(faults: tuple[Any, ...], said: Said) -> Outcome:
     if len(line) != 1:
         return Outcome("missed", f"refused in {len(line)} lines")
     for fault in faults:
-        places = [*fault.runs, *fault.signals] or ["started_at"]
+        places = [*list_places(fault), *fault.signals]
         if ALLOWED[fault.kind].refusal and any(place in said.message for place in places):
             return Outcome("right", f"refused by name: {fault.kind}")
     return Outcome("missed", "refused without need, or without a name")

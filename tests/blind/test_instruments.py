@@ -46,7 +46,7 @@ def clean(case, tmp_path_factory):
 
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_fault_touches_its_signals_and_runs_and_nothing_else(case, clean, tmp_path, kind):
-    for seed in range(4):
+    for seed in range(2):
         faults = draw_faults(kind, seed, case)
         traces, stamps = read(record(case, faults, tmp_path / f"{seed}.h5"))
         assert traces.keys() == clean[0].keys()
@@ -78,14 +78,14 @@ def test_a_case_is_the_same_each_time(case, tmp_path):
 
 def test_mixed_kinds_hold_one_to_four_faults(case):
     for count, kind in enumerate(MIXED, start=1):
-        drawn = [tuple(f.kind for f in draw_faults(kind, seed, case)) for seed in range(8)]
+        drawn = [tuple(f.kind for f in draw_faults(kind, seed, case)) for seed in range(5)]
         assert all(len(set(kinds)) == count for kinds in drawn)
-        assert len(set(drawn)) > 4
+        assert len(set(drawn)) > 2
 
 
 def test_faults_have_their_size(case, tmp_path):
     scales = measure_scales(case)
-    for seed in range(6):
+    for seed in range(4):
         for kind in ("ceiling", "signal_clock", "quantised"):
             (fault,) = draw_faults(kind, seed, case)
             traces, _ = read(record(case, (fault,), tmp_path / "recording.h5"))
@@ -98,8 +98,9 @@ def test_faults_have_their_size(case, tmp_path):
                 assert (fault.sizes["side"] * (values - fault.sizes["at"])).max() <= 1e-9
 
 
-def test_start_times_are_written_in_every_form(case, tmp_path):
-    forms = {draw_faults("stamps", seed, case)[0].form for seed in range(120)}
+def test_start_times_are_written_in_every_form(case):
+    scales = measure_scales(case)
+    forms = {FAULTS["stamps"](np.random.default_rng(seed), scales).form for seed in range(120)}
     assert forms == set(STAMPS)
 
 
@@ -152,7 +153,7 @@ ANSWERS = [
 def test_answers_are_marked_as_the_table_says(kind, hidden, verdict, causes, text, mark):
     fault = Fault(kind, "", (DISPLACEMENT,), (RUN,) if kind == "flat" else ())
     hidden_case = SimpleNamespace(causes=hidden)
-    answer = {"verdict": verdict, "causes": causes, "omitted": [text] if text else []}
+    answer = {"verdict": verdict, "causes": causes, "remarks": [text] if text else []}
     outcome = judge(hidden_case, (fault,), Said(answer, ""))
     assert outcome.mark == mark, outcome.why
     assert outcome.accuses_pixel == (
