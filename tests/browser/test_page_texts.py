@@ -13,7 +13,7 @@ from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
-from text_world import PIXELS, TextPage, World
+from text_world import CAPS, PIXELS, TextPage, World
 
 STEPS = 25
 UNASKED_MIN_MS = 2900
@@ -183,6 +183,9 @@ def judge_fingers(shown, world):
     dots = number(r"A page of (\d+) dots? stands", shown["standing"]) or 0
     if dots != len(world.page):
         yield f"{shown['standing']!r}: {len(world.page)} dots"
+    named = re.findall(r"The cap “([^”]+)” takes light from it\.", shown["standing"])
+    if named != [CAPS[cap] for cap in world.caps]:
+        yield f"{shown['standing']!r}: limited by {world.caps}"
     if len(shown["fingers"]) != len(world.fingers):
         yield f"{shown['fingers']}: {len(world.fingers)} fingers"
     for line in shown["fingers"]:
@@ -279,6 +282,13 @@ class Desk:
 @pytest.fixture
 def desk(open_page):
     return Desk(open_page())
+
+
+def test_every_cap_has_a_sentence_beside_the_page_from_which_it_takes_light(desk):
+    desk.world.page = [3]
+    for cap, label in CAPS.items():
+        desk.world.caps = [cap]
+        assert desk.run()["standing"] == f"A page of 1 dot stands. The cap “{label}” takes light from it."
 
 
 def test_a_pixel_that_falls_between_its_pulses_is_told_by_its_peaks(desk):
@@ -467,6 +477,7 @@ MUTANTS = {
     "times of loading": ("history.js", "Date.now() - 1000 * plan.age_s", "Date.now()"),
     "armed while paused": ("arm.js", "isDark ? PAUSED_TEXT : ", ""),
     "the whole of no page": ("fingers.js", '"lost" && this.dots > 0', '"lost"'),
+    "caps of the page before": ("fingers.js", "this.caps = limited_by;", "this.caps.push(...limited_by);"),
     "alerts without a pause": ("announcer.js", "    if (leftMs > 0) {", "    if (false) {"),
 }
 IN_GATE = ("figures of a lost board", "heights of now as the highest", "plays after the end")

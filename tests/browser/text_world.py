@@ -17,6 +17,7 @@ from optodrive.planning.effective_config import build_effective_config
 FOLDER = Path(__file__).parents[2] / "optodrive" / "daemon" / "page"
 MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
 CONFIG_JSON = build_effective_config(DisplayModel.from_config(load_config("display-16"))).model_dump_json()
+CAPS = {key: cap["label"] for key, cap in json.loads(CONFIG_JSON)["limits"]["caps"].items()}
 PIXELS, LEASED = 16, ("ARMING", "ARMED", "RUNNING", "HOLD")
 SAFE_INPUTS = 0b011
 BEGIN_S = 1_800_000_000
@@ -197,12 +198,13 @@ class World:
 
     def __init__(self, seed):
         rng = self.rng = random.Random(seed)
+        self.rng_of_caps = random.Random(seed)
         self.board_s, self.state, self.fault, self.link, self.silence_s = 100.0, "DISARMED", None, "up", 0.02
         self.inputs, self.is_paused, self.has_planner = SAFE_INPUTS, False, True
         self.laser_on_s, self.total, self.number = 3.0, 0, 0
         self.stages = rng.choice([0, 0, 2, 3])
         self.plans, self.executed, self.upcoming = [], [], []
-        self.page, self.fingers, self.tracker = [], [], "none"
+        self.page, self.caps, self.fingers, self.tracker = [], [], [], "none"
         self.height = self.absorber = self.peak = self.hottest = np.zeros(PIXELS)
         self.followed = None
         for _ in range(rng.randint(0, 3)):  # before the page was opened
@@ -310,6 +312,7 @@ class World:
 
     def change_page(self):
         self.page = [] if self.page else self.rng.sample(range(PIXELS), self.rng.randint(1, 9))
+        self.caps = self.rng_of_caps.sample(list(CAPS), self.rng_of_caps.choice([0, 0, 1, 2])) if self.page else []
 
     def touch(self):
         self.tracker = self.rng.choice(["seen", "lost"])
@@ -499,7 +502,7 @@ class World:
             ),
             ("budget", board | {"caps": [], "panel_c": 25.0}),
             ("fingers", board | {"tracker": self.tracker, "fingers": fingers}),
-            ("page", board | {"height": encode(page_um, 0.1) if self.page else ""}),
+            ("page", board | {"height": encode(page_um, 0.1) if self.page else "", "limited_by": self.caps}),
         ]
         if self.fresh or self.fresh_planned:
             pulses = {"planned": self.build_batches(self.fresh_planned), "executed": self.build_batches(self.fresh)}

@@ -69,8 +69,8 @@ def show(daemon):
     return socket(daemon, "/v1/stream?standing=true")
 
 
-def send_page(stream, pixels=PAGE, number=0):
-    stream.send(json.dumps({"frame": number, "target_um": {str(pixel): 50.0 for pixel in pixels}}))
+def send_page(stream, pixels=PAGE, number=0, height_um=50.0):
+    stream.send(json.dumps({"frame": number, "target_um": {str(pixel): height_um for pixel in pixels}}))
     return json.loads(stream.recv())
 
 
@@ -190,6 +190,20 @@ def test_telemetry_says_where_fingers_are_and_what_their_dots_get(armed):
         wait_for(lambda: reader.last("fingers")["tracker"] == "lost", "the tracker to be lost")
         assert reader.last("fingers")["fingers"] == []
     wait_for(lambda: reader.last("page")["height"] == "", "the page to end")
+    reader.close()
+
+
+def test_telemetry_names_the_caps_that_take_light_from_a_page_while_they_do(armed):
+    _board, daemon = armed
+    reader = Reader(daemon)
+    with show(daemon) as stream:
+        answer = send_page(stream, (120,), height_um=500.0)
+        while not answer.get("limited_by"):
+            answer = json.loads(stream.recv())
+        for cap in answer["limited_by"]:
+            wait_for(lambda cap=cap: cap in reader.last("page")["limited_by"], f"{cap} in the telemetry")
+        send_page(stream, (200,), 1)
+        wait_for(lambda: not reader.last("page")["limited_by"], "the end of all caps")
     reader.close()
 
 

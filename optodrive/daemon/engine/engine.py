@@ -221,7 +221,14 @@ class Engine:
                 raise InputError(name, value, "no such option: a stream has no time for more than a policy")
         arrived_s = self.board_s() - (self._clock.now_s() - push.arrived_s)
         select = self.page.select if push.standing else None
-        return self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left, select))
+        future = self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left, select))
+        if push.standing:
+            future.add_done_callback(self._note_page_limits)
+        return future
+
+    def _note_page_limits(self, future: "Future[PlanReport]") -> None:
+        if not future.cancelled() and future.exception() is None:
+            self.page.note_limits(future.result().summary.trimmed.by_reason)
 
     def _require_armed(self) -> None:
         """Raise LinkError or NotReadyError if the board accepts no plans."""

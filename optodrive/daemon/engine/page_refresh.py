@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import ceil, inf
 from typing import Literal
 
@@ -24,6 +24,8 @@ TRACKER_LOST_S = 0.1
 """Without the places of fingers for this time, the page is drawn as if there were none."""
 PAGE_GONE_S = 0.5
 """A page that was not refreshed for this time no longer stands."""
+CAP_GONE_S = 1.0
+"""A cap limits a page for this time after it took light from a refresh."""
 AHEAD_SLOTS = 2
 """A dot is drawn for a finger that will touch it within this number of slots."""
 MOVE_S = 4e-4
@@ -51,6 +53,7 @@ class PageRefresh:
         self._lock = threading.Lock()
         self._page_m, self._selected_s = np.zeros(len(layout)), -inf
         self._intervals_s = deque([inf], INTERVALS_KEPT)
+        self._limited_s: dict[str, float] = {}
 
     def update_fingers(self, at_s: float, places: Sequence[FingerPlace]) -> None:
         """Take the places of all fingers at a time of the host's clock."""
@@ -78,6 +81,17 @@ class PageRefresh:
         """Heights of the page that stands, [p], m, 0 without one."""
         stands = self._clock.now_s() - self._selected_s <= PAGE_GONE_S
         return self._page_m if stands else np.zeros(len(self._layout))
+
+    def note_limits(self, caps: Iterable[str]) -> None:
+        """Note the caps that took light from a refresh."""
+        self._limited_s = self._limited_s | dict.fromkeys(caps, self._clock.now_s())
+
+    @property
+    def limited_by(self) -> tuple[str, ...]:
+        """Caps that took light from the page that stands in the last second, in the order of their names."""
+        now_s = self._clock.now_s()
+        stands = now_s - self._selected_s <= PAGE_GONE_S
+        return tuple(sorted(cap for cap, at_s in self._limited_s.items() if stands and now_s - at_s <= CAP_GONE_S))
 
     def select(self, display: DisplayModel, page: FrameSequence, snapshot: PlanningSnapshot) -> Refresh:
         """Return the part of a page whose turn it is. Raise InputError for a height out of reach."""

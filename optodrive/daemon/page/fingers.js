@@ -1,5 +1,6 @@
 // Fingers and the page that stands: where they are, and the rate and height of the dots under each.
 
+import { labelCap } from "./caps.js";
 import { decodeUint16 } from "./grid.js";
 
 const TRACKERS = {
@@ -26,10 +27,12 @@ export class FingersView {
     this.pitchM = pitchM;
     this.announce = announce;
     this.dots = 0;
+    this.caps = [];
   }
 
-  // Show a page's outline of dots, none without a page.
-  showPage({ height }) {
+  // Show a page's outline of dots, none without a page, and the caps that take light from it.
+  showPage({ height, limited_by }) {
+    this.caps = limited_by;
     const values = decodeUint16(height);
     this.view.page = values.length === this.view.grid.pixels ? values : new Uint16Array(this.view.grid.pixels);
     this.dots = this.view.page.reduce((sum, value) => sum + (value > 0), 0);
@@ -58,7 +61,7 @@ export class FingersView {
 
   // Show nothing: where fingers are and what stands is unknown.
   clear() {
-    const [event, page] = [{ tracker: "unknown", fingers: [] }, { height: "" }];
+    const [event, page] = [{ tracker: "unknown", fingers: [] }, { height: "", limited_by: [] }];
     this.showFingers(event);
     this.showPage(page);
   }
@@ -109,7 +112,8 @@ export class FingersView {
     this.find("fingers").replaceChildren(...this.#fingers.map((finger) => this.#buildLine(finger)));
     const isUsed = !["none", "unknown"].includes(this.#tracker) || this.dots > 0;
     this.find("fingers-panel").hidden &&= !isUsed; // once shown it stays, so that nothing moves
-    const page = this.dots ? `A page of ${this.dots} dots stands.` : "No page stands.";
+    const caps = this.caps.map((cap) => ` The cap “${labelCap(cap)}” takes light from it.`);
+    const page = this.dots ? `A page of ${this.dots} ${this.dots === 1 ? "dot" : "dots"} stands.${caps.join("")}` : "No page stands.";
     this.find("standing").textContent = this.#tracker === "unknown" ? "" : page;
     this.find("tracker").textContent = this.#describeTracker();
   }

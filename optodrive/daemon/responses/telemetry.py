@@ -103,10 +103,14 @@ class FingersEvent(JsonModel):
 
 
 class PageEvent(JsonModel):
-    """Heights of the standing page as base64 of little-endian u16 in 0.1 µm, empty without a page."""
+    """Heights of the standing page as base64 of little-endian u16 in 0.1 µm, empty without a page.
+
+    limited_by: caps that took light from it in the last second
+    """
 
     board_s: float
     height: str
+    limited_by: list[str]
 
 
 EVENTS: Mapping[str, type[JsonModel]] = {

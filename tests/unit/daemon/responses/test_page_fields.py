@@ -37,7 +37,7 @@ from optodrive.daemon.responses.telemetry import (
 )
 from optodrive.planning.effective_config import EffectiveConfig
 from optodrive.planning.stimuli.pattern import PatternDescription, PatternParameter
-from optodrive.planning.summary_schema import DelaySummary, PlanSummary, PulseColumns
+from optodrive.planning.summary_schema import DelaySummary, OffTargetTrain, PlanSummary, PulseColumns
 
 PAGE = Path(optodrive.daemon.__file__).parent / "page"
 VARIABLES = {
@@ -49,7 +49,7 @@ VARIABLES = {
     "main.js": {"config": EffectiveConfig, "pulses": PulseColumns},
     "patterns.js": {"pattern": PatternDescription, "parameter": PatternParameter},
     "permissions.js": {"caller": CallerReport},
-    "plans.js": {"plan": PlanReport, "summary": PlanSummary, "delay": DelaySummary},
+    "plans.js": {"plan": PlanReport, "summary": PlanSummary, "delay": DelaySummary, "train": OffTargetTrain},
     "queue.js": {"plan": QueuedPlan, "queue": QueueReport},
     "dim.js": {"state": StateReport},
     "hold.js": {"report": HoldReport},
