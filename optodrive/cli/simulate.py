@@ -39,7 +39,14 @@ PIXELS_RECORDED_MAX = 16
 def simulate(
     frames: FramesArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="recording.h5", help="Write the recording.")] = None,
-    pixels: Annotated[str | None, typer.Option("--pixels", metavar="0,1,…", help="Pixels to record, or all.")] = None,
+    pixels: Annotated[
+        str | None,
+        typer.Option(
+            "--pixels",
+            metavar="0,1,…",
+            help=f"Pixels to record, or all; by default the {PIXELS_RECORDED_MAX} that rise highest.",
+        ),
+    ] = None,
     dt: Annotated[float, typer.Option("--dt", metavar="SECONDS", help="Time between samples.")] = 1e-3,
     noise: Annotated[
         float, typer.Option("--noise", help="Noise of the recording as a factor of the instruments'; 0: none.")
@@ -126,11 +133,12 @@ def simulate(
     report["truth"] = {"terms": true_terms, "ignored_terms": ignored_terms}
     report |= {"noise": None if out is None else noise, "repeats": repeats, "group": group}
     written = [] if out is None else [*instruments.describe(), *list_written(out)]
-    print_answer(report, [*_format_report(report, truth), *written], json)
+    print_answer(report, [*_format_report(report, truth, selected is None), *written], json)
     exit_unless_fits(feasibility)
 
 
-def _format_report(report: dict[str, Any], truth: Path | None) -> Iterator[str]:
+def _format_report(report: dict[str, Any], truth: Path | None, is_default: bool) -> Iterator[str]:
+    """Yield the lines of a report. is_default: whether no option chose the recorded pixels."""
     yield from format_plan_summary(report["summary"])
     if truth is not None:
         terms, ignored = report["truth"]["terms"], report["truth"]["ignored_terms"]
@@ -138,6 +146,9 @@ def _format_report(report: dict[str, Any], truth: Path | None) -> Iterator[str]:
         if ignored:
             yield f"                 not simulated: {', '.join(ignored)} of its base set (not in planner_terms)"
     yield f"executed         {report['executed']} of {report['planned']} planned"
+    recorded, driven = len(report["pixels"]), report["driven_pixels"]
+    if is_default and recorded < driven:
+        yield f"recorded         {recorded} of {driven} driven pixels; --pixels names others, or all"
     for item in report["pixels"]:
         yield (
             f"pixel {item['pixel']:<10} {item['measured_max_um']:.1f} µm measured, {item['predicted_max_um']:.1f} µm "
@@ -183,6 +194,7 @@ def _build_report(
         "planned": len(planned_sequence.plan),
         "executed": len(executed),
         "complete": executed.complete,
+        "driven_pixels": len(set(planned_sequence.plan.pixel.tolist())),
         "simulated_max_um": m_to_um(float(simulated_m.max())) if len(executed) else 0.0,
         "pixels": [
             {

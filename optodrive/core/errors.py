@@ -146,7 +146,7 @@ def suggest_near_name(name: str, known: list[str]) -> str:
     simplified = {_simplify(each): each for each in known}
     longer = [each for each in simplified if len(name) > 1 and each.startswith(_simplify(name))]
     match = get_close_matches(_simplify(name), longer, n=1, cutoff=0.0)
-    match = match or get_close_matches(_simplify(name), simplified, n=1, cutoff=0.5)
+    match = match or get_close_matches(_simplify(name), simplified, n=1, cutoff=0.6)
     return f"nearest is '{simplified[match[0]]}'" if match else ""
 
 

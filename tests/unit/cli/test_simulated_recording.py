@@ -71,3 +71,14 @@ def test_without_a_name_repeats_share_a_group_and_one_run_may_have_a_name(simula
 def test_settings_without_effect_are_refused(frames, options, expected, capsys):
     assert run(["simulate", frames, *options]) == 2
     assert capsys.readouterr().err == f"optodrive: {expected}\n"
+
+
+def test_pixels_that_are_not_recorded_by_default_are_counted(tmp_path, capsys):
+    path = tmp_path / "all.json"
+    path.write_text(json.dumps({"frames": [{"show_at_s": 0.0, "duration_s": 2.0, "target_um": [50.0] * 437}]}))
+    assert run(["simulate", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert "\nrecorded         16 of 437 driven pixels; --pixels names others, or all\n" in shown
+    assert shown.count("measured") == 16
+    assert run(["simulate", str(path), "--pixels", "3,4"]) == 0
+    assert "driven pixels" not in capsys.readouterr().out

@@ -128,6 +128,7 @@ def test_flags_are_true_or_false():
             "pattern: got 'experiment-7', expected a known pattern, nearest is 'experiment-",
         ),
         ("x" * 5000, {}, "unknown_pattern", "one of experiment-1"),
+        ("hello", {}, "unknown_pattern", "got 'hello', expected a known pattern, one of experiment-1"),
         (
             "all",
             {"heigth_um": 5},
