@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from forked_process import run_process
+from forked_process import FULL_INDICATOR, run_process
 from optodrive.link.transport.link_capture import LinkCapture
 from rig import OPTODRIVE, PATIENT_LEASE_S, Board, long_train, wait_for
 
@@ -108,12 +108,12 @@ def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tm
 
 @pytest.fixture
 def seeded(tmp_path):
-    """Return a function that starts boards with repeating nonces."""
+    """Return a function that starts boards with repeating nonces, whose indicator is on as long as a replay's."""
     boards = []
 
     def make(folder):
         folder.mkdir()
-        boards.append(Board(folder, seed=7))
+        boards.append(Board(folder, seed=7, program=FULL_INDICATOR))
         return boards[-1]
 
     yield make
@@ -125,6 +125,7 @@ def replay(*arguments):
     command = [OPTODRIVE, "wire", "replay", *arguments, "--json"]
     run = run_process(command, capture_output=True, text=True)
     assert run.returncode in (0, 1), run.stderr
+    assert run.stdout, run.stderr
     verdict = json.loads(run.stdout)
     assert run.returncode == (not verdict["identical"])
     return verdict

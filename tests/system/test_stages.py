@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -171,7 +172,18 @@ def test_the_loss_of_one_board_darkens_the_other_within_its_lease(bench):
     assert "stage 'left'" in state["link"]["error"]
 
 
-@pytest.mark.parametrize("end", ["killed", "suspended"])
+def fill(port):
+    """Write to the terminal of a board that does not read until it has no room."""
+    terminal = os.open(port.resolve(), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        with suppress(BlockingIOError):
+            while True:
+                os.write(terminal, bytes(4096))
+    finally:
+        os.close(terminal)
+
+
+@pytest.mark.parametrize("end", ["killed", "suspended", "full"])
 def test_the_other_board_draws_what_is_left_where_configured(programs, tmp_path, end):
     bench = Bench(tmp_path, programs, GOES_ON)
     lost, left = bench.boards
@@ -184,8 +196,11 @@ def test_the_other_board_draws_what_is_left_where_configured(programs, tmp_path,
             lost.kill()
         else:
             lost.process.send_signal(signal.SIGSTOP)
+        if end == "full":
+            fill(lost.port)
         stages = wait_for(lambda: (s := bench.daemon.state()["stages"])[0]["lost"] and s, "the loss")
         assert (stages[0]["connected"], stages[1]["lost"]) == (False, None)
+        assert ("accepts no bytes" in stages[0]["lost"]) == (end == "full")
         assert "stage     left at " in bench.run_command("status")
         assert ": lost, the others go on: " in bench.run_command("status")
         answer = bench.daemon.finished(plan)
@@ -197,6 +212,7 @@ def test_the_other_board_draws_what_is_left_where_configured(programs, tmp_path,
         state = bench.daemon.call("POST", "/v1/stop")
         assert state["stages"][1]["board"]["state"] == "DISARMED"
         assert not left.of("gate")[-1]["on"]
+        assert not left.of("fault")  # as it would have without a lease
     finally:
         bench.stop()
 

@@ -113,7 +113,7 @@ class BoardGroup(GroupState):
                     raise
             else:
                 if self._were_armed and not session.has_arming:
-                    self._lose_alone(session, f"the board {describe_end(session)}")
+                    self._lose_alone(session, f"the board {describe_end(session)}{session.describe_port_fault('; ')}")
         self._were_armed |= self.has_arming and all(one.board.state in ARMED_STATES for one in self._present)
 
     # --- loss of one --------------------------------------------------------------------------------------------

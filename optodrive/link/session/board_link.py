@@ -262,6 +262,11 @@ class BoardLink:
         self.disconnect()
         return message
 
+    def describe_port_fault(self, before: str = "") -> str:
+        """Return the evident fault of the open port with a text before it, or an empty text."""
+        fault = self._transport.describe_fault()
+        return f"{before}{fault}" if fault else ""
+
     def close(self) -> None:
         """Send ABORT if possible and close the link permanently."""
         if self.connected:
@@ -301,9 +306,10 @@ class BoardLink:
         return self._requirements.lease_s if is_short else SILENCE_TIMEOUT_S
 
     def _exchange(self, wait_s: float) -> None:
-        out = self._connection.bytes_to_send(self._clock.now_s(), self._requirements.max_in_flight_bytes)
-        if out:
-            self._transport.write(out)
+        # Written even if there is nothing new: a port sends at the next call what it had no room for.
+        self._transport.write(
+            self._connection.bytes_to_send(self._clock.now_s(), self._requirements.max_in_flight_bytes)
+        )
         data = self._transport.read(wait_s)
         if data:
             now_s = self._clock.now_s()

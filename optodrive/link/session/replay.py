@@ -138,6 +138,7 @@ class Replay:
                 self._clock.sleep(remaining_s)
 
     def _receive(self, wait_s: float) -> None:
+        self._transport.write(b"")  # what there was no room for
         data = self._transport.read(wait_s)
         if data:
             self._owed_s = None

@@ -29,7 +29,7 @@ class Transport(Protocol):
         """Return the bytes that have arrived. Wait at most timeout_s for the first."""
 
     def write(self, data: bytes) -> None:
-        """Hand all of data to the operating system."""
+        """Hand data to the operating system, and the rest of it, if there is no room, at the next calls."""
 
     def fileno(self) -> int | None:
         """Return a descriptor that is readable when bytes have arrived, None if there is none or it is closed."""
@@ -41,7 +41,7 @@ class Transport(Protocol):
         """Close the link. It may be opened again. Do nothing if it is closed."""
 
     def release(self) -> None:
-        """Close permanently and stop everything that open() has started."""
+        """Send unsent data, close permanently, and stop everything that open() has started."""
 
 
 class TransportKind(NamedTuple):

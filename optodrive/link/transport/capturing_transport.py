@@ -32,8 +32,9 @@ class CapturingTransport:
         return data
 
     def write(self, data: bytes) -> None:
-        """Hand all of data to the operating system. Record it first, so that it precedes its answer in the capture."""
-        self._record(TO_BOARD, data)
+        """Hand data to the operating system. Record it first, so that it precedes its answer in the capture."""
+        if data:
+            self._record(TO_BOARD, data)
         self._transport.write(data)
 
     def fileno(self) -> int | None:

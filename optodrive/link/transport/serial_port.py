@@ -32,6 +32,8 @@ class SerialPort:
         self._serial: serial.Serial | None = None
         self._settings: list[Any] = []
         self._node: os.stat_result | None = None
+        self._unsent = b""
+        self._full_since_s: float | None = None
 
     def open(self) -> None:
         """Open the port.
@@ -67,20 +69,25 @@ class SerialPort:
             return first + port.read(port.in_waiting) if first else b""
 
     def write(self, data: bytes) -> None:
-        """Write all of data. Raise LinkError if the device does not accept it within half a second.
+        """Hand data to the operating system, now as far as it has room, and the rest at the next calls.
 
-        pyserial would poll the device after each write, which waits for a worker of the kernel.
+        Raise LinkError if it has no room for all for half a second. A caller that serves several ports never waits
+        here: one that accepts nothing would cost the others their leases. pyserial would poll the device after each
+        write, which waits for a worker of the kernel.
         """
-        port, rest, deadline_s = self._require_open(), memoryview(data), None
+        port = self._require_open()
+        self._unsent += data
         with guard_port(self.name):
-            while rest:
-                try:
-                    rest = rest[os.write(port.fileno(), rest) :]
-                except BlockingIOError:
-                    deadline_s = deadline_s or time.monotonic() + WRITE_TIMEOUT_S
-                    if time.monotonic() > deadline_s:
-                        raise TimeoutError(errno.ETIMEDOUT, "no room in its buffer") from None
-                    time.sleep(WRITE_RETRY_S)
+            try:
+                while self._unsent:
+                    self._unsent = self._unsent[os.write(port.fileno(), self._unsent) :]
+                self._full_since_s = None
+            except BlockingIOError:
+                now_s = time.monotonic()
+                if self._full_since_s is None:
+                    self._full_since_s = now_s
+                if now_s - self._full_since_s > WRITE_TIMEOUT_S:
+                    raise TimeoutError(errno.ETIMEDOUT, "no room in its buffer") from None
 
     def fileno(self) -> int | None:
         """Return the descriptor of the open port."""
@@ -88,7 +95,7 @@ class SerialPort:
             return None if self._serial is None else int(self._serial.fileno())
 
     def describe_fault(self) -> str:
-        """Return that the port is missing or replaced, or that another program has changed its settings."""
+        """Return that the port is missing or replaced, has settings of another program, or accepts nothing."""
         if self._serial is None or self._node is None:
             return ""
         with suppress(Exception):  # of a port that has failed
@@ -98,7 +105,10 @@ class SerialPort:
                 return f"{self.name} is missing: unplugged, or its power is off"
             if (node.st_dev, node.st_ino) != (self._node.st_dev, self._node.st_ino):
                 return describe_replug(self.name)
-            return self._describe_changed_settings(termios.tcgetattr(self._serial.fileno()))
+            changed = self._describe_changed_settings(termios.tcgetattr(self._serial.fileno()))
+            if changed or self._full_since_s is None:
+                return changed
+            return f"{self.name} accepts no bytes: check whether the device hangs, its plug and its supply"
         return ""
 
     def _describe_changed_settings(self, settings: list[Any]) -> str:
@@ -113,7 +123,8 @@ class SerialPort:
         )
 
     def close(self) -> None:
-        """Close the port."""
+        """Close the port and drop unsent data."""
+        self._unsent, self._full_since_s = b"", None
         if self._serial is not None:
             port, self._serial = self._serial, None
             with suppress(Exception):  # closing an unplugged device fails
@@ -122,7 +133,11 @@ class SerialPort:
                 _abandon(port)
 
     def release(self) -> None:
-        """Close the port."""
+        """Send unsent data for up to half a second and close the port."""
+        with suppress(LinkError):
+            while self._unsent:
+                time.sleep(WRITE_RETRY_S)
+                self.write(b"")
         self.close()
 
 

@@ -45,7 +45,7 @@ class SimulatedBoard(SerialPort):
 
     def release(self) -> None:
         """Close the port and terminate the board process, which turns the gate off before it exits."""
-        self.close()
+        super().release()
         if self._process is not None:
             self._process.terminate()
             self._process.wait()

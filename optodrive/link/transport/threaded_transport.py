@@ -8,6 +8,7 @@ import os
 import select
 import threading
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 
 from optodrive.link.transport.base import Transport, guard_opening, guard_port
@@ -44,7 +45,7 @@ class ThreadedTransport:
             return b"" if self._reader is None else self._reader.take(timeout_s)
 
     def write(self, data: bytes) -> None:
-        """Hand all of data to the operating system."""
+        """Hand data to the operating system, and the rest of it, if there is no room, at the next calls."""
         with guard_port(self.name):
             self._transport.write(data)
 
@@ -58,13 +59,16 @@ class ThreadedTransport:
 
     def close(self) -> None:
         """Let the thread close the link after its read. The link may be opened again."""
+        self._stop_reader(self._transport.close)
+
+    def _stop_reader(self, close: Callable[[], None]) -> None:
         if self._reader is not None:
             reader, self._reader = self._reader, None
-            reader.stop()
+            reader.stop(close)
 
     def release(self) -> None:
-        """Close permanently."""
-        self.close()
+        """Send unsent data and close permanently."""
+        self._stop_reader(self._transport.release)
         if self._last_reader is not None:
             self._last_reader.join(RELEASE_TIMEOUT_S)
         self._transport.release()
@@ -80,6 +84,7 @@ class _Reader:
         self._error: Exception | None = None
         self._lock = threading.Lock()
         self._stopped = self._finished = False
+        self._close = transport.close
         self._thread = threading.Thread(target=self._run, name="read-port", daemon=True)
         try:
             self._thread.start()
@@ -99,12 +104,12 @@ class _Reader:
             raise self._error
         return b"".join(chunks)
 
-    def stop(self) -> None:
+    def stop(self, close: Callable[[], None]) -> None:
         with self._lock:
-            self._stopped = True
+            self._stopped, self._close = True, close
             os.close(self.descriptor)
             if self._finished:
-                self._transport.close()
+                close()
 
     def join(self, timeout_s: float | None = None) -> None:
         self._thread.join(timeout_s)
@@ -121,7 +126,7 @@ class _Reader:
         with self._lock:
             self._finished = True
             if self._stopped:
-                self._transport.close()
+                self._close()
                 return
         self._notify()
 

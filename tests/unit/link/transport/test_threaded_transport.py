@@ -4,10 +4,12 @@ import os
 import select
 import threading
 import tty
+from contextlib import suppress
 
 import pytest
 
 from optodrive.core.errors import InputError, LinkError
+from optodrive.link.transport import serial_port
 from optodrive.link.transport.serial_port import SerialPort
 from optodrive.link.transport.threaded_transport import ThreadedTransport
 
@@ -85,9 +87,58 @@ def test_it_can_be_closed_and_opened_again(terminal):
         assert read_all(terminal.port, 5) == b"again"
 
 
+def fill(port):
+    """Write more than a terminal has room for, and return it."""
+    data = os.urandom(100_000)
+    port.write(data)
+    return data
+
+
 def test_a_device_that_accepts_nothing_is_a_lost_link(terminal):
-    with pytest.raises(LinkError, match="lost"):
-        terminal.port.write(bytes(1_000_000))
+    fill(terminal.port)
+    assert "accepts no bytes" in terminal.port.describe_fault()
+
+    def go_on():
+        while True:
+            terminal.port.write(b"")
+
+    with pytest.raises(LinkError, match="lost: the device accepts no bytes"):
+        go_on()
+
+
+def test_a_device_that_accepts_nothing_holds_up_no_other_one(terminal, monkeypatch):
+    other = Terminal()
+    monkeypatch.setattr(serial_port.time, "sleep", lambda wait_s: pytest.fail("the caller of both waits"))
+    sent = fill(terminal.port)
+    try:
+        for k in range(10):
+            terminal.port.write(bytes([k]))
+            other.port.write(bytes([k]))
+            assert os.read(other.master, 100) == bytes([k])
+        received = b""
+        while len(received) < len(sent) + 10:
+            terminal.port.write(b"")
+            received += os.read(terminal.master, 1_000_000)
+        assert received == sent + bytes(range(10))
+        assert terminal.port.describe_fault() == ""
+    finally:
+        monkeypatch.undo()
+        other.port.release()
+        other.hang_up()
+
+
+def test_what_waits_is_sent_before_the_permanent_close_and_dropped_by_another(terminal):
+    for leave in (terminal.port.close, terminal.port.release):
+        sent, received = fill(terminal.port), b""
+        leaving = threading.Thread(target=leave)
+        leaving.start()
+        with suppress(OSError):  # the port is closed
+            while True:
+                received += os.read(terminal.master, 1_000_000)
+        leaving.join()
+        assert (received == sent) == (leave == terminal.port.release)
+        if leave == terminal.port.close:
+            terminal.port.open()
 
 
 def test_a_missing_port_is_an_input_error(tmp_path):
