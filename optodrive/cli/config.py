@@ -2,9 +2,10 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from json import dumps
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -116,15 +117,20 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
         return
     document = effective.model_dump(mode="json")
     pixels = document["display"].pop("pixels")
-    document["display"]["pixels"] = f"{len(pixels)} (listed with --json)"
-    for section, content in document.items():
-        if isinstance(content, dict):
-            print(f"[{section}]")
-            for key, value in content.items():
-                print(f"{key} = {value}")
-            print()
-        else:
-            print(f"{section} = {content}")
+    document["display"]["pixels"] = f"{len(pixels)}, listed with --json"
+    print("\n".join(_list_section(document, "")))
+
+
+def _list_section(table: dict[str, Any], name: str) -> Iterator[str]:
+    """Yield the lines of a section, and then those of the sections within it, as in a configuration file."""
+    if name:
+        yield f"\n[{name}]"
+    for key, value in table.items():
+        if not isinstance(value, dict) or not value:
+            yield f"{key} = {dumps(value, ensure_ascii=False)}"
+    for key, value in table.items():
+        if isinstance(value, dict) and value:
+            yield from _list_section(value, f"{name}.{key}" if name else key)
 
 
 @GROUP.command()
