@@ -8,7 +8,7 @@ from collections import Counter
 from contextlib import suppress
 
 import pytest
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from optodrive.core.beat import BeatWriter
@@ -54,11 +54,17 @@ class Application:
                 await send({"type": "lifespan.startup.complete"})
             await send({"type": "lifespan.shutdown.complete"})
         elif scope["type"] == "websocket":
-            await self.echo(receive, send)
+            await (self.refuse if scope["path"] == "/refused" else self.echo)(receive, send)
         else:
             self.arrivals.append((scope["path"], scope["state"][ARRIVED_S]))
             scope[CALLER] = ANN if scope["path"] == "/trusted" else ANONYMOUS
             await self.answer(scope["path"], receive, send)
+
+    async def refuse(self, receive, send):
+        await receive()
+        await send({"type": "websocket.http.response.start", "status": 403, "headers": []})
+        for piece, more in ((b"no, ", True), (b"not you", False)):
+            await send({"type": "websocket.http.response.body", "body": piece, "more_body": more})
 
     async def echo(self, receive, send):
         await receive()
@@ -381,8 +387,8 @@ def test_stop_precedes_requests_that_arrived_before_it(open_client, acceptor, se
     assert "/v1/stop" in application.calls[1:29]
 
 
-def open_websocket(port, **options):
-    return connect(f"ws://127.0.0.1:{port}/v1/stream", proxy=None, ping_interval=None, **options)
+def open_websocket(port, path="/v1/stream", **options):
+    return connect(f"ws://127.0.0.1:{port}{path}", proxy=None, ping_interval=None, **options)
 
 
 def send_and_get_close_code(stream, message):
@@ -420,6 +426,17 @@ def test_text_that_is_not_utf_8_closes_the_stream_without_a_traceback(port, capl
         with pytest.raises(ConnectionClosed) as closed:
             stream.recv()
     assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1007, "text that is not UTF-8")
+    assert caplog.records == []
+
+
+def test_a_refused_websocket_is_answered_and_leaves_no_line_in_the_log(port, caplog):
+    for _ in range(3):
+        with pytest.raises(InvalidStatus) as refused:
+            open_websocket(port, "/refused")
+        assert (refused.value.response.status_code, refused.value.response.body) == (403, b"no, not you")
+    with open_websocket(port) as stream:  # the connection of a refusal ends after its answer, and so does what it logs
+        stream.send("abc")
+        assert stream.recv() == "3"
     assert caplog.records == []
 
 

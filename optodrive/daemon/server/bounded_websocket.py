@@ -37,7 +37,7 @@ class _Arrival(NamedTuple):
 
 
 class Utf8WebSocket(WebSocketsSansIOProtocol):
-    """uvicorn's protocol, which closes the connection at text that is not UTF-8, without a traceback in the log."""
+    """uvicorn's protocol, which closes the connection at text that is not UTF-8. It logs neither that nor a refusal."""
 
     def send_receive_event_to_app(self) -> None:
         """Queue a message that is complete."""
@@ -49,6 +49,11 @@ class Utf8WebSocket(WebSocketsSansIOProtocol):
             self.handle_parser_exception()
             return
         super().send_receive_event_to_app()
+
+    async def send(self, message: Any) -> None:
+        """Send a message of the application. A refusal completes the handshake, which else counts as an error."""
+        await super().send(message)
+        self.handshake_complete = self.handshake_complete or self.close_sent
 
 
 class BoundedWebSocket(Utf8WebSocket):
