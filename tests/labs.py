@@ -5,7 +5,7 @@ import numpy as np
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
-from optodrive.physics.term import SignalDelays
+from optodrive.physics.term import BySignal
 from optodrive.physics.terms import discover_terms
 
 PIXEL = Pixel(180.0, 100e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
@@ -26,8 +26,8 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0):
     noise: factor on noise and jitters; 0 gives repeats that are equal to the last digit, without missing samples
     """
     rng = np.random.default_rng(seed)
-    parts = [SignalDelays(), *(discover_terms()[key].signal_delays(values) for key, values in terms.items())]
-    delays = SignalDelays(*(sum(column) for column in zip(*parts, strict=True)))
+    parts = [BySignal(), *(discover_terms()[key].signal_delays(values) for key, values in terms.items())]
+    delays = BySignal(*(sum(column) for column in zip(*parts, strict=True)))
     runs = []
     for name in groups:
         pulses = np.array(GROUPS[name])

@@ -175,9 +175,12 @@ def _diagnose_jointly(
         diagnosis = study(measurement, seed, prior, epsilon, on_progress)
         discovery = None
         if discovers or diagnosis.verdict == "unexplained":
+            from optodrive.lab.diagnosis.search_log import SearchLog
             from optodrive.lab.pixel_discovery import discover_in_pixel
 
-            discovery = discover_in_pixel(measurement, prior, epsilon, on_progress)
+            log = SearchLog(omissions=diagnosis.omissions)
+            step = "the search for a term that no catalogue holds"
+            discovery = log.attempt(step, discover_in_pixel, None, measurement, prior, epsilon, on_progress)
     return _build_output(diagnosis, title, paths, provenance, out or OUT, config_name, width_m, discovery)
 
 

@@ -34,7 +34,7 @@ from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_s
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.snapshot import SnapshotCache, compute_snapshot
 from optodrive.physics.stability import check_time_constants
-from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, SESSION_TIME, TermValues
+from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, SESSION_TIME, BySignal, TermValues
 from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import all_terms
 
@@ -176,18 +176,30 @@ class ExtendedThermalState:
         gas_terms = {key: values for key, values in self._values.items() if not all_terms()[key].moves_membrane}
         ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
         delays = [all_terms()[key].signal_delays(values) for key, values in self._values.items()]
-        late_s = tuple(sum(getattr(item, name) for item in delays) for name in ("temperature", "displacement", "force"))
+        names = BySignal._fields[:3]
+        late_s = tuple(sum(getattr(item, name) for item in delays) for name in names)
+        rates = [all_terms()[key].signal_rates(values) for key, values in self._values.items()]
+        true_s = [t_s / (1.0 + sum(getattr(item, name) for item in rates)) for name in names]
         columns = []
         for index in pixels:
             acting = self._select_acting(pulses, index)
             experiment = PixelExperiment(
-                acting, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, session_time=1.0, full_w=full_w
+                acting,
+                index,
+                ambient_k,
+                (true_s[0], true_s[1], true_s[2]),
+                dose_before=1.0,
+                session_time=1.0,
+                full_w=full_w,
             )
             one = self.pixels.elements[index]
-            absorber_k, displacement_m, force_n = simulate_signals(experiment, one, self._active, late_s)
+            recorded = list(simulate_signals(experiment, one, self._active, late_s))
+            for key, values in self._values.items():
+                record = all_terms()[key].record
+                recorded = [record(values, name, t_s, each) for name, each in zip(names, recorded, strict=True)]
             # κ = 1, because a dead pixel's κ is 0.
             gas_k = simulate_signals(experiment, one._replace(kappa_m_per_k=1.0), ActiveTerms.from_values(gas_terms))[1]
-            columns.append((absorber_k, gas_k, displacement_m, force_n))
+            columns.append((recorded[0], gas_k, *recorded[1:]))
         signals = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
         return PixelTrace(t_s, np.array(pixels, dtype=np.int64), *signals)
 

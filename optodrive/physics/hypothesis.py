@@ -113,7 +113,17 @@ class RecordingScope:
     has_neighbour_pulses: bool
     power_levels: int
 
+    def list_signal_sets(self, names: tuple[str, ...]) -> list[tuple[str, ...]]:
+        """Return all of these signals together and, of a recording of several, each measured one alone."""
+        measured = [(name,) for name in self.signals if name in names]
+        return [names, *(measured if len(self.signals) > 1 else [])]
+
     @property
     def subsystem(self) -> str:
         """Return "mirrors" for a recording of mirror positions alone, else "pixels"."""
         return "mirrors" if set(self.signals) <= {"mirrors"} else "pixels"
+
+
+def describe_signals(names: tuple[str, ...]) -> str:
+    """Return the name of a set of signals in a hypothesis's label."""
+    return "all signals" if len(names) > 1 else names[0]

@@ -14,7 +14,13 @@ import numpy as np
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.servo import Servo
-from optodrive.physics.hypothesis import FreeParameter, Hypothesis, RecordingScope, TermParameter
+from optodrive.physics.hypothesis import (
+    FreeParameter,
+    Hypothesis,
+    RecordingScope,
+    TermParameter,
+    describe_signals,
+)
 
 TermValues = Mapping[str, float]
 """A term's parameters by name, SI."""
@@ -115,8 +121,8 @@ class HeatGainBound(NamedTuple):
 NO_HEAT_GAIN = HeatGainBound()
 
 
-class SignalDelays(NamedTuple):
-    """Delay of each recorded signal behind the pixel, s."""
+class BySignal(NamedTuple):
+    """One number for each recorded signal."""
 
     temperature: float = 0.0
     displacement: float = 0.0
@@ -136,7 +142,9 @@ class Term:
     Diagnosis: signature, where the effect shows in recorded data, empty if it is no possible cause of a discrepancy;
     subsystems, the kinds of recording that can show it; varies_between_runs, whether repeats of one drive differ by it;
     is_exact, whether the effect has no other form than the term's, but for its share in each signal;
-    is_linear and fit_every_start as in `Hypothesis`; detection_limit, replaces the computed smallest visible effect.
+    is_linear and fit_every_start as in `Hypothesis`; detection_limit, replaces the computed smallest visible effect;
+    remedy, what to do at an instrument to see whether it is this, in a sentence; removes_zero, whether the zero of a
+    signal on which it acts is equal in all runs.
     """
 
     key: str
@@ -159,6 +167,14 @@ class Term:
     is_linear: bool = False
     fit_every_start: bool = False
     detection_limit: str = ""
+    remedy: str = ""
+    removes_zero: bool = False
+
+    @property
+    def is_instrument(self) -> bool:
+        """Whether the term acts in an instrument, rather than in the pixel, its light or the mirrors."""
+        kernels = self.kernels._replace(sensor_reading=None, sensor_lag=None)
+        return self.in_pixel and self.subsystems != ("mirrors",) and not any(kernels)
 
     @property
     def row_length(self) -> int:
@@ -182,9 +198,17 @@ class Term:
         """Return the index of the only pixel that the term affects, or None if it affects all."""
         return None
 
-    def signal_delays(self, values: TermValues) -> SignalDelays:
-        """Return the delays that the term gives to the recorded signals."""
-        return SignalDelays()
+    def signal_delays(self, values: TermValues) -> BySignal:
+        """Return the delays behind the pixel that the term gives to the recorded signals, s."""
+        return BySignal()
+
+    def signal_rates(self, values: TermValues) -> BySignal:
+        """Return the share by which the stated times of each signal run faster than true ones."""
+        return BySignal()
+
+    def record(self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray) -> FloatArray:
+        """Return an instrument's record [n] of a pixel's signal, one of `BySignal`, at these times."""
+        return value
 
     def servo(self, values: TermValues) -> Servo | None:
         """Return the servo that the mirrors follow under the term, or None if it does not concern them."""
@@ -203,3 +227,17 @@ class Term:
         starts = tuple(dict(zip(grid, values, strict=True)) for values in product(*grid.values()))
         free = tuple(self.free(name) for name in grid)
         return [Hypothesis(self.key, self.key, starts, free, self.is_linear, self.fit_every_start)]
+
+    def build_hypotheses_by_signal(self, scope: RecordingScope, start: float) -> list[Hypothesis]:
+        """Return the hypotheses of one number for all signals and of one for each, of a term with one per signal."""
+        names = tuple(item.name for item in self.parameters)
+        return [
+            Hypothesis(
+                self.key,
+                f"{self.key} of {describe_signals(acting)}",
+                (dict.fromkeys(names, 0.0) | dict.fromkeys(acting, start),),
+                (self.free(*acting),),
+                is_linear=True,
+            )
+            for acting in scope.list_signal_sets(names)
+        ]

@@ -21,7 +21,7 @@ from optodrive.lab.diagnosis.fitting import fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_file import build_model_toml
-from optodrive.lab.diagnosis.model_selection import select_from_single_causes
+from optodrive.lab.diagnosis.model_selection import compare_from_single_causes
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import assign_bins
@@ -30,6 +30,7 @@ from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.diagnosis.refitting import RefittedCandidate
 from optodrive.lab.diagnosis.report import build_report
 from optodrive.lab.diagnosis.search_log import SearchLog
+from optodrive.lab.inference.claim import claim
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.terms import discover_terms
 
@@ -108,10 +109,30 @@ def test_a_weak_lag_and_a_late_clock_are_one_shape_and_neither_is_ruled_out():
     assert judged["sensor_lag"] == judged["clock_offset of temperature"] == "indistinguishable"
 
 
+def move_zeros(recording, size_m=5e-6):
+    """Return the recording with another zero of displacement in each run, as no AC coupling leaves it."""
+    rng, runs = np.random.default_rng(5), []
+    for item in recording.runs:
+        signal = item.signals["displacement_m"]
+        moved = replace(signal, value=signal.value + size_m * rng.standard_normal())
+        runs.append(replace(item, signals=item.signals | {"displacement_m": moved}))
+    return Measurement(tuple(runs))
+
+
 def test_two_hidden_causes_are_named_together():
-    found = diagnose(lab(13, TWO))
+    found = diagnose(move_zeros(lab(13, TWO)))
     assert found.verdict == "cause"
     assert set(found.causes) == set(TWO)
+
+
+def test_a_leak_is_told_from_ac_coupling_by_what_the_recording_states():
+    found = diagnose(lab(13, {"gas_leak": TWO["gas_leak"]}))
+    assert (found.verdict, set(found.causes)) == ("ambiguous", {"gas_leak", "high_pass"})
+    assert any("couple the input DC" in line for line in build_narrative(found))
+    leak = lab(13, {"gas_leak": TWO["gas_leak"]})
+    stated = tuple(replace(run, attributes=run.attributes | {"coupling": "DC"}) for run in leak.runs)
+    found = diagnose(Measurement(stated))
+    assert (found.verdict, found.causes) == ("cause", ("gas_leak",))
 
 
 def test_without_repeats_nothing_is_named_for_certain():
@@ -163,8 +184,10 @@ def test_a_pair_is_not_named_for_a_cause_whose_own_fit_had_ended_elsewhere():
     singles.sort(key=lambda item: item.chi2)
     assert singles[0].causes == ("membrane_creep",)
     detection = detect(problem, base, hypotheses)
-    verdict = select_from_single_causes(problem, base, hypotheses, detection, singles, SearchLog())
-    assert (verdict.verdict, verdict.causes) == ("cause", ("wall_heating",))
+    found = claim(
+        compare_from_single_causes(problem, base, hypotheses, detection, singles, SearchLog()).collect_evidence()
+    )
+    assert (found.verdict, found.causes) == ("cause", ("wall_heating",))
 
 
 @pytest.mark.parametrize(

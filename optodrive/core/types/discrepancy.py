@@ -1,6 +1,6 @@
 """Result of a diagnosis: causes, held-out gain, candidate ranking, next experiment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from optodrive.core.types.arrays import FloatArray
 
@@ -199,13 +199,15 @@ class ExampleTrace:
 class Discrepancy:
     """Diagnosis of a recording.
 
-    verdict: "cause", "none", "unexplained", "ambiguous", "instrument" if only disturbances were found, or "incomplete"
-    if no error was found but failures prevent "none"; disturbances: of the instruments, which were subtracted before
+    verdict: "cause", "none", "unexplained", "ambiguous", "instrument" if only disturbances were found, "undecided" if
+    the data show neither an effect nor its absence, or "incomplete" if no error was found but failures prevent "none";
+    reasons: why the verdict is not more definite, in sentences; omissions: steps that failed and that the verdict does
+    not need, with the errors; disturbances: of the instruments, which were subtracted before
     all else; probabilities: of all explanations; terms: the extension, term → parameter → value; base:
     nominal parameters as refitted with it; residual_traces: the first run of every group, with the models fitted to all
     runs; held_out_traces, held_out_errors: with the models fitted to the other runs; explained_fraction: share of the
     detected excess of χ²; doubts: why the size of a named cause is uncertain, a clause by cause; failures: hypotheses
-    that could not be computed, with the reasons; height_error_held_out, height_error_fitted: on pushes to which the
+    that could not be computed, with the errors; height_error_held_out, height_error_fitted: on pushes to which the
     models were not fitted, and on all, None if none was measured
     """
 
@@ -234,3 +236,5 @@ class Discrepancy:
     height_error_held_out: HeightError | None
     height_error_fitted: HeightError | None
     elapsed_s: float
+    reasons: tuple[str, ...] = ()
+    omissions: dict[str, str] = field(default_factory=dict)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.core.errors import DivergedError, OptodriveError
+from optodrive.core.errors import OptodriveError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.evidence import compute_form_evidence
 from optodrive.lab.diagnosis.fitting import (
@@ -21,7 +21,7 @@ from optodrive.lab.diagnosis.fitting import (
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
-from optodrive.lab.diagnosis.search_log import SearchLog
+from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE, SearchLog
 from optodrive.physics.hypothesis import Hypothesis
 
 ROUNDING_FRACTION = 1e-12
@@ -91,7 +91,7 @@ def simulate_effects(
         ]
         try:
             changes = [predict(problem.data, point, problem.epsilon) - base.prediction for point in points]
-        except DivergedError as error:
+        except UNCOMPUTABLE as error:
             log.add_failure(item.label, error)
             continue
         starts += [(item, start) for start in _select_starts(item)]

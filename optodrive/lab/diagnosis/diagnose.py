@@ -26,7 +26,7 @@ from optodrive.lab.diagnosis.copied_runs import check_copied_runs
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset
 from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
-from optodrive.lab.diagnosis.estimates import compute_estimates, describe_doubts, is_at_limit
+from optodrive.lab.diagnosis.estimates import compute_estimates, describe_doubts, describe_limits, is_at_limit
 from optodrive.lab.diagnosis.fitting import (
     BaseParameterPrior,
     FitProblem,
@@ -35,15 +35,24 @@ from optodrive.lab.diagnosis.fitting import (
     fit,
 )
 from optodrive.lab.diagnosis.height_error import compute_height_error
-from optodrive.lab.diagnosis.held_out_gain import compute_held_out_errors, compute_held_out_gain, split_runs
+from optodrive.lab.diagnosis.held_out_gain import (
+    compute_held_out_changes,
+    compute_held_out_errors,
+    compute_held_out_gain,
+    split_runs,
+)
 from optodrive.lab.diagnosis.hypotheses import build_hypotheses
-from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, remove_disturbances
+from optodrive.lab.diagnosis.instrument_disturbances import (
+    find_dc_coupled,
+    find_disturbances,
+    remove_disturbances,
+)
 from optodrive.lab.diagnosis.model_selection import (
     MAX_INTRA_PULSE_POWER_EXCESS,
     MAX_REPLICATE_EXCESS,
     Verdict,
+    compare_explanations,
     has_replicate_excess,
-    select_causes,
 )
 from optodrive.lab.diagnosis.next_experiment import propose_for_verdict
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
@@ -51,9 +60,10 @@ from optodrive.lab.diagnosis.numeric_limits import check_numeric_limits
 from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
-from optodrive.lab.diagnosis.refitting import refit_strongest
+from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
 from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, ignore_progress
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
+from optodrive.lab.inference.claim import HeldOutChange, claim, combine_claims
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -83,7 +93,7 @@ class _SubsystemFit:
     candidates: tuple[CandidateCause, ...]
     rivals: tuple[RivalModel, ...]
     next_experiment: NextExperiment | None
-    failures: dict[str, str]
+    log: SearchLog
     disturbances: tuple[InstrumentDisturbance, ...]
 
     @property
@@ -119,6 +129,8 @@ def diagnose(
     for part in build_dataset(measurement).split_subsystems():
         timing_s = max((item.problem.noise.timing_sigma_s for item in subsystems), default=0.0)
         candidates = build_hypotheses(part)
+        if all(run.attributes.get("coupling") == "DC" for run in measurement.runs):
+            candidates = [item for item in candidates if not discover_terms()[item.key].removes_zero]
         if subsystems:
             # All signals share one clock, determined by the pixels; a late mirror then is a lag of the mirror.
             candidates = [item for item in candidates if len(discover_terms()[item.key].subsystems) == 1]
@@ -129,7 +141,12 @@ def diagnose(
                 hold_out,
             )
         )
-    verdict, causes = _combine_verdicts(subsystems)
+    log = SearchLog(on_progress)
+    for subsystem in subsystems:
+        log.failures.update(subsystem.log.failures)
+        log.omissions.update(subsystem.log.omissions)
+    disturbances = tuple(item for subsystem in subsystems for item in subsystem.disturbances)
+    claimed = combine_claims([subsystem.verdict.claim for subsystem in subsystems], log.failures, bool(disturbances))
     main = subsystems[0]
     parameters: dict[str, Estimate] = {}
     terms: dict[str, dict[str, float]] = {}
@@ -138,7 +155,8 @@ def diagnose(
         estimates = compute_estimates(subsystem.data, subsystem.final, subsystem.covariance)
         parameters |= estimates
         chosen = subsystem.verdict.chosen
-        doubts |= {} if chosen is None else describe_doubts(chosen.hypotheses, estimates)
+        if chosen is not None:
+            doubts |= describe_doubts(chosen.hypotheses, estimates) | describe_limits(chosen.hypotheses, estimates)
         terms |= {key: dict(values) for key, values in subsystem.final.point.terms.items()}
     has_pixels = any(kind < 3 for kind in main.data.kinds)
     base = (
@@ -147,13 +165,16 @@ def diagnose(
     held_out = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.held_out.runs}))
     fitted = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.data.runs}.difference(held_out)))
     explained_fractions = [
-        subsystem.verdict.explained_fraction for subsystem in subsystems if subsystem.verdict.verdict != "none"
+        subsystem.verdict.explained_fraction for subsystem in subsystems if subsystem.verdict.chosen is not None
     ]
-    comparisons = [subsystem.comparison for subsystem in subsystems]
+    comparisons = [
+        item for item in (log.attempt("traces", _compare, None, subsystem) for subsystem in subsystems) if item
+    ]
+    blind, no_traces = main.blind_points, tuple[ResidualTrace, ...]()
     return Discrepancy(
-        verdict=verdict,
-        causes=causes,
-        disturbances=tuple(item for subsystem in subsystems for item in subsystem.disturbances),
+        verdict=claimed.verdict,
+        causes=claimed.causes,
+        disturbances=disturbances,
         probabilities=reduce(Probabilities.combine, (subsystem.verdict.probabilities for subsystem in subsystems)),
         hypothesis_labels=tuple(
             item.label
@@ -163,7 +184,7 @@ def diagnose(
         ),
         parameters=parameters,
         base=base,
-        terms=terms if verdict == "cause" or verdict == "ambiguous" else {},
+        terms=terms if claimed.causes else {},
         gain=next((subsystem.gain for subsystem in subsystems if subsystem.verdict.chosen is not None), None),
         candidates=tuple(item for subsystem in subsystems for item in subsystem.candidates),
         next_experiment=next(
@@ -173,17 +194,33 @@ def diagnose(
         held_out_runs=held_out,
         residual_traces=tuple(trace for comparison in comparisons for trace in comparison.trace_groups()),
         example_traces=tuple(example for comparison in comparisons for example in comparison.trace_examples()),
-        held_out_traces=tuple(trace for subsystem in subsystems for trace in _trace_held_out(subsystem)),
-        held_out_errors=tuple(error for subsystem in subsystems for error in _compute_held_out_errors(subsystem)),
+        held_out_traces=tuple(
+            trace for subsystem in subsystems for trace in log.attempt("traces", _trace_held_out, no_traces, subsystem)
+        ),
+        held_out_errors=tuple(
+            error
+            for subsystem in subsystems
+            for error in log.attempt("held-out errors", _compute_held_out_errors, list[HeldOutError](), subsystem)
+        ),
         rivals=tuple(rival for subsystem in subsystems for rival in subsystem.rivals),
         remarks=_build_remarks(subsystems),
         explained_fraction=min(explained_fractions, default=0.0),
         doubts=doubts,
-        failures={label: reason for subsystem in subsystems for label, reason in subsystem.failures.items()},
-        height_error_held_out=compute_height_error(main.problem, main.held_out, *main.blind_points),
-        height_error_fitted=compute_height_error(main.problem, main.data, main.base.point, main.final.point),
+        failures=log.failures,
+        height_error_held_out=log.attempt(
+            "error of heights", compute_height_error, None, main.problem, main.held_out, *blind
+        ),
+        height_error_fitted=log.attempt(
+            "error of heights", compute_height_error, None, main.problem, main.data, main.base.point, main.final.point
+        ),
         elapsed_s=perf_counter() - began_s,
+        reasons=claimed.reasons,
+        omissions=log.omissions,
     )
+
+
+def _compare(subsystem: _SubsystemFit) -> ModelComparison:
+    return subsystem.comparison
 
 
 def _diagnose_subsystem(
@@ -201,42 +238,57 @@ def _diagnose_subsystem(
     fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
     log.on_progress("noise and nominal model")
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
-    prediction = predict(data, base.point, epsilon)
-    sensitivity = compute_jitter_sensitivity(data, base.point, epsilon, prediction)
-    disturbances, added = find_disturbances(data, data.value - prediction, sensitivity, problem.noise)
+    nothing: tuple[tuple[InstrumentDisturbance, ...], FloatArray] = ((), np.zeros(len(data.value)))
+    disturbances, added = log.attempt("disturbances of instruments", _find_disturbances, nothing, data, problem, base)
     if disturbances:
         log.on_progress("nominal model without the instruments' disturbances")
         data = remove_disturbances(data, added)
         fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
         problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
-    problem, base = _revise_noise(problem, base, hypotheses, min_timing_sigma_s, log)
-    verdict = select_causes(problem, base, hypotheses, log)
-    gains: dict[str, float] = {}
-    for candidate in verdict.candidates:
-        candidate_gain = compute_held_out_gain(problem, held_out, base.point, candidate.fit.point, seed)
-        if candidate_gain is not None:
-            gains[candidate.label] = candidate_gain.reduction
+    residual = problem.data.value - base.prediction
+    coupled = log.attempt("zeros of the runs", find_dc_coupled, frozenset[str](), problem.data, residual, problem.noise)
+    hypotheses = [
+        item
+        for item in hypotheses
+        if not (discover_terms()[item.key].removes_zero and coupled.intersection(item.free[0].names))
+    ]
+    problem, base = log.attempt(
+        "noise beside an effect", _revise_noise, (problem, base), problem, base, hypotheses, min_timing_sigma_s, log
+    )
+    selection = compare_explanations(problem, base, hypotheses, log)
+    first = claim(selection.collect_evidence())
     all_data = FitProblem(data, problem.noise, prior, epsilon)
-    log.on_progress("fitting all runs")
-    chosen = verdict.chosen
-    gain = None if chosen is None else compute_held_out_gain(problem, held_out, base.point, chosen.fit.point, seed)
-    start = base if chosen is None else chosen.fit
-    final = fit(all_data, start.point, start.free, iterations=6)
-    if all(kind in MIRROR_KINDS for kind in data.kinds):  # judge each point by its own jitter sensitivities
-        points = (start.point, final.point)
-        final = min((fit(all_data, point, start.free, iterations=1) for point in points), key=lambda item: item.chi2)
-    if verdict.verdict in ("none", "ambiguous") and held_out_runs:
-        # The held-out, hottest runs may show an effect, or which one: repeat the selection with all runs.
-        all_base = final if chosen is None else fit(all_data, base.point, base.free)
-        wider = select_causes(all_data, all_base, hypotheses, log)
-        if wider.verdict != "none":
-            gain = None
-            problem, base, held_out, verdict = all_data, all_base, data.select([]), wider
-            if wider.chosen is not None:
-                final = wider.chosen.fit
-    experiment = propose_for_verdict(problem, base, verdict, log.on_progress)
-    named = () if verdict.chosen is None else verdict.chosen.hypotheses
-    covariance = compute_covariance(all_data, final, named, hypotheses)
+    if first.verdict in ("none", "undecided", "ambiguous") and held_out_runs:
+        # The held-out, hottest runs may show an effect, or which one: compare the explanations with all runs.
+        log.on_progress("fitting all runs")
+        chosen = selection.choose(first)
+        all_base = fit(all_data, base.point, base.free)
+        wider = compare_explanations(all_data, all_base, hypotheses, log)
+        if claim(wider.collect_evidence()).verdict not in ("none", first.verdict) or chosen is not None:
+            problem, base, held_out, selection = all_data, all_base, data.select([]), wider
+    unchanged = tuple[HeldOutChange, ...]()
+    changes = {
+        item: log.attempt(
+            "held-out runs", compute_held_out_changes, unchanged, problem, held_out, base.point, item.fit.point
+        )
+        for item in selection.candidates
+    }
+    first = claim(selection.collect_evidence(changes))
+    final, covariance = _fit_all(all_data, base, selection.choose(first), hypotheses, log)
+    chosen, doubts = selection.choose(first), {}
+    if chosen is not None:
+        estimates = compute_estimates(data, final, covariance)
+        doubts = {chosen: describe_doubts(chosen.hypotheses, estimates)}
+    verdict = Verdict(claim(selection.collect_evidence(changes, doubts)), selection)
+    if verdict.chosen is not chosen:
+        final, covariance = _fit_all(all_data, base, verdict.chosen, hypotheses, log)
+    gains: dict[str, HeldOutGain | None] = {
+        item.label: log.attempt(
+            "held-out gain", compute_held_out_gain, None, problem, held_out, base.point, item.fit.point, seed
+        )
+        for item in verdict.candidates
+    }
+    reductions = {label: gain.reduction for label, gain in gains.items() if gain is not None}
     return _SubsystemFit(
         data,
         held_out,
@@ -245,13 +297,43 @@ def _diagnose_subsystem(
         verdict,
         final,
         covariance,
-        gain,
-        judge_candidates(verdict, gains),
-        list_rivals(verdict, gains),
-        experiment,
-        log.failures,
+        None if verdict.chosen is None else gains[verdict.chosen.label],
+        judge_candidates(verdict, reductions),
+        list_rivals(verdict, reductions),
+        log.attempt("the next experiment", propose_for_verdict, None, problem, base, verdict, log.on_progress),
+        log,
         disturbances,
     )
+
+
+def _find_disturbances(
+    data: Dataset, problem: FitProblem, base: ModelFit
+) -> tuple[tuple[InstrumentDisturbance, ...], FloatArray]:
+    """Return the disturbances of the instruments beside the nominal fit, and their values in the data [m]."""
+    prediction = predict(data, base.point, problem.epsilon)
+    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, prediction)
+    return find_disturbances(data, data.value - prediction, sensitivity, problem.noise)
+
+
+def _fit_all(
+    problem: FitProblem,
+    base: ModelFit,
+    chosen: RefittedCandidate | None,
+    hypotheses: list[Hypothesis],
+    log: SearchLog,
+) -> tuple[ModelFit, FloatArray]:
+    """Return the chosen model fitted to all runs, the nominal one if there is none, and its covariance."""
+    log.on_progress("fitting all runs")
+    start = base if chosen is None else chosen.fit
+    final = fit(problem, start.point, start.free, iterations=6)
+    if all(kind in MIRROR_KINDS for kind in problem.data.kinds):  # judge each point by its own jitter sensitivities
+        points = (start.point, final.point)
+        final = min((fit(problem, point, start.free, iterations=1) for point in points), key=lambda item: item.chi2)
+    named = () if chosen is None else chosen.hypotheses
+    covariance = log.attempt(
+        "intervals beside other forms", compute_covariance, final.covariance, problem, final, named, hypotheses
+    )
+    return final, covariance
 
 
 def _revise_noise(
@@ -304,24 +386,6 @@ def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
             if delay_s != 0.0:
                 return delay_s
     return 0.0
-
-
-def _combine_verdicts(subsystems: list[_SubsystemFit]) -> tuple[str, tuple[str, ...]]:
-    """Return the weakest verdict of the subsystems that have an error, with all their causes.
-
-    Without an error the verdict is "incomplete" if a hypothesis could not be computed, and "instrument" if only an
-    instrument is disturbed.
-    """
-    verdicts = [subsystem.verdict for subsystem in subsystems if subsystem.verdict.verdict != "none"]
-    if not verdicts:
-        if any(subsystem.failures for subsystem in subsystems):
-            return "incomplete", ()
-        return "instrument" if any(subsystem.disturbances for subsystem in subsystems) else "none", ()
-    causes = tuple(dict.fromkeys(cause for item in verdicts for cause in item.causes))
-    for verdict in ("unexplained", "ambiguous"):
-        if any(item.verdict == verdict for item in verdicts):
-            return verdict, causes if verdict == "ambiguous" else ()
-    return "cause", causes
 
 
 def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:

@@ -12,12 +12,12 @@ from contextlib import suppress
 
 import numpy as np
 
-from optodrive.core.errors import DivergedError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -70,7 +70,7 @@ def compute_discrepancy_basis(
         for start in () if item.is_linear or item.fit_every_start else item.starts:
             alternatives.append(ParameterPoint(fitted.point.base, {**others, item.key: start}))
         for alternative in alternatives:
-            with suppress(DivergedError):  # no form of the effect
+            with suppress(*UNCOMPUTABLE):  # no form of the effect
                 columns.append(predict(data, alternative, problem.epsilon) - fitted.prediction)
     nonzero = [column for column in columns if np.abs(column).max(initial=0.0) > 0.0]
     return np.stack(nonzero, axis=1) if nonzero else np.zeros((len(data.value), 0))

@@ -68,14 +68,16 @@ def build_headline(answer: DisplayAnswer) -> str:
     wrong += [f"{doubtful} with a cause of uncertain size"] if doubtful else []
     total = sum(count for count, _ in counts) + unexplained
     incomplete = sum(item.verdict == "incomplete" for item in _list_discrepancies(answer))
+    undecided = sum(item.verdict == "undecided" for item in _list_discrepancies(answer))
     failed = len(answer.failed)
     prefix = f"Of {format_pixel_count(len(answer.pixels))}, each diagnosed separately,"
     missing = f"; {failed} {'has' if failed == 1 else 'have'} no answer" if failed else ""
     missing += f"; for {incomplete}, the search is incomplete" if incomplete else ""
+    missing += f"; {undecided} {'is' if undecided == 1 else 'are'} undecided" if undecided else ""
     if failed == len(answer.pixels):
         return f"{prefix} none has an answer."
     if not total:
-        others = f"none of the other {len(answer.pixels) - failed - incomplete}" if failed or incomplete else "none"
+        others = f"none of the other {len(answer.pixels) - failed - incomplete - undecided}" if missing else "none"
         return f"{prefix} {others} shows an error of the nominal model{missing}."
     return f"{prefix} {total} show an error of the nominal model: {', '.join(wrong)}{missing}."
 

@@ -65,12 +65,28 @@ def describe_doubts(hypotheses: Iterable[Hypothesis], estimates: dict[str, Estim
     return doubts
 
 
+def describe_limits(hypotheses: Iterable[Hypothesis], estimates: dict[str, Estimate]) -> dict[str, str]:
+    """Return, by cause, a clause for each named cause of which a number lies at a limit of its plausible range."""
+    doubts: dict[str, str] = {}
+    for item in hypotheses:
+        ended = [free.label for free in item.free if _ends_at_limit(free, estimates[f"{free.key}.{free.names[0]}"])]
+        if ended:
+            places = "lies at a limit of its plausible range" if len(ended) == 1 else "lie at limits of their ranges"
+            doubts[item.key] = f"{' and '.join(ended)} {places}"
+    return doubts
+
+
+def _ends_at_limit(free: FreeParameter, estimate: Estimate) -> bool:
+    """Return whether a number lies at a limit: a size at any, a shape at its largest value, unless that is a share."""
+    high = free.parameter.high
+    is_largest = free.parameter.is_shape and high != 1.0 and abs(estimate.value - high) <= LIMIT_SHARE * abs(high)
+    return estimate.at_limit or is_largest
+
+
 def _describe_doubt(free: FreeParameter, estimate: Estimate) -> str:
     """Return the doubt about one size, or nothing."""
-    if estimate.at_limit:
-        return f"{free.label} lies at a limit of its plausible range"
     absent = free.parameter.low if free.logarithmic else 0.0
-    if not estimate.low <= absent <= estimate.high:
+    if estimate.at_limit or not estimate.low <= absent <= estimate.high:
         return ""
     interval = format_range(estimate.low, estimate.high, free.parameter.unit)
     contained = "the smallest plausible size" if free.logarithmic else "zero"

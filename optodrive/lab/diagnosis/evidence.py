@@ -14,6 +14,10 @@ given columns of its own effect in other forms (`discrepancy_basis.py`), with a 
 bins take beside a cause belongs to that cause in another form if the cause explains nearly all, and to none of these if
 it explains less; the same holds for its own other forms, with a more lenient share (`compute_own_share`).
 
+Nothing. A cause may also act so weakly that no recording of this kind could show it, and a recording without any effect
+does not make that less probable. What of a cause's probability lies at such sizes (`compute_hidden_share`) counts as no
+effect, which is thus: none, or none that would have been seen.
+
 Noise. The noise model is an estimate from few repeats, so a difference in evidence is worth less the larger it is: it
 is converted as the likelihood of a Student distribution with the degrees of freedom of the noise (`temper`), relative
 to the best explanation, so that rivals which nearly agree are compared almost as normal ones.
@@ -48,6 +52,10 @@ FORM_REST, BINS_REST, PAIR_REST, REST_POWER = 0.4, 0.03, 0.03, 4.0
 too, is as likely another cause's."""
 MAX_FORM_PROBABILITY = 0.95
 """Largest probability that the second cause of a pair only mends the form of the first one."""
+HIDDEN_SIGMA = 2.0
+"""Size of an effect, in σ, below which nobody would have seen it."""
+SIGMAS = np.geomspace(0.1, 100.0, 400)
+"""Sizes of effects, in σ, over which the share of those that nobody would have seen is computed."""
 UNIFORM_VARIANCE = 1.0 / 12.0
 """Variance of a uniform distribution over a unit range."""
 
@@ -57,7 +65,8 @@ class Explanation:
     """A model of the recording.
 
     causes: none for no effect or for something else; degrees: degrees of freedom of the noise by which it differs from
-    the best explanation; own_share: probability that these causes, rather than something else, are what it describes
+    the best explanation; own_share: probability that these causes, rather than something else, are what it describes;
+    hidden: probability that their effect is too small to be seen
     """
 
     causes: tuple[str, ...]
@@ -65,6 +74,7 @@ class Explanation:
     log_evidence: float
     degrees: float
     own_share: float = 1.0
+    hidden: float = 0.0
 
 
 def compute_log_evidence(problem: FitProblem, fitted: ModelFit, chi2: float) -> float:
@@ -93,6 +103,16 @@ def is_size(free: FreeParameter) -> bool:
 def compute_score_evidence(ratio: float) -> float:
     """Return the gain in log evidence of an effect of this likelihood ratio that was not refitted."""
     return 0.5 * (ratio - log1p(ratio * UNIFORM_VARIANCE * SIZE_LOG_SPAN**2))
+
+
+def compute_hidden_share(ratio: float) -> float:
+    """Return the posterior probability that an effect of this likelihood ratio is smaller than `HIDDEN_SIGMA`.
+
+    The logarithm of its size is uniform a priori, as in `compute_log_evidence`.
+    """
+    logs = SIGMAS * max(ratio, 0.0) ** 0.5 - 0.5 * SIGMAS**2
+    weights = np.exp(logs - logs.max())
+    return float(weights[SIGMAS < HIDDEN_SIGMA].sum() / weights.sum())
 
 
 def compute_form_evidence(gram: FloatArray, right: FloatArray) -> float:
@@ -182,7 +202,8 @@ def compute_probabilities(explanations: Iterable[Explanation]) -> Probabilities:
         none_of_these += weight * (1.0 - item.own_share)
         if item.causes:
             key = tuple(sorted(item.causes))
-            causes[key] = causes.get(key, 0.0) + weight * item.own_share
+            causes[key] = causes.get(key, 0.0) + weight * item.own_share * (1.0 - item.hidden)
+            no_effect += weight * item.own_share * item.hidden
         else:
             no_effect += weight * item.own_share
     return Probabilities(no_effect, none_of_these, causes)

@@ -8,8 +8,10 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import HeldOutError, HeldOutGain
 from optodrive.lab.diagnosis.dataset import SIGNALS, Dataset
 from optodrive.lab.diagnosis.fitting import FitProblem, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus_by_group
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.lab.inference.claim import HeldOutChange
 
 BOOTSTRAP_DRAWS = 400
 MIN_EXCESS_SIGMA = 4.0
@@ -104,6 +106,27 @@ def compute_held_out_errors(
                 rmse = [float(np.sqrt(np.concatenate([item[part] for part in parts]).mean())) for item in squares]
                 errors.append(HeldOutError(group, SIGNALS[kind], len(parts), rmse[0], rmse[1], rmse[2]))
     return errors
+
+
+def compute_held_out_changes(
+    problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint
+) -> tuple[HeldOutChange, ...]:
+    """Return the change of χ², jitters marginalised, in every signal of every held-out group.
+
+    With a residual r of the nominal model and a difference d of the predictions, both whitened, it is d·d − 2 r·d, and
+    noise gives it a standard deviation of 2 |d|.
+    """
+    changes = []
+    for group, runs in data.groups.items():
+        for kind in data.select(runs).kinds:
+            part = data.select(runs, (kind,))
+            before, after = (predict(part, point, problem.epsilon) for point in (nominal, extended))
+            jitter = compute_jitter_sensitivity(part, extended, problem.epsilon, after)
+            columns = np.column_stack([part.value - before, after - before])
+            gram = compute_normal_equations(part, columns, problem.noise, jitter.power, jitter.timing).total
+            norm2 = float(gram[1, 1])
+            changes.append(HeldOutChange(group, SIGNALS[kind], norm2 - 2.0 * float(gram[0, 1]), 2.0 * norm2**0.5))
+    return tuple(changes)
 
 
 def _draw_interval(chi2_pairs: FloatArray, seed: int) -> tuple[float, float] | None:

@@ -16,7 +16,7 @@ All are subtracted from the data, and the diagnosis goes on without them.
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import chdtrc, fdtrc
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import InstrumentDisturbance
@@ -24,10 +24,14 @@ from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Dataset
 from optodrive.lab.diagnosis.fitting import JitterSensitivity
 from optodrive.lab.diagnosis.instrument_hops import find_hops
 from optodrive.lab.diagnosis.instrument_lines import MAX_LINES, find_line
-from optodrive.lab.diagnosis.noise_model import NoiseModel, find_resolution
+from optodrive.lab.diagnosis.noise_model import NoiseModel, find_resolution, whiten
+from optodrive.physics.term import BySignal
 
 DRIFT_DEGREES, MAX_DRIFT_P, MIN_DRIFT_RUNS, MIN_QUIET_SAMPLES = (1, 3), 1e-6, 6, 4
 """Degrees of the polynomial of a drift, its largest p value, and the smallest number of runs and of samples in each."""
+
+MAX_ZERO_P = 1e-4
+"""Largest p value of zeros that differ from run to run."""
 
 
 def find_disturbances(
@@ -60,6 +64,31 @@ def find_disturbances(
 def remove_disturbances(data: Dataset, added: FloatArray) -> Dataset:
     """Return the data without the values of the disturbances."""
     return replace(data, value=data.value - added)
+
+
+def find_dc_coupled(data: Dataset, residual: FloatArray, noise: NoiseModel) -> frozenset[str]:
+    """Return the names of the signals, as in `BySignal`, whose zero differs from run to run.
+
+    Behind an AC coupling that has settled, no zero differs. The zero of a run is the generalised least squares mean of
+    its residuals before the first pulse, so slow noise does not pass for a difference.
+    """
+    found = set()
+    for kind in (kind for kind in data.kinds if kind in PIXEL_KINDS):
+        rows = []
+        for block in data.blocks:
+            pulses = data.runs[block.run].pulses
+            count = int(np.searchsorted(block.t_s, pulses[:, 0].min())) if block.kind == kind and len(pulses) else 0
+            if count >= MIN_QUIET_SAMPLES:
+                columns = np.column_stack([np.ones(count), residual[block.part][:count]])
+                whitened, _ = whiten(block.t_s[:count], columns, noise.coloured[kind])
+                weight = float(whitened[:, 0] @ whitened[:, 0])
+                rows.append((float(whitened[:, 0] @ whitened[:, 1]) / weight, weight))
+        if len(rows) >= MIN_DRIFT_RUNS:
+            zeros, weights = np.array(rows).T
+            spread = float(weights @ (zeros - np.average(zeros, weights=weights)) ** 2)
+            if chdtrc(len(rows) - 1, spread) < MAX_ZERO_P:
+                found.add(BySignal._fields[kind])
+    return frozenset(found)
 
 
 def _find_drift(data: Dataset, residual: FloatArray, kind: int) -> tuple[InstrumentDisturbance, FloatArray] | None:

@@ -12,17 +12,14 @@ other forms of their own effect and a free mean per bin, and second causes are r
 that a search began with the wrong single, whose parts are then refitted alone. `evidence.py` turns all of them into
 probabilities.
 
-Verdict. Nothing is named while no effect is likely (`MAX_NO_EFFECT`). Causes are named that each act with a
-probability of `MIN_NAMED`; else the fewest sets that have it together are ambiguous, unless none of these is more
-probable than each.
-If repeats differ by more than the noise model allows, nothing is named at all (decision 8).
+Verdict. None here: what may be claimed of these numbers is decided in `lab/inference/claim.py`.
 
 Invariants. Nothing here changes the data or the noise model. The same recording gives the same verdict. A hypothesis
 that cannot be computed is recorded in the log with its reason.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import log, log1p, prod
 
@@ -41,6 +38,7 @@ from optodrive.lab.diagnosis.evidence import (
     PRIOR_ONE_CAUSE,
     PRIOR_TWO_CAUSES,
     Explanation,
+    compute_hidden_share,
     compute_log_evidence,
     compute_own_share,
     compute_probabilities,
@@ -50,19 +48,10 @@ from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
 from optodrive.lab.diagnosis.noise_certainty import NoiseCertainty, count_noise_degrees
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
 from optodrive.lab.diagnosis.search_log import SearchLog
+from optodrive.lab.inference.claim import Alternative, Claim, Evidence, HeldOutChange
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
-MAX_NO_EFFECT = 0.05
-"""Largest probability of no effect with which an effect counts as detected."""
-MIN_NAMED = 0.97
-"""Smallest probability of what is named: of one set of causes, or of all sets of an ambiguity."""
-MIN_ALONE = 0.2
-"""Smallest probability of the named causes without another one, which would else be missing in the answer."""
-MIN_LISTED = 0.01
-"""Smallest probability of a further set of causes in an ambiguity."""
-MAX_AMBIGUOUS = 4
-"""Largest number of sets of causes in an ambiguity; a longer list is no answer."""
 NEAR_CHI2 = 30.0
 """χ² above the best refit within which another one is always examined."""
 EXAMINED_SINGLES, EXAMINED_PAIRS = 3, 2
@@ -80,21 +69,92 @@ MAX_INTRA_PULSE_POWER_EXCESS = 25.0
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """Verdict on a subsystem.
+class Selection:
+    """The explanations of a subsystem, compared.
 
-    chosen: the model for all later steps; candidates: refits, best first; nominal_detection: beside the nominal fit;
-    nominal_chi2: of that fit; explained_fraction: share of the detected excess
+    candidates: refits, most probable first; shares: of the excess that each explains alone and with other forms of its
+    effect, where examined; nominal_detection: beside the nominal fit; nominal_chi2: of that fit
     """
 
-    verdict: str
-    causes: tuple[str, ...]
     probabilities: Probabilities
-    chosen: RefittedCandidate | None
     candidates: tuple[RefittedCandidate, ...]
+    shares: Mapping[RefittedCandidate, tuple[float, float]]
     nominal_detection: Detection
     nominal_chi2: float
-    explained_fraction: float = 0.0
+    has_repeats: bool
+    repeats_differ: bool = False
+
+    def collect_evidence(
+        self,
+        held_out: Mapping[RefittedCandidate, tuple[HeldOutChange, ...]] | None = None,
+        doubts: Mapping[RefittedCandidate, Mapping[str, str]] | None = None,
+    ) -> Evidence:
+        """Return the evidence for the judge, with held-out runs and doubts about sizes where these are known."""
+        alternatives = tuple(
+            Alternative(
+                item.causes,
+                self.shares.get(item),
+                (held_out or {}).get(item, ()),
+                (doubts or {}).get(item, {}),
+            )
+            for item in self.candidates
+        )
+        return Evidence(self.probabilities, alternatives, self.has_repeats, self.repeats_differ)
+
+    def choose(self, claimed: Claim) -> RefittedCandidate | None:
+        """Return the model for all later steps: that of the first set which the claim names."""
+        named = {tuple(sorted(keys)) for keys in claimed.sets[:1]}
+        return next((item for item in self.candidates if tuple(sorted(item.causes)) in named), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Claim about a subsystem, with the explanations that it follows from."""
+
+    claim: Claim
+    selection: Selection
+
+    @property
+    def verdict(self) -> str:
+        """The verdict, as in `Discrepancy`."""
+        return self.claim.verdict
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """The causes named."""
+        return self.claim.causes
+
+    @property
+    def probabilities(self) -> Probabilities:
+        """Probabilities of all explanations."""
+        return self.selection.probabilities
+
+    @property
+    def chosen(self) -> RefittedCandidate | None:
+        """The model for all later steps, None without a cause."""
+        return self.selection.choose(self.claim)
+
+    @property
+    def candidates(self) -> tuple[RefittedCandidate, ...]:
+        """Refits, the chosen one first, then by probability."""
+        chosen = self.chosen
+        return tuple(sorted(self.selection.candidates, key=lambda item: item is not chosen))
+
+    @property
+    def nominal_detection(self) -> Detection:
+        """Detection beside the nominal fit."""
+        return self.selection.nominal_detection
+
+    @property
+    def nominal_chi2(self) -> float:
+        """χ² of the nominal fit."""
+        return self.selection.nominal_chi2
+
+    @property
+    def explained_fraction(self) -> float:
+        """Share of the detected excess that the chosen model explains."""
+        chosen = self.chosen
+        return 0.0 if chosen is None else self.selection.shares.get(chosen, (0.0, 0.0))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,18 +182,20 @@ def has_replicate_excess(problem: FitProblem) -> bool:
     )
 
 
-def select_causes(problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog) -> Verdict:
-    """Return the verdict on one subsystem."""
+def compare_explanations(
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], log: SearchLog
+) -> Selection:
+    """Compare all explanations of one subsystem."""
     log.on_progress("testing the nominal model")
     nominal_detection = detect(problem, base, hypotheses, log)
     if has_replicate_excess(problem):
         probabilities = Probabilities(1.0 - CERTAIN, CERTAIN, {(item.key,): 0.0 for item in hypotheses})
-        return Verdict("unexplained", (), probabilities, None, (), nominal_detection, base.chi2)
+        return Selection(probabilities, (), {}, nominal_detection, base.chi2, True, repeats_differ=True)
     singles = refit_strongest(problem, base, (), nominal_detection.scores, log)
-    return select_from_single_causes(problem, base, hypotheses, nominal_detection, singles, log)
+    return compare_from_single_causes(problem, base, hypotheses, nominal_detection, singles, log)
 
 
-def select_from_single_causes(
+def compare_from_single_causes(
     problem: FitProblem,
     base: ModelFit,
     hypotheses: list[Hypothesis],
@@ -141,8 +203,8 @@ def select_from_single_causes(
     singles: list[RefittedCandidate],
     log: SearchLog,
     examined: "_Examined | None" = None,
-) -> Verdict:
-    """Return the verdict that follows from refitted single causes, best first.
+) -> Selection:
+    """Compare the explanations that follow from refitted single causes, best first.
 
     examined: what is known already of some of them
     """
@@ -156,13 +218,19 @@ def select_from_single_causes(
             pairs = refit_pairs(problem, hypotheses, select_near(base, singles), residual_detection, log)
             restarted = refit_alone(problem, base, pairs[0], singles, log) if pairs else singles
             if restarted[0].log_evidence > singles[0].log_evidence + RESTART_GAIN:
-                return select_from_single_causes(problem, base, hypotheses, nominal_detection, restarted, log, examined)
+                return compare_from_single_causes(
+                    problem, base, hypotheses, nominal_detection, restarted, log, examined
+                )
         for item in select_near(base, pairs)[:EXAMINED_PAIRS]:
             _examine(problem, base, hypotheses, item, examined, log)
     explanations = _list_explanations(problem, base, hypotheses, nominal_detection, [*singles, *pairs], examined)
-    refits = [*singles, *pairs]
     probabilities = compute_probabilities(explanations)
-    return _build_verdict(problem, base, nominal_detection, refits, examined, probabilities)
+    best: dict[tuple[str, ...], RefittedCandidate] = {}
+    for item in sorted([*singles, *pairs], key=lambda candidate: -candidate.log_evidence):
+        best.setdefault(tuple(sorted(item.causes)), item)
+    candidates = tuple(best[keys] for keys, _ in probabilities.ranked if keys in best)
+    shares = {item: (rest.explained, rest.explained_with_forms) for item, rest in examined.items()}
+    return Selection(probabilities, candidates, shares, nominal_detection, base.chi2, problem.noise.from_replicates)
 
 
 def select_near(base: ModelFit, ranked: list[RefittedCandidate]) -> list[RefittedCandidate]:
@@ -228,10 +296,12 @@ def _list_explanations(
     for score in nominal_detection.scores:
         if score.hypothesis.label not in refitted:
             evidence = nothing + compute_score_evidence(score.ratio)
-            out.append(Explanation((score.hypothesis.key,), priors.compute((score.hypothesis,)), evidence, degrees))
+            prior, hidden = priors.compute((score.hypothesis,)), compute_hidden_share(score.ratio)
+            out.append(Explanation((score.hypothesis.key,), prior, evidence, degrees, hidden=hidden))
     for item in refits:
         prior = priors.compute(item.hypotheses)
-        out.append(Explanation(item.causes, prior, item.log_evidence, degrees_of[item]))
+        hidden = compute_hidden_share(base.chi2 - item.chi2)
+        out.append(Explanation(item.causes, prior, item.log_evidence, degrees_of[item], hidden=hidden))
         single, share = _find_sufficient_single(item, refits, examined)
         if single is not None:
             mended = priors.compute(single.hypotheses) + log(OTHER_ODDS * share / priors.catalogue)
@@ -305,41 +375,3 @@ def _find_sufficient_single(
     ]
     best, share = max(singles, key=lambda pair: pair[1], default=(None, 0.0))
     return (best, min(share, MAX_FORM_PROBABILITY)) if share > 0.0 else (None, 0.0)
-
-
-def _build_verdict(
-    problem: FitProblem,
-    base: ModelFit,
-    nominal_detection: Detection,
-    refits: list[RefittedCandidate],
-    examined: _Examined,
-    probabilities: Probabilities,
-) -> Verdict:
-    by_causes: dict[tuple[str, ...], RefittedCandidate] = {}
-    for item in sorted(refits, key=lambda candidate: -candidate.log_evidence):
-        by_causes.setdefault(tuple(sorted(item.causes)), item)
-    ranked = [keys for keys, _ in probabilities.ranked if keys in by_causes]
-    candidates = tuple(by_causes[keys] for keys in ranked)
-    if probabilities.no_effect > MAX_NO_EFFECT:
-        return Verdict("none", (), probabilities, None, candidates, nominal_detection, base.chi2)
-    if not candidates or probabilities.none_of_these > probabilities.causes[ranked[0]]:
-        return Verdict("unexplained", (), probabilities, None, candidates, nominal_detection, base.chi2)
-    named = tuple(
-        sorted(key for key in {key for keys in ranked for key in keys} if probabilities.sum_of(key) >= MIN_NAMED)
-    )
-    if named in by_causes and probabilities.causes[named] >= MIN_ALONE and problem.noise.from_replicates:
-        candidates = (by_causes[named], *(item for item in candidates if item is not by_causes[named]))
-        chosen = [named]
-    else:
-        named, chosen, total = (), list[tuple[str, ...]](), 0.0
-        for keys in ranked[:MAX_AMBIGUOUS]:
-            if total >= MIN_NAMED or (chosen and probabilities.causes[keys] < MIN_LISTED):
-                break
-            total += probabilities.causes[keys]
-            chosen.append(keys)
-    best = candidates[0]
-    rest = examined.get(best)
-    explained = 0.0 if rest is None else rest.explained
-    causes = tuple(dict.fromkeys(key for keys in chosen for key in by_causes[keys].causes))
-    verdict = "cause" if named else "ambiguous"
-    return Verdict(verdict, causes, probabilities, best, candidates, nominal_detection, base.chi2, explained)

@@ -11,16 +11,17 @@ from optodrive.core.types.discrepancy import (
     Discrepancy,
     Estimate,
     HeightError,
-    InstrumentDisturbance,
-    Probabilities,
+)
+from optodrive.lab.inference.claim import NOTHING_FOUND, format_probability
+from optodrive.lab.inference.sentences import (
+    describe_claim,
+    describe_disturbance,
+    describe_gain,
+    describe_probabilities,
 )
 from optodrive.physics.terms import discover_terms
 
 MAX_RULED_OUT = 6
-NOTHING_FOUND = ("none", "instrument", "incomplete")
-"""Verdicts that find no error of the model."""
-MIN_SHOWN = 0.01
-"""Smallest probability of a set of causes that the text states."""
 
 
 def _format_interval(item: Estimate) -> str:
@@ -32,7 +33,7 @@ def _format_interval(item: Estimate) -> str:
 
 def build_narrative(discrepancy: Discrepancy) -> list[str]:
     """Return the lines of the narrative: headline, causes, gain, rejected causes, next experiment and remarks."""
-    lines = [_build_headline(discrepancy), ""]
+    lines = [*describe_claim(discrepancy, discover_terms()), ""]
     if discrepancy.causes:
         lines += [
             f"- {discover_terms()[key].label} ({key}); visible in {discover_terms()[key].signature}."
@@ -48,10 +49,12 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
         lines.append(f"This explains {discrepancy.explained_fraction:.1%} of the excess χ² of the nominal model.")
     lines.append(_describe_height_error(discrepancy))
     lines += _describe_locations(discrepancy)
-    lines += _describe_gain(discrepancy)
+    lines += describe_gain(discrepancy.gain, discrepancy.verdict, len(discrepancy.held_out_runs))
+    lines += [f"To tell: {remedy}" for key in discrepancy.causes if (remedy := discover_terms()[key].remedy)]
     if discrepancy.failures:
         lines.append("Could not be computed, and may explain what was measured:")
         lines += [f"- {label}: {reason}" for label, reason in discrepancy.failures.items()]
+    lines += [f"Left out, for it failed: {step} ({error})." for step, error in discrepancy.omissions.items()]
     if discrepancy.verdict in NOTHING_FOUND:
         lines += ["Detection limit of each effect:"]
         lines += [f"- {item.label}: {item.detection_limit}" for item in _deduplicate_by_label(discrepancy.candidates)]
@@ -77,62 +80,6 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
         ]
     lines += list(discrepancy.remarks)
     return lines
-
-
-def describe_probabilities(probabilities: Probabilities) -> str:
-    """Return the probabilities in one sentence, those of sets of causes above `MIN_SHOWN`."""
-    parts = [
-        f"{' with '.join(keys)} {format_probability(probability)}"
-        for keys, probability in probabilities.ranked
-        if probability >= MIN_SHOWN
-    ]
-    parts += [
-        f"none of these causes {format_probability(probabilities.none_of_these)}",
-        f"no effect {format_probability(probabilities.no_effect)}",
-    ]
-    return f"Probabilities: {', '.join(parts)}."
-
-
-def describe_disturbance(item: InstrumentDisturbance) -> str:
-    """Return a disturbance of an instrument as a clause."""
-    name, unit = item.signal.rsplit("_", 1)
-    size = format_quantity(item.size, unit)
-    if item.form == "line":
-        return f"{name} carries a line of {item.frequency_hz:.4g} Hz with an amplitude of {size}"
-    if item.form == "hops":
-        return f"the zero of {name} hops by {size}, seen in {item.runs} run{'s' if item.runs > 1 else ''}"
-    return f"the zero of {name} drifts by {size} over the recording"
-
-
-def format_probability(probability: float) -> str:
-    """Return a probability in percent, never as certainty."""
-    if probability < 1e-3:
-        return "< 0.1 %"
-    return "> 99.9 %" if probability > 1.0 - 1e-3 else f"{100.0 * probability:.1f} %"
-
-
-def _build_headline(discrepancy: Discrepancy) -> str:
-    names = [discover_terms()[key].label for key in discrepancy.causes]
-    if discrepancy.verdict == "none":
-        return "No error found: the refitted nominal model agrees with this recording within its noise."
-    if discrepancy.verdict == "instrument":
-        found = " and ".join(describe_disturbance(item) for item in discrepancy.disturbances)
-        return f"No error of the model found, but an instrument is disturbed: {found}."
-    failed = ", ".join(discrepancy.failures)
-    if discrepancy.verdict == "incomplete":
-        return f"The search is incomplete, for {failed} could not be computed; nothing else shows an error."
-    doubts = "".join(f", but {clause}" for clause in discrepancy.doubts.values())
-    others = f"; {failed} could not be computed and may explain it" if failed else ""
-    wrong = f"The nominal model is wrong{', perhaps' if doubts or failed else ''}"
-    if discrepancy.verdict == "cause":
-        return f"{wrong} because {' and '.join(names)}{doubts}{others}."
-    if discrepancy.verdict == "ambiguous" and len(names) == 1:
-        probability = format_probability(discrepancy.probabilities.sum_of(discrepancy.causes[0]))
-        return f"The nominal model is wrong, perhaps because {names[0]} ({probability}){doubts}{others}."
-    if discrepancy.verdict == "ambiguous" and names:
-        causes = "; or ".join(names)
-        return f"The nominal model is wrong; this data cannot separate these causes: {causes}{doubts}{others}."
-    return f"The nominal model is wrong, and no known cause explains it{others}."
 
 
 def _describe_height_error(discrepancy: Discrepancy) -> str:
@@ -174,30 +121,6 @@ def _describe_locations(discrepancy: Discrepancy) -> list[str]:
     ]
 
 
-def _describe_gain(discrepancy: Discrepancy) -> list[str]:
-    gain = discrepancy.gain
-    if gain is None:
-        if discrepancy.verdict in ("cause", "ambiguous"):
-            return ["The gain cannot be measured: no held-out run shows the effect."]
-        return []
-    if gain.interval is None:
-        interval = "one experiment was held out, so there is no interval"
-    else:
-        interval = f"95 %: {gain.interval[0]:.0%} to {gain.interval[1]:.0%}"
-    lines = [
-        f"On {len(discrepancy.held_out_runs)} runs held out of the selection, the extended model removes "
-        f"{gain.reduction:.0%} of the avoidable error ({interval})."
-    ]
-    for name, nominal in gain.nominal.items():
-        unit = name.rsplit("_", 1)[1]
-        extended, floor = gain.extended[name], gain.noise_floor[name]
-        lines.append(
-            f"  {name}: RMSE {format_quantity(nominal, unit)} nominal, {format_quantity(extended, unit)} extended, "
-            f"noise {format_quantity(floor, unit)}"
-        )
-    return lines
-
-
 def _deduplicate_by_label(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
     """Return the first candidate of each label, sorted. Pixels come before mirrors."""
     first: dict[str, CandidateCause] = {}
@@ -212,6 +135,7 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
     return {
         "verdict": discrepancy.verdict,
         "causes": list(discrepancy.causes),
+        "reasons": list(discrepancy.reasons),
         "disturbances": [
             {
                 "signal": item.signal,
@@ -238,6 +162,7 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
         "explained_fraction": discrepancy.explained_fraction,
         "doubts": discrepancy.doubts,
         "failures": discrepancy.failures,
+        "omissions": discrepancy.omissions,
         "height_error": {
             "held_out": _height_error_to_json(discrepancy.height_error_held_out),
             "fitted": _height_error_to_json(discrepancy.height_error_fitted),

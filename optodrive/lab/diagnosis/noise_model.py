@@ -50,6 +50,8 @@ ROUNDING_SHARE = 1e-6
 """Steps between samples below this share of the largest value are rounding errors, not quantisation."""
 ROUNDING_S = 0.02
 """Duration for which the rounding error of a settled signal without noise persists."""
+MAX_LAG = 40
+"""Samples over which correlations of whitened samples are looked at."""
 MIN_QUANTA = 8
 """Minimum number of steps between distinct samples for quantisation to be recognised."""
 
@@ -188,22 +190,37 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
             coloured[kind] = replace(item, white=max(item.white, error), sigma=sigma, tau_s=tau_s)
             baseline_sigma[kind] = max(baseline_sigma[kind], error)
     model = NoiseModel(coloured, power_sigma, timing_sigma_s, baseline_sigma, True, has_noise=repeats_differ)
-    return replace(
-        model,
-        replicate_excess=max(
-            (_compute_replicate_excess(item, model) for item in contrasts if item.kind in PIXEL_KINDS), default=0.0
-        ),
-    )
+    return replace(model, replicate_excess=_compute_replicate_excess(contrasts, model))
 
 
-def _compute_replicate_excess(contrast: Contrast, model: NoiseModel) -> float:
-    """Return the excess of a contrast's χ², jitters marginalised, over its expectation, in σ."""
+def _compute_replicate_excess(contrasts: list[Contrast], model: NoiseModel) -> float:
+    """Return the largest excess of a contrast's χ², jitters marginalised, over its expectation, in σ.
+
+    Where the model whitens the noise badly, as of a signal that was filtered, squares of neighbours are no independent
+    ones, and the sum of them varies more by the sum of the squared correlations.
+    """
+    largest = 0.0
+    for kind in {item.kind for item in contrasts if item.kind in PIXEL_KINDS}:
+        found = [_compute_excess(item, model) for item in contrasts if item.kind == kind]
+        correlations = np.median([correlation for _, correlation in found], axis=0)
+        largest = max(largest, max(excess for excess, _ in found) / sqrt(1.0 + 2.0 * float((correlations**2).sum())))
+    return largest
+
+
+def _compute_excess(contrast: Contrast, model: NoiseModel) -> tuple[float, FloatArray]:
+    """Return the excess of one contrast's χ² for independent samples, and the correlations of its whitened samples."""
     size = np.array([model.power_sigma, model.timing_sigma_s, model.baseline_sigma[contrast.kind]])
     columns = np.column_stack([contrast.value, contrast.jitter * size])
     whitened, _ = whiten(contrast.t_s, columns, model.coloured[contrast.kind])
     gram, count = whitened.T @ whitened, len(contrast.value)
     inner = gram[1:, 1:] + np.eye(len(size))
-    return float((gram[0, 0] - gram[0, 1:] @ np.linalg.solve(inner, gram[0, 1:]) - count) / sqrt(2.0 * count))
+    jitter = np.linalg.solve(inner, gram[0, 1:])
+    values = whitened[:, 0] - whitened[:, 1:] @ jitter
+    lags = range(1, min(MAX_LAG, count // 4) + 1)
+    correlations = np.zeros(MAX_LAG)
+    correlations[: len(lags)] = [float(values[lag:] @ values[:-lag]) for lag in lags]
+    correlations /= max(float(values @ values), EPS)
+    return float((gram[0, 0] - gram[0, 1:] @ jitter - count) / sqrt(2.0 * count)), correlations
 
 
 def _minimize(function: Callable[[FloatArray], float], start: FloatArray, step: float, evaluations: int) -> FloatArray:

@@ -1,7 +1,7 @@
 """Model prediction for a recording's drive, as one vector aligned with the measured one."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.device.servo import simulate_servo
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, PIXEL_KINDS, Dataset
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import ActiveTerms, simulate_signals
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.stability import check_time_constants
-from optodrive.physics.term import SignalDelays, TermValues
+from optodrive.physics.term import BySignal, TermValues
 from optodrive.physics.terms import all_terms
 
 BASE_PARAMETERS = ("R", "C", "tau_g", "kappa", "phi")
@@ -43,28 +43,44 @@ def predict(
     out = np.zeros(len(data.value))
     pixel = point.pixel(epsilon * power_factor)
     terms = [(all_terms()[key], values) for key, values in point.terms.items()]
-    signal_delays = [term.signal_delays(values) for term, values in terms]
-    signal_count = len(SignalDelays._fields)
-    delays_s = [delay_s + sum(delays[signal] for delays in signal_delays) for signal in range(signal_count)]
+    delays_s = BySignal(*(delay_s + sum(each) for each in _transpose([t.signal_delays(v) for t, v in terms])))
+    rates = BySignal(*(sum(each) for each in _transpose([t.signal_rates(v) for t, v in terms])))
     check_time_constants(point.terms)
     active = ActiveTerms.from_values(point.terms)
     if any(term.varies_between_runs for term, _ in terms):
         for experiment, numbers in data.experiments:
-            signals = simulate_signals(experiment, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
+            signals = simulate_signals(_time_truly(experiment, rates), pixel, active, delays_s[:3])
             for kind in PIXEL_KINDS:
                 if numbers[kind] >= 0:
                     out[data.blocks[numbers[kind]].part] = signals[kind]
     else:
         for item in data.drive_groups:
-            signals = simulate_signals(item.experiment, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
+            signals = simulate_signals(_time_truly(item.experiment, rates), pixel, active, delays_s[:3])
             for kind, number, rows in item.block_rows:
                 out[data.blocks[number].part] = signals[kind][rows]
     servo = next((servo for term, values in terms if (servo := term.servo(values)) is not None), None)
     for block in data.blocks:
         commands = data.runs[block.run].commands
-        if block.kind in MIRROR_KINDS and commands is not None:
+        if block.kind in PIXEL_KINDS:
+            for term, values in terms:
+                out[block.part] = term.record(values, BySignal._fields[block.kind], block.t_s, out[block.part])
+        elif commands is not None:
             column = commands[:, 1 + MIRROR_KINDS.index(block.kind)]
-            out[block.part] = simulate_servo(commands[:, 0], column, block.t_s - delays_s[3], servo)
+            t_s = block.t_s / (1.0 + rates.mirrors) - delays_s.mirrors
+            out[block.part] = simulate_servo(commands[:, 0], column, t_s, servo)
     if not np.isfinite(out).all():
         raise DivergedError(", ".join(point.terms) or "the nominal model", Unquoted("no number"), "finite predictions")
     return out
+
+
+def _transpose(rows: list[BySignal]) -> Iterable[tuple[float, ...]]:
+    return zip(*rows, strict=True) if rows else [()] * len(BySignal._fields)
+
+
+def _time_truly(experiment: PixelExperiment, rates: BySignal) -> PixelExperiment:
+    """Return the experiment with the true times of its samples."""
+    if not any(rates):
+        return experiment
+    times = experiment.t_s
+    true_s = (times[0] / (1.0 + rates[0]), times[1] / (1.0 + rates[1]), times[2] / (1.0 + rates[2]))
+    return replace(experiment, t_s=true_s)

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.core.errors import DivergedError
 from optodrive.lab.diagnosis.detection import Detection, Score, detect
 from optodrive.lab.diagnosis.evidence import compute_log_evidence
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
-from optodrive.lab.diagnosis.search_log import SearchLog
+from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE, SearchLog
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
 CHI2_ABANDON = 300.0
@@ -74,7 +73,7 @@ def refit_strongest(
                 result = _refit_every_start(problem, base, score.hypothesis, free)
             else:
                 result = fit(problem, start, free, chi2_abandon=chi2_abandon)
-        except DivergedError as error:
+        except UNCOMPUTABLE as error:
             log.add_failure(score.hypothesis.label, error)
             continue
         chi2_by_score = base.chi2 - score.ratio if _is_within_ranges(score) else np.inf
@@ -96,7 +95,7 @@ def _retry(
         starts = score.hypothesis.starts
         points += [ParameterPoint(base.point.base, {**base.point.terms, score.hypothesis.key: s}) for s in starts]
     for point in points:
-        with suppress(DivergedError):
+        with suppress(*UNCOMPUTABLE):
             result = min(result, fit(problem, point, free), key=lambda item: item.chi2)
     return result
 
@@ -150,7 +149,7 @@ def refit_alone(
         free = (*base.free, *item.free)
         try:
             result = fit(problem, point, free)
-        except DivergedError as error:
+        except UNCOMPUTABLE as error:
             log.add_failure(item.label, error)
             continue
         candidate = RefittedCandidate((item,), result, result.chi2, compute_log_evidence(problem, result, result.chi2))

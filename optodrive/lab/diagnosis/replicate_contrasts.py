@@ -9,6 +9,8 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
 
 MIRROR_SETTLED_S = 4e-3
+MIN_COMMON = 16
+"""Smallest number of samples of a contrast."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +73,35 @@ def _select_settled(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray
 
 
 def _find_common_rows(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | None:
-    """Return the rows of each time axis that all axes share to 0.1 µs, or None for fewer than 16."""
+    """Return the rows of each time axis that belong together, or None for fewer than 16.
+
+    These are times that all axes share to 0.1 µs. Free-running instruments share none: then each sample belongs to the
+    nearest one of the first axis, within half an interval. What the residuals change by in this time counts as noise.
+    """
     keys = [np.round(times * 1e7).astype(np.int64) for times in (first, *others)]
     shared = keys[0]
     for key in keys[1:]:
         shared = np.intersect1d(shared, key, assume_unique=True)
-    if len(shared) < 16:
+    if len(shared) >= MIN_COMMON:
+        return [np.searchsorted(key, shared).astype(np.int64) for key in keys]
+    if len(first) < MIN_COMMON:
         return None
-    return [np.searchsorted(key, shared).astype(np.int64) for key in keys]
+    nearest = [_match_nearest(first, times) for times in others]
+    kept = np.flatnonzero(np.all([rows >= 0 for rows in nearest], axis=0))
+    return [kept, *(rows[kept] for rows in nearest)] if len(kept) >= MIN_COMMON else None
+
+
+def _match_nearest(first: FloatArray, times: FloatArray) -> IntArray:
+    """Return the row of the nearest time for each of the first axis, each at most once, or −1."""
+    middle = 0.5 * (first[1:] + first[:-1])
+    owner = np.searchsorted(middle, times)
+    distance = np.abs(times - first[owner])
+    best = np.lexsort((distance, owner))
+    owners, at = np.unique(owner[best], return_index=True)
+    rows = np.full(len(first), -1, dtype=np.int64)
+    is_near = distance[best][at] <= 0.51 * float(np.median(np.diff(first)))
+    rows[owners[is_near]] = best[at][is_near]
+    return rows
 
 
 def build_residual_contrasts(

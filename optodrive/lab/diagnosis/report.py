@@ -9,9 +9,12 @@ from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.types.discrepancy import Discrepancy, Probabilities, ResidualTrace
 from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
-from optodrive.lab.diagnosis.narrative import MIN_SHOWN, build_narrative, format_probability
+from optodrive.lab.diagnosis.narrative import build_narrative
 from optodrive.lab.diagnosis.next_steps import OUT, NextStep, list_next_steps
 from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_residuals, draw_share
+from optodrive.lab.diagnosis.search_log import SearchLog
+from optodrive.lab.inference.claim import format_probability
+from optodrive.lab.inference.sentences import MIN_SHOWN
 
 MAX_TRACES = 12
 NAMED = ("identified", "indistinguishable")
@@ -35,9 +38,10 @@ def build_report(
     sections: HTML that follows the probabilities
     """
     has_extension = bool(discrepancy.terms)
+    steps = SearchLog().attempt("next steps", list_next_steps, list[NextStep](), discrepancy, recordings, out, config)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     parts = [
-        *_build_next_steps(list_next_steps(discrepancy, recordings, out, config)),
+        *_build_next_steps(steps),
         *_build_probabilities(discrepancy.probabilities),
         *sections,
         "<h2>Measured against model</h2>",
@@ -75,8 +79,8 @@ def _build_probabilities(probabilities: Probabilities) -> list[str]:
     ]
     return [
         "<h2>Probabilities</h2>",
-        "<p>Of each cause alone, of causes that act together, of a cause that is in no catalogue, and of no effect. "
-        "They sum to one; what has less than "
+        "<p>Of each cause alone, of causes that act together, of a cause that is in no catalogue, and of no effect, or "
+        "none that this recording could show. They sum to one; what has less than "
         f"{format_probability(MIN_SHOWN)} is not listed.</p>",
         render_table(("explanation", "diagram", "probability"), cells, frozenset({2}), "Probabilities"),
     ]

@@ -6,8 +6,8 @@ from typing import Any
 
 from optodrive.core.quantity import format_quantity
 from optodrive.core.svg_plot import Axis, Series, draw_plot
-from optodrive.lab.diagnosis.narrative import format_probability
 from optodrive.lab.discovery import Curve
+from optodrive.lab.inference.claim import format_probability
 from optodrive.lab.pixel_discovery.findings import NODES, PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.planned_terms import PlannedTerms
 

@@ -28,7 +28,9 @@ LONG_PULSE_S = 0.1
 """Overlapping pulses above this width, s, that would not overlap a thousand times shorter, are taken to be in ms."""
 OVERLAP_MAX_S = 1e-9
 """Tolerated overlap of consecutive pulses: the rounding error of their times."""
-RUN_ATTRIBUTES = ("group", "aim_x_m", "aim_y_m", "bridge_width_m", "started_at")
+COUPLINGS = ("DC", "AC")
+"""Couplings of the instruments' inputs."""
+RUN_ATTRIBUTES = ("group", "aim_x_m", "aim_y_m", "bridge_width_m", "started_at", "coupling")
 """Attributes of a run that have a meaning, besides `ambient_K`."""
 SIGNAL_ATTRIBUTES = ("pixel", "sigma", "unit", "units")
 MISSPELT_SIMILARITY = 0.8
@@ -67,6 +69,8 @@ def pop_ambient_k(place: str, attributes: Attributes) -> float:
         expected = f"a temperature between {AMBIENT.low:g} and {AMBIENT.high:g} K{likely}"
         raise InputError(f"{place}: ambient_K", value, expected)
     check_names(place, attributes, RUN_ATTRIBUTES)
+    if attributes.get("coupling", "DC") not in COUPLINGS:
+        raise InputError(f"{place}: coupling", attributes["coupling"], " or ".join(COUPLINGS))
     return float(value)
 
 

@@ -1,7 +1,7 @@
 """Clock offset: the clock of one instrument, or of all, is late."""
 
 from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
-from optodrive.physics.term import SignalDelays, Term, TermValues
+from optodrive.physics.term import BySignal, Term, TermValues
 
 START_S = 2e-4
 
@@ -21,25 +21,15 @@ class ClockOffset(Term):
     is_exact = True
     subsystems = ("pixels", "mirrors")
     signature = "every edge, in proportion to the slope"
+    remedy = "trigger the instrument by the light itself, and record again."
 
-    def signal_delays(self, values: TermValues) -> SignalDelays:
+    def signal_delays(self, values: TermValues) -> BySignal:
         """Return the offsets of the four clocks."""
-        return SignalDelays(**values)
+        return BySignal(**values)
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
         """Return a common offset of all clocks and, for a recording of several signals, one offset per signal."""
-        clocks = tuple(item.name for item in self.parameters)
-        single = [(name,) for name in scope.signals] if len(scope.signals) > 1 else []
-        return [
-            Hypothesis(
-                self.key,
-                f"{self.key} of {'all signals' if len(names) > 1 else names[0]}",
-                (dict.fromkeys(clocks, 0.0) | dict.fromkeys(names, START_S),),
-                (self.free(*names),),
-                is_linear=True,
-            )
-            for names in (clocks, *single)
-        ]
+        return self.build_hypotheses_by_signal(scope, START_S)
 
 
 TERM = ClockOffset()

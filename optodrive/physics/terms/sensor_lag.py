@@ -3,7 +3,7 @@
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.hypothesis import TermParameter
-from optodrive.physics.term import Kernels, SignalDelays, Term, TermValues
+from optodrive.physics.term import BySignal, Kernels, Term, TermValues
 
 
 @kernel
@@ -36,10 +36,11 @@ class SensorLag(Term):
     is_fast = True
     cannot_add_heat = True
     signature = "edges of temperature against those of displacement"
+    remedy = "record a step of light with a faster detector, or at a shorter exposure."
 
-    def signal_delays(self, values: TermValues) -> SignalDelays:
+    def signal_delays(self, values: TermValues) -> BySignal:
         """Return the thermometer's delay."""
-        return SignalDelays(temperature=values["time"] * values["delay_share"])
+        return BySignal(temperature=values["time"] * values["delay_share"])
 
 
 TERM = SensorLag()

@@ -1,0 +1,1 @@
+"""Decision on the claims that measured data permit."""

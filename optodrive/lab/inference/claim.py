@@ -1,0 +1,223 @@
+"""Judge of the claims about a recording.
+
+Theory of operation
+
+Problem. A probability is relative to the explanations that were compared. Where the right one is not among them, as
+where an instrument did what no hypothesis describes, the least bad of the others takes it all, though it explains
+little or makes worse what the fit never saw. So a probability alone must not name a cause.
+
+Conditions. A cause is named only if it is probable, and explains half of the excess alone and nine tenths with other
+forms of its own effect, and makes no signal of a held-out group worse beyond noise, and all of them together better,
+and if the interval of its effect does not contain zero. Each condition is a number from data that the fit did not see,
+or did not shape. What fails is `ambiguous` where the name is still likely, else `unexplained`, and the reason is part
+of the claim. Without repeats the noise is a guess, and nothing is certain.
+
+Nothing found. `none` needs a large probability of no effect. Between that and an effect that is certain, the recording
+cannot tell, and the claim says so: `undecided`.
+
+Everything here is a function of `Evidence`. No caller makes a verdict of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from optodrive.core.types.discrepancy import Probabilities
+
+Causes = tuple[str, ...]
+"""Keys of causes that act together."""
+
+MIN_NO_EFFECT = 0.9
+"""Smallest probability of no effect with which nothing counts as found."""
+MAX_NO_EFFECT = 0.05
+"""Largest probability of no effect with which an effect counts as detected."""
+MIN_NAMED = 0.97
+"""Smallest probability of what is named: of one set of causes, or of all sets of an ambiguity."""
+MIN_ALONE = 0.2
+"""Smallest probability of the named causes without another one, which would else be missing in the answer."""
+MIN_LISTED = 0.01
+"""Smallest probability of a further set of causes in an ambiguity."""
+MAX_AMBIGUOUS = 4
+"""Largest number of sets of causes in an ambiguity; a longer list is no answer."""
+MIN_EXPLAINED, MIN_EXPLAINED_WITH_FORMS = 0.5, 0.9
+"""Smallest share of the excess that a cause explains alone, and with other forms of its effect."""
+MAX_WORSE_SIGMA = 3.0
+"""Largest increase of a held-out signal's error, in σ, that counts as noise."""
+WORST_FIRST = ("unexplained", "ambiguous", "cause", "incomplete", "undecided", "instrument", "none")
+"""Verdicts, in the order in which that of one part of a recording decides that of the whole."""
+NOTHING_FOUND = ("none", "instrument", "incomplete", "undecided")
+"""Verdicts that name no error."""
+
+
+@dataclass(frozen=True)
+class HeldOutChange:
+    """Change of χ² of one signal of a held-out group by an extension, and the standard deviation of it by noise."""
+
+    group: str
+    signal: str
+    chi2: float
+    noise: float
+
+    @property
+    def sigma(self) -> float:
+        """Increase in σ, negative where the extension is better."""
+        return self.chi2 / max(self.noise, 1e-12)
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A fitted set of causes.
+
+    explained: shares of the excess that it explains alone and with other forms of its effect, None if not known;
+    held_out: its changes, empty if nothing was held out; doubts: clauses on sizes whose intervals
+    contain no effect, by cause
+    """
+
+    causes: Causes
+    explained: tuple[float, float] | None = None
+    held_out: tuple[HeldOutChange, ...] = ()
+    doubts: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The causes in words."""
+        return " and ".join(self.causes)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence from a recording or a part of it.
+
+    alternatives: the fitted sets of causes, most probable first; has_repeats: whether the noise is known;
+    repeats_differ: by more than noise
+    """
+
+    probabilities: Probabilities
+    alternatives: tuple[Alternative, ...]
+    has_repeats: bool = True
+    repeats_differ: bool = False
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A verdict, the sets of causes that it names, and why it is not more definite, in sentences."""
+
+    verdict: str
+    sets: tuple[Causes, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def causes(self) -> Causes:
+        """All causes named, each once."""
+        return tuple(dict.fromkeys(key for keys in self.sets for key in keys))
+
+
+def claim(evidence: Evidence) -> Claim:
+    """Return the strongest claim that the evidence permits."""
+    probabilities = evidence.probabilities
+    if evidence.repeats_differ:
+        return Claim("unexplained", reasons=("Repeats differ by more than noise, so nothing was compared.",))
+    if probabilities.no_effect > MAX_NO_EFFECT:
+        return _claim_nothing(probabilities)
+    ranked = evidence.alternatives
+    if not ranked or probabilities.none_of_these > max(probabilities.causes[_sort(item.causes)] for item in ranked):
+        return Claim("unexplained")
+    certain = _find_certain(evidence)
+    listed = _list_ambiguous(evidence) if certain is None else [certain]
+    refusals = {item.causes: _list_refusals(item) for item in listed}
+    sets = tuple(causes for causes, reasons in refusals.items() if not reasons)
+    reasons = tuple(reason for each in refusals.values() for reason in each)
+    if not sets:
+        return Claim("unexplained", reasons=reasons)
+    if certain is None:
+        return Claim("ambiguous", sets, reasons)
+    doubts = _list_doubts(certain)
+    return Claim("ambiguous" if doubts else "cause", sets, doubts)
+
+
+def combine_claims(claims: Sequence[Claim], failures: Mapping[str, str], has_disturbances: bool) -> Claim:
+    """Return the claim of a whole recording from those of its parts.
+
+    failures: hypotheses that could not be computed; has_disturbances: of instruments, which were subtracted
+    """
+    verdicts = {item.verdict for item in claims}
+    verdicts |= ({"incomplete"} if failures else set()) | ({"instrument"} if has_disturbances else set())
+    verdict = next(each for each in WORST_FIRST if each in verdicts)
+    names = verdict in ("ambiguous", "cause")
+    sets = tuple(keys for item in claims for keys in item.sets) if names else ()
+    return Claim(verdict, sets, tuple(dict.fromkeys(reason for item in claims for reason in item.reasons)))
+
+
+def _claim_nothing(probabilities: Probabilities) -> Claim:
+    if probabilities.no_effect >= MIN_NO_EFFECT:
+        return Claim("none")
+    reason = (
+        f"No effect has a probability of {format_probability(probabilities.no_effect)}, where "
+        f"{format_probability(MIN_NO_EFFECT)} would show that there is none and {format_probability(MAX_NO_EFFECT)} "
+        "that there is one."
+    )
+    return Claim("undecided", reasons=(reason,))
+
+
+def _find_certain(evidence: Evidence) -> Alternative | None:
+    """Return the set of all causes that each act with `MIN_NAMED`, if it was fitted and noise is known."""
+    probabilities = evidence.probabilities
+    keys = {key for item in evidence.alternatives for key in item.causes}
+    named = tuple(sorted(key for key in keys if probabilities.sum_of(key) >= MIN_NAMED))
+    if not evidence.has_repeats or probabilities.causes.get(named, 0.0) < MIN_ALONE:
+        return None
+    return next((item for item in evidence.alternatives if _sort(item.causes) == named), None)
+
+
+def _list_ambiguous(evidence: Evidence) -> list[Alternative]:
+    """Return the fewest sets that have `MIN_NAMED` together."""
+    listed: list[Alternative] = []
+    total = 0.0
+    for item in evidence.alternatives[:MAX_AMBIGUOUS]:
+        probability = evidence.probabilities.causes[_sort(item.causes)]
+        if total >= MIN_NAMED or (listed and probability < MIN_LISTED):
+            break
+        total += probability
+        listed.append(item)
+    return listed
+
+
+def _list_refusals(item: Alternative) -> tuple[str, ...]:
+    """Return why a set of causes must not be named at all, not even as one of several."""
+    out = []
+    if item.explained is not None and item.explained[0] < MIN_EXPLAINED:
+        out.append(f"{item.name} explains {_format_share(item.explained[0])} of the excess, less than half.")
+    noise = sum(each.noise**2 for each in item.held_out) ** 0.5
+    total = HeldOutChange("", "", sum(each.chi2 for each in item.held_out), noise)
+    if total.sigma > MAX_WORSE_SIGMA:
+        out.append(f"With {item.name}, the held-out runs are predicted worse, by {total.sigma:.1f} σ.")
+    return tuple(out)
+
+
+def _list_doubts(item: Alternative) -> tuple[str, ...]:
+    """Return why a probable set of causes that is not refused is not certain."""
+    out = []
+    if item.explained is not None and item.explained[1] < MIN_EXPLAINED_WITH_FORMS:
+        share = _format_share(item.explained[1])
+        out.append(f"{item.name} explains {share} of the excess in all its forms, less than nine tenths.")
+    out += [
+        f"With {item.name}, {each.signal} of the held-out group {each.group} is predicted worse, by {each.sigma:.1f} σ."
+        for each in item.held_out
+        if each.sigma > MAX_WORSE_SIGMA
+    ]
+    out += [f"{key} is not certain: {clause}." for key, clause in item.doubts.items()]
+    return tuple(out)
+
+
+def _sort(causes: Causes) -> Causes:
+    return tuple(sorted(causes))
+
+
+def _format_share(share: float) -> str:
+    return f"{100.0 * share:.1f} %".replace("-", "−")
+
+
+def format_probability(probability: float) -> str:
+    """Return a probability in percent, never as certainty."""
+    if probability < 1e-3:
+        return "< 0.1 %"
+    return "> 99.9 %" if probability > 1.0 - 1e-3 else f"{100.0 * probability:.1f} %"

@@ -1,0 +1,235 @@
+"""The judge names a cause only on four conditions, and its words agree with its numbers."""
+
+import ast
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import optodrive.lab
+from optodrive.core.types.discrepancy import Discrepancy, HeldOutGain, InstrumentDisturbance, Probabilities
+from optodrive.lab.inference import claim as judge
+from optodrive.lab.inference.claim import (
+    MAX_NO_EFFECT,
+    MAX_WORSE_SIGMA,
+    MIN_NO_EFFECT,
+    NOTHING_FOUND,
+    WORST_FIRST,
+    Alternative,
+    Claim,
+    Evidence,
+    HeldOutChange,
+    claim,
+    combine_claims,
+)
+from optodrive.lab.inference.sentences import describe_claim, describe_gain, describe_probabilities
+from optodrive.physics.terms import discover_terms
+
+CAUSES = ("gas_leak", "laser_droop", "high_pass", "membrane_stiffening")
+SETS = (*((key,) for key in CAUSES), ("gas_leak", "laser_droop"), ("high_pass", "laser_droop"))
+BETTER = HeldOutChange("strong", "displacement_m", -400.0, 40.0)
+WORSE = HeldOutChange("strong", "absorber_temperature_K", 50.0, 10.0)
+DOUBT = {"gas_leak": "the 95 % interval of gas_leak.rate, −1 to 2, contains zero"}
+
+
+def make_evidence(probability=0.99, **changes):
+    """Return the evidence of a leak that is certain, but for what is changed."""
+    leak = Alternative(("gas_leak",), (0.98, 0.99), (BETTER,))
+    rest = 1.0 - probability
+    probabilities = Probabilities(0.2 * rest, 0.3 * rest, {("gas_leak",): probability, ("laser_droop",): 0.5 * rest})
+    alternatives = (replace(leak, **changes), Alternative(("laser_droop",), (0.6, 0.7)))
+    return Evidence(probabilities, alternatives)
+
+
+def test_a_cause_that_meets_all_conditions_is_named():
+    assert claim(make_evidence()) == Claim("cause", (("gas_leak",),))
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict", "reason", "limit"),
+    [
+        ({"explained": (-0.071, 0.2)}, "unexplained", "explains −7.1 % of the excess, less than half", "MIN_EXPLAINED"),
+        ({"explained": (0.8, 0.85)}, "ambiguous", "85.0 % of the excess in all", "MIN_EXPLAINED_WITH_FORMS"),
+        ({"held_out": (BETTER, WORSE)}, "ambiguous", "absorber_temperature_K .* strong .* 5.0 σ", "MAX_WORSE_SIGMA"),
+        ({"held_out": (WORSE,)}, "unexplained", "predicted worse, by 5.0 σ", "MAX_WORSE_SIGMA"),
+        ({"doubts": DOUBT}, "ambiguous", "gas_leak is not certain: the 95 % interval .* contains zero", ""),
+    ],
+)
+def test_each_condition_keeps_a_cause_from_being_named(monkeypatch, changes, verdict, reason, limit):
+    found = claim(make_evidence(**changes))
+    assert found.verdict == verdict
+    assert re.search(reason, " ".join(found.reasons))
+    # The mutant without the condition names the cause.
+    if limit:
+        for name in ("MIN_EXPLAINED", "MIN_EXPLAINED_WITH_FORMS") if limit == "MIN_EXPLAINED" else (limit,):
+            monkeypatch.setattr(judge, name, 1e9 if limit == "MAX_WORSE_SIGMA" else -1e9)
+        assert claim(make_evidence(**changes)).verdict == "cause"
+    else:
+        assert claim(make_evidence(**changes | {"doubts": {}})).verdict == "cause"
+
+
+def test_without_repeats_nothing_is_certain():
+    assert claim(replace(make_evidence(), has_repeats=False)).verdict == "ambiguous"
+    assert claim(replace(make_evidence(), repeats_differ=True)).verdict == "unexplained"
+
+
+def test_sets_that_explain_little_leave_an_ambiguity():
+    evidence = make_evidence(0.8)
+    assert claim(evidence).sets == (("gas_leak",), ("laser_droop",))
+    little = replace(evidence.alternatives[1], explained=(0.14, 0.2))
+    found = claim(replace(evidence, alternatives=(evidence.alternatives[0], little)))
+    assert (found.verdict, found.sets) == ("ambiguous", (("gas_leak",),))
+    assert "laser_droop explains 14.0 %" in found.reasons[0]
+
+
+@pytest.mark.parametrize(("no_effect", "verdict"), [(0.95, "none"), (0.31, "undecided"), (0.06, "undecided")])
+def test_nothing_found_is_not_said_where_the_data_cannot_tell(no_effect, verdict):
+    rest = {("laser_droop",): 1.0 - no_effect}
+    evidence = Evidence(Probabilities(no_effect, 0.0, rest), (Alternative(("laser_droop",), (0.9, 1.0)),))
+    assert claim(evidence).verdict == verdict
+
+
+@st.composite
+def draw_evidence(draw):
+    """Draw probabilities that sum to 1, and what is known of each set of causes."""
+    sets = draw(st.lists(st.sampled_from(SETS), unique_by=lambda keys: tuple(sorted(keys)), max_size=5))
+    weights = [draw(st.sampled_from((0.0, 1e-5, 1e-3, 0.02, 0.3, 1.0, 40.0))) for _ in range(len(sets) + 2)]
+    total = sum(weights) or 1.0
+    no_effect, none, *causes = (weight / total for weight in weights) if sum(weights) else (1.0, *weights[1:])
+    probabilities = Probabilities(no_effect, none, {tuple(sorted(k)): p for k, p in zip(sets, causes, strict=True)})
+    shares = st.one_of(st.none(), st.tuples(st.floats(-2.0, 1.0), st.floats(0.0, 1.0)))
+    change = st.builds(HeldOutChange, st.sampled_from("ab"), st.just("force_N"), st.floats(-99, 99), st.floats(0.1, 9))
+    alternatives = tuple(
+        Alternative(
+            keys,
+            draw(shares),
+            tuple(draw(st.lists(change, max_size=3))),
+            {keys[0]: "a clause"} if draw(st.booleans()) else {},
+        )
+        for keys in sorted(sets, key=lambda keys: -probabilities.causes[tuple(sorted(keys))])
+    )
+    return Evidence(probabilities, alternatives, draw(st.booleans()), draw(st.integers(0, 9)) == 0)
+
+
+@given(draw_evidence())
+@settings(max_examples=400, deadline=None)
+def test_every_claim_keeps_the_conditions(evidence):
+    found = claim(evidence)
+    probabilities = evidence.probabilities
+    named = [item for item in evidence.alternatives if item.causes in found.sets]
+    for item in named:
+        assert item.explained is None or item.explained[0] >= 0.5
+        total, noise = sum(each.chi2 for each in item.held_out), sum(each.noise**2 for each in item.held_out) ** 0.5
+        assert not item.held_out or total <= MAX_WORSE_SIGMA * noise * (1 + 1e-9)
+    if found.verdict == "cause":
+        (item,) = named
+        assert evidence.has_repeats
+        assert not item.doubts
+        assert item.explained is None or item.explained[1] >= 0.9
+        assert all(each.chi2 <= 3.0 * each.noise for each in item.held_out)
+        assert all(probabilities.sum_of(key) >= 0.97 for key in item.causes)
+    assert (found.verdict == "none") == (not evidence.repeats_differ and probabilities.no_effect >= MIN_NO_EFFECT)
+    assert (found.verdict in ("none", "undecided")) == (
+        not evidence.repeats_differ and probabilities.no_effect > MAX_NO_EFFECT
+    )
+    assert bool(found.sets) == (found.verdict in ("cause", "ambiguous"))
+
+
+@given(st.lists(draw_evidence(), min_size=1, max_size=2), st.booleans(), st.booleans(), st.floats(-1.0, 1.0))
+@settings(max_examples=300, deadline=None)
+def test_every_sentence_agrees_with_the_numbers_beside_it(parts, fails, is_disturbed, reduction):
+    failures = {"gas_leak": "a reason"} if fails else {}
+    disturbances = (InstrumentDisturbance("force_N", "line", 1e-3, 50.0, 3),) if is_disturbed else ()
+    found = combine_claims([claim(part) for part in parts], failures, is_disturbed)
+    probabilities = (
+        parts[0].probabilities if len(parts) == 1 else parts[0].probabilities.combine(parts[1].probabilities)
+    )
+    gain = HeldOutGain({"force_N": 2e-3}, {"force_N": 1e-3}, {"force_N": 1e-4}, reduction, None)
+    answer = build_answer(found, probabilities, failures, disturbances)
+    headline, *reasons = describe_claim(answer, discover_terms())
+    assert tuple(reasons) == found.reasons
+    labels = [discover_terms()[key].label for key in found.causes]
+    assert all(label in headline for label in labels)
+    assert (headline.startswith("No error found")) == (found.verdict == "none")
+    if found.verdict in NOTHING_FOUND:
+        assert " is wrong" not in headline
+        assert "differs from the nominal" not in headline
+    else:
+        assert "No error" not in headline
+    assert ("because" in headline and "perhaps" not in headline) == (found.verdict == "cause" and not failures)
+    assert ("cannot separate" in headline) == (found.verdict == "ambiguous" and len(labels) > 1)
+    stated = dict(re.findall(r"(\w[\w ]*?),? (< 0\.1 %|> 99\.9 %|[\d.]+ %)", describe_probabilities(probabilities)))
+    assert_states(stated["none of these causes"], probabilities.none_of_these)
+    said = describe_gain(gain, found.verdict, 4)[0]
+    assert ("removes" in said) == (reduction >= 0.0)
+    assert f"{abs(reduction):.0%}" in said
+    if found.verdict == "undecided":
+        first = next(part.probabilities.no_effect for part in parts if claim(part).verdict == "undecided")
+        assert_states(re.search(r"of (< 0\.1 %|> 99\.9 %|[\d.]+ %), where", found.reasons[0])[1], first)
+
+
+def assert_states(text, probability):
+    """Assert that a probability in words is the number."""
+    if text.startswith("<"):
+        assert probability < 1e-3
+    elif text.startswith(">"):
+        assert probability > 0.999
+    else:
+        assert float(text.removesuffix(" %")) == pytest.approx(100.0 * probability, abs=0.051)
+
+
+def build_answer(found, probabilities, failures, disturbances):
+    """Return a diagnosis with this claim and nothing else."""
+    return Discrepancy(
+        verdict=found.verdict,
+        causes=found.causes,
+        disturbances=disturbances,
+        probabilities=probabilities,
+        hypothesis_labels=(),
+        parameters={},
+        base={},
+        terms={},
+        gain=None,
+        candidates=(),
+        next_experiment=None,
+        fitted_runs=(),
+        held_out_runs=(),
+        residual_traces=(),
+        example_traces=(),
+        held_out_traces=(),
+        held_out_errors=(),
+        rivals=(),
+        remarks=(),
+        explained_fraction=0.0,
+        doubts={},
+        failures=failures,
+        height_error_held_out=None,
+        height_error_fitted=None,
+        elapsed_s=0.0,
+        reasons=found.reasons,
+    )
+
+
+def list_claims(source):
+    """Return the lines of a module on which it makes a claim of its own."""
+    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    return [node.lineno for node in calls if ast.unparse(node.func).rpartition(".")[2] == "Claim"]
+
+
+def test_only_the_judge_makes_claims():
+    for path in Path(optodrive.lab.__file__).parent.rglob("*.py"):
+        assert path.parts[-2:] == ("inference", "claim.py") or not list_claims(path.read_text()), path
+    assert list_claims('found = claim(evidence) or judge.Claim("cause", (("gas_leak",),))') == [1]
+
+
+@given(st.lists(st.sampled_from(WORST_FIRST), min_size=1, max_size=2), st.booleans(), st.booleans())
+def test_the_worst_part_decides(verdicts, fails, is_disturbed):
+    names = ("cause", "ambiguous")
+    parts = [Claim(each, (("gas_leak",),) if each in names else ()) for each in verdicts]
+    found = combine_claims(parts, {"x": "y"} if fails else {}, is_disturbed)
+    others = [*verdicts, *(["incomplete"] if fails else []), *(["instrument"] if is_disturbed else [])]
+    assert found.verdict == min(others, key=WORST_FIRST.index)
+    assert bool(found.causes) == (found.verdict in names)

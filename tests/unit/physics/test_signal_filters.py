@@ -1,0 +1,47 @@
+"""Filters of what instruments record, against scipy's and against closed forms."""
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, filtfilt, lfilter
+
+from optodrive.physics.signal_filters import low_pass, low_pass_both_ways, moving_mean
+from optodrive.physics.terms import discover_terms
+
+T_S = np.arange(0.0, 0.5, 1e-3)
+SIGNAL = np.where(T_S > 0.1, 1.0 - np.exp(-(T_S - 0.1) / 0.03), 0.0)
+
+
+def test_a_low_pass_answers_a_ramp_exactly_at_any_times():
+    t_s = np.sort(np.random.default_rng(0).uniform(0.0, 0.5, 200))
+    t_s[0] = 0.0
+    expected = t_s - 0.02 * (1.0 - np.exp(-t_s / 0.02))
+    assert low_pass(t_s, t_s, 0.02) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_high_pass_is_that_of_a_circuit():
+    cutoff_hz = 1.0
+    b, a, _ = cont2discrete(([1.0, 0.0], [1.0, 2 * np.pi * cutoff_hz]), 1e-3, "foh")
+    values = dict.fromkeys(("temperature", "displacement", "force"), 0.0) | {"displacement": cutoff_hz}
+    term = discover_terms()["high_pass"]
+    assert term.record(values, "displacement", T_S, SIGNAL) == pytest.approx(lfilter(b[0], a, SIGNAL), abs=1e-9)
+    assert term.record(values, "temperature", T_S, SIGNAL) is SIGNAL
+
+
+def test_smoothing_is_a_moving_mean_or_a_filter_run_both_ways():
+    term, width_s = discover_terms()["smoothing"], 0.015
+    values = {"temperature": 0.0, "displacement": width_s, "force": 0.0, "tails": 0.0, "late": 0.0}
+    mean = np.convolve(SIGNAL, np.ones(15) / 15, "same")
+    inside = slice(20, -20)
+    assert term.record(values, "displacement", T_S, SIGNAL)[inside] == pytest.approx(mean[inside], abs=4e-4)
+    tau_s = width_s / np.sqrt(24.0)
+    b, a, _ = cont2discrete(([1.0], [tau_s, 1.0]), 1e-3, "foh")
+    both = filtfilt(b[0], a, SIGNAL)
+    wide = term.record(values | {"tails": 1.0}, "displacement", T_S, SIGNAL)
+    assert wide[inside] == pytest.approx(both[inside], abs=2e-4)
+    assert low_pass_both_ways(T_S, SIGNAL, 1e-7) == pytest.approx(SIGNAL, abs=1e-4)
+
+
+def test_a_moving_mean_of_what_is_linear_is_itself():
+    t_s = np.sort(np.random.default_rng(1).uniform(0.0, 1.0, 300))
+    inside = (t_s > t_s[0] + 0.05) & (t_s < t_s[-1] - 0.05)
+    assert moving_mean(t_s, 3.0 * t_s, 0.1)[inside] == pytest.approx(3.0 * t_s[inside], abs=1e-9)
