@@ -266,7 +266,7 @@ class HeatRecord:
     def _judge(self, file: int) -> None:
         status = os.fstat(file)
         if not status.st_size:
-            self.hot_reason = "this machine has no record of its heat"
+            self.hot_reason = "this machine had no record of its heat"
         elif not _has_mode(status, SHARED_FILE):
             self.hot_reason = "not every user could write the record of its heat"
         elif status.st_ctime_ns != status.st_mtime_ns:
@@ -292,7 +292,7 @@ class HeatRecord:
                 return self._parse(_read(self._file), boot, now_s)
             except (_UncountedError, OSError, ValueError, EOFError, KeyError, BadZipFile) as error:
                 self.hot_reason = (
-                    str(error) if isinstance(error, _UncountedError) else "the record of its heat is damaged"
+                    str(error) if isinstance(error, _UncountedError) else "the record of its heat was damaged"
                 )
         hot = build_hot_budget_state(self._cold, self._budget)
         self._cooling_reason = self.hot_reason
@@ -303,9 +303,9 @@ class HeatRecord:
     def _parse(self, data: bytes, boot: str, now_s: float) -> BudgetState:
         digest_end = len(MAGIC) + sha256().digest_size
         if not data.startswith(MAGIC):
-            raise _UncountedError("the record of its heat is of another version")
+            raise _UncountedError("the record of its heat was of another version")
         if sha256(data[digest_end:]).digest() != data[len(MAGIC) : digest_end]:
-            raise _UncountedError("the record of its heat is damaged")
+            raise _UncountedError("the record of its heat was damaged")
         with np.load(io.BytesIO(data[digest_end:])) as table:
             arrays = {key: table[key] for key in table.files}
         self._recall_cooling(arrays, boot, now_s)
@@ -313,7 +313,7 @@ class HeatRecord:
         if "at_s" not in arrays:
             raise _UncountedError("the process that used it last was killed")
         if str(arrays["model"]) != self._model:
-            raise _UncountedError("the record of its heat is of another configuration")
+            raise _UncountedError("the record of its heat was of another configuration")
         state = BudgetState(**{item.name: self._read_column(arrays, item.name) for item in fields(BudgetState)})
         if not boot or not str(arrays["boot"]):
             raise _UncountedError("this computer hides since when it runs")
@@ -335,7 +335,7 @@ class HeatRecord:
         stored, expected = arrays[name], np.asarray(getattr(self._cold, name))
         fits = stored.dtype == expected.dtype and stored.ndim == expected.ndim
         if not fits or (stored.shape != expected.shape and name not in RECENT) or np.isnan(stored).any():
-            raise _UncountedError("the record of its heat is damaged")
+            raise _UncountedError("the record of its heat was damaged")
         return float(stored) if stored.ndim == 0 else stored
 
     def begin_use(self) -> None:

@@ -94,6 +94,12 @@ def judge_known(shown, world):
         yield f"hatched: {shown['hatched']} {shown['stale']!r} with figures that are new"
     if shown["stats"]["Laser on"] != f"{world.laser_on_s:.2f} s":
         yield f"Laser on {shown['stats']['Laser on']}, reported {world.laser_on_s:.2f}"
+    minutes = {None: "", 59.0: "for 1 min: ", 700.0: "for 12 min: "}[world.hot_for_s if world.has_planner else None]
+    expected = (
+        f"{minutes}the display counts as hot, because the process that used it last was killed" if minutes else ""
+    )
+    if shown["stats"].get("Less light", "") != expected:
+        yield f"less light {shown['stats'].get('Less light')!r}, expected {expected!r}"
     words = ("open", "closed") if not world.inputs & 1 else ("closed", "open")
     if shown["lamps"][0] != f"Interlock {words[0]}":
         yield f"{shown['lamps'][0]!r} of inputs {world.inputs}"

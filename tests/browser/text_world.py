@@ -203,6 +203,7 @@ class World:
         self.inputs, self.is_paused, self.has_planner = SAFE_INPUTS, False, True
         self.laser_on_s, self.total, self.number = 3.0, 0, 0
         self.stages = rng.choice([0, 0, 2, 3])
+        self.hot_for_s = rng.choice([None, None, 59.0, 700.0])
         self.plans, self.executed, self.upcoming = [], [], []
         self.page, self.caps, self.fingers, self.tracker = [], [], [], "none"
         self.height = self.absorber = self.peak = self.hottest = np.zeros(PIXELS)
@@ -440,8 +441,14 @@ class World:
                 "frames_superseded": 0,
             },
             "planner": {"busy": False, "alive": self.has_planner},
-            "limits": {"power_share": 1.0 if self.has_planner else None},
+            "limits": self.build_limits(),
         }
+
+    def build_limits(self):
+        if not self.has_planner:
+            return {"power_share": None}
+        reason = "" if self.hot_for_s is None else "the process that used it last was killed"
+        return {"power_share": 1.0, "hot_reason": reason, "hot_for_s": self.hot_for_s}
 
     def build_batches(self, pulses):
         batches = {}

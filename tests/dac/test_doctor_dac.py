@@ -40,7 +40,7 @@ def test_any_device_and_no_interlock_are_warnings(examine):
     warnings = {check for check, finding in findings.items() if finding.status == "warning"}
     assert warnings == {"board", "interlock", "heat"}
     assert findings["heat"].observation == (
-        "the display counts as hot, because this machine has no record of its heat; it cools within 786 s"
+        "the display counts as hot, because this machine had no record of its heat; it cools within 786 s"
     )
     assert 'uid = "Helios 1163021877"' in findings["board"].remedy
     assert "nothing is emitted before" in findings["interlock"].remedy

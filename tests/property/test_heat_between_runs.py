@@ -50,7 +50,7 @@ def test_no_surface_passes_its_cap(steps):
 
 @pytest.mark.slow
 @pytest.mark.timeout(0)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.lists(STEPS, min_size=2, max_size=10))
 def test_no_surface_passes_its_cap_in_long_sequences(steps):
     check_sequence(steps)

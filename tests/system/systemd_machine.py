@@ -12,6 +12,7 @@ import optodrive
 
 PROGRAM = "/opt/optodrive/optodrive"
 BASE, PACKAGES, CHECKOUT = "/opt/optodrive/python", "/opt/optodrive/packages", "/opt/optodrive/checkout"
+PYTHON = Path(BASE, "bin", Path(sys.executable).resolve().name)
 BOOT_TIMEOUT_S = 240
 ENVIRONMENT = f"Environment=PYTHONPATH={CHECKOUT}:{PACKAGES} LD_LIBRARY_PATH={BASE}/lib"
 """Line of a unit that starts PROGRAM: the package, and the library of an interpreter from another place."""
@@ -63,9 +64,8 @@ def run_script(root, script):
     place = root / "opt/optodrive"
     for name in ("python", "packages", "checkout"):
         (place / name).mkdir(parents=True, exist_ok=True)
-    python = Path(BASE, "bin", Path(sys.executable).resolve().name)
     program = root / PROGRAM.lstrip("/")
-    program.write_text(f"#!{python}\nfrom optodrive.cli.main import main\nmain()\n")
+    program.write_text(f"#!{PYTHON}\nfrom optodrive.cli.main import main\nmain()\n")
     program.chmod(0o755)
     (place / "script").write_text(script)
     (root / "etc/systemd/system/test.service").write_text(UNIT)

@@ -25,6 +25,7 @@ export class Status {
       "Pulses executed": hasPlanner(state) ? totals.executed : "–",
       "Streamed frames shown": hasPlanner(state) ? totals.frames_shown : "–",
       "Board temperature": ofBoard(board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`),
+      ...describeHeat(state.limits),
       ...Object.fromEntries(state.stages.map((stage) => [`Stage ${stage.name}`, describeStage(stage)])),
     };
     this.stats.replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [createElement("dt", name), createElement("dd", value)]));
@@ -80,6 +81,9 @@ export class Status {
 
 // Whether the planner process runs, without which nothing is known of plans.
 export const hasPlanner = ({ limits }) => limits.power_share !== null;
+
+// Why plans get less light than later, while the display counts as hot.
+const describeHeat = ({ hot_reason: reason, hot_for_s: duration }) => (reason ? { "Less light": `for ${Math.ceil(duration / 60)} min: the display counts as hot, because ${reason}` } : {});
 
 // One of several stages: the state of its board, and its clock against the host's; lost or without a link its cause.
 function describeStage({ board, connected, error: cause, lost, clock_error_us: error, clock_drift_ppm: drift }) {

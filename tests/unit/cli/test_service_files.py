@@ -20,6 +20,7 @@ from optodrive.cli.service_files import (
 from optodrive.core.errors import RefusedError
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.pixel_map import PixelMap, write_pixel_map
+from optodrive.planning import heat_record
 from optodrive.planning.display_model import DisplayModel
 
 MANIFEST_PATH, RULES_PATH, USERS_PATH = ServicePaths().manifest, ServicePaths().rules, ServicePaths().users
@@ -83,6 +84,15 @@ def test_keys_that_the_daemon_section_does_not_state_are_those_of_the_service(in
     assert (daemon.socket, daemon.tokens, daemon.port) == expected
     assert daemon.audit == "/var/lib/optodrive/audit.jsonl"
     assert section.splitlines()[0] in at(CONFIG_PATH).read_text()
+
+
+def test_the_record_of_heat_is_that_of_the_machine(install, at):
+    """With a folder of its own, or without the identity of the computer's run, each start would be hot."""
+    install()
+    unit = at(UNIT_PATH).read_text()
+    assert f"ExecStartPre=+mkdir -p -m 1777 {heat_record.FOLDER}\n" in unit
+    assert f"BindPaths=-{heat_record.FOLDER}\n" in unit
+    assert "\nProcSubset" not in unit
 
 
 def test_a_daemon_table_in_one_line_is_refused_with_the_missing_keys(install, at, tmp_path):

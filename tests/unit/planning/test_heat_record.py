@@ -88,7 +88,7 @@ def test_the_folder_and_its_files_belong_to_all(desk):
 
 def test_without_a_record_a_display_is_hot_and_cools_from_then_on(desk):
     state, reason = desk.load()
-    assert (reason, desk.is_hot(state)) == ("this machine has no record of its heat", True)
+    assert (reason, desk.is_hot(state)) == ("this machine had no record of its heat", True)
     desk.up_s += 2000.0
     later, reason = desk.load()
     assert not reason
@@ -330,7 +330,7 @@ def test_a_board_that_is_a_program_is_cold_and_leaves_no_record(desk):
 
 
 def test_a_hot_display_says_why_until_it_has_cooled(desk):
-    reason = "this machine has no record of its heat"
+    reason = "this machine had no record of its heat"
     with desk.open() as record:
         record.load()
         why, cooling_s = record.read_cooling()
