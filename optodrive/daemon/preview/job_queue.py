@@ -1,12 +1,14 @@
 """Waiting jobs of the preview process, bounded for each kind and each caller."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from optodrive.core.errors import BusyError
 from optodrive.core.ipc import Message, MessageSocket
 
-WAITING_MAX: Mapping[str, int] = {"build": 8, "dry_run": 8}
+WAITING_MAX: Mapping[str, int] = {"build": 16, "dry_run": 16}
+"""Waiting jobs of one kind: of as many callers, which get a place each."""
 CALLER_WAITING_MAX = 4
 """Waiting jobs of one caller and kind, so that one caller cannot fill the queue."""
 
@@ -39,34 +41,54 @@ class Job(NamedTuple):
 
 
 class JobQueue:
-    """Jobs that wait for a worker."""
+    """Jobs that wait for a worker. Callers take turns, and share the queue evenly where it is full."""
 
     def __init__(self) -> None:
         self._jobs: list[Job] = []
+        self._turns: dict[str, int] = {}
+        """Number of the last job of each caller that was taken."""
 
-    def add(self, job: Job) -> None:
-        """Add a job. Raise BusyError if too many wait."""
+    def add(self, job: Job) -> Job | None:
+        """Add a job. Return the one that had to leave a full queue for it, if any: the newest of the largest caller.
+
+        Raise BusyError if too many of the caller's own jobs wait.
+        """
         same_kind = [waiting for waiting in self._jobs if waiting.message.kind == job.message.kind]
-        of_caller = [waiting for waiting in same_kind if job.caller and waiting.caller == job.caller]
-        if len(same_kind) >= WAITING_MAX[job.message.kind] or len(of_caller) >= CALLER_WAITING_MAX:
-            raise BusyError(f"too many requests wait: {len(same_kind)} before this one; try again later")
+        counts = Counter(waiting.caller for waiting in same_kind)
+        if job.caller and counts[job.caller] >= CALLER_WAITING_MAX:
+            raise build_busy_error(counts[job.caller])
+        displaced = None
+        if len(same_kind) >= WAITING_MAX[job.message.kind]:
+            largest, count = counts.most_common(1)[0]
+            if count <= counts[job.caller] + 1:
+                raise build_busy_error(len(same_kind))
+            displaced = next(waiting for waiting in reversed(same_kind) if waiting.caller == largest)
+            self._jobs.remove(displaced)
         self._jobs.append(job)
+        return displaced
 
     def put_back(self, job: Job) -> None:
         """Add a job again that was begun."""
         self._jobs.append(job)
 
     def take(self, may_start: Callable[[Job], bool], busy_callers: set[str]) -> Job | None:
-        """Remove and return the next job that may start: the first of a caller without a running job, else the first.
+        """Remove and return the next job that may start, None if there is none.
 
-        Return None if there is none.
+        It is that of a caller without a running job, of these that of the caller whose last turn was first.
         """
         candidates = [job for job in self._jobs if may_start(job)]
-        job = next((job for job in candidates if job.caller not in busy_callers), next(iter(candidates), None))
-        if job is not None:
-            self._jobs.remove(job)
+        if not candidates:
+            return None
+        job = min(candidates, key=lambda each: (each.caller in busy_callers, self._turns.get(each.caller, 0)))
+        self._jobs.remove(job)
+        self._turns[job.caller] = max(self._turns.values(), default=0) + 1
         return job
 
     def drop(self, client: MessageSocket, job_id: int | None = None) -> None:
         """Drop a job of a connection that has lost its caller, or all jobs of a lost connection."""
         self._jobs = [job for job in self._jobs if job.client is not client or job_id not in (None, job.job_id)]
+
+
+def build_busy_error(waiting: int) -> BusyError:
+    """Build the error of a job for which the queue has no room."""
+    return BusyError(f"too many requests wait: {waiting} before this one; try again later")

@@ -11,7 +11,7 @@ from optodrive.core.beat import BeatWriter, SupervisorGoneError
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.daemon.message_loop import MessageLoop, MessageServer
-from optodrive.daemon.preview.job_queue import Job, JobQueue
+from optodrive.daemon.preview.job_queue import WAITING_MAX, Job, JobQueue, build_busy_error
 from optodrive.daemon.preview.jobs import build_refusal, run_job
 from optodrive.daemon.preview.worker import JobRunner, Worker, build_timeout_error
 from optodrive.daemon.runtime_folder import RuntimeFolder
@@ -21,7 +21,8 @@ from optodrive.planning.display_model import DisplayModel
 QUICK_MAX, HEAVY_MAX = 2, 3
 """Usual builds at once, and dry runs and slow builds at once, one of a caller: a usual build waits for usual ones only.
 
-A build that turns out to be slow while too many heavy jobs run is ended, and begins again when it is its turn.
+A build that turns out to be slow while too many heavy jobs run is ended, and begins again when it is its turn: callers
+take turns, so that one waits for one heavy job of each other caller at most.
 """
 LOOP_WAIT_S, ENDING_WAIT_S = 0.1, 0.01
 """Longest wait for messages, usually and while a worker ends."""
@@ -85,9 +86,12 @@ class PreviewServer:
         elif message.kind in ("build", "dry_run"):
             job = Job(client, message)
             try:
-                self._queue.add(job)
+                displaced = self._queue.add(job)
             except OptodriveError as error:
                 self._reply(job, build_refusal(error))
+            else:
+                if displaced is not None:
+                    self._reply(displaced, build_refusal(build_busy_error(WAITING_MAX[message.kind])))
             self._start_jobs()
 
     def _on_client_lost(self, client: MessageSocket) -> None:

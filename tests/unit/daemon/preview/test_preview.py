@@ -7,6 +7,7 @@ import pickle
 import signal
 import socket
 import time
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,10 +15,12 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.beat import BeatWriter
+from optodrive.core.errors import BusyError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.daemon.engine import request_body
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.preview import jobs, worker
+from optodrive.daemon.preview.job_queue import CALLER_WAITING_MAX, WAITING_MAX, Job, JobQueue
 from optodrive.daemon.preview.process import run_preview
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
@@ -317,20 +320,92 @@ def test_a_library_that_gives_up_for_want_of_memory_is_one_line(start):
     assert (status, document["code"]) == (422, "too_large")
 
 
+@pytest.mark.parametrize("kind", ["build", "dry_run"])
+@pytest.mark.parametrize("callers", [3, 4, 8])
+def test_light_builds_pass_all_heavy_callers(start, monkeypatch, callers, kind):
+    """In order: of work that never ends nothing is answered but for want of room, and a further caller is served."""
+    lift_limits(monkeypatch, kind)
+    monkeypatch.setattr(jobs, "make_plan", build_slowly)
+    preview = start()
+    heavy = preview.socket
+    for job_id in range(callers * CALLER_WAITING_MAX):
+        if kind == "build":
+            preview.build(job_id, b"bad", caller=f"heavy {job_id % callers}")
+        else:
+            preview.dry_run(job_id, SMALL, caller=f"heavy {job_id % callers}")
+    heavy.flush()
+    preview.socket = preview.connect()
+    for job_id in range(100, 104):
+        preview.build(job_id, SMALL, caller="light")
+        message = preview.result()
+        assert (message.fields["id"], message.fields["status"]) == (job_id, 200)
+    refused = list(heavy.receive())
+    assert {message.fields["status"] for message in refused} <= {503}
+    assert {message.fields["id"] % callers for message in refused} in (set(), set(range(callers))), "from all alike"
+    heavy.close()
+
+
+@pytest.mark.parametrize("callers", [3, 4, 8])
+def test_callers_take_turns(callers):
+    """A caller that came first with many jobs gets one turn for one of each other caller."""
+    queue = JobQueue()
+    for number in range(CALLER_WAITING_MAX):
+        queue.add(_job("first", number))
+    for caller in range(1, callers):
+        for number in range(2):
+            queue.add(_job(f"caller {caller}", number))
+    order = [queue.take(lambda job: True, set()).caller for _ in range(2 * callers)]
+    turn = ["first", *(f"caller {k}" for k in range(1, callers))]
+    assert order == [*turn, *turn]
+
+
+@pytest.mark.parametrize("callers", [2, 4, 5, WAITING_MAX["build"]])
+def test_a_full_queue_is_shared_evenly(callers):
+    queue, left = JobQueue(), []
+    for number in range(CALLER_WAITING_MAX):
+        for caller in range(callers):
+            with suppress(BusyError):
+                left.append(queue.add(_job(f"caller {caller}", number)))
+    waiting = Counter(job.caller for job in queue._jobs)
+    assert sum(waiting.values()) == min(WAITING_MAX["build"], callers * CALLER_WAITING_MAX)
+    assert len(waiting) == callers
+    assert max(waiting.values()) - min(waiting.values()) <= 1
+    if callers < WAITING_MAX["build"]:
+        displaced = queue.add(_job("late", 0))
+        assert (displaced is None) == (callers * CALLER_WAITING_MAX < WAITING_MAX["build"])
+        assert displaced is None or waiting[displaced.caller] == max(waiting.values())
+    else:
+        with pytest.raises(BusyError, match="too many requests wait: 16 before this one"):
+            queue.add(_job("late", 0))
+
+
+def test_a_caller_with_many_waiting_jobs_is_refused():
+    queue = JobQueue()
+    for number in range(CALLER_WAITING_MAX):
+        assert queue.add(_job("one", number)) is None
+    with pytest.raises(BusyError, match=f"too many requests wait: {CALLER_WAITING_MAX} before this one"):
+        queue.add(_job("one", 9))
+    assert queue.add(_job("another", 0)) is None
+
+
+def _job(caller, number):
+    return Job(None, Message("build", {"id": number, "push": {"caller": caller}}, b""))
+
+
 def test_the_queue_is_bounded_for_each_kind_and_each_caller(start, monkeypatch):
     lift_limits(monkeypatch, "build")
     monkeypatch.setattr(worker, "QUICK_S", NO_LIMIT_S)
     preview = start()
-    for job_id in range(12):
-        preview.build(job_id, b"bad", caller=f"caller {job_id % 8}")
+    for job_id in range(20):
+        preview.build(job_id, b"bad", caller=f"caller {job_id % 16}")
     refused = preview.results(2)
     for message in refused.values():
         status, document = problem(message)
         assert (status, document["code"]) == (503, "busy")
         assert "too many requests wait" in document["detail"]
-    assert set(refused) == {10, 11}
+    assert set(refused) == {18, 19}
     before = preview.workers()
-    for job_id in range(10):
+    for job_id in range(18):
         preview.send("drop", job_id)
     wait_for(lambda: len(before & preview.workers()) == 1)  # the spare one; the others have ended
     for job_id in range(20, 27):
