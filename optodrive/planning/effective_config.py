@@ -21,7 +21,12 @@ UNITS = {"R": "K/W", "C": "J/K", "epsilon": "1", "tau_g": "s", "kappa": "m/K", "
 
 
 class PixelPlace(Section):
-    """The position of one pixel on the display, and the width of its bridges."""
+    """The position of one pixel on the display, and the width of its bridges.
+
+    index: of the pixel
+    x_m, y_m: centre on the display, from its middle, m
+    bridge_width_m: width of its bridges, m
+    """
 
     index: int
     x_m: float
@@ -30,13 +35,21 @@ class PixelPlace(Section):
 
 
 class EffectiveDisplay(DisplaySection):
-    """The section [display] and its pixels, by index."""
+    """The section [display] and its pixels, by index.
+
+    pixels: places of all pixels, by index
+    """
 
     pixels: tuple[PixelPlace, ...]
 
 
 class CapDescription(Section):
-    """A cap as shown to people: its label, its unit and its setting in the section [limits]."""
+    """A cap as shown to people: its label, its unit and its setting in the section [limits].
+
+    label: of the cap for people
+    unit: of the cap
+    setting: its key in the section [limits]
+    """
 
     label: str
     unit: str
@@ -44,13 +57,19 @@ class CapDescription(Section):
 
 
 class EffectiveLimits(LimitsSection):
-    """The section [limits] and descriptions of its caps, by the key that plans and telemetry use."""
+    """The section [limits] and descriptions of its caps, by the key that plans and telemetry use.
+
+    caps: by the name that plans and telemetry use
+    """
 
     caps: dict[str, CapDescription]
 
 
 class EffectiveScanner(ScannerSection):
-    """The section [scanner] and the settling time of a move by one pitch, after a long dwell."""
+    """The section [scanner] and the settling time of a move by one pitch, after a long dwell.
+
+    settling_pitch_s: settling time of a move by one pitch, s
+    """
 
     settling_pitch_s: float
 
@@ -65,7 +84,17 @@ class EffectivePanel(PanelSection):
 
 
 class EffectivePixelModel(PixelModelSection):
-    """The section [pixel_model] and the parameters of a pixel. `planner_terms` holds the parameters of each term."""
+    """The section [pixel_model] and the parameters of a pixel. `planner_terms` holds the parameters of each term.
+
+    R: thermal resistance from the absorber to the wall, K/W
+    C: heat capacity of the absorber and its gas, J/K
+    epsilon: absorbed share of the light
+    tau_g: time constant between absorber and gas, s
+    kappa: rise of the membrane per kelvin, m/K
+    phi: force per kelvin, N/K
+    planner_terms: parameters of each term that plans take into account, by its key
+    units: of the pixel's parameters
+    """
 
     R: float
     C: float

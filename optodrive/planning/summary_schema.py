@@ -5,7 +5,15 @@ from optodrive.planning.feasibility.report import FeasibilityReport
 
 
 class TrimmedPulse(JsonModel):
-    """One pulse that the limiter reduced. `target_um` is None for a pulse of a train given by its width."""
+    """One pulse that the limiter reduced. `target_um` is None for a pulse of a train given by its width.
+
+    pixel: of the pulse
+    start_s: time from the plan's zero, s
+    trimmed_j: energy that was removed, J
+    reason: caps that removed it
+    predicted_um: height that is left, µm
+    target_um: requested height, µm, null for a pulse of a train given by its width
+    """
 
     pixel: int
     start_s: float
@@ -16,7 +24,13 @@ class TrimmedPulse(JsonModel):
 
 
 class TrimmingSummary(JsonModel):
-    """Energy that the limiter removed, by cap. `worst` lists up to 20 pulses, the largest reduction first."""
+    """Energy that the limiter removed, by cap. `worst` lists up to 20 pulses, the largest reduction first.
+
+    pulses: number of pulses that were reduced
+    energy_j: energy that was removed, J
+    by_reason: number of pulses by the caps that reduced them
+    worst: up to 20 pulses, the largest reduction first
+    """
 
     pulses: int
     energy_j: float
@@ -25,7 +39,13 @@ class TrimmingSummary(JsonModel):
 
 
 class ShortfallSummary(JsonModel):
-    """The first pulse that a cap reduced. `fits_after_s` is None if no delay makes it fit."""
+    """The first pulse that a cap reduced. `fits_after_s` is None if no delay makes it fit.
+
+    pixel: of the pulse
+    cap: that reduced it
+    margin_j: energy by which the pulse exceeds the cap, J
+    fits_after_s: delay after which all of it fits, s, null if none helps
+    """
 
     pixel: int
     cap: str
@@ -34,7 +54,13 @@ class ShortfallSummary(JsonModel):
 
 
 class DelaySummary(JsonModel):
-    """Time that a frame or train waited for a cap, and the first pixel that needed it."""
+    """Time that a frame or train waited for a cap, and the first pixel that needed it.
+
+    source: id of the frame, or the train
+    pixel: the first one that had to wait
+    cap: for which it waited
+    wait_s: time by which it waited, s
+    """
 
     source: str
     pixel: int
@@ -43,7 +69,12 @@ class DelaySummary(JsonModel):
 
 
 class DeadPixelSummary(JsonModel):
-    """Dead pixels that the frames request and the plan omits. `message` is None if there are none."""
+    """Dead pixels that the frames request and the plan omits. `message` is None if there are none.
+
+    pixels: indices of the dead pixels
+    count: their number
+    message: them in a sentence, null without any
+    """
 
     pixels: list[int]
     count: int
@@ -51,7 +82,13 @@ class DeadPixelSummary(JsonModel):
 
 
 class SkippedTarget(JsonModel):
-    """A target that needs no pulse."""
+    """A target that needs no pulse.
+
+    frame: id of the frame
+    pixel: of the target
+    target_um: requested height, µm
+    reason: why it needs no pulse
+    """
 
     frame: str
     pixel: int
@@ -60,7 +97,11 @@ class SkippedTarget(JsonModel):
 
 
 class CyclePeak(JsonModel):
-    """Predicted peak of one cycle of a train, counted from 1."""
+    """Predicted peak of one cycle of a train, counted from 1.
+
+    cycle: number of the cycle, from 1
+    peak_um: predicted peak, µm
+    """
 
     cycle: int
     peak_um: float
@@ -71,6 +112,9 @@ class OffTargetTrain(JsonModel):
 
     cycles, off_target: number of its cycles, and of those whose peak differs; min_um, max_um: smallest and largest of
     these peaks; peaks: the first 20 of them; message: all of this in a sentence
+    train: name of the train
+    pixel: of the train
+    target_um: requested height of the peaks, µm
     """
 
     train: str
@@ -85,7 +129,11 @@ class OffTargetTrain(JsonModel):
 
 
 class OffTargetSummary(JsonModel):
-    """Trains by height with predicted peaks more than 2 % off their target: number, and the first 20."""
+    """Trains by height with predicted peaks more than 2 % off their target: number, and the first 20.
+
+    count: number of these trains
+    trains: the first 20 of them
+    """
 
     count: int
     trains: list[OffTargetTrain]
@@ -95,6 +143,10 @@ class SimultaneitySummary(JsonModel):
     """How the pulses of a simultaneous frame were interleaved.
 
     `simultaneity_single_pulse`: without interleaving
+    interleaved_rounds: number of rounds of sub-pulses
+    simultaneity: largest share of their targets that all pixels have at one time
+    simultaneity_single_pulse: the same with one pulse per pixel
+    extra_s: beam time that the rounds take more, s
     """
 
     interleaved_rounds: int
@@ -104,7 +156,15 @@ class SimultaneitySummary(JsonModel):
 
 
 class FrameSummary(JsonModel):
-    """Times of one frame on the plan's time line, s. `on_time` counts its pulses that end before the deadline."""
+    """Times of one frame on the plan's time line, s. `on_time` counts its pulses that end before the deadline.
+
+    frame: id of the frame
+    show_at_s, deadline_s: times at which the frame begins and must be drawn
+    first_pulse_s, end_s: start of its first pulse and end of its last one
+    late_s: time by which it ends after its deadline, 0 if it does not
+    pulses, on_time: number of its pulses, and of those that end in time
+    simultaneous: how its pulses were interleaved, null unless it is a simultaneous frame
+    """
 
     frame: str
     show_at_s: float
@@ -126,6 +186,22 @@ class PlanSummary(JsonModel):
     beam_on_s: of all stages together; beam_on_fraction: of the time of all stages
     below_threshold: pulses below laser.threshold_w, which emit nothing
     early_step_s: time by which steps precede the end of the light, 0 if they follow it
+    pulses: number of pulses
+    duration_s: from the plan's zero to the end of its last pulse, s
+    settling_s: time for which the gate waits for the mirrors, s
+    lead_in_s: time from the plan's zero to its first pulse, s
+    galvo_pause_s: time of the pauses in which the mirrors' coils cool, s
+    energy_j: incident energy of all pulses, J
+    headroom_min_k: smallest distance of an absorber to its cap, K
+    trimmed: what the limiter removed
+    shortfall: first pulse that a cap reduced, null without one
+    off_target: trains by height that miss it
+    delays: frames and trains that waited for a cap
+    dead: dead pixels that were requested and left out
+    skipped: targets that need no pulse
+    frames: times of each frame
+    late_messages: frames that miss their deadlines, in sentences
+    train_lateness_max_s: longest delay of a train's pulse after its requested start, s
     """
 
     feasibility: FeasibilityReport | None
@@ -159,6 +235,13 @@ class PulseColumns(JsonModel):
     """The pulses of a plan by column, in order. `target_um` is None for a pulse without a target height.
 
     stage: number of the pulse's stage, in the order of the configuration, from 0
+    start_s, width_s: time from the plan's zero at which the gate opens, and for how long, s
+    power_w: power at the sample, W
+    pixel: of each pulse
+    energy_j, trimmed_j: incident energy, and energy that the limiter removed, J
+    reason: caps that removed it, empty without one
+    target_um: requested height, µm, null without one
+    predicted_um: highest displacement of the pixel until its next pulse, µm
     """
 
     start_s: FloatColumn

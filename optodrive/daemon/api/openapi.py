@@ -48,8 +48,12 @@ EVENT_RESPONSES: dict[int | str, dict[str, Any]] = {
                     "type": "object",
                     "required": ["event", "data"],
                     "properties": {
-                        "event": {"type": "string"},
-                        "data": {"type": "string", "contentMediaType": "application/json"},
+                        "event": {"type": "string", "description": "kind of the event"},
+                        "data": {
+                            "type": "string",
+                            "contentMediaType": "application/json",
+                            "description": "the event in JSON",
+                        },
                     },
                     "oneOf": [
                         {"properties": {"event": {"const": event}, "data": {"contentSchema": _refer_to(model)}}}

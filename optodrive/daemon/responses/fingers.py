@@ -34,6 +34,7 @@ class FingersMessage(JsonModel):
     """All fingertips that a tracker sees at a time.
 
     age_s: time since the tracker saw them
+    fingers: all fingertips on the display, at most 20
     """
 
     fingers: Annotated[tuple[FingerMessage, ...], Field(max_length=FINGERS_MAX)]
@@ -54,7 +55,10 @@ def validate_fingers(message: object) -> FingersMessage:
 
 
 class FingersRefusal(JsonModel):
-    """Why a message was not taken. The fingertips before it remain."""
+    """Why a message was not taken. The fingertips before it remain.
+
+    problem: what the message may not have
+    """
 
     model_config = ConfigDict(json_schema_serialization_defaults_required=False)
 

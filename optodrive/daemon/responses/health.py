@@ -6,7 +6,11 @@ from optodrive.core.json_model import JsonModel
 
 
 class HealthReport(JsonModel):
-    """Whether the daemon runs, and its version."""
+    """Whether the daemon runs, and its version.
+
+    status: ok, as the daemon answers
+    version: of optodrive
+    """
 
     status: Literal["ok"] = "ok"
     version: str

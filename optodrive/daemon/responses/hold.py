@@ -12,6 +12,7 @@ class HoldReport(JsonModel):
     """Status of an arming that a client holds. A message has only the members that apply to its status.
 
     problem: why the board was not armed; reason: what has ended the arming, as the end of a sentence
+    status: of the arming
     """
 
     model_config = ConfigDict(json_schema_serialization_defaults_required=False)

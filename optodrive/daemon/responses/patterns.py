@@ -5,6 +5,9 @@ from optodrive.planning.stimuli.pattern import PatternDescription
 
 
 class PatternList(JsonModel):
-    """The named patterns and their parameters."""
+    """The named patterns and their parameters.
+
+    patterns: in the order in which `optodrive patterns` lists them
+    """
 
     patterns: list[PatternDescription]

@@ -22,6 +22,9 @@ class PlanOnset(JsonModel):
     """Gate on of a plan's first pulse: on the board's clock, on the host's CLOCK_MONOTONIC and in Unix time, s.
 
     executed: whether the board has reported the pulse; before, the time is that of the plan
+    board_s: on the board's clock, s
+    monotonic_s: on the host's CLOCK_MONOTONIC, s
+    unix_s: in Unix time, s
     """
 
     board_s: float
@@ -31,7 +34,13 @@ class PlanOnset(JsonModel):
 
 
 class MaxTarget(JsonModel):
-    """The pulse with the largest target: target, prediction, and simulation from the executed pulses."""
+    """The pulse with the largest target: target, prediction, and simulation from the executed pulses.
+
+    pixel: of the pulse
+    target_um: its requested height, µm
+    predicted_um: height before the plan is played, µm
+    simulated_um: height from the executed pulses, µm, null before
+    """
 
     pixel: int
     target_um: float
@@ -40,7 +49,14 @@ class MaxTarget(JsonModel):
 
 
 class ExecutedColumns(JsonModel):
-    """Executed pulses by column, in order, as `PulseColumns`. `simulated_um` is empty until the simulation is done."""
+    """Executed pulses by column, in order, as `PulseColumns`. `simulated_um` is empty until the simulation is done.
+
+    start_s, width_s: time from the plan's zero at which the gate opened, and for how long, s
+    power_w: power at the sample, W
+    pixel: of each pulse
+    stage: number of the pulse's stage, from 0
+    simulated_um: highest displacement of the pixel until its next pulse, µm
+    """
 
     start_s: FloatColumn
     width_s: FloatColumn
@@ -57,6 +73,17 @@ class PlanReport(JsonModel):
     pulses, executed_pulses: None if they were not requested or are too many
     executed_complete, delay_s: None before the plan has ended
     onset: None without a pulse, for a dry run, and without a synchronised clock
+    plan: id of the plan
+    name: of its pattern, or push
+    status: of the plan
+    error: why it failed or ended early, null otherwise
+    starts_in_s: time until its start, s, negative afterwards
+    planned, sent, executed, dropped: number of its pulses planned, handed to the board, reported as executed, and lost
+    latency: times from the request's arrival to its light
+    timing_error: of its executed pulses, null before one
+    summary: of the plan
+    simulated_max_um: highest displacement from the executed pulses, µm, null before the simulation
+    max_target: pulse with the highest request, null without one
     """
 
     plan: str

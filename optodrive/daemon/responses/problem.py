@@ -20,6 +20,11 @@ class Problem(JsonModel):
     feasibility: the report on a sequence that does not fit
     retry_after_s: time until the next request is accepted; allow: the methods that the path accepts
     role, required_role: of the token, and the lowest that the route accepts
+    type: URN made of the code
+    title: kind of the problem in words
+    status: HTTP status
+    detail: the problem in one line
+    code: stable name of the problem for programs
     """
 
     model_config = ConfigDict(json_schema_serialization_defaults_required=False)

@@ -23,6 +23,9 @@ class FrameResult(JsonModel):
     limited_by: caps and bounds that took light from it; with a frame that stands a further message with status
     "planned" whenever the caps of the last second are others, empty when none is left
     planned, executed, dropped, simulated_max_um: of its plan, once that has ended
+    status: of the frame's plan, or refused
+    plan: id of its plan
+    latency: times from the frame's arrival to its light
     """
 
     model_config = ConfigDict(json_schema_serialization_defaults_required=False)

@@ -8,7 +8,14 @@ from optodrive.daemon.responses.state import StateReport
 
 
 class FaultEvent(JsonModel):
-    """A fault of the board or the link. All members except the states are null or empty without one."""
+    """A fault of the board or the link. All members except the states are null or empty without one.
+
+    board: state of the board
+    link: state of the link
+    fault: code of the board's fault, null without one
+    hint: what it is and how it is removed
+    link_error: why the link is down
+    """
 
     board: str
     link: str
@@ -23,6 +30,8 @@ class DisplayEvent(JsonModel):
     height, absorber: at the board time
     height_peak, absorber_peak: the largest since the previous event that the reader received, also the height to which
     a pulse that was executed since then still raises the pixel
+    board_s: time of the board, s
+    warm: whether a pixel is warmer or higher than cold
     """
 
     board_s: float
@@ -34,7 +43,17 @@ class DisplayEvent(JsonModel):
 
 
 class PulseBatch(JsonModel):
-    """Pulses of one plan by column. `row` counts in the plan, and `start_s` is board time."""
+    """Pulses of one plan by column. `row` counts in the plan, and `start_s` is board time.
+
+    plan: id of the plan
+    name: of its pattern, or push
+    row: index of each pulse in the plan
+    pixel: of each pulse
+    start_s, width_s: board time at which the gate opens, and for how long, s
+    power_w: power at the sample, W
+    trimmed_j: energy that the limiter removed, J
+    reason: caps that removed it, empty without one
+    """
 
     plan: str
     name: str
@@ -48,7 +67,12 @@ class PulseBatch(JsonModel):
 
 
 class PulsesEvent(JsonModel):
-    """Pulses planned within the next second and pulses executed, since the previous event."""
+    """Pulses planned within the next second and pulses executed, since the previous event.
+
+    board_s: time of the board, s
+    planned: pulses that begin within the next second, by plan
+    executed: pulses that the board has reported, by plan
+    """
 
     board_s: float
     planned: list[PulseBatch]
@@ -56,7 +80,14 @@ class PulsesEvent(JsonModel):
 
 
 class CapUsage(JsonModel):
-    """How much of a cap is used, and the pixel nearest to it. `fraction` is relative to ambient for temperatures."""
+    """How much of a cap is used, and the pixel nearest to it. `fraction` is relative to ambient for temperatures.
+
+    cap: name of the cap
+    fraction: share of the cap that is used
+    value, limit: the quantity and its cap, in `unit`
+    unit: of the value and of the cap
+    pixel: nearest to the cap, null for a cap of the whole display
+    """
 
     cap: str
     fraction: float
@@ -67,7 +98,12 @@ class CapUsage(JsonModel):
 
 
 class BudgetEvent(JsonModel):
-    """The usage of every cap at a board time, and the highest temperature that the panel may have."""
+    """The usage of every cap at a board time, and the highest temperature that the panel may have.
+
+    board_s: time of the board, s
+    caps: usage of each cap
+    panel_c: highest temperature that the panel may have, °C
+    """
 
     board_s: float
     caps: list[CapUsage]
@@ -80,6 +116,8 @@ class TouchedFinger(JsonModel):
     dots: of the page, under the contact
     rate_hz: mean number of pulses of a dot in the last 0.2 s, per second
     height_share: mean height of their newest pulses relative to the page's, at most 1; a dot without one counts as 0
+    number: of the fingertip, the same as long as it is tracked
+    x_m, y_m, radius_m: centre and radius of its contact, m
     """
 
     number: int
@@ -95,6 +133,8 @@ class FingersEvent(JsonModel):
     """Fingertips at a board time.
 
     tracker: seen, lost (silent for 0.1 s) or none, which has not reported since the daemon started
+    board_s: time of the board, s
+    fingers: those that the tracker sees
     """
 
     board_s: float
@@ -106,6 +146,8 @@ class PageEvent(JsonModel):
     """Heights of the standing page as base64 of little-endian u16 in 0.1 µm, empty without a page.
 
     limited_by: caps that took light from it in the last second
+    board_s: time of the board, s
+    height: of each pixel, base64 of u16 in 0.1 µm
     """
 
     board_s: float

@@ -15,6 +15,7 @@ class TimingError:
     median_s: median error
     max_abs_s: signed error of largest magnitude
     drift_ppm: slope over planned time of the error without the start delay, 0 if all pulses start at one time
+    pulses: number of executed pulses that were compared
     """
 
     pulses: int

@@ -14,6 +14,8 @@ class Omission:
     """Omitted pixels of a frame, or an omitted train.
 
     source: index as in the sequence
+    name: id of the frame, or the train
+    pixels: that are left out
     """
 
     name: str
@@ -65,6 +67,7 @@ class FeasibilityReport:
     nearest: nearest feasible variants, None for a feasible sequence
     plans_tried, plans_tried_max: plans after the first, and their limit
     fit, height_factor, omitted: fit mode, and the changes that it made to the sequence
+    fits: whether the whole sequence fits as requested
     """
 
     fits: bool

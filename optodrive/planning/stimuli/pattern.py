@@ -26,7 +26,17 @@ TEXT_MAX = 2_000
 
 @dataclass(frozen=True)
 class PatternParameter:
-    """One parameter of a pattern. `min` and `max` bound a number. A required parameter has no default."""
+    """One parameter of a pattern. `min` and `max` bound a number. A required parameter has no default.
+
+    name: of the parameter
+    kind: of its value
+    default: value when it is not given, null for none
+    description: of the parameter, in a line
+    unit: of its value, '' without one
+    choices: values of a choice
+    min, max: bounds of a number, in `unit`
+    required: whether it must be given
+    """
 
     name: str
     kind: ParameterKind
@@ -44,6 +54,10 @@ class PatternDescription:
     """A pattern without its builder, as GET /v1/patterns lists it.
 
     policy: how it is treated above a cap by default
+    name: of the pattern
+    summary: what it shows, in a line
+    notes: its particulars, '' without any
+    parameters: of the pattern
     """
 
     name: str

@@ -57,6 +57,30 @@ def test_no_model_allows_members_that_it_does_not_state(document):
     assert '"additionalProperties": True' not in repr(document)
 
 
+def list_undescribed(name, schema):
+    """Yield the members without a description, except those that only narrow what is described beside them."""
+    for node in list_schemas(schema):
+        members = node.get("properties", {})
+        if all(isinstance(content, dict) for content in members.values()):
+            for member, content in members.items():
+                states = set(content) & {"type", "$ref", "anyOf", "oneOf", "enum"}
+                if states and not str(content.get("description", "")).strip():
+                    yield f"{name}.{member}"
+
+
+def test_every_member_is_described(document):
+    undescribed = list(list_undescribed("document", document))
+    assert undescribed == []
+
+
+def test_an_undescribed_member_is_found(document):
+    schema = document["components"]["schemas"]["BoardReport"]
+    bare = {**schema["properties"]["uid"]}
+    assert bare.pop("description")
+    broken = {**schema, "properties": {**schema["properties"], "uid": bare}}
+    assert list(list_undescribed("BoardReport", broken)) == ["BoardReport.uid"]
+
+
 def test_every_event_has_its_model(document):
     schema = document["paths"]["/v1/telemetry"]["get"]["responses"]["200"]["content"]["text/event-stream"]["schema"]
     stated = {
