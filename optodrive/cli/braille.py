@@ -38,7 +38,9 @@ def braille(
     key_file: Annotated[
         Path, typer.Option("--key-file", help="With brlapi: key that a client must be able to read.")
     ] = KEY_FILE,
-    height_um: Annotated[float, typer.Option("--height-um", min=0.0, help="Height of a dot, µm.")] = HEIGHT_UM,
+    height_um: Annotated[
+        float, typer.Option("--height-um", min=1.0, max=1000.0, help="Height of a dot, µm.")
+    ] = HEIGHT_UM,
     fingers: Annotated[
         bool, typer.Option("--fingers", help="Refresh dots under fingers first, whose places a tracker reports.")
     ] = False,

@@ -77,7 +77,7 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
     except (typer.Abort, KeyboardInterrupt):
         return report_interruption()
     except UsageError as error:
-        message = " ".join(error.format_message().split())
+        message = " ".join(error.format_message().replace("Value error, ", "").split())  # which pydantic prefixes
         if message:  # empty without arguments: typer has printed the help
             print(f"optodrive: {message}", file=sys.stderr)
         return 2

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +17,8 @@ RootOption = Annotated[
 ]
 
 NameOption = Annotated[
-    str, typer.Option("--name", metavar="NAME", help="Of a further service on this host, the unit optodrive@NAME.")
+    str | None,
+    typer.Option("--name", metavar="NAME", help="Of a further service on this host, the unit optodrive@NAME."),
 ]
 
 GROUP = typer.Typer(help="Manage the files of the systemd service; no command starts it.", no_args_is_help=True)
@@ -25,7 +27,7 @@ GROUP = typer.Typer(help="Manage the files of the systemd service; no command st
 @GROUP.command()
 def install(
     config: ConfigOption = None,
-    name: NameOption = "",
+    name: NameOption = None,
     root: RootOption = Path("/"),
     program: Annotated[
         Path | None,
@@ -43,7 +45,7 @@ def install(
         list_serial_ports,
     )
 
-    paths = ServicePaths(name)
+    paths = ServicePaths.from_option(name)
     installation = Installation(root, paths)
     installed_config = installation.resolve(paths.config)
     # An upgrade keeps the installed configuration.
@@ -76,31 +78,37 @@ def install(
 
 
 @GROUP.command()
-def remove(name: NameOption = "", root: RootOption = Path("/"), json: JsonOption = False) -> None:
+def remove(name: NameOption = None, root: RootOption = Path("/"), json: JsonOption = False) -> None:
     """Remove the installed files, except edited ones."""
-    from optodrive.cli.service_files import Installation, ServicePaths
+    from optodrive.cli.service_files import Installation, ServicePaths, list_units
 
-    paths = ServicePaths(name)
+    paths = ServicePaths.from_option(name)
     actions = Installation(root, paths).remove()
-    if not _print_files("action", actions, json) and actions:
+    if not _print_files("action", actions, json, list_units(root)) and actions:
         unit = paths.unit_name
         print(f"stop the service if it is running: systemctl disable --now {unit}; then systemctl daemon-reload")
+        if (paths.rules, "removed") in actions:
+            print("then udevadm control --reload")
         kept = f"/var/lib/{paths.program} (tokens, audit file), /var/cache/optodrive (compiled kernels)"
         print(f"kept: {kept}, the user optodrive")
 
 
 @GROUP.command()
-def show(name: NameOption = "", root: RootOption = Path("/"), json: JsonOption = False) -> None:
+def show(name: NameOption = None, root: RootOption = Path("/"), json: JsonOption = False) -> None:
     """List the installed files, and whether they were edited."""
-    from optodrive.cli.service_files import Installation, ServicePaths
+    from optodrive.cli.service_files import Installation, ServicePaths, list_units
 
-    installation = Installation(root, ServicePaths(name))
+    installation = Installation(root, ServicePaths.from_option(name))
     statuses = [(path, str(installation.file_status(path))) for path in installation.installed_files()]
-    _print_files("status", statuses, json)
+    _print_files("status", statuses, json, list_units(root))
 
 
-def _print_files(kind: str, files: list[tuple[Path, str]], json: bool) -> bool:
-    """Print the files with an action or a status each. Return whether that is all to print, as one JSON object."""
+def _print_files(kind: str, files: list[tuple[Path, str]], json: bool, units: Sequence[str] = ()) -> bool:
+    """Print the files with an action or a status each. Return whether that is all to print, as one JSON object.
+
+    units: of the services that are installed; they are named where there is no file
+    """
     document = {"files": [{"path": str(path), kind: text} for path, text in files]}
-    print_answer(document, [f"{path}: {text}" for path, text in files] or ["nothing is installed"], json)
+    others = f" of this name; there is {', '.join(units)}" if units else ""
+    print_answer(document, [f"{path}: {text}" for path, text in files] or [f"nothing is installed{others}"], json)
     return json

@@ -4,11 +4,11 @@ import json
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from optodrive.cli.service_program import check_program
 from optodrive.core.errors import InputError, RefusedError
@@ -28,6 +28,13 @@ class ServicePaths:
     def __post_init__(self) -> None:
         if self.name and not re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,31}", self.name):
             raise InputError("--name", self.name, "up to 32 of a to z, 0 to 9, - and _, a letter or digit first")
+
+    @classmethod
+    def from_option(cls, name: str | None) -> Self:
+        """Build the paths of the service that --name states. Raise InputError, also for an empty name."""
+        if name == "":
+            raise InputError("--name", name, "a name, or no --name for the first service of this host")
+        return cls(name or "")
 
     @property
     def program(self) -> str:
@@ -105,6 +112,13 @@ class ServiceFile:
     path: Path
     text: str
     preserve_edits: bool = False
+
+
+def list_units(root: Path) -> list[str]:
+    """Return the units of all services that are installed below a root."""
+    found = (root / "etc/optodrive").glob("**/installed.json")
+    folders = sorted(path.parent.relative_to(root / "etc/optodrive") for path in found)
+    return [ServicePaths("" if folder == Path() else folder.name).unit_name for folder in folders]
 
 
 def build_service_files(
@@ -337,6 +351,11 @@ class Installation:
             del self._digests[str(path)]
             actions.append((path, "removed" if status == "as installed" else "was missing"))
         self._save_digests()
+        folder = self.resolve(self._manifest).parent
+        with suppress(OSError):  # a folder with an edited file, or with another service
+            folder.rmdir()
+            if folder.parent.name == "optodrive":
+                folder.parent.rmdir()
         return actions
 
     def _is_current(self, file: ServiceFile) -> bool:

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -97,9 +97,12 @@ def study(
             sessions = _simulate(design, out, participants, display_config)
         else:
             sessions = {participant: _run_person(design, out, participant, url, hold, lsl, page, display_config)}
-    finally:  # also of a session that has not ended
-        if (out / "sourcedata").is_dir():
-            write_dataset(out)
+    except BaseException:  # a session that has not ended has tables, too
+        with suppress(InputError):
+            if (out / "sourcedata").is_dir():
+                write_dataset(out)
+        raise
+    write_dataset(out)
     report = _build_report(design, sessions, out)
     if design.matching is not None and display_config is not None:
         report["sensitivity"] = _write_sensitivity(design, design.matching, sessions, out, display_config)

@@ -41,6 +41,7 @@ def add(
     from optodrive.core.files import check_output
     from optodrive.daemon.api.roles import ROLES
     from optodrive.daemon.api.token_file import add_token, create_token, write_holder_file
+    from optodrive.daemon.api.tokens import read_private_tokens
 
     known = {each: each for each in ROLES}
     if role not in known:
@@ -63,6 +64,8 @@ def add(
     elif out is None:
         print(token.secret)
     _print_next(f"{name}, {role}: added to {path}" + (f", and written to {out}" if out is not None else ""))
+    if not any(each.role == "armer" for each in read_private_tokens(path).all):
+        print(f"optodrive: warning: no token of {path} may arm; add one with --role armer", file=sys.stderr)
 
 
 @GROUP.command("list")

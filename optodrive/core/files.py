@@ -42,6 +42,22 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_private_text(path: Path, text: str) -> None:
+    """Write a text file of mode 0600 atomically, in UTF-8.
+
+    Raises OSError if it cannot be written; the file that was there before is then unchanged.
+    """
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")  # mode 0600
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(name).replace(path)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
 def check_output(option: str, path: Path | None, *suffixes: str, folder: bool = False, may_exist: bool = False) -> None:
     """Raise InputError unless a new output can be written at this path, before anything is computed for it.
 

@@ -90,7 +90,9 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
     if table.get("format") != expected:
         raise InputError(f"{path}: format", table.get("format", MISSING), f"'{expected}'")
     if type(table.get("version")) is not int or table["version"] != version:
-        raise InputError(f"{path}: version", table.get("version", MISSING), f"{version}, the one this release reads")
+        found = table.get("version", MISSING)
+        newer = "; a newer release wrote this file" if type(found) is int and found > version else ""
+        raise InputError(f"{path}: version", found, f"{version}, the one this release reads{newer}")
 
 
 def parse_table(path: Path, table: dict[str, Any], model: type[Model]) -> Model:

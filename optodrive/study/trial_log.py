@@ -125,11 +125,15 @@ class TrialLog:
         self._write({"record": "familiarised", "presentations": list(presentations)})
 
     def _append(self, record: Mapping[str, Any]) -> None:
-        """Append a record. It is on the disk when this returns."""
-        line = json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n"
-        self._file.write(line.encode())
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        """Append a record. It is on the disk when this returns. Raise InputError if it cannot be written."""
+        rest = (json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n").encode()
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            expected = "room for the log; the session goes on with the same command"
+            raise InputError(str(self.path), error.strerror or str(error), expected) from None
 
     def _require_open(self) -> int:
         """Return the trial that was begun last. Raise ValueError if none was, which is a bug."""
@@ -198,7 +202,7 @@ def has_stimuli(path: Path) -> bool:
 
 def _open_locked(path: Path) -> Any:
     try:
-        file = path.open("a+b")
+        file = path.open("a+b", buffering=0)  # no rest is written again when the file is closed
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a file that can be written") from None
     try:

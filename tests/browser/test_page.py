@@ -321,6 +321,20 @@ def test_the_token_is_asked_for(visit, daemon, axe):
     window.open()  # an address that differs only in its hash does not load the page anew
 
 
+def test_a_token_is_typed_by_keys_alone(visit, daemon):
+    page = visit().page
+    page.goto(f"{daemon.url}/")
+    field = page.get_by_label("Token of this daemon")
+    expect(field).to_be_focused()
+    page.keyboard.type("surely-another-token")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("not the token of the daemon")
+    expect(field).to_be_focused()
+    page.keyboard.type(TOKEN)
+    page.keyboard.press("Enter")
+    page.get_by_text("live", exact=True).wait_for()
+
+
 def test_a_browser_that_keeps_no_cookie_is_told_so(visit, daemon):
     page = visit().page
     page.add_init_script("Object.defineProperty(Document.prototype, 'cookie', {set() {}, get: () => ''})")

@@ -63,9 +63,13 @@ def write_holder_file(path: Path, token: Token) -> None:
     """Write a new file of mode 0600 with one token, for `OPTODRIVE_TOKENS` of its holder."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise InputError(str(path), error.strerror, "a path for a new file") from None
+    try:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
             file.write(HEAD + format_token(token))
     except OSError as error:
+        path.unlink()  # a part of it would be in the way of the next attempt
         raise InputError(str(path), error.strerror, "a path for a new file") from None
 
 

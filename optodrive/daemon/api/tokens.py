@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError
 
 from optodrive.core.errors import MISSING, InputError
+from optodrive.core.files import write_private_text
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES, Role
@@ -136,9 +137,7 @@ def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
     ]
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        path.unlink(missing_ok=True)
-        path.touch(mode=0o600, exist_ok=False)
-        path.write_text("".join(lines), encoding="utf-8")
+        write_private_text(path, "".join(lines))
     except OSError as error:
         raise InputError(str(path), error.strerror, "a writable path for the daemon's tokens") from None
     return tokens

@@ -3,6 +3,7 @@
 import inspect
 import re
 from difflib import get_close_matches
+from enum import EnumType
 
 import pytest
 from typer.main import get_command
@@ -91,3 +92,28 @@ def test_a_misspelt_variable_of_the_environment_is_refused(monkeypatch, capsys):
                 "optodrive: environment: got 'OPTODRIVE_TOKN', expected a known variable, "
                 "nearest is 'OPTODRIVE_TOKEN'\n"
             )
+
+
+CHOICES = [
+    pytest.param(path, option, id=" ".join((*path, option.opts[0])))
+    for path, command in list_commands(ROOT)
+    for option in command.params
+    if isinstance(getattr(option, "type_descriptor", None) and option.type_descriptor.annotation, EnumType)
+]
+
+
+def test_some_options_have_choices():
+    assert CHOICES
+
+
+@pytest.mark.parametrize(("path", "option"), CHOICES)
+def test_a_value_that_is_no_choice_is_refused_with_the_choices(path, option, capsys):
+    assert run([*path, f"{option.opts[0]}=surely-unknown"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"optodrive: Invalid value for '{option.opts[0]}': 'surely-unknown' is not one of '")
+
+
+@pytest.mark.parametrize("height_um", ["0", "-1", "1001", "nan"])
+def test_a_height_that_no_dot_has_is_refused(height_um, capsys):
+    assert run(["braille", "port", f"--height-um={height_um}"]) == 2
+    assert "--height-um" in capsys.readouterr().err

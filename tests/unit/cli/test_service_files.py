@@ -366,13 +366,33 @@ def test_two_displays_have_a_service_each(install, at, tmp_path):
     assert "daemon.port 8001" in third
     other.write_text(other.read_text().replace("port = 8001", "port = 8002"))
     assert "has the board serial /dev/optodrive-board" in install("--config", other, "--name", "third", status=1).err
-    install("--name", "second", command="remove")
+    assert "udevadm control --reload" in install("--name", "second", command="remove").out
     assert at(UNIT_PATH).read_text() == one
     assert not at(paths.unit).exists()
     assert not at(paths.rules).exists()
+    for command in ("show", "remove"):
+        output = install("--name", "second", command=command).out
+        assert output == "nothing is installed of this name; there is optodrive\n"
 
 
-@pytest.mark.parametrize("name", ["a b", "../x", "A", "-x", "x\n", "a" * 33])
+def test_the_last_service_leaves_no_folder_of_its_own(install, at, tmp_path):
+    other = board_config(tmp_path, 'transport = "simulated"')
+    other.write_text(other.read_text().replace('name = "display-437"', 'name = "second"') + "[daemon]\nport = 8001\n")
+    install()
+    install("--config", other, "--name", "second")
+    install(command="remove")
+    assert install(command="show").out == "nothing is installed of this name; there is optodrive@second\n"
+    folder = at(CONFIG_PATH).parent
+    assert [path.name for path in folder.iterdir()] == ["second"]
+    install("--name", "second", command="remove")
+    assert not folder.exists()
+    install()
+    (folder / "notes.txt").write_text("of somebody else")
+    install(command="remove")
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../x", "A", "-x", "x\n", "a" * 33])
 def test_a_name_that_is_no_part_of_a_path_is_refused(install, name):
     assert "--name" in install(f"--name={name}", status=2).err
 

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from limited_files import largest_file
 from optodrive.cli.main import run
 from optodrive.daemon.api.tokens import read_private_tokens
 
@@ -131,3 +132,21 @@ def test_a_table_that_cannot_be_told_apart_is_left_alone(path, capfd):
     assert run(["token", "revoke", "a", "--file", str(path)]) == 2
     assert "edit it by hand" in capfd.readouterr().err
     assert path.read_text() == before
+
+
+def test_a_full_disk_leaves_no_part_of_a_file(path, tmp_path, capsys):
+    command = ["token", "add", "cara", "--role", "viewer", "--file", str(path), "--out", str(tmp_path / "cara.toml")]
+    with largest_file(20):
+        assert run(command) == 2
+    assert "cara.toml: got 'File too large'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [path]
+    assert run(command) == 0
+
+
+def test_a_file_of_which_no_token_may_arm_is_named(path, tmp_path, capfd):
+    new = ["token", "add", "cara", "--role", "operator", "--file", str(tmp_path / "new.toml"), "--out"]
+    assert run([*new, str(tmp_path / "cara.toml")]) == 0
+    assert "no token of" in capfd.readouterr().err
+    old = ["token", "add", "cara", "--role", "operator", "--file", str(path), "--out", str(tmp_path / "other.toml")]
+    assert run(old) == 0
+    assert "no token of" not in capfd.readouterr().err

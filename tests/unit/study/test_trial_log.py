@@ -6,6 +6,7 @@ import stat
 
 import pytest
 
+from limited_files import largest_file
 from optodrive.core.errors import BusyError, InputError
 from optodrive.study.session import draw_order
 from optodrive.study.study_file import load_study
@@ -162,3 +163,18 @@ def test_a_log_of_another_participant_does_not_begin_anew(tmp_path):
     open_log(path).__exit__(None, None, None)
     with pytest.raises(InputError, match="participant: got '01'"):
         open_log(path, STUDY.model_copy(update={"title": "Other"}), "02")
+
+
+def test_a_full_disk_ends_a_session_in_one_line_and_loses_no_trial(tmp_path):
+    path = tmp_path / "log.jsonl"
+    with open_log(path) as log:
+        run_trials(log, 2)
+    for beyond in (0, 30):  # the line is refused, or cut
+        with open_log(path) as log:
+            size = path.stat().st_size
+            with largest_file(size + beyond), pytest.raises(InputError, match=r"log\.jsonl: got 'File too large'"):
+                log.begin(2)
+        assert path.stat().st_size == size + beyond
+    with open_log(path) as log:
+        run_trials(log, 1)
+    assert [json.loads(line).get("trial") for line in path.read_text().splitlines()][-2:] == [2, 2]

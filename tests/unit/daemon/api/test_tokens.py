@@ -1,5 +1,6 @@
 import pytest
 
+from limited_files import largest_file
 from optodrive.core.errors import InputError
 from optodrive.daemon.api.tokens import (
     ENVIRONMENT_VARIABLE,
@@ -116,7 +117,9 @@ def test_a_secret_shows_in_no_repr_and_no_error(tmp_path):
 
 
 def test_another_version_is_refused_by_name(tmp_path):
-    with pytest.raises(InputError, match="version: got 2"):
+    with pytest.raises(
+        InputError, match="version: got 2, expected 1, the one this release reads; a newer release wrote this file"
+    ):
         read_tokens(write_tokens(tmp_path / "t.toml", ("anna", "armer", SECRET), version=2))
 
 
@@ -156,3 +159,16 @@ def test_a_given_secret_is_kept_as_it_is_or_refused_without_being_shown(tmp_path
             create_tokens(tmp_path / "b.toml", wrong)
         assert wrong not in str(caught.value)
         assert not (tmp_path / "b.toml").exists()
+
+
+def test_a_full_disk_leaves_no_part_of_the_daemons_tokens(tmp_path):
+    path = tmp_path / "tokens.toml"
+    with largest_file(20), pytest.raises(InputError, match="got 'File too large'"):
+        load_daemon_tokens(str(path), 1)
+    assert list(tmp_path.glob("*tokens*")) == []
+    tokens, _ = load_daemon_tokens(str(path), 1)  # the next start creates them
+    content = path.read_bytes()
+    with largest_file(20), pytest.raises(InputError, match="got 'File too large'"):
+        create_tokens(path)
+    assert path.read_bytes() == content
+    assert load_daemon_tokens(str(path), 1)[0].all == tokens.all
