@@ -221,6 +221,7 @@ def run_case(kind: str, seed: int, cause: str, *, quick: bool = False) -> dict[s
         "heights": outcome.heights,
         "message": said.message[-600:],
         "no_effect": (answer.get("probabilities") or {}).get("no_effect"),
+        "reasons": answer.get("reasons"),
         "remarks": answer.get("remarks"),
         "doubts": answer.get("doubts"),
         "failures": answer.get("failures"),

@@ -105,7 +105,7 @@ class Said:
         """Every statement about the data, each as one text."""
         if self.message:
             return [self.message]
-        keys = ("data", "disturbances", "doubts", "failures", "remarks")
+        keys = ("data", "reasons", "disturbances", "doubts", "failures", "remarks")
         parts: list[Any] = [*self.omissions]
         for key in keys:
             held = self.answer.get(key) or ()
@@ -206,10 +206,11 @@ def _judge_refusal(faults: tuple[Any, ...], said: Said) -> Outcome:
     if len(line) != 1:
         return Outcome("missed", f"refused in {len(line)} lines")
     for fault in faults:
-        places = [*list_places(fault), *fault.signals]
-        if ALLOWED[fault.kind].refusal and any(place in said.message for place in places):
+        rule, places = ALLOWED[fault.kind], [*list_places(fault), *fault.signals]
+        is_true = re.search(rule.words, said.message, re.IGNORECASE) and "likely in ms" not in said.message
+        if rule.refusal and is_true and any(place in said.message for place in places):
             return Outcome("right", f"refused by name: {fault.kind}")
-    return Outcome("missed", "refused without need, or without a name")
+    return Outcome("missed", "refused without need, without a name, or for a false reason")
 
 
 def _judge_verdict(verdict, causes, hidden, names, near, twins, *, named: bool, weak: bool) -> tuple[str, str]:

@@ -167,6 +167,11 @@ def test_answers_are_marked_as_the_table_says(kind, hidden, verdict, causes, tex
         ("sentinel", f"optodrive: r.h5: /runs/{RUN}/{DISPLACEMENT}/value[3]: -9999.0, expected at most 0.01", "right"),
         ("sentinel", "optodrive: r.h5: a value is impossible", "missed"),
         ("sentinel", f"optodrive: r.h5: {DISPLACEMENT}\nsecond line", "missed"),
+        (
+            "exchanged",
+            "optodrive: recording: r/pulses: width_s: got times that do not suit, it is likely in ms",
+            "missed",
+        ),
         ("coloured", f"optodrive: r.h5: {DISPLACEMENT}: too noisy", "missed"),
         ("coloured", "Traceback (most recent call last):\nKeyError: 'x'", "wrong"),
         ("coloured", "Killed", "wrong"),
