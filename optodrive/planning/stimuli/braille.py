@@ -3,6 +3,7 @@
 A cell is the set of its raised dots. Dots 1, 2, 3 run down the left column, 4, 5, 6 down the right one.
 """
 
+import re
 import unicodedata
 from string import ascii_letters, ascii_lowercase
 
@@ -52,6 +53,7 @@ PUNCTUATION = {
 }
 """Punctuation except the upright double quote, which opens at the start of a word and closes elsewhere."""
 
+LETTER_RUN = re.compile("[A-Za-z]+")
 _SUPPORTED_CHARACTERS = frozenset(ascii_letters) | DIGITS.keys() | PUNCTUATION.keys() | frozenset('" \t\r\n')
 
 
@@ -71,18 +73,18 @@ def encode_lines(text: str, where: str) -> list[list[list[Cell]]]:
 def encode_word(word: str) -> list[Cell]:
     """Encode one word of supported characters, with its number, capital and letter indicators."""
     cells: list[Cell] = []
-    in_number = False
+    in_number, runs = False, _find_capital_runs(word)
     for position, character in enumerate(word):
         if character in DIGITS:
             cells += () if in_number else NUMERIC_INDICATOR
             cells.append(DIGITS[character])
             in_number = True
-        elif character in ".," and (in_number or (word[:position] == "" and word[1:2].isdigit())):
+        elif character in ".," and (in_number or (position == 0 and word[1:2].isdigit())):
             cells += () if in_number else NUMERIC_INDICATOR
             cells += PUNCTUATION[character]
             in_number = True
         elif character in ascii_letters:
-            cells += _select_letter_indicators(word, position, in_number)
+            cells += _select_letter_indicators(character, position, in_number, runs)
             cells.append(LETTERS[character.lower()])
             in_number = False
         else:
@@ -91,17 +93,18 @@ def encode_word(word: str) -> list[Cell]:
     return cells
 
 
-def _select_letter_indicators(word: str, position: int, in_number: bool) -> tuple[Cell, ...]:
+def _find_capital_runs(word: str) -> dict[int, int]:
+    """Return the start of the run of each letter that stands in a run of two or more letters, all of them capitals."""
+    runs = (run for run in LETTER_RUN.finditer(word) if run.end() - run.start() >= 2 and run[0].isupper())
+    return {position: run.start() for run in runs for position in range(run.start(), run.end())}
+
+
+def _select_letter_indicators(letter: str, position: int, in_number: bool, runs: dict[int, int]) -> tuple[Cell, ...]:
     """Return the indicators before a letter. One word indicator covers a whole run of capitals."""
-    if word[position].islower():
-        return GRADE_1_INDICATOR if in_number and word[position] in "abcdefghij" else ()
-    start, end = position, position
-    while start > 0 and word[start - 1] in ascii_letters:
-        start -= 1
-    while end < len(word) and word[end] in ascii_letters:
-        end += 1
-    if end - start >= 2 and word[start:end].isupper():
-        return CAPITAL_WORD_INDICATOR if position == start else ()
+    if letter.islower():
+        return GRADE_1_INDICATOR if in_number and letter in "abcdefghij" else ()
+    if position in runs:
+        return CAPITAL_WORD_INDICATOR if position == runs[position] else ()
     return CAPITAL_LETTER_INDICATOR
 
 

@@ -18,7 +18,7 @@ from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.braille import Cell
 from optodrive.planning.stimuli.cell_slots import Spacing
-from optodrive.planning.stimuli.text import Lines, show_pages, translate
+from optodrive.planning.stimuli.text import PAGES_MAX, Lines, show_pages, translate
 
 FileFormat = Literal["auto", "braille", "text"]
 """What a file holds: braille, text, or what its content says."""
@@ -30,6 +30,10 @@ PEF = "{http://www.daisy.org/ns/2008/pef}"
 FIRST_CELL, LAST_SIX_DOT_CELL = 0x2800, 0x283F
 MARKUP_STARTS, MARKUP_END = ("<?xml", "<pef", "<!"), ">"
 CPM_END = "\x1a"
+CHARACTERS_MAX = 500_000
+"""Characters of a file: twice a volume of braille."""
+TAGS_MAX = 100_000
+"""Tags of a PEF file: two volumes in rows of a few cells."""
 SPACING = Spacing(dot_step=1, cell_gap=1, line_gap=1)
 
 
@@ -44,14 +48,19 @@ def build_braille_file(
 ) -> FrameSequence:
     """Build the pages of a BRF or PEF file, or of text, wrapped at words into the display's lines, each for `seconds`.
 
-    format: what the file holds; table: of liblouis, for text. Raises InputError (bad_text, does_not_fit, and with a
-    table bad_table, missing_library).
+    format: what the file holds; table: of liblouis, for text. Raises InputError (bad_text, does_not_fit, too_many,
+    raises_nothing, and with a table bad_table, missing_library).
     """
     place = f"{where}: file"
+    if len(file) > 4 * CHARACTERS_MAX:
+        raise InputError(place, Unquoted(f"{len(file)} bytes"), f"at most {4 * CHARACTERS_MAX}", code="too_many")
     if format != "text" and _is_markup(file):
         pages = [[_split_words(row) for row in page] for page in _read_pef(file, place)]
     else:
         text = _decode(file, place).replace("\r\n", "\n").replace("\r", "\n").rstrip(CPM_END)
+        if len(text) > CHARACTERS_MAX or text.count("\f") >= PAGES_MAX:
+            found = Unquoted(f"{len(text)} characters, {text.count(chr(12)) + 1} pages")
+            raise InputError(place, found, f"at most {CHARACTERS_MAX} characters, {PAGES_MAX} pages", code="too_many")
         if format == "text" or (format == "auto" and _is_text(text)):
             pages = [translate(page, table, place) for page in text.split("\f")]
         else:
@@ -113,6 +122,8 @@ def _read_brf(text: str, where: str) -> list[list[str]]:
 
 def _read_pef(file: bytes, where: str) -> list[list[str]]:
     """Return the rows of each page of a PEF file."""
+    if file.count(b"<") > TAGS_MAX:
+        raise InputError(where, Unquoted(f"{file.count(b'<')} tags"), f"at most {TAGS_MAX}", code="too_many")
     try:
         root: Element = fromstring(file, forbid_dtd=True)
     except DefusedXmlException:
@@ -123,16 +134,17 @@ def _read_pef(file: bytes, where: str) -> list[list[str]]:
         raise InputError(where, root.tag[:80], f"the root element {PEF}pef", code="bad_text")
     pages: list[list[str]] = []
     number = 0
-    for page in root.iter(f"{PEF}page"):
-        pages.append([])
-        for row in page.iter(f"{PEF}row"):
+    for element in root.iter():  # once: pages and rows that hold others would be read over and over
+        if element.tag == f"{PEF}page":
+            pages.append([])
+        elif element.tag == f"{PEF}row" and pages:
             number += 1
-            text = "".join(row.itertext()).strip()
+            text, place = (element.text or "").strip(), f"{where}: row {number}"
+            if len(element):
+                raise InputError(place, element[0].tag[:80], "cells alone in a row", code="bad_text")
             wrong = next((each for each in text if not FIRST_CELL <= ord(each) <= LAST_SIX_DOT_CELL), None)
             if wrong is not None:
-                raise InputError(
-                    f"{where}: row {number}", wrong, "cells of six dots, U+2800 to U+283F", code="bad_text"
-                )
+                raise InputError(place, wrong, "cells of six dots, U+2800 to U+283F", code="bad_text")
             pages[-1].append(text)
     return pages
 

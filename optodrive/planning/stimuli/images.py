@@ -26,8 +26,11 @@ SOURCE_PIXELS_MAX = 16_000_000
 """Largest number of pixels of an image file."""
 SIDE_MAX = 20_000
 """Largest width and height of an image: the weights of a lattice place cover a whole side."""
-ANIMATION_PIXELS_MAX = 200_000_000
-"""Largest number of pixels of all images of an animation."""
+ANIMATION_PIXELS_MAX = 64_000_000
+"""Largest number of pixels of all images of an animation: about three seconds of computation."""
+SCANS_MAX = 100
+"""Largest number of passes of a JPEG over its picture, each of which takes the work of the whole."""
+SCAN_MARK = b"\xff\xda"
 
 ANIMATION_FRAMES_MAX = 2_000
 FRAME_DURATION_MIN_S, FRAME_DURATION_MAX_S = 0.02, 60.0
@@ -188,6 +191,9 @@ def _open_image(file: bytes, where: str) -> Iterator["Image"]:
         try:
             with Image.open(BytesIO(file), formats=FORMATS) as image:
                 _check_size(image, where)
+                if image.format == "JPEG" and file.count(SCAN_MARK) > SCANS_MAX:
+                    found = f"a JPEG of {file.count(SCAN_MARK)} passes"
+                    raise InputError(where, found, f"at most {SCANS_MAX}", code="too_many")
                 yield image
         except (Image.DecompressionBombError, Image.DecompressionBombWarning):
             raise _too_large_error(where, "a far larger picture") from None

@@ -4,7 +4,7 @@ import unicodedata
 
 import numpy as np
 
-from optodrive.core.errors import InputError, build_nothing_raised_error
+from optodrive.core.errors import InputError, Unquoted, build_nothing_raised_error
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
@@ -12,7 +12,10 @@ from optodrive.planning.stimuli.braille import SPACE, Cell, encode_lines
 from optodrive.planning.stimuli.cell_slots import CellSlot, Spacing, find_line_slots
 from optodrive.planning.stimuli.liblouis import translate_lines
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture, sequence_end_s
+from optodrive.planning.stimuli.sequence_file import FRAMES_MAX
 
+PAGES_MAX = 3_000
+"""Largest number of pages of the display: about two seconds of computation."""
 Lines = list[list[list[Cell]]]
 """Lines of words of cells."""
 
@@ -53,7 +56,10 @@ def show_pages(
     seconds: float,
     spacing: Spacing,
 ) -> FrameSequence:
-    """Build pages of lines of words in braille, wrapped as by build_text. Raises InputError (does_not_fit)."""
+    """Build pages of lines of words in braille, wrapped as by build_text.
+
+    Raises InputError (does_not_fit; too_many before a frame is built).
+    """
     estimator = BeamTimeEstimator(config)
     slots = find_line_slots(estimator.lattice, spacing)
     if not slots:
@@ -62,6 +68,9 @@ def show_pages(
     for lines in pages:
         rows = wrap_words(lines, [len(line) for line in slots])
         shown += [rows[first : first + len(slots)] for first in range(0, len(rows), len(slots))]
+        if len(shown) > PAGES_MAX:
+            found = Unquoted(f"more than {PAGES_MAX} pages of {config.name}")
+            raise InputError(where, found, "fewer: a part of the file or text", code="too_many")
     frames: list[TactileFrame] = []
     for number, page in enumerate(shown, start=1):
         target_m = _draw_page(page, slots, height_m, len(estimator.lattice.layout))
@@ -72,6 +81,9 @@ def show_pages(
             f"page-{number}",
             sequence_end_s(FrameSequence(tuple(frames[-1:]))),
         )
+        if len(frames) > FRAMES_MAX:
+            found = Unquoted(f"{len(shown)} pages for {seconds:g} s each")
+            raise InputError(where, found, f"pages that take at most {FRAMES_MAX} frames in all", code="too_many")
     return FrameSequence(frames=tuple(frames))
 
 
@@ -81,18 +93,18 @@ def wrap_words(lines: list[list[list[Cell]]], widths: list[int]) -> list[list[Ce
     for words in lines:
         rows.append([])
         for word in words:
-            rest = word
             gap = [SPACE] if rows[-1] else []
-            if rows[-1] and len(rows[-1]) + 1 + len(rest) > widths[(len(rows) - 1) % len(widths)]:
+            if rows[-1] and len(rows[-1]) + 1 + len(word) > widths[(len(rows) - 1) % len(widths)]:
                 rows.append([])
                 gap = []
             rows[-1] += gap
-            while len(rows[-1]) + len(rest) > (width := widths[(len(rows) - 1) % len(widths)]):
+            first = 0  # of the cells not yet shown: to cut them off would copy the rest of a long word in each row
+            while len(rows[-1]) + len(word) - first > (width := widths[(len(rows) - 1) % len(widths)]):
                 space = width - len(rows[-1])
-                rows[-1] += rest[:space]
-                rest = rest[space:]
+                rows[-1] += word[first : first + space]
+                first += space
                 rows.append([])
-            rows[-1] += rest
+            rows[-1] += word[first:]
     return rows
 
 
