@@ -84,11 +84,19 @@ def diagnose(
     discover: Annotated[
         bool, typer.Option("--discover", help="Seek a term that no catalogue holds, even where a cause is named.")
     ] = False,
+    use: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--use",
+            metavar="KIND",
+            help="Use data that a finding of this kind leaves out: outlier, clipped, …; repeatable.",
+        ),
+    ] = None,
 ) -> None:
     """Name the errors of the model in measured data, and the gain from correcting them."""
     import_extra("scipy")
     if live:
-        _refuse_with_live(recordings, workers, dask, discover)
+        _refuse_with_live(recordings, workers, dask, discover, use)
         _check_json(json)
         _diagnose_live(context, LiveRequest(out or DEFAULT_OUT, budget_s, yes, seed, config), json)
         return
@@ -99,6 +107,7 @@ def diagnose(
     from optodrive.lab.recording import DisplayRuns
 
     _check_output_paths(json, out)
+    used = _check_use(use or [])
     if dask is not None and workers is not None:
         raise InputError("--workers", workers, "no such option together with --dask: a cluster has its own workers")
     settings = None if config is None else load_config(config)
@@ -110,16 +119,18 @@ def diagnose(
             if discover:
                 expected = f"a recording of at most {MAX_JOINT_PIXELS} pixels; this one has {len(runs.pixels)}"
                 raise InputError("--discover", True, expected)
-            output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers, provenance)
+            output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers, provenance, used)
         else:
-            output = _diagnose_jointly(recordings, out, title, seed, config, settings, provenance, discover)
+            output = _diagnose_jointly(recordings, out, title, seed, config, settings, provenance, discover, used)
         _write_output(output, out, json)
 
 
-def _refuse_with_live(recordings: list[Path] | None, workers: int | None, dask: str | None, discover: bool) -> None:
+def _refuse_with_live(
+    recordings: list[Path] | None, workers: int | None, dask: str | None, discover: bool, use: list[str] | None
+) -> None:
     """Raise InputError for an argument that --live does not take."""
     given = {"RECORDING": recordings and str(recordings[0]), "--workers": workers, "--dask": dask}
-    for name, value in (given | {"--discover": discover or None}).items():
+    for name, value in (given | {"--discover": discover or None, "--use": use or None}).items():
         if value is not None:
             raise InputError(name, value, "nothing with --live, which measures one pixel itself")
 
@@ -162,6 +173,7 @@ def _diagnose_jointly(
     config: "Config | None",
     provenance: "Provenance",
     discovers: bool,
+    use: tuple[str, ...],
 ) -> _DiagnosisOutput:
     """Diagnose one pixel, or a few pixels with common parameters, and seek a term where no known cause explains all."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
@@ -172,15 +184,17 @@ def _diagnose_jointly(
     prior, epsilon, width_m = build_prior(measurement, config)
     announce_compilation()
     with show_step("reading") as on_progress:
-        diagnosis = study(measurement, seed, prior, epsilon, on_progress)
+        diagnosis = study(measurement, seed, prior, epsilon, on_progress, use=use)
         discovery = None
         if discovers or diagnosis.verdict == "unexplained":
             from optodrive.lab.diagnosis.search_log import SearchLog
+            from optodrive.lab.inspection.inspection import inspect_recording
             from optodrive.lab.pixel_discovery import discover_in_pixel
 
             log = SearchLog(omissions=diagnosis.omissions)
             step = "the search for a term that no catalogue holds"
-            discovery = log.attempt(step, discover_in_pixel, None, measurement, prior, epsilon, on_progress)
+            usable = inspect_recording(measurement, use).measurement
+            discovery = log.attempt(step, discover_in_pixel, None, usable, prior, epsilon, on_progress)
     return _build_output(diagnosis, title, paths, provenance, out or OUT, config_name, width_m, discovery)
 
 
@@ -229,6 +243,7 @@ def _diagnose_per_pixel(
     dask: str | None,
     workers: int | None,
     provenance: "Provenance",
+    use: tuple[str, ...],
 ) -> _DiagnosisOutput:
     """Diagnose many pixels independently."""
     from optodrive.cli.diagnose_display import diagnose_display
@@ -237,7 +252,7 @@ def _diagnose_per_pixel(
     from optodrive.lab.diagnosis.model_file import build_model_toml
 
     announce_compilation()
-    diagnosis = diagnose_display(runs, seed, config, dask, workers)
+    diagnosis = diagnose_display(runs, seed, config, dask, workers, use)
     median_parameters, width_m, description = diagnosis.build_model()
     model = (
         None
@@ -274,6 +289,16 @@ def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) 
     model = "" if output.model_toml is None else ", model.toml"
     written = [] if out is None else [f"written: {out}/report.html, diagnosis.json{model}"]
     print_answer(output.document, [*output.narrative, *written], json == STDOUT)
+
+
+def _check_use(kinds: list[str]) -> tuple[str, ...]:
+    from optodrive.core.errors import suggest_nearest
+    from optodrive.lab.inspection.inspection import KINDS
+
+    for kind in kinds:
+        if kind not in KINDS:
+            raise InputError("--use", kind, f"a kind of finding, {suggest_nearest(kind, list(KINDS))}")
+    return tuple(kinds)
 
 
 def _check_output_paths(json: str | None, out: Path | None) -> None:

@@ -18,7 +18,12 @@ PROGRESS_LINES = 10
 
 
 def diagnose_display(
-    runs: "DisplayRuns", seed: int, config: "Config | None", dask: str | None, workers: int | None
+    runs: "DisplayRuns",
+    seed: int,
+    config: "Config | None",
+    dask: str | None,
+    workers: int | None,
+    use: tuple[str, ...] = (),
 ) -> "DisplayAnswer":
     """Diagnose every pixel independently, on local processes or a cluster.
 
@@ -34,9 +39,9 @@ def diagnose_display(
     )
 
     start_s = perf_counter()
-    tasks = [PixelTask(item.pixel, item.read, seed, config) for item in runs.pixels]
+    tasks = [PixelTask(item.pixel, item.read, seed, config, use) for item in runs.pixels]
     if runs.mirrors is not None:
-        tasks.append(PixelTask(None, runs.mirrors.read, seed, config))
+        tasks.append(PixelTask(None, runs.mirrors.read, seed, config, use))
     if dask is None:
         compile_kernels()
     pixels: list[PixelAnswer] = []

@@ -45,9 +45,11 @@ def show(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Validate a recording, and list the signals of each run."""
+    """Validate a recording, state its unusable data, and list the signals of each run."""
     from optodrive.core.errors import InputError
     from optodrive.core.files import check_output
+    from optodrive.lab.inspection.inspection import inspect_recording
+    from optodrive.lab.inspection.page import build_finding, build_lines
     from optodrive.lab.recording.merge import read_recording_or_session
     from optodrive.lab.recording.summary import build_summary
     from optodrive.lab.recording.trials import read_trials_if_any
@@ -57,12 +59,16 @@ def show(
     if is_session and out is not None:
         raise InputError("--out", str(out), "a recording with signals; this is a session, which has pulses alone")
     runs, found = build_summary(measurement), read_trials_if_any(recording)
+    page = None if is_session else inspect_recording(measurement)
     plotted_runs = None if out is None else _draw_signals(out, measurement)
     if json:
         picture = None if out is None else {"file": str(out), "runs": plotted_runs}
-        answer = {"recording": str(recording), "runs": runs, "trials": describe_trials(found), "picture": picture}
-        print_json(answer)
+        data = None if page is None else [build_finding(item) for item in page.findings]
+        answer = {"recording": str(recording), "data": data, "runs": runs, "trials": describe_trials(found)}
+        print_json(answer | {"picture": picture})
         return
+    if page is not None:
+        print("\n".join([*build_lines(page.findings, page.failures), ""]))
     headings = ("run", "group", "pulses", "energy", "signal", "pixel", "samples", "missing", "span")
     numbers = frozenset({"pulses", "energy", "pixel", "samples", "missing"})
     print_table(headings, [cells for run in runs for cells in _format_rows(run)], numbers)

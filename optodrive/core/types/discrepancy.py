@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.measurements import DataFinding
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,8 @@ class Discrepancy:
     runs; held_out_traces, held_out_errors: with the models fitted to the other runs; explained_fraction: share of the
     detected excess of χ²; doubts: why the size of a named cause is uncertain, a clause by cause; failures: hypotheses
     that could not be computed, with the errors; height_error_held_out, height_error_fitted: on pushes to which the
-    models were not fitted, and on all, None if none was measured
+    models were not fitted, and on all, None if none was measured; data_findings,
+    inspection_failures: of the inspection of the recording before all else
     """
 
     verdict: str
@@ -238,3 +240,10 @@ class Discrepancy:
     elapsed_s: float
     reasons: tuple[str, ...] = ()
     omissions: dict[str, str] = field(default_factory=dict)
+    data_findings: tuple[DataFinding, ...] = ()
+    inspection_failures: tuple[str, ...] = ()
+
+    @property
+    def omitted_data(self) -> tuple[DataFinding, ...]:
+        """Findings that left data out."""
+        return tuple(item for item in self.data_findings if item.action == "left out")

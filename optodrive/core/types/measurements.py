@@ -63,3 +63,20 @@ class Measurement:
     """Recording: runs in order."""
 
     runs: tuple[Run, ...]
+
+
+@dataclass(frozen=True)
+class DataFinding:
+    """Finding of the inspection of a recording.
+
+    signal: empty for all signals of the runs; action: "noted", "left out" or "refused"; samples: that it concerns;
+    numbers: value and unit by name
+    """
+
+    runs: tuple[str, ...]
+    signal: str
+    kind: str
+    text: str
+    action: str = "noted"
+    samples: int = 0
+    numbers: dict[str, tuple[float, str]] = field(default_factory=dict)

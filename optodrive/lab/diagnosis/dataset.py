@@ -1,7 +1,6 @@
 """Recording as one vector of finite samples, divided into blocks of one signal of one run each."""
 
 from dataclasses import dataclass, replace
-from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import Measurement, Run
+from optodrive.lab.inspection.start_times import read_start_times
 from optodrive.physics.pixel_ode import PixelExperiment
 
 SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad", "mirror_y_rad")
@@ -140,7 +140,9 @@ class Dataset:
 def build_dataset(measurement: Measurement) -> Dataset:
     """Convert a recording to vector form. Raise InputError if it has no finite sample."""
     runs = measurement.runs
-    start_times_s = _compute_start_times_s(runs)
+    stated_s = read_start_times(runs).seconds
+    is_stated = stated_s is not None and len(runs) > 1 and bool(np.ptp(stated_s))
+    start_times_s = stated_s if stated_s is not None and is_stated else np.arange(float(len(runs)))
     order = np.argsort(start_times_s, kind="stable")
     session_span_s = max(float(start_times_s.max() - start_times_s.min()), 1e-9)
     full_power_w = max([FULL_POWER_W, *(float(run.pulses[:, 2].max()) for run in runs if len(run.pulses))])
@@ -149,7 +151,6 @@ def build_dataset(measurement: Measurement) -> Dataset:
     blocks: list[Block] = []
     experiments: list[tuple[PixelExperiment, tuple[int, int, int]]] = []
     values: list[FloatArray] = []
-    has_start_times = all("started_at" in run.attributes for run in runs)
     offset = 0
     for number, run in enumerate(runs):
         by_pixel: dict[int, dict[int, int]] = {}
@@ -177,7 +178,7 @@ def build_dataset(measurement: Measurement) -> Dataset:
                 dose_before=doses_before_j[number].get(pixel, 0.0) / max_total_j,
                 dose_per_j=1.0 / max_total_j,
                 session_time=float(2.0 * (start_times_s[number] - start_times_s.min()) / session_span_s - 1.0),
-                session_time_per_s=2.0 / session_span_s if has_start_times else 0.0,
+                session_time_per_s=2.0 / session_span_s if is_stated else 0.0,
                 full_w=full_power_w,
             )
             experiments.append((experiment, block_numbers))
@@ -233,17 +234,6 @@ def _round_pulses(pulses: FloatArray) -> FloatArray:
     """Return pulses rounded to 1 µs and 0.1 mW, within which they are equal, in order of time."""
     rounded = np.round(pulses * [1e6, 1e6, 1e4, 1.0]) + 0.0
     return np.asarray(rounded[np.argsort(rounded[:, 0], kind="stable")])
-
-
-def _compute_start_times_s(runs: tuple[Run, ...]) -> FloatArray:
-    """Return the start time of each run, s: the stated one, or the run's number if any run states none."""
-    timestamps = [run.attributes.get("started_at") for run in runs]
-    if all(isinstance(timestamp, str) for timestamp in timestamps):
-        try:
-            return np.array([datetime.fromisoformat(str(timestamp)).timestamp() for timestamp in timestamps])
-        except ValueError:
-            pass
-    return np.arange(float(len(runs)))
 
 
 def _compute_doses_j(runs: tuple[Run, ...], order: IntArray) -> tuple[dict[int, float], list[dict[int, float]]]:

@@ -1,5 +1,6 @@
 """Diagnosis of a recording, separately for pixels and mirrors and then combined."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import reduce
 from time import perf_counter
@@ -64,6 +65,7 @@ from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
 from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, ignore_progress
 from optodrive.lab.diagnosis.signal_traces import ModelComparison
 from optodrive.lab.inference.claim import HeldOutChange, claim, combine_claims
+from optodrive.lab.inspection.inspection import inspect_recording
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -115,13 +117,18 @@ def diagnose(
     epsilon: float = DEFAULT_EPSILON,
     on_progress: ProgressCallback = ignore_progress,
     hold_out: bool = True,
+    use: Iterable[str] = (),
 ) -> Discrepancy:
     """Diagnose a recording.
 
-    hold_out: whether runs are held out to measure the gain, where there are enough of them. Raises InputError if it has
-    no data to compare with the model, a quantity that is probably in a wrong unit, or a copy in place of a repeat.
+    hold_out: whether runs are held out to measure the gain, where there are enough of them; use: kinds of findings of
+    the inspection that leave nothing out. Raises InputError if it has no data to compare with the model, a quantity
+    that is probably in a wrong unit, or a copy in place of a repeat.
     """
     began_s = perf_counter()
+    inspection = inspect_recording(measurement, use)
+    inspection.check()
+    measurement = inspection.measurement
     check_numeric_limits(measurement)
     check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel(epsilon))
     check_copied_runs(measurement)
@@ -203,7 +210,7 @@ def diagnose(
             for error in log.attempt("held-out errors", _compute_held_out_errors, list[HeldOutError](), subsystem)
         ),
         rivals=tuple(rival for subsystem in subsystems for rival in subsystem.rivals),
-        remarks=_build_remarks(subsystems),
+        remarks=(*inspection.remarks, *_build_remarks(subsystems)),
         explained_fraction=min(explained_fractions, default=0.0),
         doubts=doubts,
         failures=log.failures,
@@ -216,6 +223,8 @@ def diagnose(
         elapsed_s=perf_counter() - began_s,
         reasons=claimed.reasons,
         omissions=log.omissions,
+        data_findings=inspection.findings,
+        inspection_failures=inspection.failures,
     )
 
 

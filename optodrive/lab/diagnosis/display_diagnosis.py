@@ -25,12 +25,14 @@ class PixelTask:
 
     pixel: None for the mirrors
     read: reads the pixel's runs
+    use: kinds of findings of the inspection that leave nothing out
     """
 
     pixel: int | None
     read: Callable[[], Measurement]
     seed: int = 0
     config: Config | None = None
+    use: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,10 +150,12 @@ def diagnose_pixel(task: PixelTask) -> PixelAnswer:
     try:
         measurement = task.read()
         prior, epsilon, width_m = build_prior(measurement, task.config)
-        discrepancy = diagnose(measurement, task.seed, prior, epsilon)
+        discrepancy = diagnose(measurement, task.seed, prior, epsilon, use=task.use)
     except InputError as error:
         return PixelAnswer(task.pixel, None, str(error))
-    bare = replace(discrepancy, residual_traces=(), example_traces=(), held_out_traces=())
+    bare = replace(
+        discrepancy, residual_traces=(), example_traces=(), held_out_traces=(), data_findings=discrepancy.omitted_data
+    )
     return PixelAnswer(task.pixel, bare, width_m=width_m)
 
 

@@ -36,6 +36,11 @@ def build_display_narrative(answer: DisplayAnswer) -> list[str]:
             )
         if group.doubtful:
             lines.append(f"  Sizes not established, see the pixels' doubts: {format_ranges(group.doubtful)}.")
+    partly = [item.pixel for item in answer.pixels if item.discrepancy is not None and item.discrepancy.omitted_data]
+    if partly:
+        lines.append(
+            f"- data left out, see omitted of the pixels: {format_ranges([n for n in partly if n is not None])}."
+        )
     failed = answer.failed
     if failed:
         lines.append(f"- {format_pixel_count(len(failed))} without an answer: {format_ranges(_list_indices(failed))}.")

@@ -19,6 +19,7 @@ from optodrive.lab.inference.sentences import (
     describe_gain,
     describe_probabilities,
 )
+from optodrive.lab.inspection.page import build_finding
 from optodrive.physics.terms import discover_terms
 
 MAX_RULED_OUT = 6
@@ -33,7 +34,7 @@ def _format_interval(item: Estimate) -> str:
 
 def build_narrative(discrepancy: Discrepancy) -> list[str]:
     """Return the lines of the narrative: headline, causes, gain, rejected causes, next experiment and remarks."""
-    lines = [*describe_claim(discrepancy, discover_terms()), ""]
+    lines = [*describe_claim(discrepancy, discover_terms()), *describe_omitted(discrepancy), ""]
     if discrepancy.causes:
         lines += [
             f"- {discover_terms()[key].label} ({key}); visible in {discover_terms()[key].signature}."
@@ -80,6 +81,13 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
         ]
     lines += list(discrepancy.remarks)
     return lines
+
+
+def describe_omitted(discrepancy: Discrepancy) -> list[str]:
+    """Return the lines on data that the verdict does not rest on."""
+    omitted = [f"- {item.text}" for item in discrepancy.omitted_data]
+    failed = [f"- could not be inspected: {item}" for item in discrepancy.inspection_failures]
+    return ["Not used (--use KIND of diagnose uses it):", *omitted] * bool(omitted) + failed
 
 
 def _describe_height_error(discrepancy: Discrepancy) -> str:
@@ -147,6 +155,9 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
             }
             for item in discrepancy.disturbances
         ],
+        "data": [build_finding(item) for item in discrepancy.data_findings],
+        "omitted": [build_finding(item) for item in discrepancy.omitted_data],
+        "not_inspected": list(discrepancy.inspection_failures),
         "probabilities": {
             "no_effect": discrepancy.probabilities.no_effect,
             "none_of_these": discrepancy.probabilities.none_of_these,

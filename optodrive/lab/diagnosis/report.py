@@ -15,6 +15,7 @@ from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_
 from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.inference.claim import format_probability
 from optodrive.lab.inference.sentences import MIN_SHOWN
+from optodrive.lab.inspection.page import build_section
 
 MAX_TRACES = 12
 NAMED = ("identified", "indistinguishable")
@@ -41,6 +42,7 @@ def build_report(
     steps = SearchLog().attempt("next steps", list_next_steps, list[NextStep](), discrepancy, recordings, out, config)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     parts = [
+        *build_section(discrepancy.data_findings, discrepancy.inspection_failures),
         *_build_next_steps(steps),
         *_build_probabilities(discrepancy.probabilities),
         *sections,

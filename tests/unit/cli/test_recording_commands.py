@@ -33,7 +33,10 @@ def test_convert_there_and_back(path, tmp_path, capsys):
 
 def test_show_prints_a_row_for_each_signal(path, capsys):
     assert run(["recording", "show", str(path)]) == 0
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    page, _, table = capsys.readouterr().out.partition("\n\n")
+    assert page.splitlines()[0] == "Nothing is left out."
+    assert "displacement_m: 101 samples in 1 run at 1000 Hz, 2.0% of them missing." in page
+    lines = [line.split() for line in table.splitlines()]
     assert lines[0] == ["run", "group", "pulses", "energy", "signal", "pixel", "samples", "missing", "span"]
     energy = ["55.67", "mJ"]
     assert lines[1][:5] == ["run2", "a", "2", *energy]

@@ -1,0 +1,377 @@
+"""First page about a recording, before any physics.
+
+`inspect_recording` returns the findings, and the recording without the samples and signals that cannot be used. Every
+step sees the recording as the steps before it left it. A step that fails is listed, and takes nothing along.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.plausible_ranges import RECORDING
+from optodrive.core.quantity import format_quantity
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
+from optodrive.core.types.measurements import DataFinding, Measurement, Run, Signal
+from optodrive.lab.inspection.response_faults import RESPONSE_STEPS
+from optodrive.lab.inspection.signal_faults import (
+    find_ceiling,
+    find_hold,
+    find_interpolation,
+    find_outlier_candidates,
+    find_sentinels,
+    find_stuck,
+    measure_deviation,
+    measure_noise,
+    select_near_ceiling,
+)
+from optodrive.lab.inspection.start_times import KIND as START_TIMES
+from optodrive.lab.inspection.start_times import read_start_times
+from optodrive.lab.inspection.work import (
+    Edit,
+    Found,
+    Step,
+    Work,
+    count,
+    describe,
+    find_unit,
+    format_span,
+    list_names,
+    remove_samples,
+    select_finite,
+)
+
+LOWEST_K, HIGHEST_K = 1.0, 5000.0
+"""Limits of a possible temperature."""
+TEMPERATURE = "absorber_temperature_K"
+SAME_PHASE, EDGE_SAMPLES, EDGE_S, REPEAT_SIGMAS, NEAR = 0.05, 4.0, 3e-3, 4.5, 8
+"""Distance of samples of repeats that are compared, in intervals; of an outlier from an edge of the drive, in intervals
+and s; its deviation from a repeat, and the number of samples on either side that judge it."""
+MAX_PASSES, MAX_REPEATS, MIN_SAMPLES = 3, 3, 24
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Findings, the recording without unusable data, and failed steps."""
+
+    findings: tuple[DataFinding, ...]
+    measurement: Measurement
+    failures: tuple[str, ...] = ()
+
+    @property
+    def omitted(self) -> tuple[DataFinding, ...]:
+        """Findings that left data out."""
+        return tuple(item for item in self.findings if item.action == "left out")
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Texts of noted findings other than sampling and noise."""
+        return tuple(item.text for item in self.findings if item.action == "noted" and item.kind not in FACTS)
+
+    def check(self) -> None:
+        """Raise InputError for the first finding that is refused, or if nothing is left."""
+        for item in self.findings:
+            if item.action == "refused":
+                where = f"recording: {list_names(item.runs)}: {item.kind}"
+                raise InputError(where, Unquoted("what cannot be used"), item.text.rstrip("."))
+        is_empty = not any(
+            np.isfinite(signal.value).any() for run in self.measurement.runs for signal in run.signals.values()
+        )
+        if self.omitted and is_empty:
+            reason = self.omitted[-1].text.removesuffix("; left out.")
+            raise InputError("recording", Unquoted("no signal that can be used"), f"at least one; {reason}")
+
+
+def inspect_recording(measurement: Measurement, use: Iterable[str] = ()) -> Inspection:
+    """Inspect a recording.
+
+    use: kinds that are noted only, so that what they concern stays in the recording
+    """
+    used, work = frozenset(use), Work(measurement)
+    findings: list[DataFinding] = []
+    failures: list[str] = []
+    for step in STEPS:
+        if step in RESPONSE_STEPS and any(
+            item.kind in RESPONSE_KINDS and item.action == "refused" for item in findings
+        ):
+            continue  # what is refused already would be found once more under other names
+        for name in [""] if step.is_joint else work.names:
+            try:
+                with np.errstate(all="ignore"):
+                    edits, new = step.find(work, name)
+            except Exception as error:  # an optional step never takes the answer along
+                failures.append(f"{step.kind}{' of ' if name else ''}{name}: {type(error).__name__}: {error}")
+                continue
+            if step.kind in used:
+                new = [replace(item, action="noted", text=_put_back(item.text)) for item in new]
+            else:
+                work.apply(edits)
+            findings += new
+    return Inspection(tuple(findings), work.build(), tuple(failures))
+
+
+def _put_back(text: str) -> str:
+    return text.replace("; left out.", "; used all the same.")
+
+
+def _mask_all(work: Work, name: str, find: Callable[[FloatArray], BoolArray]) -> list[Edit]:
+    edits = []
+    for number, signal in work.list_signals(name):
+        value = select_finite(signal)[2]
+        is_bad = find(value) if len(value) else np.zeros(0, dtype=bool)
+        if is_bad.any():
+            edits.append(remove_samples(number, name, signal, is_bad))
+    return edits
+
+
+def _find_sentinels(work: Work, name: str) -> Found:
+    high = RECORDING[name].high
+    kept = np.concatenate([select_finite(signal)[2] for _, signal in work.list_signals(name)])
+    centre = float(np.median(kept))
+    limits = (LOWEST_K, HIGHEST_K) if name == TEMPERATURE else (centre - high, centre + high)
+    edits = _mask_all(work, name, lambda value: find_sentinels(value, *limits))
+    if not edits:
+        return [], []
+    values = np.concatenate([item.values for item in edits])
+    samples, runs = count(len(values), "sample"), count(len(edits), "run")
+    shown = list_names([f"{value:.6g}" for value in np.unique(values).tolist()])
+    return edits, [
+        describe(work, "sentinel", name, edits, f"{name}: {samples} of {runs} are {shown}, no measured value")
+    ]
+
+
+def _find_stuck(work: Work, name: str) -> Found:
+    edits = _mask_all(work, name, find_stuck)
+    if not edits:
+        return [], []
+    samples, runs = count(sum(item.samples for item in edits), "sample"), count(len(edits), "run")
+    shown = format_span(np.concatenate([item.values for item in edits]), find_unit(name))
+    return edits, [describe(work, "stuck", name, edits, f"{name}: {samples} of {runs} are stuck at {shown}")]
+
+
+def _find_held(work: Work, name: str) -> Found:
+    edits, intervals_s = [], []
+    for number, signal in work.list_signals(name):
+        _, t_s, value = select_finite(signal)
+        held = find_hold(t_s, value)
+        if held is not None:
+            intervals_s.append(held[0])
+            edits.append(remove_samples(number, name, signal, ~held[1]))
+    if not edits:
+        return [], []
+    every = format_span(np.array(intervals_s), "s")
+    text = (
+        f"{name}: in {count(len(edits), 'run')} each sample is repeated until the next, every {every}; the first counts"
+    )
+    return edits, [describe(work, "held", name, edits, text)]
+
+
+def _find_interpolated(work: Work, name: str) -> Found:
+    edits, intervals_s = [], []
+    for number, signal in work.list_signals(name):
+        _, t_s, value = select_finite(signal)
+        found = find_interpolation(t_s, value)
+        if found is not None:
+            interval_s, knots_s, knots = found
+            intervals_s.append(interval_s)
+            edits.append(Edit(number, name, replace(signal, t_s=knots_s, value=knots), len(value) - len(knots), value))
+    if not edits:
+        return [], []
+    every = format_span(np.array(intervals_s), "s")
+    text = (
+        f"{name}: in {count(len(edits), 'run')} samples lie on lines between points {every} apart; these points count"
+    )
+    return edits, [describe(work, "interpolated", name, edits, text)]
+
+
+def _find_clipped(work: Work, name: str) -> Found:
+    edits, findings = [], []
+    is_mirror = name.startswith("mirror")
+    for sign, side in ((1.0, "highest"), (-1.0, "lowest")):
+        signals = [(number, signal, *select_finite(signal)[1:]) for number, signal in work.list_signals(name)]
+        may_be_smooth = sign > 0.0 and not is_mirror
+        found = [
+            top for _, _, t_s, value in signals if (top := find_ceiling(t_s, sign * value, may_be_smooth)) is not None
+        ]
+        if not found:
+            continue
+        ceiling = min(found)
+        own = []
+        for number, signal, _, value in signals:
+            if len(value) and float((sign * value).max()) >= ceiling:
+                own.append(remove_samples(number, name, signal, select_near_ceiling(sign * value, ceiling)))
+        work.apply(own)
+        samples, total = sum(item.samples for item in own), sum(len(value) for _, _, _, value in signals)
+        text = f"{name}: {count(samples, 'sample')} ({samples / total:.1%}) of {count(len(own), 'run')} are at or near "
+        text += f"{format_quantity(sign * ceiling, find_unit(name))}, where the signal is clipped, its {side} value"
+        findings.append(describe(work, "clipped", name, own, text))
+        edits += own
+    return edits, findings
+
+
+def _find_outliers(work: Work, name: str) -> Found:
+    edits, largest = [], 0.0
+    for number, signal in work.list_signals(name):
+        _, t_s, value = select_finite(signal)
+        if len(value) < MIN_SAMPLES:
+            continue
+        rows, is_bad = np.arange(len(value)), np.zeros(len(value), dtype=bool)
+        repeats = _list_alike(work, number, name, t_s)
+        for _ in range(MAX_PASSES):
+            kept = rows[~is_bad]
+            new = _list_outliers(work.runs[number], t_s[kept], value[kept], [other[kept] for other in repeats])
+            for first, width, score in new:
+                is_bad[kept[first : first + width]] = True
+                largest = max(largest, score)
+            if not new:
+                break
+        if is_bad.any():
+            edits.append(remove_samples(number, name, signal, is_bad))
+    if not edits:
+        return [], []
+    samples, runs = count(sum(item.samples for item in edits), "sample"), count(len(edits), "run")
+    where = list_names([work.runs[item.run].name for item in edits])
+    text = f"{name}: {samples} of {runs} ({where}) deviate by up to {largest:.0f} σ from the samples beside them"
+    return edits, [describe(work, "outlier", name, edits, text)]
+
+
+def _list_alike(work: Work, run: int, name: str, t_s: FloatArray) -> list[FloatArray]:
+    """Return the values of repeats at the same times, NaN where they have none."""
+    interval_s = float(np.median(np.diff(t_s)))
+    alike = []
+    for other in work.find_repeats(run):
+        signal = work.signals.get((other, name))
+        if signal is None:
+            continue
+        _, other_s, value = select_finite(signal)
+        if len(other_s) < MIN_SAMPLES:
+            continue
+        row = np.clip(np.searchsorted(other_s, t_s), 1, len(other_s) - 1)
+        row -= np.abs(other_s[row - 1] - t_s) < np.abs(other_s[row] - t_s)
+        is_same = np.abs(other_s[row] - t_s) < SAME_PHASE * interval_s
+        if is_same.mean() > 0.5:
+            alike.append(np.where(is_same, value[row], np.nan))
+    return alike[:MAX_REPEATS]
+
+
+def _list_outliers(
+    run: Run, t_s: FloatArray, value: FloatArray, repeats: list[FloatArray]
+) -> list[tuple[int, int, float]]:
+    """Return first sample, number of samples and σ of outliers that no repeat shares."""
+    edges_s = _list_edges(run)
+    reach_s = max(EDGE_SAMPLES * float(np.median(np.diff(t_s))), EDGE_S)
+    noise = measure_noise(value)
+    sigma = max(noise.sigma, 0.5 * noise.quantum)
+    found = []
+    for first, width, score in find_outlier_candidates(t_s, value):
+        own = np.arange(first, first + width)
+        compared = [other for other in repeats if np.isfinite(other[own]).all()]
+        is_far = not len(edges_s) or float(np.abs(edges_s[:, None] - t_s[own]).min()) > reach_s
+        if all(_differs(value - other, own, sigma) for other in compared) and (compared or is_far):
+            found.append((first, width, score))
+    taken = {row for first, width, _ in found for row in range(first, first + width)}
+    for at, other in enumerate(repeats):  # in a difference of repeats the signal itself is no longer in the way
+        is_common = np.isfinite(other)
+        rows = np.flatnonzero(is_common)
+        for first, width, score in find_outlier_candidates(t_s[rows], (value - other)[rows], noise.quantum):
+            own = rows[first : first + width]
+            others = [item for number, item in enumerate(repeats) if number != at and np.isfinite(item[own]).all()]
+            is_mine = all(_differs(value - item, own, sigma) for item in others)
+            if not others:
+                mine, its = (measure_deviation(t_s[rows], item[rows], first, width)[0] for item in (value, other))
+                is_mine = mine > its
+            if is_mine and not taken.intersection(own.tolist()):
+                taken.update(own.tolist())
+                found += [(int(row), 1, score) for row in own]
+    return found
+
+
+def _differs(difference: FloatArray, own: IntArray, sigma: float) -> bool:
+    """Return whether samples of a difference of repeats deviate from those beside them."""
+    near = difference[max(own[0] - NEAR, 0) : own[-1] + NEAR + 1]
+    near = near[np.isfinite(near)]
+    centre = float(np.median(near))
+    spread = max(1.4826 * float(np.median(np.abs(near - centre))), 1.4 * sigma)
+    return bool((np.abs(difference[own] - centre) > REPEAT_SIGMAS * spread).all())
+
+
+def _list_edges(run: Run) -> FloatArray:
+    """Return the times at which light or mirrors change."""
+    commands_s = np.zeros(0) if run.commands is None else run.commands[:, 0]
+    return np.concatenate([run.pulses[:, 0], run.pulses[:, 0] + run.pulses[:, 1], commands_s])
+
+
+def _note_start_times(work: Work, _: str) -> Found:
+    return [], list(read_start_times(work.runs).findings)
+
+
+def _note_sampling(work: Work, name: str) -> Found:
+    signals = [(number, signal) for number, signal in work.list_signals(name) if len(signal.t_s) > 2]
+    if not signals:
+        return [], []
+    intervals_s = np.array([float(np.median(np.diff(signal.t_s))) for _, signal in signals])
+    total = sum(len(signal.t_s) for _, signal in signals)
+    missing = sum(int(np.isnan(signal.value).sum()) for _, signal in signals)
+    rate = f"{1.0 / intervals_s.max():.4g}"
+    rate += f" to {1.0 / intervals_s.min():.4g}" if np.ptp(intervals_s) > 0.01 * intervals_s.min() else ""
+    text = f"{name}: {count(total, 'sample')} in {count(len(signals), 'run')} at {rate} Hz"
+    text += f", {missing / total:.1%} of them missing" if missing else ""
+    gaps = [(float(np.diff(select_finite(signal)[1]).max(initial=0.0)), number) for number, signal in signals]
+    longest_s, at = max(gaps)
+    if longest_s > 10.0 * intervals_s.max():
+        text += f", the longest gap {format_quantity(longest_s, 's')} in {work.runs[at].name}"
+    free = [number for number, signal in signals if _has_other_phase(work, number, name, signal)]
+    text += f"; {count(len(free), 'run')} sampled at other phases than their repeats" if free else ""
+    runs = tuple(work.runs[number].name for number, _ in signals)
+    numbers = {"interval": (float(np.median(intervals_s)), "s"), "missing": (missing / total, "1")}
+    return [], [DataFinding(runs, name, "sampling", f"{text}.", samples=total, numbers=numbers)]
+
+
+def _has_other_phase(work: Work, run: int, name: str, signal: Signal) -> bool:
+    others = [work.signals.get((other, name)) for other in work.find_repeats(run)]
+    interval_s = float(np.median(np.diff(signal.t_s)))
+    return any(
+        other is not None
+        and abs((other.t_s[0] - signal.t_s[0] + 0.5 * interval_s) % interval_s - 0.5 * interval_s)
+        > SAME_PHASE * interval_s
+        for other in others
+    )
+
+
+def _note_noise(work: Work, name: str) -> Found:
+    found = [
+        measure_noise(value) for _, signal in work.list_signals(name) if len(value := select_finite(signal)[2]) >= 16
+    ]
+    if not found:
+        return [], []
+    sigma, quantum = (float(np.median([getattr(item, key) for item in found])) for key in ("sigma", "quantum"))
+    unit = find_unit(name)
+    text = f"{name}: noise of {format_quantity(sigma, unit)} between neighbouring samples"
+    if quantum:
+        coarse = ", coarser than the noise" if quantum > 2.0 * sigma else ""
+        text += f", resolution {format_quantity(quantum, unit)}{coarse}"
+    numbers = {"noise": (sigma, unit), "resolution": (quantum, unit)}
+    return [], [
+        DataFinding(
+            tuple(work.runs[n].name for n, _ in work.list_signals(name)), name, "noise", f"{text}.", numbers=numbers
+        )
+    ]
+
+
+STEPS = (
+    Step("sentinel", _find_sentinels),
+    Step("held", _find_held),
+    Step("interpolated", _find_interpolated),
+    Step("stuck", _find_stuck),
+    Step("clipped", _find_clipped),
+    Step("outlier", _find_outliers),
+    *RESPONSE_STEPS,
+    Step(START_TIMES, _note_start_times, is_joint=True),
+    Step("sampling", _note_sampling),
+    Step("noise", _note_noise),
+)
+RESPONSE_KINDS = tuple(step.kind for step in RESPONSE_STEPS)
+FACTS = ("sampling", "noise")
+KINDS = tuple(step.kind for step in STEPS if step.kind not in FACTS)
+"""Kinds of findings that may leave something out, which `use` puts back."""

@@ -1,0 +1,316 @@
+"""Faults in the samples of one signal of one run.
+
+Theory of operation
+
+Every test compares samples with others of the same signal, so none needs a model of the pixel. Where a smooth signal
+without noise, or a coarse converter, would look like the fault, the test asks for what these cannot show: a ceiling is
+reached without slowing down; held samples change at equal intervals and by more than the converter's step; interpolated
+ones have no curvature but at equal intervals; an outlier deviates from what its neighbours on the left predict, from
+what those on the right predict, and more than these neighbours do from a smooth curve.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
+
+MIN_QUANTA, ROUNDING = 8, 1e-6
+"""Smallest number of steps between levels by which a converter's step is found, and rounding error of a value."""
+SENTINELS = (999.0, 999.9, 9999.0, 99999.0, 32767.0, 32768.0, 65535.0, 2147483647.0, 1e30, 9.9e37, 9.91e37, 1e38)
+"""Magnitudes that programs write in place of a missing value, beside float32's largest and 0 K."""
+LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
+SENTINEL_GAP, SENTINEL_SHARE = 0.2, 0.5
+"""Distance of a repeated impossible value from all others, relative to their range; largest share of such values."""
+MIN_STUCK, STUCK_TIES = 20, 0.2
+"""Smallest number of equal samples in a row that are stuck; largest share of equal neighbours among the others."""
+MIN_TIES, PILE, NEXT_LEVELS, CEILING_SIGMAS = 5, 2.0, 5, 4.0
+"""Equal samples at a ceiling, also relative to those at each of the next levels of a converter; σ below it that are
+left out too."""
+APPROACH, SLOWING, RISE = 0.02, 2.5, 0.3
+"""Bands below a ceiling, relative to the range, in which the last approach is timed; by how much it may slow down."""
+HOLD_SHARE, HOLD_BLOCKS, FEW_BLOCKS, LONG_BLOCK, HOLD_REGULAR, HOLD_STEPS = 0.45, 8, 4, 5.0, 0.97, 0.3
+"""Of held samples: smallest share of equal neighbours, number of blocks, and of blocks of `LONG_BLOCK` samples, share
+of regular intervals, and of steps above the quantum."""
+COLLINEAR_SHARE, MIN_SEGMENTS, MIN_SEGMENT = 0.5, 8, 3
+"""Of interpolated samples: smallest share without curvature, number of straight parts, and of samples in each."""
+OUTLIER_SIGMAS, SIDE, MAX_WIDTH, ROUGHNESS = 6.0, 5, 3, 6.0
+"""Smallest deviation, samples on either side that predict it, largest number of samples of an outlier, and ratio to the
+deviations of its neighbours."""
+
+
+@dataclass(frozen=True)
+class SampleNoise:
+    """Noise between neighbouring samples.
+
+    sigma: robust; is_rough: whether neighbours differ as noise does, rather than as a smooth signal; quantum: step of
+    which all values are multiples, 0 if there is none
+    """
+
+    sigma: float
+    is_rough: bool
+    quantum: float
+
+
+def measure_noise(value: FloatArray) -> SampleNoise:
+    """Return the noise of samples in order of time."""
+    if len(value) < 16:
+        return SampleNoise(0.0, False, 0.0)
+    near, far = (_estimate_sigma(value, stride) for stride in (1, 2))
+    return SampleNoise(near, near > 0.5 * far and near > 1e-9 * float(np.abs(value).max()), find_quantum(value, 1))
+
+
+def _estimate_sigma(value: FloatArray, stride: int) -> float:
+    """Return the standard deviation of white noise by third differences, which are small where a signal is smooth."""
+    differences = value[3 * stride :] - 3.0 * (value[2 * stride : -stride] - value[stride : -2 * stride])
+    return float(1.4826 * np.median(np.abs(differences - value[: -3 * stride])) / np.sqrt(20.0))
+
+
+def find_quantum(value: FloatArray, min_quanta: int = MIN_QUANTA) -> float:
+    """Return the step of which all values are multiples, or 0 if there is none, or too few levels."""
+    levels = np.unique(value)
+    steps = np.diff(levels)
+    steps = steps[steps > ROUNDING * float(np.abs(levels).max())]
+    if len(steps) < min_quanta:
+        return 0.0
+    count = (levels - levels[0]) / steps.min()
+    return float(steps.min()) if float(np.abs(count - np.round(count)).max()) < 0.05 else 0.0
+
+
+def find_sentinels(value: FloatArray, low: float, high: float) -> BoolArray:
+    """Return which samples stand for a missing value.
+
+    low, high: limits of what is possible
+    """
+    is_impossible = (value <= low) | (value >= high)
+    magnitude = np.abs(value)
+    is_known = np.zeros(len(value), dtype=bool)
+    for sentinel in (*SENTINELS, LARGEST_FLOAT32):
+        is_known |= np.abs(magnitude - sentinel) <= 1e-6 * sentinel
+    _levels, inverse, counts = np.unique(value, return_inverse=True, return_counts=True)
+    is_repeated = counts[inverse] > 1
+    candidates = (is_impossible & (is_known | is_repeated | (value == 0.0))) | is_known
+    if not candidates.any() or candidates.mean() > SENTINEL_SHARE:
+        return np.zeros(len(value), dtype=bool)
+    rest = value[~candidates]
+    distance = np.where(value > rest.max(), value - rest.max(), np.where(value < rest.min(), rest.min() - value, 0.0))
+    # Possible values are sentinels only where the signal is nowhere near them.
+    return np.asarray(candidates & (is_impossible | (distance > SENTINEL_GAP * float(np.ptp(rest)))))
+
+
+def find_stuck(value: FloatArray) -> BoolArray:
+    """Return which samples belong to a long row of equal ones in a signal whose neighbours differ otherwise.
+
+    Rows at the largest or the smallest value are left to the search for a ceiling.
+    """
+    starts, lengths = _find_rows(value)
+    is_long = (lengths >= MIN_STUCK) & (value[starts] != value.max()) & (value[starts] != value.min())
+    is_stuck = np.repeat(is_long, lengths)
+    if not is_long.any():
+        return is_stuck
+    others, noise = lengths[lengths < MIN_STUCK], measure_noise(value[~np.repeat(lengths >= MIN_STUCK, lengths)])
+    ties = 1.0 - len(others) / max(int(others.sum()), 1)
+    is_noisy = noise.is_rough and noise.sigma > noise.quantum and ties <= STUCK_TIES
+    return is_stuck if is_noisy else np.zeros(len(value), dtype=bool)
+
+
+def _find_rows(value: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return first samples and lengths of the rows of equal samples."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(value) != 0.0) + 1])
+    return starts, np.diff(np.append(starts, len(value)))
+
+
+def find_ceiling(t_s: FloatArray, value: FloatArray, may_be_smooth: bool) -> float | None:
+    """Return the value at which samples pile up at the top, or None.
+
+    may_be_smooth: whether a ceiling is sought without noise too, where a signal at rest ends in equal samples as well
+    """
+    if len(value) < 4 * MIN_TIES:
+        return None
+    top, noise = float(value.max()), measure_noise(value)
+    is_tie = value >= top - 1e-12 * abs(top)
+    if is_tie.sum() < MIN_TIES or is_tie.all():
+        return None
+    if noise.is_rough and noise.sigma > noise.quantum:
+        if noise.quantum < 0.1 * noise.sigma:
+            return top
+        levels = [np.abs(value - top + step * noise.quantum) < 0.5 * noise.quantum for step in range(1, NEXT_LEVELS)]
+        below = max(int(level.sum()) for level in levels)
+        return top if is_tie.sum() > max(PILE * below, 2 * MIN_TIES) else None
+    return top if may_be_smooth and _is_reached_fast(t_s, value, is_tie, noise.quantum) else None
+
+
+def _is_reached_fast(t_s: FloatArray, value: FloatArray, is_tie: BoolArray, quantum: float) -> bool:
+    """Return whether the longest row at the top is reached without slowing down."""
+    starts, lengths = _find_rows(is_tie.astype(np.float64))
+    is_top = is_tie[starts]
+    at = int(starts[is_top][np.argmax(lengths[is_top])])
+    length = int(lengths[is_top].max())
+    top, range_ = float(value.max()), float(np.ptp(value))
+    band = max(APPROACH * range_, 4.0 * quantum)
+    before = value[:at]
+    if length < MIN_TIES or not len(before) or 2.0 * band > 0.5 * range_:
+        return False
+    crossings = [np.flatnonzero(before < top - depth) for depth in (RISE * range_, 2.0 * band, band)]
+    if any(not len(rows) for rows in crossings):
+        return False
+    first, second, last = (int(rows[-1]) for rows in crossings)
+    if at - first < 6:  # too few samples of the rise
+        return False
+    dt_s = float(np.median(np.diff(t_s)))
+    slow_s, usual_s = float(t_s[at] - t_s[last]), float(t_s[last] - t_s[second])
+    return slow_s <= SLOWING * usual_s + dt_s and length * dt_s >= 5.0 * slow_s
+
+
+def select_near_ceiling(value: FloatArray, ceiling: float) -> BoolArray:
+    """Return the samples at and near a ceiling. Gaps count too, so that noise does not select."""
+    noise = measure_noise(value)
+    margin = max(CEILING_SIGMAS * noise.sigma, 2.0 * noise.quantum)
+    is_near = value >= ceiling - margin
+    rows = np.flatnonzero(is_near)
+    for first, last in itertools.pairwise(rows):
+        if last - first <= 4:
+            is_near[first:last] = True
+    return np.asarray(np.convolve(is_near, np.ones(5), mode="same") > 0.5)
+
+
+def find_hold(t_s: FloatArray, value: FloatArray) -> tuple[float, BoolArray] | None:
+    """Return the interval of a slower channel whose samples are repeated, s, and which samples are fresh, or None."""
+    if len(value) < 2 * HOLD_BLOCKS:
+        return None
+    starts, lengths = _find_rows(value)
+    fewest = FEW_BLOCKS if float(np.median(lengths)) >= LONG_BLOCK else HOLD_BLOCKS
+    if len(starts) < fewest + 2 or 1.0 - len(starts) / len(value) < HOLD_SHARE:
+        return None
+    dt_s = float(np.median(np.diff(t_s)))
+    intervals_s = np.diff(t_s[starts[1:]])
+    usual_s = float(np.median(intervals_s))
+    period_s = float(intervals_s[np.abs(intervals_s - usual_s) < 1.5 * dt_s].mean())
+    count = np.round(intervals_s / period_s)
+    if period_s < 1.8 * dt_s or float((count == 1.0).mean()) < 0.5:
+        return None
+    tolerance_s = 1.2 * dt_s if period_s > 4.0 * dt_s else 0.3 * dt_s
+    is_regular = np.abs(intervals_s - np.maximum(count, 1.0) * period_s) <= tolerance_s
+    steps = np.abs(np.diff(value[starts]))
+    is_large = steps > 1.5 * find_quantum(value, 2)
+    if float(is_regular.mean()) < HOLD_REGULAR or float(is_large.mean()) < HOLD_STEPS:
+        return None
+    is_fresh = np.zeros(len(value), dtype=bool)
+    is_fresh[starts[1:]] = True  # the first block began before the recording
+    return period_s, is_fresh
+
+
+def find_interpolation(t_s: FloatArray, value: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
+    """Return the interval of a slower channel whose samples are joined by lines, s, its times and values, or None."""
+    if len(value) < 2 * MIN_SEGMENTS * MIN_SEGMENT:
+        return None
+    dt_s, slope = np.diff(t_s), np.diff(value) / np.diff(t_s)
+    precision = float(np.abs(value).max()) * (2.0**-22 if np.all(value == value.astype(np.float32)) else 2.0**-48)
+    tolerance = 4.0 * max(precision, find_quantum(value)) / float(np.median(dt_s))
+    is_corner = np.abs(np.diff(slope)) > tolerance
+    is_sloped = np.abs(slope[1:]) > 3.0 * tolerance
+    if not is_sloped.any() or float((~is_corner[is_sloped]).mean()) < COLLINEAR_SHARE:
+        return None
+    bounds = np.concatenate([[-1], np.flatnonzero(is_corner), [len(is_corner)]])
+    parts = [(int(a) + 1, int(b) + 1) for a, b in itertools.pairwise(bounds) if b - a >= MIN_SEGMENT]
+    lines = [(first, last, (value[last] - value[first]) / (t_s[last] - t_s[first])) for first, last in parts]
+    knots_s = []
+    for (a, b, one), (c, _, other) in itertools.pairwise(lines):
+        if abs(one - other) > 20.0 * tolerance and c - b <= 1:
+            knots_s.append((value[c] - other * t_s[c] - value[a] + one * t_s[a]) / (one - other))
+    if len(knots_s) < MIN_SEGMENTS:
+        return None
+    intervals_s = np.diff(knots_s)
+    usual_s = float(np.median(intervals_s))
+    count = np.round(intervals_s / usual_s)
+    if float((np.abs(intervals_s - count * usual_s) < 0.2 * usual_s).mean()) < HOLD_REGULAR or (count < 1.0).any():
+        return None
+    period_s = float((knots_s[-1] - knots_s[0]) / count.sum())
+    number = np.concatenate([[0.0], np.cumsum(count)])
+    period_s, zero_s = np.polyfit(number, knots_s, 1)
+    every = np.arange(np.ceil((t_s[0] - zero_s) / period_s), np.floor((t_s[-1] - zero_s) / period_s) + 1.0)
+    every_s = zero_s + period_s * every
+    firsts = np.array([first for first, _, _ in lines])
+    row = np.clip(np.searchsorted(t_s[firsts], every_s) - 1, 0, len(lines) - 1)
+    slopes = np.array([slope for _, _, slope in lines])
+    is_inside = every_s <= t_s[np.array([last for _, last, _ in lines])][row] + 2.0 * float(np.median(dt_s))
+    values = value[firsts[row]] + slopes[row] * (every_s - t_s[firsts[row]])
+    return float(period_s), every_s[is_inside], values[is_inside]
+
+
+def find_outlier_candidates(t_s: FloatArray, value: FloatArray, quantum: float = 0.0) -> list[tuple[int, int, float]]:
+    """Return first sample, number of samples and σ of deviations from both sides.
+
+    quantum: step of the converter, where the values do not show it
+    """
+    count = len(value)
+    if count < 4 * SIDE + MAX_WIDTH:
+        return []
+    noise = measure_noise(value)
+    floor = max(0.5 * noise.quantum, quantum, 1e-9 * float(np.abs(value).max()), 1e-300)
+    left = [_predict(t_s, value, k) for k in range(1, MAX_WIDTH + 1)]
+    right = [_mirror(_predict(-t_s[::-1], value[::-1], k)) for k in range(1, MAX_WIDTH + 1)]
+    scores = []
+    for sides in (left, right):
+        deviations = [value - predicted for predicted in sides]
+        known = [np.abs(item[np.isfinite(item)]) for item in deviations]
+        scales = [max(1.4826 * float(np.median(item)), floor) if len(item) else np.inf for item in known]
+        scores.append([item / scale for item, scale in zip(deviations, scales, strict=True)])
+    found: list[tuple[int, int, float]] = []
+    taken = np.zeros(count, dtype=bool)
+    for width in range(MAX_WIDTH, 0, -1):  # a narrower one inside a wider one is a part of it
+        score = np.full(count - width + 1, np.inf)
+        for at in range(width):
+            a = scores[0][at][at : count - width + 1 + at]
+            b = scores[1][width - 1 - at][at : count - width + 1 + at]
+            both = np.where(a * b > 0.0, np.minimum(np.abs(a), np.abs(b)), 0.0)
+            score = np.minimum(score, np.nan_to_num(both))
+        for first in np.flatnonzero(score > OUTLIER_SIGMAS).tolist():
+            own = slice(first, first + width)
+            if not taken[own].any() and _is_isolated(t_s, value, first, width, max(noise.sigma, floor)):
+                found.append((first, width, float(score[first])))
+                taken[own] = True
+    return sorted(found)
+
+
+def _predict(t_s: FloatArray, value: FloatArray, ahead: int) -> FloatArray:
+    """Return the value of each sample that a line through `SIDE` samples predicts which end `ahead` samples before it.
+
+    NaN where there are none or where a gap is among them.
+    """
+    out = np.full(len(value), np.nan)
+    times, values = sliding_window_view(t_s, SIDE), sliding_window_view(value, SIDE)
+    times, values, target_s = times[: len(times) - ahead], values[: len(values) - ahead], t_s[SIDE - 1 + ahead :]
+    centre_s, mean = times.mean(axis=1), values.mean(axis=1)
+    offset_s = times - centre_s[:, None]
+    slope = (offset_s * values).sum(axis=1) / (offset_s**2).sum(axis=1)
+    near = target_s - times[:, 0] < 2.0 * (SIDE + ahead) * float(np.median(np.diff(t_s)))
+    out[SIDE - 1 + ahead :] = np.where(near, mean + slope * (target_s - centre_s), np.nan)
+    return out
+
+
+def _mirror(values: FloatArray) -> FloatArray:
+    return values[::-1]
+
+
+def _is_isolated(t_s: FloatArray, value: FloatArray, first: int, width: int, sigma: float) -> bool:
+    """Return whether a cubic through the neighbours fits these far better than the samples between them."""
+    deviation, local = measure_deviation(t_s, value, first, width)
+    return deviation > ROUGHNESS * max(sigma, local)
+
+
+def measure_deviation(t_s: FloatArray, value: FloatArray, first: int, width: int) -> tuple[float, float]:
+    """Return the smallest deviation of samples from a cubic through their neighbours, and that of these, rms."""
+    rows = np.concatenate([np.arange(first - SIDE, first), np.arange(first + width, first + width + SIDE)])
+    if rows[0] < 0 or rows[-1] >= len(value):
+        return 0.0, 0.0
+    span_s = float(t_s[rows[-1]] - t_s[rows[0]])
+    centre_s = float(t_s[first : first + width].mean())
+    design = np.vander((t_s[rows] - centre_s) / span_s, 4)
+    solved = np.linalg.lstsq(design, value[rows], rcond=None)[0]
+    left = value[rows] - design @ solved
+    own = np.vander((t_s[first : first + width] - centre_s) / span_s, 4)
+    deviation = np.abs(value[first : first + width] - own @ solved)
+    return float(deviation.min()), float(np.sqrt((left**2).sum() / (len(rows) - 4)))

@@ -1,0 +1,336 @@
+"""Faults of instruments of many sizes and places are found and left out; of a clean recording nothing is."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from labs import lab
+from optodrive.core.errors import InputError
+from optodrive.core.types.measurements import Measurement, Signal
+from optodrive.lab.inspection.inspection import inspect_recording
+
+HEIGHT, HEAT = "displacement_m", "absorber_temperature_K"
+EXAMPLES = settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@cache
+def build_clean(seed=1, rate=1000.0, noise=1.0):
+    return lab(seed, {}, rate=rate, noise=noise)
+
+
+def change(measurement, name, function, runs=None):
+    """Return the recording with `function(t_s, value)` in place of a signal's values, or of its times and values."""
+    out = []
+    for number, run in enumerate(measurement.runs):
+        signals = dict(run.signals)
+        if runs is None or number in runs:
+            signal = signals[name]
+            new = function(signal.t_s, signal.value.copy())
+            t_s, value = new if isinstance(new, tuple) else (signal.t_s, new)
+            signals[name] = Signal(signal.pixel, t_s, value, signal.sigma)
+        out.append(replace(run, signals=signals))
+    return Measurement(tuple(out))
+
+
+def find(measurement, use=()):
+    """Return kinds and actions of what is not merely a fact, and the inspection."""
+    inspection = inspect_recording(measurement, use)
+    assert inspection.failures == ()
+    return {item.kind for item in inspection.findings if item.action != "noted"}, inspection
+
+
+def list_missing(before, after, name):
+    """Return run number and sample of what was left out."""
+    out = []
+    for number, (old, new) in enumerate(zip(before.runs, after.runs, strict=True)):
+        lost = np.isfinite(old.signals[name].value) & ~np.isfinite(new.signals[name].value)
+        out += [(number, int(row)) for row in np.flatnonzero(lost)]
+    return out
+
+
+@pytest.mark.parametrize("rate", [500.0, 2000.0])
+@pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
+def test_of_a_clean_recording_nothing_is_left_out(rate, noise):
+    assert find(build_clean(3, rate, noise))[0] == set()
+
+
+@pytest.mark.parametrize("quantum", [0.1, 1.0, 4.0])
+@pytest.mark.parametrize("noise", [0.0, 0.2, 1.0])
+def test_a_converters_steps_are_noted_and_nothing_is_left_out(quantum, noise):
+    step_m = quantum * 2e-6
+    measurement = change(build_clean(4, 1000.0, noise), HEIGHT, lambda _, value: step_m * np.round(value / step_m))
+    kinds, inspection = find(measurement)
+    assert kinds == set()
+    (noted,) = (item for item in inspection.findings if item.kind == "noise" and item.signal == HEIGHT)
+    assert noted.numbers["resolution"][0] == pytest.approx(step_m)
+
+
+@EXAMPLES
+@given(
+    seed=st.integers(0, 10**6),
+    size=st.floats(25.0, 1e4),
+    width=st.integers(1, 3),
+    count=st.integers(1, 5),
+    name=st.sampled_from([HEIGHT, HEAT]),
+)
+def test_outliers_are_left_out_and_nothing_else(seed, size, width, count, name):
+    clean, rng = build_clean(), np.random.default_rng(seed)
+    sigma = {HEIGHT: 2e-6, HEAT: 0.3}[name]
+    hit = {}
+    for run in (3 * rng.choice(5, count, replace=False) + rng.integers(0, 3, count)).tolist():  # one of the repeats
+        value = clean.runs[run].signals[name].value
+        first = int(rng.integers(12, len(value) - 16))
+        if np.isfinite(value[first - 8 : first + 12]).all():
+            hit[run] = range(first, first + width)
+
+    def add(run):
+        def change_values(t_s, value):
+            value[list(hit[run])] += rng.choice([-1.0, 1.0]) * size * sigma
+            return value
+
+        return change_values
+
+    measurement = clean
+    for run in hit:
+        measurement = change(measurement, name, add(run), {run})
+    kinds, inspection = find(measurement)
+    expected = [(run, row) for run in sorted(hit) for row in hit[run]]
+    lost = list_missing(measurement, inspection.measurement, name)
+    assert set(lost) == set(expected)
+    assert kinds == ({"outlier"} if expected else set())
+    assert list_missing(measurement, find(measurement, ["outlier"])[1].measurement, name) == []
+
+
+def test_a_glitch_that_repeats_share_is_no_outlier():
+    clean = build_clean()
+
+    def add(t_s, value):
+        value[40] += 1e-4
+        return value
+
+    group = [number for number, run in enumerate(clean.runs) if run.attributes["group"] == "strong"]
+    assert find(change(clean, HEIGHT, add, group))[0] == set()
+
+
+@EXAMPLES
+@given(share=st.floats(0.5, 0.95), quantum=st.sampled_from([0.0, 1e-7, 1e-6]), noise=st.sampled_from([0.05, 1.0]))
+def test_a_ceiling_is_left_out_with_what_is_near(share, quantum, noise):
+    clean = build_clean(5, 1000.0, noise)
+    top = max(float(np.nanmax(run.signals[HEIGHT].value)) for run in clean.runs)
+    ceiling = share * top
+
+    def clip(_, value):
+        value = np.minimum(value, ceiling)
+        return quantum * np.round(value / quantum) if quantum else value
+
+    kinds, inspection = find(change(clean, HEIGHT, clip))
+    assert kinds == {"clipped"}
+    (found,) = inspection.omitted
+    assert found.numbers["highest"][0] == pytest.approx(ceiling, abs=max(quantum, 1e-12))
+    for old, new in zip(clean.runs, inspection.measurement.runs, strict=True):
+        kept = np.isfinite(new.signals[HEIGHT].value)
+        assert np.nanmax(old.signals[HEIGHT].value[kept]) < ceiling
+        far = old.signals[HEIGHT].value < ceiling - 12.0 * 2e-6 * noise - 3.0 * quantum - 0.02 * top
+        assert (kept & far).sum() > 0.9 * (far & np.isfinite(old.signals[HEIGHT].value)).sum()
+
+
+def test_what_settles_is_no_ceiling():
+    """Long pulses end in equal samples, exact or in steps of a converter; a settled membrane is none either."""
+    runs = []
+    for run in lab(1, {}, groups=("weak", "strong"), noise=0.0).runs:
+        t_s = np.arange(4000) / 1000.0
+        signals = {
+            name: Signal(
+                0,
+                t_s,
+                scale
+                * np.where(
+                    t_s < 0.02,
+                    0.0,
+                    np.where(t_s < 3.0, 1.0 - np.exp(-(t_s - 0.02) / 0.02), np.exp(-(t_s - 3.0) / 0.02)),
+                ),
+            )
+            for name, scale in ((HEIGHT, 1e-4), (HEAT, 100.0))
+        }
+        signals[HEAT] = replace(signals[HEAT], value=signals[HEAT].value + 293.15)
+        pulses = run.pulses.copy()
+        pulses[0, :2] = 0.02, 2.98
+        runs.append(replace(run, signals=signals, pulses=pulses))
+    for step_m in (0.0, 1e-7, 1e-6):
+        measurement = change(
+            Measurement(tuple(runs)), HEIGHT, lambda _, value, q=step_m: q * np.round(value / q) if q else value
+        )
+        assert find(measurement)[0] == set()
+
+
+@pytest.mark.parametrize("start", [0, 3, 7])
+@pytest.mark.parametrize("period", [2, 5, 10, 25])
+def test_held_samples_leave_the_fresh_ones(period, start):
+    clean = lab(6, {}, rate=1000.0, groups=("weak", "middle", "strong"))
+    fresh = {}
+
+    def hold(t_s, value):
+        finite = np.isfinite(value)
+        value = np.interp(t_s, t_s[finite], value[finite])
+        rows = np.maximum((np.arange(len(value)) - start) // period * period + start, 0)
+        fresh[len(fresh)] = rows == np.arange(len(value))
+        return value[rows]
+
+    measurement = change(clean, HEAT, hold)
+    kinds, inspection = find(measurement)
+    assert kinds == {"held"}
+    for number, run in enumerate(inspection.measurement.runs):
+        kept = np.isfinite(run.signals[HEAT].value)
+        assert kept[fresh[number]].sum() >= fresh[number].sum() - 1
+        assert not kept[~fresh[number]].any()
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.37])
+@pytest.mark.parametrize("period_s", [0.005, 0.01, 0.02])
+@pytest.mark.parametrize("kind", ["float64", "float32"])
+def test_interpolated_samples_leave_the_points_between_which_they_lie(period_s, phase, kind):
+    clean = lab(7, {}, rate=2000.0, groups=("weak", "middle", "strong"))
+    points = {}
+
+    def interpolate(t_s, value):
+        finite = np.isfinite(value)
+        every_s = np.arange(phase * period_s, t_s[-1] + period_s, period_s)
+        known = np.interp(every_s, t_s[finite], value[finite])
+        points[len(points)] = every_s, known
+        return np.interp(t_s, every_s, known).astype(kind).astype(np.float64)
+
+    kinds, inspection = find(change(clean, HEAT, interpolate))
+    assert kinds == {"interpolated"}
+    for number, run in enumerate(inspection.measurement.runs):
+        signal, (every_s, known) = run.signals[HEAT], points[number]
+        rows = np.argmin(np.abs(every_s[:, None] - signal.t_s), axis=0)
+        assert len(signal.t_s) > 0.85 * (signal.t_s[-1] - signal.t_s[0]) / period_s
+        assert np.abs(every_s[rows] - signal.t_s).max() < 2e-5
+        assert np.abs(known[rows] - signal.value).max() < 0.02
+
+
+@EXAMPLES
+@given(
+    marker=st.sampled_from([-9999.0, 9999.0, 0.0, 9.9e37, -1.0, 1e30, 3.4028234663852886e38, 65535.0]),
+    seed=st.integers(0, 100),
+    share=st.floats(0.005, 0.2),
+)
+def test_sentinels_are_left_out(marker, seed, share):
+    rng = np.random.default_rng(seed)
+
+    def lose(_, value):
+        lost = rng.random(len(value)) < share
+        lost[[30, 50]] = True
+        value[lost] = marker
+        return value
+
+    measurement = change(build_clean(), HEAT, lose, {2, 3})
+    kinds, inspection = find(measurement)
+    assert "sentinel" in kinds
+    for run in inspection.measurement.runs:
+        assert np.nanmin(run.signals[HEAT].value) > 200.0
+        assert np.nanmax(run.signals[HEAT].value) < 1000.0
+    inspection.check()
+
+
+def test_a_possible_value_is_a_sentinel_only_far_from_the_signal():
+    def lose(_, value):
+        value[::40] = 999.0
+        return value
+
+    kinds, _ = find(change(build_clean(), HEAT, lose, {4}))
+    assert kinds == {"sentinel"}
+
+
+@pytest.mark.parametrize("runs", [{3}, {0, 7}, {9, 10, 11}])
+@pytest.mark.parametrize("level", [0.0, 2e-6])
+@pytest.mark.parametrize("name", [HEIGHT, HEAT])
+def test_a_dead_signal_is_left_out_of_its_runs(runs, level, name):
+    rng, scale = np.random.default_rng(1), {HEIGHT: 1.0, HEAT: 1e5}[name]
+    rest = {HEIGHT: 1e-5, HEAT: 293.15}[name]
+
+    def silence(t_s, value):
+        return rest + level * scale * rng.standard_normal(len(t_s))
+
+    kinds, inspection = find(change(build_clean(), name, silence, runs))
+    assert kinds == {"dead"}
+    assert {n for n, run in enumerate(inspection.measurement.runs) if name not in run.signals} == runs
+
+
+def test_a_signal_that_responds_in_no_run_is_left_out():
+    rng = np.random.default_rng(2)
+    kinds, inspection = find(change(build_clean(), HEIGHT, lambda t_s, _: 2e-6 * rng.standard_normal(len(t_s))))
+    assert kinds == {"dead"}
+    assert all(HEIGHT not in run.signals for run in inspection.measurement.runs)
+
+
+def test_stuck_samples_are_left_out():
+    def stick(_, value):
+        value[60:120] = value[60]
+        return value
+
+    measurement = change(build_clean(), HEIGHT, stick, {6})
+    kinds, inspection = find(measurement)
+    assert kinds == {"stuck"}
+    assert {row for run, row in list_missing(measurement, inspection.measurement, HEIGHT)} >= set(range(61, 119))
+
+
+def test_a_turned_sign_is_left_out_with_its_remedy():
+    kinds, inspection = find(change(build_clean(), HEIGHT, lambda _, value: -value))
+    assert kinds == {"sign"}
+    assert "multiply it by −1" in inspection.omitted[0].text
+
+
+@pytest.mark.parametrize("shift_s", [-0.02, 0.008, 0.05])
+def test_a_trigger_that_is_off_is_told(shift_s):
+    def shift(t_s, value):
+        return t_s + shift_s, value
+
+    one = change(change(build_clean(), HEIGHT, shift, {6}), HEAT, shift, {6})
+    kinds, inspection = find(one)
+    assert kinds == {"trigger"}
+    assert not inspection.measurement.runs[6].signals
+    every = change(change(build_clean(), HEIGHT, shift), HEAT, shift)
+    kinds, inspection = find(every)
+    assert kinds == {"trigger"}
+    with pytest.raises(InputError, match="correct t_s or start_s"):
+        inspection.check()
+
+
+@pytest.mark.parametrize(("one", "other"), [(3, 9), (0, 12), (6, 10), (2, 7)])
+@pytest.mark.parametrize("names", [[HEIGHT], [HEIGHT, HEAT]])
+def test_exchanged_files_are_named(one, other, names):
+    runs = list(build_clean().runs)
+    first, second = runs[one], runs[other]
+    for name in names:
+        a, b = first.signals[name], second.signals[name]
+        runs[one] = replace(runs[one], signals={**runs[one].signals, name: b})
+        runs[other] = replace(runs[other], signals={**runs[other].signals, name: a})
+    kinds, inspection = find(Measurement(tuple(runs)))
+    assert kinds == {"exchanged"}
+    assert {run for item in inspection.omitted for run in item.runs} == {first.name, second.name}
+
+
+def test_a_step_that_fails_takes_nothing_along(monkeypatch):
+    def fail(t_s, value):
+        raise ZeroDivisionError("no")
+
+    monkeypatch.setattr("optodrive.lab.inspection.inspection.find_hold", fail)
+    inspection = inspect_recording(change(build_clean(), HEIGHT, lambda _, value: -value))
+    assert [item.partition(":")[0] for item in inspection.failures] == [f"held of {name}" for name in (HEAT, HEIGHT)]
+    assert {item.kind for item in inspection.omitted} == {"sign"}
+
+
+def test_nothing_left_is_refused():
+    measurement = Measurement(
+        tuple(
+            replace(run, signals={HEIGHT: replace(run.signals[HEIGHT], value=-run.signals[HEIGHT].value)})
+            for run in build_clean().runs
+        )
+    )
+    with pytest.raises(InputError, match="multiply it by"):
+        inspect_recording(measurement).check()
