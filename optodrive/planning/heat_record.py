@@ -72,6 +72,9 @@ class _UncountedError(Exception):
     """A record counts for no user, for the stated reason."""
 
 
+RECORD_ERRORS = (_UncountedError, OSError, ValueError, EOFError, KeyError, BadZipFile)
+
+
 def read_boot() -> tuple[str, float]:
     """Return the identity of the computer's present run, '' if it is hidden, and the time since its start, s."""
     boot = ""
@@ -94,9 +97,8 @@ class HeatRecord:
 
     kind: of device; identity: what the device says it is, None if it cannot be known: then no device of this kind has a
     record any more, because it may be each of them; '' if nothing heats it: then nothing is recorded
-    owner: mark of a run of the program, which is_own compares
+    owner: mark of a run of the program, which resume() compares
     hot_reason: why the display counts as hot, '' if the record says how warm it is
-    is_own: whether this owner wrote the record last, known after load()
     """
 
     def __init__(
@@ -109,7 +111,6 @@ class HeatRecord:
         owner: str = "",
     ) -> None:
         self.hot_reason = self._cooling_reason = ""
-        self.is_own = False
         self._cooled_s = -inf
         self._kind, self._identity, self._owner = kind, identity, owner
         self._name = f"{kind}-{re.sub('[^0-9A-Za-z._]+', '-', identity or '')}"
@@ -290,7 +291,7 @@ class HeatRecord:
         if not self.hot_reason and self._file is not None:
             try:
                 return self._parse(_read(self._file), boot, now_s)
-            except (_UncountedError, OSError, ValueError, EOFError, KeyError, BadZipFile) as error:
+            except RECORD_ERRORS as error:
                 self.hot_reason = (
                     str(error) if isinstance(error, _UncountedError) else "the record of its heat was damaged"
                 )
@@ -300,16 +301,20 @@ class HeatRecord:
         self.save(hot)
         return hot
 
+    def resume(self) -> bool:
+        """Return whether this owner wrote the record last, whose own knowledge is then as new."""
+        if self.hot_reason or self._file is None:
+            return False
+        try:
+            arrays = self._read_arrays(_read(self._file))
+            self._recall_cooling(arrays, *read_boot())
+        except RECORD_ERRORS:
+            return False
+        return bool(self._owner) and str(arrays["owner"]) == self._owner
+
     def _parse(self, data: bytes, boot: str, now_s: float) -> BudgetState:
-        digest_end = len(MAGIC) + sha256().digest_size
-        if not data.startswith(MAGIC):
-            raise _UncountedError("the record of its heat was of another version")
-        if sha256(data[digest_end:]).digest() != data[len(MAGIC) : digest_end]:
-            raise _UncountedError("the record of its heat was damaged")
-        with np.load(io.BytesIO(data[digest_end:])) as table:
-            arrays = {key: table[key] for key in table.files}
+        arrays = self._read_arrays(data)
         self._recall_cooling(arrays, boot, now_s)
-        self.is_own = bool(self._owner) and str(arrays["owner"]) == self._owner
         if "at_s" not in arrays:
             raise _UncountedError("the process that used it last was killed")
         if str(arrays["model"]) != self._model:
@@ -323,6 +328,16 @@ class HeatRecord:
         if not zero_s <= now_s:
             raise _UncountedError("the record of its heat is of a time to come")
         return shift_state(state, zero_s - now_s)
+
+    @staticmethod
+    def _read_arrays(data: bytes) -> dict[str, Any]:
+        digest_end = len(MAGIC) + sha256().digest_size
+        if not data.startswith(MAGIC):
+            raise _UncountedError("the record of its heat was of another version")
+        if sha256(data[digest_end:]).digest() != data[len(MAGIC) : digest_end]:
+            raise _UncountedError("the record of its heat was damaged")
+        with np.load(io.BytesIO(data[digest_end:])) as table:
+            return {key: table[key] for key in table.files}
 
     def _recall_cooling(self, arrays: dict[str, Any], boot: str, now_s: float) -> None:
         """Keep why the display counted as hot, and until when it cools from that."""

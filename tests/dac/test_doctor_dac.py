@@ -49,7 +49,7 @@ def test_any_device_and_no_interlock_are_warnings(examine):
 def test_another_device_is_a_problem(examine):
     findings = examine(Bench(), uid="Helios 1")
     assert findings["port"].status == "problem"
-    assert "Helios 1163021877" in findings["port"].observation
+    assert "Helios 1163021877" in findings["port"].remedy
 
 
 def test_an_unplugged_device_is_a_problem(examine):

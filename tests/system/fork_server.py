@@ -121,6 +121,8 @@ def serve(control):
 
 def become(request, standard):
     """Give this fork the descriptors, arguments, environment, folder and limits of the requested process."""
+    from optodrive.planning import heat_record
+
     for number, descriptor in enumerate(standard):
         os.dup2(descriptor, number)
         os.close(descriptor)
@@ -137,6 +139,8 @@ def become(request, standard):
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(request["folder"])
+    if "HEAT_FOLDER" in os.environ:  # in place of that which all users share
+        heat_record.FOLDER = Path(os.environ["HEAT_FOLDER"])
     for limit, values in request["limits"]:
         resource.setrlimit(limit, values)
     Path("/proc/self/comm").write_text(request["program"][:15])

@@ -37,10 +37,13 @@ KNOWN_TIMEOUT_S = 1.0
 
 
 class Recalled(NamedTuple):
-    """A record that was opened, its state, and the uptime of that state's zero, s."""
+    """A record that was opened, its state, and the uptime of that state's zero, s.
+
+    budget: None if what this daemon knows is as new
+    """
 
     record: HeatRecord
-    budget: BudgetState
+    budget: BudgetState | None
     zero_s: float
 
 
@@ -95,12 +98,12 @@ class KeptHeat:
 
         continues: whether the estimate continues that of an earlier planner of this daemon
         """
-        self._collect(continues)
+        self._collect()
         if self._opening is not None or self._writing is not None or self._clock.now_s() < self._retry_s:
             return
         is_up, uids = self._session.connected, self._session.list_uids()
         if is_up and all(uids) and join_uids(uids) != self._identity:
-            self._open(join_uids(uids))
+            self._open(join_uids(uids), continues)
         if self._record is None or self._opening is not None:
             return
         if is_up and self._session.board.state in LEASED_STATES:
@@ -116,7 +119,7 @@ class KeptHeat:
 
     # --- opening ------------------------------------------------------------------------------------------------
 
-    def _open(self, identity: str) -> None:
+    def _open(self, identity: str, continues: bool) -> None:
         """Open the record of other boards than before, of which none is in use."""
         self._known.clear()
         before, self._record, self._is_in_use = self._record, None, False
@@ -126,22 +129,24 @@ class KeptHeat:
         if not identity:
             self._known.set()
             return
-        self._opening = self._executor.submit(self._recall, identity, is_replaced)
+        self._opening = self._executor.submit(self._recall, identity, is_replaced, continues)
         self._opening.add_done_callback(lambda _: self._wake())
 
-    def _recall(self, identity: str, is_replaced: bool) -> Recalled:
+    def _recall(self, identity: str, is_replaced: bool, continues: bool) -> Recalled:
         """Open a record, in the executor's thread. is_replaced: whether other boards drew the display before."""
         record = HeatRecord(BOARDS, identity, self._display, self._clock, owner=self._owner).open()
         if is_replaced and not record.hot_reason:
             record.hot_reason = "its board was replaced"
+        if continues and record.resume():
+            return Recalled(record, None, 0.0)
         return Recalled(record, record.load(), read_boot()[1])
 
-    def _collect(self, continues: bool) -> None:
+    def _collect(self) -> None:
         """Use the results of the executor."""
         if self._opening is not None and self._opening.done():
             opened, self._opening = self._opening, None
             try:
-                self._begin(opened.result(), continues)
+                self._begin(opened.result())
                 self._error = ""
             except InputError as error:
                 self._identity, self._error = None, str(error)
@@ -156,11 +161,11 @@ class KeptHeat:
                 self._retry_s = self._clock.now_s() + RETRY_S
                 self._plan_queue.end_all(PlanStatus.FAILED, self._error)
 
-    def _begin(self, recalled: Recalled, continues: bool) -> None:
-        """Continue with the heat of a record."""
+    def _begin(self, recalled: Recalled) -> None:
+        """Replace the estimate by that of the record, if it is newer."""
         self._record = recalled.record
         self._plan_queue.end_all(PlanStatus.FAILED, "the board was replaced")
-        if not (continues and self._record.is_own):
+        if recalled.budget is not None:
             with self._plan_queue.lock:
                 zero_s = self._session.board_s() - (read_boot()[1] - recalled.zero_s)
                 budget = shift_state(recalled.budget, zero_s)
