@@ -45,6 +45,8 @@ def format_plan_summary(summary: "PlanSummary") -> list[str]:
     more = summary.off_target.count - TRAINS_LISTED_MAX
     if more > 0:
         lines.append(f"peaks            and those of {more} more trains")
+    if summary.repeats is not None and summary.repeats.message:
+        lines.append(f"intervals        {summary.repeats.message}")
     if summary.delays:
         lines.append(f"delayed          {_format_delays(summary.delays)}")
     lines += [f"late             {message}" for message in summary.late_messages[:LATE_LISTED_MAX]]

@@ -1,12 +1,14 @@
 """The summary of a planned sequence, and plan.csv."""
 
 import csv
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from optodrive.core.files import atomic_write
-from optodrive.core.types.arrays import IntArray
+from optodrive.core.quantity import format_quantity
+from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.units import m_to_um
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FeasibilityReport
@@ -18,7 +20,10 @@ from optodrive.planning.summary_schema import (
     FrameSummary,
     OffTargetSummary,
     OffTargetTrain,
+    PixelIntervals,
     PlanSummary,
+    RedrawnSummary,
+    RepeatSummary,
     ShortfallSummary,
     SimultaneitySummary,
     SkippedTarget,
@@ -28,14 +33,21 @@ from optodrive.planning.summary_schema import (
 
 DEAD_LISTED_MAX = 20
 TRIMMED_LISTED_MAX = 20
+INTERVALS_LISTED_MAX, INTERVAL_TOLERANCE = 20, 0.05
+"""Pixels listed; difference between two pulses' time and that of their frames, in periods, that is reported."""
 TRAINS_LISTED_MAX, PEAKS_LISTED_MAX, PEAKS_NAMED_MAX = 20, 20, 4
 PEAK_TOLERANCE = 0.02
 """Relative difference between a peak and the target of its train above which a plan reports it."""
 SKIP_REASON = "the residual heat of the pixel reaches the target without a pulse"
 
 
-def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | None = None) -> PlanSummary:
-    """Summarize timing, energy, predicted displacement and the limiter's changes."""
+def summarize_plan(
+    planned: PlannedSequence, feasibility: FeasibilityReport | None = None, pulsed_s: FloatArray | None = None
+) -> PlanSummary:
+    """Summarize timing, energy, predicted displacement and the limiter's changes.
+
+    pulsed_s: of a streamed frame, time of the plan of each pixel's last pulse before it, −infinity without one, [p]
+    """
     plan = planned.plan
     beam_on_s = float(plan.width_s[plan.power_w > 0].sum())
     target_m = np.nan_to_num(plan.target_m)
@@ -60,6 +72,8 @@ def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | No
         trimmed=_summarize_trimming(planned),
         shortfall=None if planned.shortfall is None else _summarize_shortfall(planned.shortfall),
         off_target=_summarize_train_peaks(planned),
+        repeats=_summarize_repeats(planned),
+        redrawn=None if pulsed_s is None else _summarize_redrawn(planned, pulsed_s),
         delays=[DelaySummary.from_object(each, source=_name_source(planned, each.source)) for each in planned.delays],
         dead=DeadPixelSummary(
             pixels=list(planned.dead_pixels),
@@ -174,6 +188,60 @@ def _summarize_off_target(train: TrainPeaks, cycles: IntArray, name: str) -> Off
         message=f"{len(cycles)} of {len(train.peak_m)} peaks of {name} {verb} from {target_um:.4g} µm by more than "
         f"{100 * PEAK_TOLERANCE:.0f} %: {', '.join(named)}",
     )
+
+
+def _summarize_repeats(planned: PlannedSequence) -> RepeatSummary | None:
+    plan, frames = planned.plan, planned.sequence.frames
+    is_repeated = [np.array_equal(frame.target_m > 0.0, before.target_m > 0.0) for before, frame in pairwise(frames)]
+    if not any(is_repeated):
+        return None
+    group, show_at_s = np.cumsum([0, *np.logical_not(is_repeated)]), np.array([frame.show_at_s for frame in frames])
+    rows = np.flatnonzero(plan.source < len(frames))
+    _, first = np.unique(np.stack([plan.pixel[rows], plan.source[rows]]), axis=1, return_index=True)
+    rows = rows[first]  # the first pulse of each pixel in each frame, by pixel, in order of the frames
+    pixel, source = plan.pixel[rows], plan.source[rows]
+    follows = (np.diff(pixel) == 0) & (np.diff(group[source]) == 0)
+    if not follows.any():
+        return None
+    pixel, interval_s = pixel[1:][follows], np.diff(plan.start_s[rows])[follows]
+    requested_s = np.diff(show_at_s[source])[follows]
+    period_s = requested_s / np.diff(source)[follows]
+    difference = np.abs(interval_s - requested_s) / period_s
+    order = np.lexsort((-difference, pixel))
+    pixels, begin = np.unique(pixel[order], return_index=True)
+    min_s, max_s = np.minimum.reduceat(interval_s[order], begin), np.maximum.reduceat(interval_s[order], begin)
+    largest, period_s = difference[order][begin], period_s[order][begin]
+    off = np.flatnonzero(largest > INTERVAL_TOLERANCE)
+    worst = [
+        PixelIntervals(pixel=int(pixels[k]), period_s=float(period_s[k]), min_s=float(min_s[k]), max_s=float(max_s[k]))
+        for k in off[np.argsort(-largest[off], kind="stable")][:INTERVALS_LISTED_MAX]
+    ]
+    return RepeatSummary(
+        pixels=len(pixels),
+        min_s=float(interval_s.min()),
+        max_s=float(interval_s.max()),
+        off_period=len(off),
+        worst=worst,
+        message=_describe_intervals(worst[0], len(off), len(pixels)) if worst else None,
+    )
+
+
+def _describe_intervals(worst: PixelIntervals, off: int, pixels: int) -> str:
+    kept = "does not keep" if off == 1 else "do not keep"
+    return (
+        f"{off} of {pixels} pixels {kept} the period of their frames to {100 * INTERVAL_TOLERANCE:.0f} %: pixel "
+        f"{worst.pixel} is drawn after {format_quantity(worst.min_s, 's')} to {format_quantity(worst.max_s, 's')} "
+        f"instead of {format_quantity(worst.period_s, 's')}"
+    )
+
+
+def _summarize_redrawn(planned: PlannedSequence, pulsed_s: FloatArray) -> RedrawnSummary | None:
+    pixels, first = np.unique(planned.plan.pixel, return_index=True)
+    since_s = planned.plan.start_s[first] - pulsed_s[pixels]
+    since_s = since_s[np.isfinite(since_s)]
+    if not len(since_s):
+        return None
+    return RedrawnSummary(pixels=len(since_s), min_s=float(since_s.min()), max_s=float(since_s.max()))
 
 
 def _finite_or_none(value: float) -> float | None:

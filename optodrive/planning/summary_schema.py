@@ -139,6 +139,48 @@ class OffTargetSummary(JsonModel):
     trains: list[OffTargetTrain]
 
 
+class PixelIntervals(JsonModel):
+    """The times between the pulses of one pixel in frames that repeat.
+
+    pixel: index of the pixel
+    period_s: of the frames
+    min_s, max_s: shortest and longest time between two pulses, s
+    """
+
+    pixel: int
+    period_s: float
+    min_s: float
+    max_s: float
+
+
+class RepeatSummary(JsonModel):
+    """Times between the pulses of pixels in frames that repeat: with the same pixels as the one before.
+
+    pixels: number of these pixels; min_s, max_s: shortest and longest time of all
+    off_period: number of pixels with a time that differs from the frames' by more than 5 % of their period;
+    worst: up to 20 of these, the largest difference first; message: a sentence about them, None without any
+    """
+
+    pixels: int
+    min_s: float
+    max_s: float
+    off_period: int
+    worst: list[PixelIntervals]
+    message: str | None
+
+
+class RedrawnSummary(JsonModel):
+    """Times since the last pulse of a streamed frame's pixels, of those that the stream has drawn before.
+
+    pixels: number of these
+    min_s, max_s: shortest and longest time, s
+    """
+
+    pixels: int
+    min_s: float
+    max_s: float
+
+
 class SimultaneitySummary(JsonModel):
     """How the pulses of a simultaneous frame were interleaved.
 
@@ -183,6 +225,7 @@ class PlanSummary(JsonModel):
     feasibility: None if it was not requested (a stream)
     predicted_max_pixel, predicted_max_um, predicted_max_target_um: the pulse with the largest predicted displacement
     target_max_um: the largest target
+    repeats: None if no frame repeats; redrawn: None but for a streamed frame with pixels that were drawn before
     beam_on_s: of all stages together; beam_on_fraction: of the time of all stages
     below_threshold: pulses below laser.threshold_w, which emit nothing
     early_step_s: time by which steps precede the end of the light, 0 if they follow it
@@ -223,6 +266,8 @@ class PlanSummary(JsonModel):
     trimmed: TrimmingSummary
     shortfall: ShortfallSummary | None
     off_target: OffTargetSummary
+    repeats: RepeatSummary | None
+    redrawn: RedrawnSummary | None
     delays: list[DelaySummary]
     dead: DeadPixelSummary
     skipped: list[SkippedTarget]

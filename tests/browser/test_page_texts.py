@@ -392,6 +392,7 @@ SUMMARY = {
     "delays": [],
     "trimmed": {"pulses": 0, "by_reason": {}, "energy_j": 0.0},
     "off_target": {"count": 0, "trains": []},
+    "repeats": None,
     "skipped": [
         {"frame": f"f{k}", "pixel": pixel, "target_um": 100.0, "reason": ""} for pixel in range(12) for k in range(9)
     ],

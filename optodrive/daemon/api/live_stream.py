@@ -166,7 +166,9 @@ class LiveStream:
 
 def report_planned(number: int, report: PlanReport) -> FrameResult:
     """Return the result of a frame that is planned."""
-    return FrameResult(
+    redrawn = report.summary.redrawn
+    intervals_s = {} if redrawn is None else {"interval_min_s": redrawn.min_s, "interval_max_s": redrawn.max_s}
+    result = FrameResult(
         frame=number,
         status=PlanStatus.PLANNED,
         plan=report.plan,
@@ -178,6 +180,7 @@ def report_planned(number: int, report: PlanReport) -> FrameResult:
         duration_s=report.summary.duration_s,
         latency=report.latency,
     )
+    return result.model_copy(update=intervals_s)
 
 
 def _report_ended(number: int, report: PlanReport) -> FrameResult:

@@ -23,11 +23,13 @@ CUT_MIN_S = 1e-5
 class RefreshCycle(NamedTuple):
     """When a stream has drawn each pixel last.
 
-    drawn_s: [p] board time of the start of the last pulse, −infinity without one; width_s: [p] its width, NaN without
+    drawn_s: [p] board time of the start of the last pulse, or of the last frame whose height the heat held, −infinity
+    without one; pulsed_s: [p] that of the last pulse alone; width_s: [p] its width, NaN without
     begun_s: the pixels drawn since then have had their turn
     """
 
     drawn_s: FloatArray
+    pulsed_s: FloatArray
     width_s: FloatArray
     begun_s: float
 

@@ -68,13 +68,14 @@ def grow_plan(
     rest = PulsePlan(**{item.name: getattr(planned.plan, item.name)[first:] for item in fields(PulsePlan)})
     pulses = DecodedPulses(**{name: column[is_added] for name, column in vars(decoded).items()})
     verify(rest, row[is_added] - first, pulses, budget, display.budget, lambda: on_progress(1.0))
+    pulsed_s = None if plan.cycle is None else plan.cycle.pulsed_s - plan.record.start_s
     return GrownPlan(
         planned=planned,
         points=points,
         added=added,
         crc=zlib.crc32(payload),
         added_crc=zlib.crc32(added.encode_payload()),
-        summary_json=summarize_plan(planned).model_dump_json().encode(),
+        summary_json=summarize_plan(planned, None, pulsed_s).model_dump_json().encode(),
     )
 
 

@@ -69,6 +69,7 @@ def make_plan(
         heat, budget = snapshot.heat, snapshot.budget
         planned, feasibility = check_feasibility(display, built.sequence, heat, budget, on_progress, **push.options)
     on_progress(1.0)
+    pulsed_s = None if snapshot.cycle is None else snapshot.cycle.pulsed_s - snapshot.start_s
     points = StagePoints.from_plan(planned.plan, scales, display.draws)
     if growth is not None and not growth.is_complete and not points.ends_with_gate_on:
         # The mirrors would point at the next lit pulse already, which is not planned yet.
@@ -84,7 +85,7 @@ def make_plan(
         name=push.name,
         pulse_count=len(planned.plan),
         duration_s=planned.duration_s,
-        summary_json=summarize_plan(planned, feasibility).model_dump_json().encode(),
+        summary_json=summarize_plan(planned, feasibility, pulsed_s).model_dump_json().encode(),
         pulses=ListedPulses.from_planned(planned),
         largest_target=LargestTarget.from_planned(planned),
         start_s=snapshot.start_s,

@@ -171,7 +171,11 @@ def _find_origin_s(plan: ActivePlan) -> float:
 
 
 def _summarize_again(planned: PlannedSequence, before_json: bytes) -> bytes:
-    """Summarize a plan again. Feasibility, first trimmed pulse and peaks of trains are its request's."""
+    """Summarize a plan again.
+
+    Its feasibility, first trimmed pulse, peaks of trains and times since earlier plans are those of its request.
+    """
     before = PlanSummary.model_validate_json(before_json)
     summary = summarize_plan(planned)
-    return summary.model_copy(update={"feasibility": before.feasibility}).model_dump_json().encode()
+    kept = {"feasibility": before.feasibility, "redrawn": before.redrawn}
+    return summary.model_copy(update=kept).model_dump_json().encode()

@@ -101,12 +101,14 @@ def continue_cycle(streamed: ActivePlan, row: int) -> RefreshCycle:
     plan, zero_s = streamed.planned.plan, streamed.record.start_s
     if streamed.cycle is None:
         pixels = len(streamed.heat_before.pixels)
-        drawn_s, width_s, begun_s = np.full(pixels, -inf), np.full(pixels, nan), zero_s
+        drawn_s, pulsed_s, width_s = np.full(pixels, -inf), np.full(pixels, -inf), np.full(pixels, nan)
+        begun_s = zero_s
     else:
-        drawn_s, width_s, begun_s = streamed.cycle.drawn_s.copy(), streamed.cycle.width_s.copy(), streamed.cycle.begun_s
+        drawn_s, pulsed_s, width_s = (column.copy() for column in streamed.cycle[:3])
+        begun_s = streamed.cycle.begun_s
     drawn_s[[pulse.pixel for pulse in streamed.planned.skipped]] = zero_s  # their heat holds them up
-    drawn_s[plan.pixel[:row]] = zero_s + plan.start_s[:row]
+    drawn_s[plan.pixel[:row]] = pulsed_s[plan.pixel[:row]] = zero_s + plan.start_s[:row]
     width_s[plan.pixel[:row]] = plan.width_s[:row]
     left = np.concatenate([plan.pixel[row:], streamed.unplanned_pixels])
     end_s = zero_s + float((plan.start_s + plan.width_s)[:row].max(initial=0.0))
-    return RefreshCycle(drawn_s, width_s, end_s if (drawn_s[left] >= begun_s).all() else begun_s)
+    return RefreshCycle(drawn_s, pulsed_s, width_s, end_s if (drawn_s[left] >= begun_s).all() else begun_s)

@@ -111,6 +111,9 @@ export class PlanControl extends EventTarget {
     if (count > 3) {
       lines.push(["warn", `And peaks of ${count - 3} more ${count === 4 ? "train" : "trains"} differ.`]);
     }
+    if (summary.repeats?.message) {
+      lines.push(["warn", `${summary.repeats.message}.`]);
+    }
     for (const delay of summary.delays.slice(0, 3)) {
       lines.push(["warn", `${delay.source} is delayed by ${delay.wait_s.toFixed(2)} s: ${labelCap(delay.cap)}.`]);
     }

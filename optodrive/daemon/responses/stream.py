@@ -22,6 +22,8 @@ class FrameResult(JsonModel):
     planned only if no newer one comes
     limited_by: caps and bounds that took light from it; with a frame that stands a further message with status
     "planned" whenever the caps of the last second are others, empty when none is left
+    interval_min_s, interval_max_s: shortest and longest time since the last pulse of a pixel that is drawn again, of
+    those that are in the plan so far; absent if none is
     planned, executed, dropped, simulated_max_um: of its plan, once that has ended
     status: of the frame's plan, or refused
     plan: id of its plan
@@ -40,6 +42,8 @@ class FrameResult(JsonModel):
     skipped: int | None = None
     trimmed: int | None = None
     limited_by: list[str] | None = None
+    interval_min_s: float | None = None
+    interval_max_s: float | None = None
     starts_in_s: float | None = None
     duration_s: float | None = None
     planned: int | None = None

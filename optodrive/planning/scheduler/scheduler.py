@@ -41,9 +41,6 @@ TRAIN_BATCH = 1000
 
 Granted = TypeVar("Granted", bound=PulsePlan)
 
-RETURN_US = 10_000
-"""Time in which the mirrors return to the begin of a path while the beam is idle: longer than any move."""
-
 
 class GalvoPause(NamedTuple):
     """A pause of a stage's mirrors after the first `rows` pulses of a batch, in which their coils cool."""
@@ -216,8 +213,10 @@ class Scheduler:
         if stretches is None or source in self._visiting_orders:
             orders = tuple(self._compute_order(source, stage) for stage in range(len(self._tools)))
         else:
-            beams = zip(self._tools, state.beams, stretches, strict=True)
-            orders = tuple(tools.path.orient(stretch, beam.pixel) for tools, beam, stretch in beams)
+            for stage, (tools, beam, stretch) in enumerate(zip(self._tools, state.beams, stretches, strict=True)):
+                if not self._can_repeat_order(source, stage, stretch.tolist()):
+                    self._orders[stage] = tools.path.orient(stretch, beam.pixel)
+            orders = tuple(self._orders[stage] for stage in range(len(self._tools)))
         if not frame.simultaneous or sum(map(len, orders)) < 2:
             return [Round(source, orders)]
         begin_us = max(free_us)
@@ -253,12 +252,22 @@ class Scheduler:
             return given
         frame, beam = self._sequence.frames[source], self._state.beams[stage]
         active = np.flatnonzero((frame.target_m > 0) & (stage_of == stage))
-        before, pixels = self._orders.get(stage, []), active.tolist()
-        idle_us = self._planner.compute_requested_us(frame.show_at_s) + self._state.delay_us - beam.free_us
-        if idle_us > RETURN_US and sorted(before) == pixels:
-            return before  # a path that reverses would give the pixels at its ends pairs of pulses
+        if self._can_repeat_order(source, stage, active.tolist()):
+            return self._orders[stage]
         self._orders[stage] = self._tools[stage].path.compute_order(active, beam.pixel)
         return self._orders[stage]
+
+    def _can_repeat_order(self, source: int, stage: int, pixels: list[int]) -> bool:
+        """Return whether the stage's last order has these pixels, and the mirrors return to its begin in time.
+
+        A path that reverses would give the pixels at its ends pairs of pulses.
+        """
+        before, beam = self._orders.get(stage, []), self._state.beams[stage]
+        if not before or sorted(before) != sorted(pixels):
+            return False
+        requested_us = self._planner.compute_requested_us(self._sequence.frames[source].show_at_s)
+        return_us = self._tools[stage].path.compute_settling_us(beam.pixel, before[0], beam.dwell_us)
+        return requested_us + self._state.delay_us - beam.free_us >= return_us
 
     def _evaluate_rounds(self, source: int, rounds: list[Round], heat: ThermalState) -> CandidateSchedule:
         """Plan the rounds of a frame without the limiter, on copies of the beam state and the heat."""
