@@ -1,6 +1,7 @@
 """The commands of the command line. Only the module of the command that runs is imported."""
 
 import os
+import re
 import sys
 import termios
 from importlib import import_module
@@ -14,6 +15,8 @@ from optodrive.cli.signals import INTERRUPTED, report_interruption
 from optodrive.core.daemon_url import check_environment
 from optodrive.core.errors import OptodriveError
 
+PYDANTIC_PHRASES = re.compile(r"Value error, |, unable to parse string as an? \w+")
+"""What pydantic adds to the reason why an option's value is refused."""
 UsageError: Any = typer.BadParameter.__bases__[0]
 """Base class of errors about arguments; typer contains its own copy of click or uses the installed one."""
 
@@ -77,7 +80,8 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
     except (typer.Abort, KeyboardInterrupt):
         return report_interruption()
     except UsageError as error:
-        message = " ".join(error.format_message().replace("Value error, ", "").split())  # which pydantic prefixes
+        message = PYDANTIC_PHRASES.sub("", " ".join(error.format_message().split()))
+        message = message.replace(": Input should be ", ": expected ")
         if message:  # empty without arguments: typer has printed the help
             print(f"optodrive: {message}", file=sys.stderr)
         return 2

@@ -4,7 +4,7 @@ import re
 from os.path import realpath
 from typing import Annotated, Literal, NamedTuple, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from optodrive.core.errors import Unquoted
 from optodrive.core.plausibility import PlausibleRange
@@ -370,16 +370,28 @@ class StageSection(Section):
     """Its board."""
 
 
+def _require_address(text: str) -> str:
+    if not text:  # would listen on every address
+        raise ValueError("an address of this computer, 127.0.0.1 to be reached from here only")
+    return text
+
+
+def _require_host_name(text: str) -> str:
+    if not re.fullmatch(r"\[[0-9a-fA-F:.]+\]|[^\[\]:/?#@\s]+", text):
+        raise ValueError("a name or address without scheme, port and path, as in lab.example or [fd00::1]")
+    return text
+
+
 class DaemonSection(Section):
     """Addresses, access and files of the daemon."""
 
-    host: str = "127.0.0.1"
+    host: Annotated[str, AfterValidator(_require_address)] = "127.0.0.1"
     """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65_535)] = 8450
     """TCP port; 0: any free one."""
     socket: str = ""
     """Path of an additional Unix socket."""
-    hosts: tuple[str, ...] = ()
+    hosts: tuple[Annotated[str, AfterValidator(_require_host_name)], ...] = ()
     """Accepted names in the Host and Origin headers besides loopback."""
     body_max_bytes: Annotated[int, Field(ge=1024, le=64_000_000)] = 8_000_000
     """Largest request body, bytes."""

@@ -79,7 +79,7 @@ class AccessPolicy:
         """Replace the tokens and limits. Every caller's rate limit starts anew. Return the tokens that are revoked."""
         revoked, self.tokens = self.tokens.find_revoked(tokens), tokens
         self.body_max_bytes = daemon.body_max_bytes
-        self._hosts = {*LOOPBACK_NAMES, *daemon.hosts}
+        self._hosts = {*LOOPBACK_NAMES, *map(str.lower, daemon.hosts)}
         self._rate_limiter = RateLimiter(daemon.requests_per_s, daemon.requests_burst)
         return revoked
 

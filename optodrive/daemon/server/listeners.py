@@ -1,5 +1,6 @@
 """The listening TCP socket of the daemon, and a warning where other computers can reach it."""
 
+import errno
 import resource
 import socket
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ DESCRIPTORS_MIN = 1024
 
 
 def open_tcp_listener(host: str, port: int) -> socket.socket:
-    """Open a socket that listens on a TCP port. Raise InputError if the address is in use."""
+    """Open a socket that listens on a TCP port. Raise InputError if host or port cannot be used."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # With an explicit protocol, asyncio disables Nagle's algorithm, which would delay each response by 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
@@ -25,7 +26,9 @@ def open_tcp_listener(host: str, port: int) -> socket.socket:
         listener.listen(BACKLOG)  # connections are accepted from the line that prints the address on
     except OSError as error:
         listener.close()
-        raise InputError("daemon.port", port, f"a free port on {host} ({error.strerror})") from None
+        if error.errno in (errno.EADDRINUSE, errno.EACCES):
+            raise InputError("daemon.port", port, f"a free port on {host} ({error.strerror})") from None
+        raise InputError("daemon.host", host, f"an address of this computer ({error.strerror})") from None
     return listener
 
 

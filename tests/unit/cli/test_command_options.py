@@ -117,3 +117,11 @@ def test_a_value_that_is_no_choice_is_refused_with_the_choices(path, option, cap
 def test_a_height_that_no_dot_has_is_refused(height_um, capsys):
     assert run(["braille", "port", f"--height-um={height_um}"]) == 2
     assert "--height-um" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("port", "says"), [("80000", "expected less than or equal to 65535"), ("abc", "expected a valid integer\n")]
+)
+def test_a_number_outside_its_range_is_refused_in_our_words(port, says, capsys):
+    assert run(["serve", f"--port={port}"]) == 2
+    assert f"Invalid value for '--port': {says}" in capsys.readouterr().err

@@ -28,7 +28,7 @@ TOKENS = Tokens((Token("eve", "viewer", "eve"), Token("bob", "operator", "bob"))
 @pytest.fixture
 def check(app):
     """Function that returns the code of a refusal, or None."""
-    policy = AccessPolicy(TOKENS, DaemonSection(hosts=("display.example",)))
+    policy = AccessPolicy(TOKENS, DaemonSection(hosts=("Display.example",)))
     table = RouteTable(app.routes)
 
     def check(**headers):

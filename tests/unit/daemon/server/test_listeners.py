@@ -2,7 +2,8 @@
 
 import pytest
 
-from optodrive.daemon.server.listeners import build_local_url, describe_exposure
+from optodrive.core.errors import InputError
+from optodrive.daemon.server.listeners import build_local_url, describe_exposure, open_tcp_listener
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
@@ -30,3 +31,16 @@ def test_an_address_of_the_network_is_warned_of(host):
 )
 def test_the_printed_address_can_be_opened(host, url):
     assert build_local_url(host, 8450) == url
+
+
+@pytest.mark.parametrize("host", ["192.0.2.7", "surely-no-name.invalid"])
+def test_an_address_of_another_computer_is_no_port_in_use(host):
+    with pytest.raises(InputError, match=r"daemon.host: got .* an address of this computer"):
+        open_tcp_listener(host, 0)
+
+
+def test_a_port_in_use_is_named():
+    with open_tcp_listener("127.0.0.1", 0) as listener:
+        port = listener.getsockname()[1]
+        with pytest.raises(InputError, match=f"daemon.port: got {port}, expected a free port on 127.0.0.1"):
+            open_tcp_listener("127.0.0.1", port)
