@@ -31,7 +31,7 @@ def patterns(
     json: JsonOption = False,
 ) -> None:
     """List the patterns and their parameters, or write one as a file for `plan`, `simulate` and `push`."""
-    from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
+    from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern, load_plug_ins
 
     if tables is not None:
         _list_tables(tables, json)
@@ -47,7 +47,10 @@ def patterns(
         raise InputError("--out", MISSING, f"--out FRAMES.json for {values[0]}")
     name = None if pattern is None else find_pattern(pattern).name
     descriptions = [item for item in describe_patterns() if name in (None, item.name)]
-    print_answer({"patterns": descriptions}, [line for item in descriptions for line in _describe(item)], json)
+    lines = [line for item in descriptions for line in _describe(item)]
+    broken = {} if name else load_plug_ins().broken
+    lines += [f"{each}: cannot be used ({reason})" for each, reason in broken.items()]
+    print_answer({"patterns": descriptions} | ({"broken": broken} if broken else {}), lines, json)
 
 
 def _list_tables(language: str, json: bool) -> None:

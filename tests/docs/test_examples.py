@@ -57,6 +57,7 @@ ELSEWHERE = {
     "optodrive simulate sweep/": "tests/accuracy/test_calibrate_pixels.py",
     "optodrive discover": "tests/accuracy/test_discovery.py",
     "optodrive diagnose recording.h5 --discover": "tests/accuracy/test_pixel_discovery.py",
+    "pip install ./lab-patterns": "tests/system/test_pattern_plug_ins.py installs it",
     "optodrive diagnose film.h5 --out cluster/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
 }
 """Beginnings of examples that are not run here, and where they are."""
@@ -68,6 +69,7 @@ SCENARIOS = {
     "readme": (write_checkout, ["README.md:Shell", "README.md:Python"]),
     "readme-rest": (write_checkout, ["README.md:REST"]),
     "patterns": (write_stimuli, ["docs/how-to/show-stimuli.md:Patterns"]),
+    "plug-ins": (write_checkout, ["docs/how-to/add-a-pattern.md:Patterns of your own"]),
     "fits": (write_checkout, ["docs/how-to/show-stimuli.md:Whether it fits"]),
     "refusals": (write_recordings, ["docs/reference/recordings.md:Refusals"]),
     "quickstart": (write_checkout, ["docs/tutorials/quickstart.md:Quickstart"]),

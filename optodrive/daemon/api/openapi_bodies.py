@@ -7,7 +7,7 @@ from optodrive.planning.stimuli.binary_frame import FRAME_NUMBER_MAX
 from optodrive.planning.stimuli.frame_json import ID_MAX, TARGET_KEYS
 from optodrive.planning.stimuli.json_values import PRIORITY_MAX, TIME_MAX_S
 from optodrive.planning.stimuli.labels import KEY_MAX, LABELS_MAX, NUMBER_MAX, TEXT_MAX
-from optodrive.planning.stimuli.pattern_registry import describe_patterns
+from optodrive.planning.stimuli.pattern_registry import PATTERNS
 from optodrive.planning.stimuli.sequence_file import FRAMES_MAX, TRAINS_MAX
 
 Schema = dict[str, Any]
@@ -168,7 +168,7 @@ SEQUENCE_EXAMPLE: Schema = {
     ],
 }
 """An example that every shipped display can show."""
-PATTERN_NAME_EXAMPLES: Schema = {"examples": [item.name for item in describe_patterns()]}
+PATTERN_NAME_EXAMPLES: Schema = {"examples": list(PATTERNS)}
 PARAMETERS_SCHEMA: Schema = {
     "type": "object",
     "properties": {"labels": _LABELS_SCHEMA},

@@ -1,11 +1,15 @@
 """Registry of the named patterns that `play` and the REST API offer."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import cache
+from importlib.metadata import entry_points
+from typing import NamedTuple
 
 import numpy as np
+from pydantic import TypeAdapter
 
-from optodrive.core.errors import InputError, build_nothing_raised_error, suggest_nearest
+from optodrive.core.errors import InputError, OptodriveError, build_nothing_raised_error, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import bring_up, experiments, images, shapes
@@ -14,7 +18,12 @@ from optodrive.planning.stimuli.comparison import build_comparison
 from optodrive.planning.stimuli.drawings import build_drawing
 from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
-from optodrive.planning.stimuli.sequence_file import raises_nothing, validate_sequence
+from optodrive.planning.stimuli.sequence_file import (
+    parse_sequence,
+    raises_nothing,
+    sequence_to_json,
+    validate_sequence,
+)
 from optodrive.planning.stimuli.showcase import build_showcase
 from optodrive.planning.stimuli.text import build_text
 
@@ -317,12 +326,64 @@ _PATTERN_LIST = (
 PATTERNS: dict[str, Pattern] = {pattern.name: pattern for pattern in _PATTERN_LIST}
 
 
+PLUG_INS = "optodrive.patterns"
+"""Group of the entry points by which other packages offer patterns."""
+
+
+class PlugIns(NamedTuple):
+    """Patterns of other packages by name, and why others cannot be used, by name."""
+
+    patterns: Mapping[str, Pattern]
+    broken: Mapping[str, str]
+
+
+@cache
+def load_plug_ins() -> PlugIns:
+    """Import the patterns of other packages. One that cannot be imported or is no pattern costs only itself."""
+    patterns: dict[str, Pattern] = {}
+    broken: dict[str, str] = {}
+    for point in entry_points(group=PLUG_INS):
+        package = point.dist.name if point.dist is not None else point.value
+        try:
+            patterns[point.name] = _check_plug_in(point.name, point.load(), package, patterns)
+        except (Exception, SystemExit) as error:  # the code of others
+            broken[point.name] = f"{package}: {type(error).__name__}: {' '.join(str(error).split())}"
+    return PlugIns({name: each for name, each in patterns.items() if name not in broken}, broken)
+
+
+def _check_plug_in(name: str, pattern: object, package: str, known: Mapping[str, Pattern]) -> Pattern:
+    """Return a pattern whose builder's errors are told, and whose sequence is checked as that of a file."""
+    if not isinstance(pattern, Pattern) or pattern.name != name:
+        raise TypeError(f"a Pattern of the entry point's name {name} is expected")
+    if name in PATTERNS or name in known:
+        raise ValueError("another pattern has this name")
+    TypeAdapter(PatternDescription).validate_python(asdict(_describe_pattern(pattern)))
+
+    def build(config: Config, where: str, **arguments: object) -> FrameSequence:
+        try:
+            return parse_sequence(sequence_to_json(pattern.build(config, where, **arguments)), config, where)
+        except OptodriveError:
+            raise
+        except Exception as error:  # the code of others
+            raise OptodriveError(f"{where} of {package}: {type(error).__name__}: {error}") from None
+
+    return replace(pattern, build=build)
+
+
 def find_pattern(name: str) -> Pattern:
-    """Return the pattern of a name. Raise InputError (unknown_pattern) with the nearest known name."""
-    if name not in PATTERNS:
-        expected = f"a known pattern, {suggest_nearest(name[:60], list(PATTERNS))}"
+    """Return the pattern of a name.
+
+    Raise InputError: unknown_pattern with the nearest known name; broken_plug_in.
+    """
+    if name in PATTERNS:
+        return PATTERNS[name]
+    plug_ins = load_plug_ins()
+    if name in plug_ins.broken:
+        raise InputError("pattern", name, f"one that can be used ({plug_ins.broken[name]})", code="broken_plug_in")
+    if name not in plug_ins.patterns:
+        expected = f"a known pattern, {suggest_nearest(name[:60], [*PATTERNS, *plug_ins.patterns])}"
         raise InputError("pattern", name, expected, code="unknown_pattern")
-    return PATTERNS[name]
+    return plug_ins.patterns[name]
 
 
 def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
@@ -368,8 +429,9 @@ def _build_by_intensity(pattern: Pattern, where: str, given: object, config: Con
 
 
 def describe_patterns() -> list[PatternDescription]:
-    """Describe every pattern and its parameters."""
-    return [
-        PatternDescription(pattern.name, pattern.summary, pattern.notes, pattern.parameters, pattern.policy)
-        for pattern in _PATTERN_LIST
-    ]
+    """Describe every pattern and its parameters, those of other packages last."""
+    return [_describe_pattern(pattern) for pattern in (*_PATTERN_LIST, *load_plug_ins().patterns.values())]
+
+
+def _describe_pattern(pattern: Pattern) -> PatternDescription:
+    return PatternDescription(pattern.name, pattern.summary, pattern.notes, pattern.parameters, pattern.policy)
