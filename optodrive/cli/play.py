@@ -1,8 +1,9 @@
 """`optodrive push | play`: frames and named patterns to a running daemon."""
 
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Unpack
 
@@ -19,12 +20,14 @@ from optodrive.cli.output import print_json, show_progress
 from optodrive.cli.pattern_parameters import parse_parameters
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.cli.push_options import add_push_options
+from optodrive.cli.signals import end_as_interrupted
 from optodrive.core.daemon_url import DEFAULT_URL
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, OptodriveError
 from optodrive.core.files import read_bounded
 from optodrive.core.types.push_options import PushOptions
 
 if TYPE_CHECKING:
+    from optodrive.client.api_request import ApiRequest
     from optodrive.client.http import DaemonClient
     from optodrive.client.plan import Plan
 
@@ -57,8 +60,8 @@ def push(
     client = DaemonClient(url)
     with _hold_if(hold, client, dry_run, wait):
         with _name_source(frames):
-            submitted = client.call(request)
-        plan = _follow_plan(client, submitted, wait, json)
+            plan = _show(client, request, dry_run, wait)
+        _report_plan(plan, json)
     exit_unless_fits(plan.summary.feasibility)
 
 
@@ -84,7 +87,8 @@ def play(
     client = DaemonClient(url)
     request = build_play_request(pattern, parameters, options, dry_run)
     with _hold_if(hold, client, dry_run, wait):
-        plan = _follow_plan(client, client.call(request), wait, json)
+        plan = _show(client, request, dry_run, wait)
+        _report_plan(plan, json)
     exit_unless_fits(plan.summary.feasibility)
 
 
@@ -111,9 +115,33 @@ def _hold_if(hold: bool, client: "DaemonClient", dry_run: bool, wait: bool) -> A
     return Hold(client.endpoint)
 
 
-def _follow_plan(client: "DaemonClient", plan: "Plan", wait: bool, as_json: bool) -> "Plan":
-    if wait and not plan.has_ended:
-        plan = _wait_until_shown(client, plan.plan)
+def _show(client: "DaemonClient", request: "ApiRequest[Plan]", dry_run: bool, wait: bool) -> "Plan":
+    """Submit a plan and wait for its end, if `wait`. A signal that ends this ends the plan as well."""
+    plan = None
+    with end_as_interrupted():
+        try:
+            plan = client.call(request)
+            return _wait_until_shown(client, plan.plan) if wait and not plan.has_ended else plan
+        except KeyboardInterrupt:
+            if not dry_run:
+                _end_plan(client, plan)
+            raise
+
+
+def _end_plan(client: "DaemonClient", plan: "Plan | None") -> None:
+    """End a plan, or stop the board if the daemon does not do so, or has not answered which plan it is. Say it."""
+    from optodrive.client.requests import STOP, build_cancel_request
+
+    if plan is not None:
+        with suppress(OptodriveError):
+            ended = client.call(build_cancel_request(plan.plan))
+            print(f"optodrive: plan {ended.plan}: {ended.status}, {ended.executed} pulses executed", file=sys.stderr)
+            return
+    client.call(STOP)
+    print("optodrive: the display was stopped, because the plan could not be ended alone", file=sys.stderr)
+
+
+def _report_plan(plan: "Plan", as_json: bool) -> None:
     if as_json:
         print_json(plan)
     else:
@@ -122,7 +150,7 @@ def _follow_plan(client: "DaemonClient", plan: "Plan", wait: bool, as_json: bool
         print(f"plan             {plan.plan}: {plan.status}")
         if plan.status == "done":
             print(f"executed         {plan.executed} of {plan.sent} sent, {plan.planned} planned")
-    return plan.raise_if_failed()
+    plan.raise_if_failed()
 
 
 def _wait_until_shown(client: "DaemonClient", plan_id: str) -> "Plan":

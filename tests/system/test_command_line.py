@@ -1,12 +1,17 @@
 """Commands to a running daemon as a shell runs them, with the address in the environment."""
 
+import json
 import os
 import re
+import signal
 import subprocess
 import sys
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Event, Thread
 
 import pytest
 
+from forked_process import start_process
 from optodrive.cli import control
 from optodrive.client import Display
 from optodrive.core.errors import LinkError
@@ -99,3 +104,95 @@ def test_an_experiment_is_shown_as_requested_or_not_at_all(rig):
     wait_for(lambda: daemon.client.post(dry_run, json={"level": 9}).is_success, "the pixels to cool")
     ended = command(daemon, "play", "experiment-4", "level=9")
     assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def start_push(url, tmp_path, *options):
+    (tmp_path / "train.json").write_text(json.dumps(long_train(seconds=300.0)))
+    return start_process(
+        [OPTODRIVE, "push", str(tmp_path / "train.json"), *options],
+        env=os.environ | {"OPTODRIVE_URL": url, "OPTODRIVE_TOKEN": TOKEN},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_ends_a_push_ends_its_light(rig, tmp_path, number):
+    board, daemon = rig
+    daemon.arm()
+    with start_push(daemon.url, tmp_path) as process:
+        wait_for(lambda: daemon.state()["queue"]["running"] is not None, "light")
+        process.send_signal(number)
+        errors = process.stderr.read()
+    assert process.returncode == 130
+    (plan,) = daemon.state()["queue"]["plans"][-1:]
+    assert plan["status"] in ("cancelled", "stopped"), errors
+    assert daemon.board_state() == ("ARMED" if plan["status"] == "cancelled" else "DISARMED")
+    wait_for(lambda: not board.all_of("gate")[-1]["on"], "the end of light")
+
+
+def test_a_push_that_does_not_wait_leaves_its_plan_playing(rig, tmp_path):
+    _, daemon = rig
+    daemon.arm()
+    with start_push(daemon.url, tmp_path, "--no-wait") as process:
+        assert process.wait() == 0
+    wait_for(lambda: daemon.state()["queue"]["running"] is not None, "light")
+
+
+class ScriptedDaemon(BaseHTTPRequestHandler):
+    """Answers what the test gives it by method and path, and leaves other requests without an answer."""
+
+    def answer(self):
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        call = f"{self.command} {self.path.partition('?')[0]}"
+        self.server.calls.append(call)
+        if call not in self.server.answers:
+            self.server.end.wait()
+            return
+        body = json.dumps(self.server.answers[call]).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    do_GET = do_POST = do_DELETE = answer  # noqa: N815 - names of http.server
+
+    def log_message(self, *arguments):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("unanswered", "awaited", "last", "says"),
+    [
+        ((), "GET /v1/plans/p7", "DELETE /v1/plans/p7", "plan p7: cancelled, 3 pulses executed"),
+        (("POST /v1/plans",), "POST /v1/plans", "POST /v1/stop", "the display was stopped, because"),
+    ],
+)
+def test_a_push_ends_its_plan_alone_if_it_knows_it(rig, tmp_path, unanswered, awaited, last, says):
+    """Before the answer nobody knows whether the daemon plays it."""
+    plan = rig[1].call("POST", "/v1/plans?dry_run=true", json=long_train(seconds=0.1)) | {
+        "plan": "p7",
+        "status": "running",
+    }
+    answers = {
+        "GET /v1/health": rig[1].call("GET", "/v1/health"),
+        "POST /v1/plans": plan,
+        "GET /v1/plans/p7": plan,
+        "DELETE /v1/plans/p7": plan | {"status": "cancelled", "executed": 3},
+        "POST /v1/stop": rig[1].call("GET", "/v1/state"),
+    }
+    with ThreadingHTTPServer(("127.0.0.1", 0), ScriptedDaemon) as server:
+        server.calls, server.end = [], Event()
+        server.answers = {call: answer for call, answer in answers.items() if call not in unanswered}
+        Thread(target=server.serve_forever, daemon=True).start()
+        with start_push(f"http://127.0.0.1:{server.server_port}", tmp_path) as process:
+            wait_for(lambda: awaited in server.calls, "the awaited request")
+            process.send_signal(signal.SIGTERM)
+            errors = process.stderr.read()
+        server.end.set()
+        server.shutdown()
+    assert process.returncode == 130
+    assert server.calls[-1] == last
+    assert errors.startswith(f"optodrive: {says}")
+    assert errors.endswith("\noptodrive: interrupted\n")
