@@ -13,6 +13,11 @@ PROBE_TIMEOUT_S = 2.0
 STOP_UNANSWERED = (
     "stop was not answered by {url} ({error}): the running plan may go on to its end; use the emergency stop or the key"
 )
+TLS_REMEDIES = {
+    "WRONG_VERSION_NUMBER": "without TLS: state http:// in place of https://",
+    "CERTIFICATE_VERIFY_FAILED": "its certificate does not hold here: name the file of its authority by SSL_CERT_FILE",
+}
+"""What to do about a failure of TLS, by OpenSSL's name of it."""
 
 
 class Endpoint:
@@ -95,6 +100,9 @@ class Endpoint:
     def build_unreachable_error(self, error: Exception) -> LinkError:
         """Build the error for a daemon that does not answer."""
         cause = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
+        for name, remedy in TLS_REMEDIES.items():
+            if name in cause:
+                return LinkError(f"{self.address} answers, but {remedy} ({cause})")
         return LinkError(f"no daemon answers at {self.address} ({cause}); is `optodrive serve` running?")
 
     def build_stop_error(self, error: Exception) -> LinkError:

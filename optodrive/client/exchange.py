@@ -109,7 +109,10 @@ def parse_response(request: ApiRequest[Response], response: httpx.Response) -> R
         try:
             return request.parse(response.content)
         except ValueError:
-            raise LinkError(f"the answer to {request.method} {request.path} is not that of this API") from None
+            raise LinkError(
+                f"the answer to {request.method} {request.path} is not that of this API: a daemon of another version "
+                "answers, or another program; after an upgrade, restart the daemon"
+            ) from None
     from optodrive.client.problems import parse_problem  # its models take longer than a whole command without them
 
     raise parse_problem(response.status_code, response.content)

@@ -4,7 +4,9 @@ import asyncio
 import socket
 import ssl
 from contextlib import AsyncExitStack
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from math import inf
+from threading import Thread
 
 import httpx
 import pytest
@@ -78,7 +80,7 @@ def test_a_response_without_a_problem_document_is_a_link_error():
 @pytest.mark.parametrize("body", [b"<html>", b"[]", b"\xff"])
 def test_a_response_of_something_else_is_a_link_error(body):
     for request in (READ_STATE, api_request.READ_STATE):
-        with pytest.raises(LinkError, match="GET /v1/state is not that of this API"):
+        with pytest.raises(LinkError, match="GET /v1/state is not that of this API: a daemon of another version"):
             parse_response(request, httpx.Response(200, content=body))
 
 
@@ -238,6 +240,29 @@ def test_certificates_are_verified_where_there_are_some(scheme, mode):
     endpoint = Endpoint(f"{scheme}://localhost", "token")
     for client in (endpoint.open_client(1.0), endpoint.open_async_client(1.0)):
         assert client._transport._pool._ssl_context.verify_mode == mode
+
+
+@pytest.mark.parametrize(
+    ("is_encrypted", "says"), [(False, "without TLS: state http://"), (True, "does not hold here: name the file")]
+)
+def test_an_answer_without_valid_tls_is_not_told_as_none(certificate, is_encrypted, says):
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
+        if is_encrypted:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(*certificate)
+            server.socket = context.wrap_socket(server.socket, server_side=True)
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            endpoint = Endpoint(f"https://localhost:{server.server_port}", "token")
+            with endpoint.open_client(None) as client, pytest.raises(httpx.TransportError) as failed:
+                client.get("/v1/health")
+        finally:
+            server.shutdown()
+            thread.join()
+    message = str(endpoint.build_unreachable_error(failed.value))
+    assert message.startswith(f"{endpoint.address} answers, but ")
+    assert says in message
 
 
 def test_a_plan_that_the_daemon_has_forgotten_was_lost_with_its_planner():

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import ssl
-import subprocess
 import sys
 import threading
 import weakref
@@ -24,15 +23,6 @@ from optodrive.device.config import PixelLayout
 FRAMES, SENDERS = 40, 3
 CALLS = 2000
 PIXEL = np.zeros(1)
-
-
-@pytest.fixture
-def certificate(tmp_path):
-    path, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
-    names = ("-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost")
-    options = ("-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *names, "-keyout", key)
-    subprocess.run(["openssl", "req", *options, "-out", path], check=True, capture_output=True)
-    return path, key
 
 
 @pytest.fixture
