@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from optodrive.cli.signals import end_as_interrupted
 from optodrive.client.http import DaemonClient
 from optodrive.client.plan import Plan
 from optodrive.client.requests import ARM, READ_STATE, STOP, build_play_request, build_read_request
@@ -27,16 +28,21 @@ def start_daemon(port: int, config: str | None) -> tuple[subprocess.Popen[bytes]
     optodrive = Path(sys.executable).with_name("optodrive")
     chosen = ["--config", config] if config else []
     daemon = subprocess.Popen([optodrive, "serve", "--port", str(port), *chosen])
-    while daemon.poll() is None:
-        if build_tokens_path(port).exists():
-            client = DaemonClient(f"http://127.0.0.1:{port}")
-            try:
-                client.call(READ_STATE)
-            except LinkError:
-                pass
-            else:
-                return daemon, client
-        time.sleep(0.05)
+    try:
+        while daemon.poll() is None:
+            if build_tokens_path(port).exists():
+                client = DaemonClient(f"http://127.0.0.1:{port}")
+                try:
+                    client.call(READ_STATE)
+                except LinkError:
+                    pass
+                else:
+                    return daemon, client
+            time.sleep(0.05)
+    except BaseException:
+        daemon.terminate()
+        daemon.wait()
+        raise
     raise RefusedError("the daemon did not start; its message above gives the reason")
 
 
@@ -110,16 +116,17 @@ def main() -> int:
     shown: list[tuple[str, Plan]] = []
     daemon = None
     try:
-        daemon, client = start_daemon(options.port, options.config)
-        print("arming: the board's indicator is on for two seconds first", flush=True)
-        client.call(ARM)
-        started_s = time.monotonic()
-        patterns = choose_patterns(client)
-        for pattern in itertools.cycle(patterns):
-            if options.seconds is not None and shown and time.monotonic() - started_s >= options.seconds:
-                break
-            shown.append((pattern, play_pattern(client, pattern)))
-        client.call(STOP)
+        with end_as_interrupted():
+            daemon, client = start_daemon(options.port, options.config)
+            print("arming: the board's indicator is on for two seconds first", flush=True)
+            client.call(ARM)
+            started_s = time.monotonic()
+            patterns = choose_patterns(client)
+            for pattern in itertools.cycle(patterns):
+                if options.seconds is not None and shown and time.monotonic() - started_s >= options.seconds:
+                    break
+                shown.append((pattern, play_pattern(client, pattern)))
+            client.call(STOP)
     except KeyboardInterrupt:
         print("\nending")
     except OptodriveError as error:

@@ -13,7 +13,7 @@ from optodrive.cli.exit_status import SUMMARY
 from optodrive.cli.invocation import Invocation
 from optodrive.cli.signals import INTERRUPTED, report_interruption
 from optodrive.core.daemon_url import check_environment
-from optodrive.core.errors import OptodriveError
+from optodrive.core.errors import InputError, OptodriveError
 
 PYDANTIC_PHRASES = re.compile(r"Value error, |, unable to parse string as an? \w+")
 """What pydantic adds to the reason why an option's value is refused."""
@@ -63,11 +63,12 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
     modules.setdefault("httpx._main", None)  # its own command line, which it leaves out where rich is not installed
     invocation = Invocation(tuple(arguments), stopped)
     command = arguments[0] if arguments else None
-    app = build_app(command)
+    root = typer.main.get_command(build_app(command))
     try:
         if command not in UNCONDITIONAL:
             check_environment()
-        status = app(args=arguments, prog_name="optodrive", standalone_mode=False, obj=invocation)
+        _refuse_repeated_option(root, arguments)
+        status = root(args=arguments, prog_name="optodrive", standalone_mode=False, obj=invocation)
         sys.stdout.flush()
         if status == INTERRUPTED:  # some versions of typer convert Ctrl-C to a status
             raise KeyboardInterrupt
@@ -92,6 +93,31 @@ def run_command(arguments: list[str], stopped: dict[str, Any] | None = None) -> 
             return 0  # the reader of stdout has exited
         print(f"optodrive: {error}", file=sys.stderr)
         return 1
+
+
+def _refuse_repeated_option(command: Any, arguments: list[str]) -> None:
+    """Raise InputError for an option that stands twice, of which only the last value would count."""
+    words, seen = iter(arguments), set()
+    for word in words:
+        subcommands = getattr(command, "commands", {})
+        if word in subcommands:
+            command = subcommands[word]
+            continue
+        if word == "--":
+            return
+        name, has_value, value = word.partition("=")
+        option = next((each for each in command.params if name[:2] == "--" and name in _list_flags(each)), None)
+        if option is None:
+            continue
+        if not option.is_flag and not has_value:
+            value = next(words, "")
+        if option in seen and not option.multiple:
+            raise InputError(name, name if option.is_flag else value, "each option once")
+        seen.add(option)
+
+
+def _list_flags(parameter: Any) -> tuple[str, ...]:
+    return (*parameter.opts, *parameter.secondary_opts)
 
 
 def build_app(command: str | None = None) -> typer.Typer:

@@ -7,6 +7,7 @@ from typing import Self
 from optodrive.client.async_http import AsyncHttp
 from optodrive.client.async_stream import AsyncStream
 from optodrive.client.endpoint import Endpoint
+from optodrive.client.fingers import AsyncFingers
 from optodrive.client.hold import AsyncHold
 from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations
 from optodrive.core.daemon_url import check_environment, read_default_url
@@ -65,6 +66,10 @@ class AsyncDisplay(DisplayOperations):
         return AsyncStream(
             self._client.endpoint, self.layout, policy, standing, self._reconnect_timeout_s, self._record_emission
         )
+
+    def fingers(self) -> AsyncFingers:
+        """Open a connection as `Display.fingers` does: `async with display.fingers() as fingers`."""
+        return AsyncFingers(self._client.endpoint)
 
     def _record_emission(self) -> None:
         self._client.require_open()

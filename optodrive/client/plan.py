@@ -9,10 +9,12 @@ from pydantic import PrivateAttr
 
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.push_options import check_keywords
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.device.config import PixelLayout
 
 
+@check_keywords
 class Plan(PlanReport):
     """A plan as the daemon reports it, placed on the display."""
 

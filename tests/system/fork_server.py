@@ -61,6 +61,9 @@ def run_to_end(program):
         status = program()
     except SystemExit as end:
         status = end.code
+    except KeyboardInterrupt:  # earlier than the program can handle it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGINT)
     except BaseException:
         traceback.print_exc()
         status = 1

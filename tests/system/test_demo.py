@@ -2,11 +2,15 @@
 
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from forked_process import Process
 from rig import config_text
 
 DEMO = Path(__file__).parents[2] / "scripts" / "demo.py"
@@ -44,3 +48,22 @@ def test_a_small_display_shows_the_patterns_that_it_has_the_space_for(tmp_path):
     refused = [line for line in ended.stdout.splitlines() if line.startswith("left out: pattern ")]
     assert [line.split()[3] for line in refused] == ["showcase:", "experiment-6:"]
     assert "experiment-1" in ended.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_demo_with_its_daemon(tmp_path, number):
+    config = tmp_path / "config.toml"
+    config.write_text(config_text())
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        port = unused.getsockname()[1]
+    command = [sys.executable, DEMO, "--port", str(port), "--config", config]
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    with Process(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as demo:
+        said = ""
+        while "arming" not in said:
+            said += demo.stdout.readline()
+        demo.send_signal(number)
+        said += demo.stdout.read()  # to its end, which is that of the daemon, too
+    assert "\nending\n" in said
+    assert "Traceback" not in said

@@ -1,5 +1,6 @@
 """Frames that stand: refreshed until the next or until their client ends, under fingers first, and dark after STOP."""
 
+import asyncio
 import base64
 import json
 import os
@@ -15,8 +16,8 @@ import pytest
 from websockets.sync.client import connect
 
 from forked_process import OPTODRIVE, start_process
-from optodrive.client import Display
-from optodrive.core.errors import BusyError, InputError
+from optodrive.client import AsyncDisplay, Display
+from optodrive.core.errors import BusyError, InputError, LinkError, NotReadyError
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
@@ -259,6 +260,23 @@ def test_the_client_refuses_a_wrong_place_and_sends_the_next_one(rig, monkeypatc
         with pytest.raises(InputError, match=r"^message: fingers\.0\.x_m: got 2\.0, expected less than or equal to 1$"):
             fingers.send([FingerPlace(1, 2.0, 0.0, 0.004)])
         fingers.send([FingerPlace(1, 0.0, 0.0, 0.004)])
+
+
+def test_the_asynchronous_client_refuses_a_wrong_place_and_sends_the_next_one(rig, monkeypatch):
+    monkeypatch.setenv("OPTODRIVE_TOKEN", TOKEN)
+
+    async def report():
+        async with AsyncDisplay(rig[1].url) as display, display.fingers() as fingers:
+            with pytest.raises(InputError, match=r"^message: fingers\.0\.x_m: got 2\.0, expected less than"):
+                await fingers.send([FingerPlace(1, 2.0, 0.0, 0.004)])
+            await fingers.send([FingerPlace(1, 0.0, 0.0, 0.004)])
+            await fingers.close()
+            with pytest.raises(LinkError, match="closed the connection"):
+                await fingers.send([])
+            with pytest.raises(NotReadyError, match="is not open"):
+                await display.fingers().send([])
+
+    asyncio.run(report())
 
 
 def test_the_client_says_once_that_places_waited_and_sends_the_next_ones(rig, monkeypatch):

@@ -20,7 +20,7 @@ from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO
 READ_MAX_S = 0.05
 SLEEP_BELOW_S = 0.999_999e-4
 """Remaining waits below this time are slept, because a read would take longer."""
-HELLO_TIMEOUT_S = 1.0
+HELLO_RETRY_S, HELLO_TIMEOUT_S = 0.25, 2.5
 SILENCE_TIMEOUT_S = 2.5
 """A board that sends nothing for this time, in which the captured one sent, is lost."""
 DRAIN_S = 0.5
@@ -97,6 +97,7 @@ class Replay:
         self._may_arm = may_arm
         self._open = False
         self._owed_s: float | None = None
+        self._hello = b""
 
     def run(self, entries: Iterable[CaptureEntry]) -> None:
         """Replay all entries. Raise LinkError if the link fails or the board falls silent."""
@@ -157,13 +158,20 @@ class Replay:
                 self._await_hello_reply()
                 frame = frame._replace(session=self.replayed.session)
             out.append(encode_frame(frame))
+            if kind is m.Hello:
+                self._hello = b"\0" + out[-1]
         return b"\0" + b"".join(out) if out else b""
 
     def _await_hello_reply(self) -> None:
-        deadline_s = self._clock.now_s() + HELLO_TIMEOUT_S
+        """Repeat HELLO until it is answered, as every host does: some ports report late that they are open."""
+        began_s = repeated_s = self._clock.now_s()
         while self.replayed.sessions < self.recorded.sessions:
-            if self._clock.now_s() > deadline_s:
+            now_s = self._clock.now_s()
+            if now_s - began_s > HELLO_TIMEOUT_S:
                 raise LinkError(f"{self._transport.name}: the board does not answer the captured HELLO")
+            if now_s - repeated_s > HELLO_RETRY_S:
+                repeated_s = now_s
+                self._transport.write(self._hello)
             self._receive(SLEEP_BELOW_S)
 
 

@@ -55,6 +55,20 @@ def test_a_misspelt_option_is_refused_with_the_nearest(path, command, capsys):
             assert flag in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("path", "command"), COMMANDS)
+def test_an_option_given_twice_is_refused(path, command, capsys):
+    """In both forms and both names of a switch, and with values that look like options."""
+    for option in command.params:
+        flags = [flag for flag in (*option.opts, *option.secondary_opts) if flag[:2] == "--"]
+        if not flags or option.multiple:
+            continue
+        first, second = ([flags[0]], [flags[-1]]) if option.is_flag else ([flags[0], "--x"], [f"{flags[0]}=--x"])
+        status = run([*path, *first, *second])
+        shown = flags[-1] if option.is_flag else "--x"
+        refusal = f"optodrive: {flags[-1]}: got '{shown}', expected each option once\n"
+        assert (status, capsys.readouterr().err) == (2, refusal)
+
+
 @pytest.mark.parametrize("group", sorted(GROUPS))
 def test_an_unknown_command_is_refused_by_name(group, capsys):
     assert run([*group, "surely-unknown"]) == 2

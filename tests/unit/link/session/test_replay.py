@@ -117,6 +117,21 @@ def test_only_frames_of_a_host_are_sent(tmp_path):
     assert b"".join(sent) == b"\0" + hello
 
 
+def test_a_hello_that_a_late_port_loses_is_repeated(recorded):
+    class LateLink(MemoryLink):
+        is_late = True
+
+        def write(self, data):
+            if data and self.is_late:
+                self.is_late = False
+            else:
+                super().write(data)
+
+    replay, log = replay_capture(recorded.path, SEED, may_arm=False, link=LateLink)
+    assert replay.replayed.sessions == replay.recorded.sessions
+    assert stays_off(log)
+
+
 def test_a_replay_follows_the_captured_clock_offset(tmp_path):
     """The captured board clock is 3.2 s ahead of the host, and START refers to board ticks."""
 
