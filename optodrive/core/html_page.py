@@ -42,15 +42,24 @@ svg .measured { fill: var(--muted); } svg .bar { fill: var(--extended); } svg .o
 
 
 def render_page(
-    title: str, verdict: str, narrative: list[str], body: Iterable[str], provenance: Provenance | None = None
+    title: str,
+    verdict: str,
+    narrative: list[str],
+    body: Iterable[str],
+    provenance: Provenance | None = None,
+    opening: Iterable[str] = (),
 ) -> str:
-    """Return an HTML page. The first line of the narrative is its heading, body is HTML that follows the narrative."""
+    """Return an HTML page. The first line of the narrative is its heading, body is HTML that follows the narrative.
+
+    opening: HTML between the heading and the other lines
+    """
     lines = [line for line in narrative if line]
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
         f"<title>{escape(title)}: {escape(verdict)}</title><style>{STYLE}</style></head><body><main>",
         f"<h1>{escape(lines[0])}</h1><p class='note'>{escape(title)}</p>",
+        *opening,
         *(f"<p{_class_attribute(line)}>{escape(line.strip())}</p>" for line in lines[1:]),
         *body,
         *([] if provenance is None else ["<h2>Provenance</h2>", _render_provenance(provenance)]),

@@ -42,7 +42,6 @@ def build_report(
     steps = SearchLog().attempt("next steps", list_next_steps, list[NextStep](), discrepancy, recordings, out, config)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     parts = [
-        *build_section(discrepancy.data_findings, discrepancy.inspection_failures),
         *_build_next_steps(steps),
         *_build_probabilities(discrepancy.probabilities),
         *sections,
@@ -68,7 +67,8 @@ def build_report(
         *(draw_residuals(trace, has_extension) for trace in _select_traces(discrepancy.residual_traces)),
         "</div>",
     ]
-    return render_page(title, discrepancy.verdict, build_narrative(discrepancy), parts, provenance)
+    data = [*build_section(discrepancy.data_findings, discrepancy.inspection_failures), "<h2>The answer</h2>"]
+    return render_page(title, discrepancy.verdict, build_narrative(discrepancy), parts, provenance, data)
 
 
 def _build_probabilities(probabilities: Probabilities) -> list[str]:

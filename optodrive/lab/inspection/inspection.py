@@ -232,7 +232,7 @@ def _find_outliers(work: Work, name: str) -> Found:
         return [], []
     samples, runs = count(sum(item.samples for item in edits), "sample"), count(len(edits), "run")
     where = list_names([work.runs[item.run].name for item in edits])
-    text = f"{name}: {samples} of {runs} ({where}) deviate by up to {largest:.0f} σ from the samples beside them"
+    text = f"{name}: {samples} of {runs} ({where}) up to {largest:.0f} σ off the samples beside them, and no repeat is"
     return edits, [describe(work, "outlier", name, edits, text)]
 
 

@@ -178,23 +178,18 @@ def _find_dead(work: Work, name: str) -> Found:
     edits: list[Edit] = []
     dark = []
     for item in flat:
-        beside = [
-            own for (run, own) in work.signals if run == item.run and own != name and not own.startswith("mirror")
-        ]
+        beside = [own for (run, own) in work.signals if run == item.run and own != name and own in TYPICAL]
         others = [found for own in beside for found in measure_responses(work, own) if found.run == item.run]
         if others and not any(found.is_seen for found in others):
             dark.append(work.runs[item.run].name)
-        else:
-            edits.append(drop_signal(item.run, name, work.signals[item.run, name]))
+        edits.append(drop_signal(item.run, name, work.signals[item.run, name]))
     findings = []
-    if dark:
-        text = f"{list_names(dark)}: no signal responds to the light; it was probably off."
-        findings.append(DataFinding(tuple(dark), "", "dark", text))
     if edits:
         names = [work.runs[item.run].name for item in edits]
         stuck = [item for item in edits if len(np.unique(item.values)) == 1]
         what = f"is stuck at {stuck[0].values[0]:.6g}" if len(stuck) == len(edits) else "does not respond to the light"
         text = f"{name} of {list_names(names)} {what}, as other runs do"
+        text += f"; nor does any other signal of {list_names(dark)}: was the light off?" if dark else ""
         findings.append(describe(work, "dead", name, edits, text))
     elif not flat:
         return _find_dead_everywhere(work, name, responses)

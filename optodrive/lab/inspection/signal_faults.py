@@ -29,16 +29,17 @@ MIN_STUCK, STUCK_TIES = 20, 0.2
 MIN_TIES, PILE, NEXT_LEVELS, CEILING_SIGMAS = 5, 2.0, 5, 4.0
 """Equal samples at a ceiling, also relative to those at each of the next levels of a converter; σ below it that are
 left out too."""
-APPROACH, SLOWING, RISE = 0.02, 2.5, 0.3
-"""Bands below a ceiling, relative to the range, in which the last approach is timed; by how much it may slow down."""
+APPROACH, SLOWING, RISE, MIN_RISE = 0.02, 2.5, 0.5, 4
+"""Bands below a ceiling, relative to the range, in which the last approach is timed; by how much it may slow down;
+the rise before it, relative to the range, and its smallest number of samples."""
 HOLD_SHARE, HOLD_BLOCKS, FEW_BLOCKS, LONG_BLOCK, HOLD_REGULAR, HOLD_STEPS = 0.45, 8, 4, 5.0, 0.97, 0.3
 """Of held samples: smallest share of equal neighbours, number of blocks, and of blocks of `LONG_BLOCK` samples, share
 of regular intervals, and of steps above the quantum."""
 COLLINEAR_SHARE, MIN_SEGMENTS, MIN_SEGMENT = 0.5, 8, 3
 """Of interpolated samples: smallest share without curvature, number of straight parts, and of samples in each."""
-OUTLIER_SIGMAS, SIDE, MAX_WIDTH, ROUGHNESS = 6.0, 5, 3, 6.0
-"""Smallest deviation, samples on either side that predict it, largest number of samples of an outlier, and ratio to the
-deviations of its neighbours."""
+OUTLIER_SIGMAS, SMOOTH_SIGMAS, SIDE, MAX_WIDTH, ROUGHNESS = 6.0, 12.0, 5, 3, 6.0
+"""Smallest deviation, also of a signal that was smoothed, samples on either side that predict it, largest number of
+samples of an outlier, and ratio to the deviations of its neighbours."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,9 @@ def find_ceiling(t_s: FloatArray, value: FloatArray, may_be_smooth: bool) -> flo
     """
     if len(value) < 4 * MIN_TIES:
         return None
-    top, noise = float(value.max()), measure_noise(value)
+    top = float(value.max())
     is_tie = value >= top - 1e-12 * abs(top)
+    noise = measure_noise(value[~is_tie])
     if is_tie.sum() < MIN_TIES or is_tie.all():
         return None
     if noise.is_rough and noise.sigma > noise.quantum:
@@ -157,11 +159,11 @@ def _is_reached_fast(t_s: FloatArray, value: FloatArray, is_tie: BoolArray, quan
     if any(not len(rows) for rows in crossings):
         return False
     first, second, last = (int(rows[-1]) for rows in crossings)
-    if at - first < 6:  # too few samples of the rise
+    if at - first < MIN_RISE:
         return False
     dt_s = float(np.median(np.diff(t_s)))
     slow_s, usual_s = float(t_s[at] - t_s[last]), float(t_s[last] - t_s[second])
-    return slow_s <= SLOWING * usual_s + dt_s and length * dt_s >= 5.0 * slow_s
+    return slow_s <= SLOWING * usual_s + 1.5 * dt_s and length * dt_s >= 5.0 * slow_s
 
 
 def select_near_ceiling(value: FloatArray, ceiling: float) -> BoolArray:
@@ -267,7 +269,7 @@ def find_outlier_candidates(t_s: FloatArray, value: FloatArray, quantum: float =
             b = scores[1][width - 1 - at][at : count - width + 1 + at]
             both = np.where(a * b > 0.0, np.minimum(np.abs(a), np.abs(b)), 0.0)
             score = np.minimum(score, np.nan_to_num(both))
-        for first in np.flatnonzero(score > OUTLIER_SIGMAS).tolist():
+        for first in np.flatnonzero(score > (OUTLIER_SIGMAS if noise.is_rough else SMOOTH_SIGMAS)).tolist():
             own = slice(first, first + width)
             if not taken[own].any() and _is_isolated(t_s, value, first, width, max(noise.sigma, floor)):
                 found.append((first, width, float(score[first])))
