@@ -120,7 +120,7 @@ class QueueStream:
         """Supersede the waiting plans, and end a running plan that is not streamed, for a newer plan."""
         with self._plans.lock:
             if self._plans.waiting:
-                self._plans.thermal.set(self._plans.thermal.estimate_before(self._plans.waiting[0]))
+                self._plans.thermal.go_back(self._plans.waiting[0])
             while self._plans.waiting:
                 plan = self._plans.waiting.popleft()
                 plan.record.dropped = plan.rest_count

@@ -48,15 +48,21 @@ class QueueThermal:
         """Return the estimate before a plan that waits, or before the rest of one that was interrupted."""
         return estimate_before_rest(plan, self._budget, self._on_progress)
 
+    def go_back(self, plan: ActivePlan) -> None:
+        """Continue from the estimate before a plan that will never be executed."""
+        estimate = self.estimate_before(plan)
+        # Pulses that were trimmed to nothing end later than the budget's time, and the heat is known from their end on.
+        self.set(estimate, max(estimate.budget.at_s, plan.record.start_s))
+
     def forget(self, plan: ActivePlan, behind: Sequence[ActivePlan]) -> None:
         """Take back the heat of a plan that will never be executed. behind: the plans that wait behind it."""
-        estimate, end_s = self.estimate_before(plan), None
+        end_s = self.end_s
+        self.go_back(plan)
         for each in behind:
-            heat, _ = estimate.shift_to_plan(each.record.start_s)
+            heat, _ = self.estimate.shift_to_plan(each.record.start_s)
             each.begin_later(heat, each.budget_before)
             estimate = ThermalEstimate.from_plan(each.planned.heat, each.planned.budget, each.record.start_s)
-            end_s = self.end_s
-        self.set(estimate, end_s)
+            self.set(estimate, end_s)
 
     def rewind(self, ended: Sequence[ActivePlan], clock_shift_s: float = 0.0, notice_s: float = 0.0) -> None:
         """Count only the pulses that the plans that end early may have executed.
