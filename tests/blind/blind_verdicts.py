@@ -98,7 +98,7 @@ class Said:
     @property
     def omissions(self) -> list[Any]:
         """What the answer did not use."""
-        return list(self.answer.get("left_out") or ())
+        return [item for item in self.answer.get("data") or () if item.get("action") == "left out"]
 
     @property
     def texts(self) -> list[str]:
@@ -106,7 +106,7 @@ class Said:
         if self.message:
             return [self.message]
         keys = ("data", "reasons", "disturbances", "doubts", "failures", "remarks")
-        parts: list[Any] = [*self.omissions]
+        parts: list[Any] = []
         for key in keys:
             held = self.answer.get(key) or ()
             parts += [held] if isinstance(held, str) else list(held.items() if isinstance(held, dict) else held)
