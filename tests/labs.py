@@ -20,9 +20,10 @@ GROUPS = {
 SIGNALS = (("absorber_temperature_K", 0.3), ("displacement_m", 2e-6))
 
 
-def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0):
+def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0, coupling="DC"):
     """Return a recording of these groups with white and coloured noise, jitters and a few missing samples.
 
+    coupling: as the runs state, if they do
     noise: factor on noise and jitters; 0 gives repeats that are equal to the last digit, without missing samples
     """
     rng = np.random.default_rng(seed)
@@ -33,6 +34,7 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0):
         pulses = np.array(GROUPS[name])
         until_s = float((pulses[:, 0] + pulses[:, 1]).max()) + 0.1
         t_s = np.arange(0.0, until_s, 1.0 / rate) + 0.5 / rate
+        attributes = {"group": name} | ({"coupling": coupling} if coupling else {})
         for _ in range(repeats):
             real = pulses.copy()
             real[:, 2] *= np.exp(noise * 0.005 * rng.standard_normal())
@@ -52,5 +54,5 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0):
                 noisy = value + noise * (coloured + white * rng.standard_normal(len(t_s)))
                 noisy[rng.random(len(t_s)) < 0.01 * (noise > 0)] = np.nan
                 signals[signal] = Signal(0, t_s, noisy + (AMBIENT_K if signal.endswith("_K") else 0.0))
-            runs.append(Run(f"run{len(runs):03d}", AMBIENT_K, pulses, signals, {"group": name}))
+            runs.append(Run(f"run{len(runs):03d}", AMBIENT_K, pulses, signals, attributes))
     return Measurement(tuple(runs))

@@ -144,7 +144,7 @@ class Term:
     is_exact, whether the effect has no other form than the term's, but for its share in each signal;
     is_linear and fit_every_start as in `Hypothesis`; detection_limit, replaces the computed smallest visible effect;
     remedy, what to do at an instrument to see whether it is this, in a sentence; removes_zero, whether the zero of a
-    signal on which it acts is equal in all runs.
+    signal on which it acts is equal in all runs; twin, the cause that no recording tells from it, of any law.
     """
 
     key: str
@@ -169,6 +169,7 @@ class Term:
     detection_limit: str = ""
     remedy: str = ""
     removes_zero: bool = False
+    twin: str = ""
 
     @property
     def is_instrument(self) -> bool:

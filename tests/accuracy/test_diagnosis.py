@@ -109,6 +109,12 @@ def test_a_weak_lag_and_a_late_clock_are_one_shape_and_neither_is_ruled_out():
     assert judged["sensor_lag"] == judged["clock_offset of temperature"] == "indistinguishable"
 
 
+def test_two_hidden_causes_are_named_together():
+    found = diagnose(lab(13, TWO))
+    assert found.verdict == "cause"
+    assert set(found.causes) == set(TWO)
+
+
 def move_zeros(recording, size_m=5e-6):
     """Return the recording with another zero of displacement in each run, as no AC coupling leaves it."""
     rng, runs = np.random.default_rng(5), []
@@ -119,20 +125,18 @@ def move_zeros(recording, size_m=5e-6):
     return Measurement(tuple(runs))
 
 
-def test_two_hidden_causes_are_named_together():
-    found = diagnose(move_zeros(lab(13, TWO)))
-    assert found.verdict == "cause"
-    assert set(found.causes) == set(TWO)
-
-
-def test_a_leak_is_told_from_ac_coupling_by_what_the_recording_states():
-    found = diagnose(lab(13, {"gas_leak": TWO["gas_leak"]}))
+@pytest.mark.parametrize("rate", [TWO["gas_leak"]["rate"], 0.5])
+def test_a_leak_is_told_from_ac_coupling_by_what_the_recording_states_or_by_its_zeros(rate):
+    terms = {"gas_leak": {"rate": rate}}
+    found = diagnose(lab(13, terms, coupling=None))
     assert (found.verdict, set(found.causes)) == ("ambiguous", {"gas_leak", "high_pass"})
     assert any("couple the input DC" in line for line in build_narrative(found))
-    leak = lab(13, {"gas_leak": TWO["gas_leak"]})
-    stated = tuple(replace(run, attributes=run.attributes | {"coupling": "DC"}) for run in leak.runs)
-    found = diagnose(Measurement(stated))
-    assert (found.verdict, found.causes) == ("cause", ("gas_leak",))
+    for recording in (
+        lab(13, {"gas_leak": {"rate": rate}}),
+        move_zeros(lab(13, {"gas_leak": {"rate": rate}}, coupling=None)),
+    ):
+        found = diagnose(recording)
+        assert (found.verdict, found.causes) == ("cause", ("gas_leak",))
 
 
 def test_without_repeats_nothing_is_named_for_certain():

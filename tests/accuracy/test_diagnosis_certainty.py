@@ -68,7 +68,8 @@ def record_orifice(seed):
                 "absorber_temperature_K": Signal(0, t_s, noisy_k),
                 "displacement_m": Signal(0, t_s, noisy_m),
             }
-            runs.append(Run(f"run{len(runs):03d}", AMBIENT_K, pulses, signals, {"group": name}))
+            stated = {"group": name, "coupling": "DC"}
+            runs.append(Run(f"run{len(runs):03d}", AMBIENT_K, pulses, signals, stated))
     return Measurement(tuple(runs))
 
 
@@ -164,11 +165,14 @@ def spread(found, low, high):
 
 def test_an_interval_that_contains_zero_is_in_the_first_sentence(late):
     assert spread(late, -40e-6, -10e-6).doubts == {}
-    assert build_narrative(late)[0] == "The nominal model is wrong because an instrument's clock is offset."
+    assert (
+        build_narrative(late)[0]
+        == "The recording differs from the nominal model because an instrument's clock is offset."
+    )
     found = spread(late, -49.7e-6, 1.39e-6)
     assert build_narrative(found)[0] == (
-        "The nominal model is wrong, perhaps because an instrument's clock is offset, but the 95 % interval of "
-        "clock_offset.all, -49.7 µs to 1.39 µs, contains zero."
+        "The recording differs from the nominal model, perhaps because an instrument's clock is offset, but the 95 % "
+        "interval of clock_offset.all, -49.7 µs to 1.39 µs, contains zero."
     )
     assert build_answer(found)["doubts"] == found.doubts
     assert "contains zero.</h1>" in build_report(found, "late.h5")

@@ -27,7 +27,13 @@ from optodrive.lab.diagnosis.copied_runs import check_copied_runs
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset
 from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
-from optodrive.lab.diagnosis.estimates import compute_estimates, describe_doubts, describe_limits, is_at_limit
+from optodrive.lab.diagnosis.estimates import (
+    compute_estimates,
+    describe_doubts,
+    describe_limits,
+    is_at_limit,
+    limit_sizes,
+)
 from optodrive.lab.diagnosis.fitting import (
     BaseParameterPrior,
     FitProblem,
@@ -81,7 +87,7 @@ NEARLY_EXPLAINED = 0.999
 class _SubsystemFit:
     """Results for the pixels or for the mirrors.
 
-    covariance: of the final parameters, discrepancy marginalised
+    estimates: of the final parameters, discrepancy marginalised
     """
 
     data: Dataset
@@ -90,7 +96,7 @@ class _SubsystemFit:
     base: ModelFit
     verdict: Verdict
     final: ModelFit
-    covariance: FloatArray
+    estimates: dict[str, Estimate]
     gain: HeldOutGain | None
     candidates: tuple[CandidateCause, ...]
     rivals: tuple[RivalModel, ...]
@@ -159,7 +165,7 @@ def diagnose(
     terms: dict[str, dict[str, float]] = {}
     doubts: dict[str, str] = {}
     for subsystem in subsystems:
-        estimates = compute_estimates(subsystem.data, subsystem.final, subsystem.covariance)
+        estimates = subsystem.estimates
         parameters |= estimates
         chosen = subsystem.verdict.chosen
         if chosen is not None:
@@ -283,14 +289,12 @@ def _diagnose_subsystem(
         for item in selection.candidates
     }
     first = claim(selection.collect_evidence(changes))
-    final, covariance = _fit_all(all_data, base, selection.choose(first), hypotheses, log)
-    chosen, doubts = selection.choose(first), {}
-    if chosen is not None:
-        estimates = compute_estimates(data, final, covariance)
-        doubts = {chosen: describe_doubts(chosen.hypotheses, estimates)}
+    chosen = selection.choose(first)
+    final, estimates = _fit_all(all_data, base, chosen, hypotheses, log)
+    doubts = {} if chosen is None else {chosen: describe_doubts(chosen.hypotheses, estimates)}
     verdict = Verdict(claim(selection.collect_evidence(changes, doubts)), selection)
     if verdict.chosen is not chosen:
-        final, covariance = _fit_all(all_data, base, verdict.chosen, hypotheses, log)
+        final, estimates = _fit_all(all_data, base, verdict.chosen, hypotheses, log)
     gains: dict[str, HeldOutGain | None] = {
         item.label: log.attempt(
             "held-out gain", compute_held_out_gain, None, problem, held_out, base.point, item.fit.point, seed
@@ -305,7 +309,7 @@ def _diagnose_subsystem(
         base,
         verdict,
         final,
-        covariance,
+        estimates,
         None if verdict.chosen is None else gains[verdict.chosen.label],
         judge_candidates(verdict, reductions),
         list_rivals(verdict, reductions),
@@ -330,8 +334,8 @@ def _fit_all(
     chosen: RefittedCandidate | None,
     hypotheses: list[Hypothesis],
     log: SearchLog,
-) -> tuple[ModelFit, FloatArray]:
-    """Return the chosen model fitted to all runs, the nominal one if there is none, and its covariance."""
+) -> tuple[ModelFit, dict[str, Estimate]]:
+    """Return the chosen model fitted to all runs, the nominal one if there is none, and its parameters."""
     log.on_progress("fitting all runs")
     start = base if chosen is None else chosen.fit
     final = fit(problem, start.point, start.free, iterations=6)
@@ -342,7 +346,8 @@ def _fit_all(
     covariance = log.attempt(
         "intervals beside other forms", compute_covariance, final.covariance, problem, final, named, hypotheses
     )
-    return final, covariance
+    estimates = compute_estimates(problem.data, final, covariance)
+    return final, log.attempt("smallest sizes of effects", limit_sizes, estimates, problem, final, named, estimates)
 
 
 def _revise_noise(

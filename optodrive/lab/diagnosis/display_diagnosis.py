@@ -63,6 +63,10 @@ class PixelSpread:
         return cls(float(np.median(values)), min(values), max(values), unit)
 
 
+NOMINAL = ("none", "instrument", "undecided")
+"""Verdicts with which a pixel keeps the nominal model."""
+
+
 @dataclass(frozen=True, eq=False)
 class PixelGroup:
     """Pixels with the same verdict and causes.
@@ -120,21 +124,21 @@ class DisplayAnswer:
     def build_model(self) -> tuple[Discrepancy | None, float | None, str]:
         """Return one pixel model of the display, its bridge width and its description, or None, None and the reason.
 
-        The model has the medians over the largest group, provided that it holds more than half of all pixels and has a
-        definite verdict.
+        The model has the medians over the largest group, provided that it holds more than half of all pixels and names
+        a cause or none; all pixels of which no error was found are one group.
         """
         groups = self.build_groups()
-        largest = groups[0] if groups else None
-        if largest is None or 2 * len(largest.answers) <= len(self.pixels):
+        nominal = [item for group in groups if group.verdict in NOMINAL for item in group.answers]
+        answers = max([nominal, *(list(group.answers) for group in groups)], key=len)
+        if 2 * len(answers) <= len(self.pixels):
             return None, None, "no set of causes holds for most pixels"
-        if largest.verdict not in ("none", "instrument", "cause"):
-            return None, None, f"most pixels are {largest.verdict}"
-        widths_m = {item.width_m for item in largest.answers}
+        verdict = answers[0].discrepancy.verdict if answers[0].discrepancy is not None else ""
+        if verdict not in (*NOMINAL, "cause"):
+            return None, None, f"most pixels are {verdict}"
+        widths_m = {item.width_m for item in answers}
         if len(widths_m) > 1:
             return None, None, "the bridge widths of the pixels differ"
-        discrepancies = [
-            item.discrepancy for item in largest.answers if item.discrepancy is not None and item.discrepancy.base
-        ]
+        discrepancies = [item.discrepancy for item in answers if item.discrepancy is not None and item.discrepancy.base]
         first = discrepancies[0]
         base = {name: _compute_median(item.base[name] for item in discrepancies) for name in first.base}
         terms = {

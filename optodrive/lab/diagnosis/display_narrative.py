@@ -7,6 +7,7 @@ from typing import Any
 from optodrive.core.quantity import format_quantity
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer, PixelGroup, PixelSpread
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+from optodrive.lab.inference.claim import WORST_FIRST
 from optodrive.physics.terms import discover_terms
 
 MAX_ERRORS = 6
@@ -120,7 +121,7 @@ def format_ranges(pixels: list[int]) -> str:
 def build_display_answer(answer: DisplayAnswer) -> dict[str, Any]:
     """Return JSON values: a summary, and per pixel index the same answer as for a recording of that pixel only."""
     model, _, reason = answer.build_model()
-    verdicts = ("none", "cause", "ambiguous", "unexplained", "instrument", "incomplete")
+    verdicts = WORST_FIRST[::-1]
     return {
         "summary": {
             "pixels": len(answer.pixels),

@@ -1,6 +1,7 @@
 """Fitted parameters with their intervals, and the doubts that these leave about a named cause."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from math import exp
 
 import numpy as np
@@ -10,11 +11,13 @@ from optodrive.core.quantity import format_range
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import Estimate
 from optodrive.lab.diagnosis.dataset import Dataset
-from optodrive.lab.diagnosis.fitting import ModelFit
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.noise_certainty import count_noise_degrees
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
+PROFILE_STEPS, PROFILE_ITERATIONS = 5, 10
+"""Halvings by which the smallest size of an effect is found, and iterations of the fit beside each."""
 LIMIT_SHARE = 1e-3
 """A fitted number within this share of a limit of its range counts as at the limit."""
 
@@ -43,6 +46,44 @@ def compute_estimates(data: Dataset, final: ModelFit, covariance: FloatArray) ->
     return out
 
 
+def limit_sizes(
+    problem: FitProblem, final: ModelFit, hypotheses: Iterable[Hypothesis], estimates: dict[str, Estimate]
+) -> dict[str, Estimate]:
+    """Return the estimates, with the intervals of sizes that seem to contain no effect by their profile likelihood.
+
+    An effect of several shapes has sizes and shapes that trade against each other, and an interval from the curvature
+    at the best fit then reaches no effect though no shape fits without it.
+    """
+    out, limit = dict(estimates), final.chi2 + float(stdtrit(count_noise_degrees(problem.data), 0.975)) ** 2
+    for item in hypotheses:
+        for free in _list_sizes(item):
+            name = f"{free.key}.{free.names[0]}"
+            if _describe_doubt(free, estimates[name]):
+                low, high = estimates[name].low, estimates[name].high
+                nearest = _find_size_bound(problem, final, free, limit)
+                ends = (low, nearest) if estimates[name].value < 0.0 else (nearest, high)
+                out |= {
+                    f"{free.key}.{each}": replace(estimates[name], low=ends[0], high=ends[1]) for each in free.names
+                }
+    return out
+
+
+def _find_size_bound(problem: FitProblem, final: ModelFit, free: FreeParameter, limit: float) -> float:
+    """Return the size towards no effect that all other numbers, fitted beside it, do not bring below this χ²."""
+    others = [item for item in final.free if item != free]
+    value, absent = free.read_value(final.point.terms), free.limits[0] if free.logarithmic else 0.0
+    excluded, kept = 0.0, 1.0
+    for _ in range(PROFILE_STEPS):
+        share = 0.5 * (excluded + kept)
+        terms = free.with_value(final.point.terms, absent + share * (value - absent))
+        if fit(problem, replace(final.point, terms=terms), others, PROFILE_ITERATIONS).chi2 > limit:
+            excluded = share
+        else:
+            kept = share
+    number = absent + excluded * (value - absent)
+    return exp(number) if free.logarithmic else number
+
+
 def is_at_limit(final: ModelFit, free: FreeParameter) -> bool:
     """Return whether a fitted number that is no shape lies at a limit of its range other than zero."""
     value, item = final.point.terms[free.key][free.names[0]], free.parameter
@@ -58,8 +99,7 @@ def describe_doubts(hypotheses: Iterable[Hypothesis], estimates: dict[str, Estim
     """
     doubts = {}
     for item in hypotheses:
-        sizes = item.free if item.is_linear else item.free[:1]
-        clauses = [_describe_doubt(free, estimates[f"{free.key}.{free.names[0]}"]) for free in sizes]
+        clauses = [_describe_doubt(free, estimates[f"{free.key}.{free.names[0]}"]) for free in _list_sizes(item)]
         if all(clauses):
             doubts[item.key] = " and ".join(clauses)
     return doubts
@@ -74,6 +114,10 @@ def describe_limits(hypotheses: Iterable[Hypothesis], estimates: dict[str, Estim
             places = "lies at a limit of its plausible range" if len(ended) == 1 else "lie at limits of their ranges"
             doubts[item.key] = f"{' and '.join(ended)} {places}"
     return doubts
+
+
+def _list_sizes(item: Hypothesis) -> tuple[FreeParameter, ...]:
+    return item.free if item.is_linear else item.free[:1]
 
 
 def _ends_at_limit(free: FreeParameter, estimate: Estimate) -> bool:

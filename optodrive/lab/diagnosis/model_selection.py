@@ -20,7 +20,7 @@ that cannot be computed is recorded in the log with its reason.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import log, log1p, prod
 
 import numpy as np
@@ -73,7 +73,7 @@ class Selection:
     """The explanations of a subsystem, compared.
 
     candidates: refits, most probable first; shares: of the excess that each explains alone and with other forms of its
-    effect, where examined; nominal_detection: beside the nominal fit; nominal_chi2: of that fit
+    effect, where examined; twins as in `Evidence`; nominal_detection: beside the nominal fit; nominal_chi2: of that fit
     """
 
     probabilities: Probabilities
@@ -82,6 +82,7 @@ class Selection:
     nominal_detection: Detection
     nominal_chi2: float
     has_repeats: bool
+    twins: Mapping[str, str] = field(default_factory=dict)
     repeats_differ: bool = False
 
     def collect_evidence(
@@ -99,7 +100,7 @@ class Selection:
             )
             for item in self.candidates
         )
-        return Evidence(self.probabilities, alternatives, self.has_repeats, self.repeats_differ)
+        return Evidence(self.probabilities, alternatives, self.twins, self.has_repeats, self.repeats_differ)
 
     def choose(self, claimed: Claim) -> RefittedCandidate | None:
         """Return the model for all later steps: that of the first set which the claim names."""
@@ -230,7 +231,17 @@ def compare_from_single_causes(
         best.setdefault(tuple(sorted(item.causes)), item)
     candidates = tuple(best[keys] for keys, _ in probabilities.ranked if keys in best)
     shares = {item: (rest.explained, rest.explained_with_forms) for item, rest in examined.items()}
-    return Selection(probabilities, candidates, shares, nominal_detection, base.chi2, problem.noise.from_replicates)
+    has_repeats, twins = problem.noise.from_replicates, _pair_twins(hypotheses)
+    return Selection(probabilities, candidates, shares, nominal_detection, base.chi2, has_repeats, twins)
+
+
+def _pair_twins(hypotheses: list[Hypothesis]) -> dict[str, str]:
+    """Return each of the causes sought by its twin, both ways."""
+    keys = {item.key for item in hypotheses}
+    # A twin in the gas shows in displacement and force; the same instrument term in the thermometer alone is none.
+    acting = {item.key for item in hypotheses if {"displacement", "force"}.intersection(item.free[0].names)}
+    pairs = [(key, twin) for key in acting if (twin := discover_terms()[key].twin) in keys]
+    return {first: second for pair in pairs for first, second in (pair, pair[::-1])}
 
 
 def select_near(base: ModelFit, ranked: list[RefittedCandidate]) -> list[RefittedCandidate]:

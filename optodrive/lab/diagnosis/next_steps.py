@@ -49,7 +49,7 @@ def list_next_steps(
         steps.append(_step("Complete the steps by the measured angles; plan with the result (--mirrors).", *servo))
     if "clock_offset" in discrepancy.causes:
         steps.append(_correct_clock(discrepancy, recordings, out, display))
-    changes_plans = any(not discover_terms()[key].is_instrument for key in discrepancy.causes)
+    changes_plans = any(_changes_plans(key) for key in discrepancy.causes)
     is_nominal = discrepancy.verdict in ("none", "instrument")
     if discrepancy.base and discrepancy.verdict != "unexplained" and (changes_plans or is_nominal):
         steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", model, *display))
@@ -58,6 +58,12 @@ def list_next_steps(
             steps.append(_step("See what the effect does to heights planned without it.", *simulate))
         steps.append(_step("Serve the display with it.", "serve", "--model", model, *display))
     return steps
+
+
+def _changes_plans(key: str) -> bool:
+    """Return whether a term acts in the pixel, rather than in an instrument or in the mirrors."""
+    kernels = discover_terms()[key].kernels._replace(sensor_reading=None, sensor_lag=None, force=None)
+    return any(hook is not None for hook in kernels)
 
 
 def _correct_clock(discrepancy: Discrepancy, recordings: Sequence[str], out: str, display: Sequence[str]) -> NextStep:

@@ -87,12 +87,13 @@ class Alternative:
 class Evidence:
     """Evidence from a recording or a part of it.
 
-    alternatives: the fitted sets of causes, most probable first; has_repeats: whether the noise is known;
-    repeats_differ: by more than noise
+    alternatives: the fitted sets of causes, most probable first; twins: causes by those that nothing in this recording
+    tells from them, both ways; has_repeats: whether the noise is known; repeats_differ: by more than noise
     """
 
     probabilities: Probabilities
     alternatives: tuple[Alternative, ...]
+    twins: Mapping[str, str] = field(default_factory=dict)
     has_repeats: bool = True
     repeats_differ: bool = False
 
@@ -131,7 +132,15 @@ def claim(evidence: Evidence) -> Claim:
     if certain is None:
         return Claim("ambiguous", sets, reasons)
     doubts = _list_doubts(certain)
-    return Claim("ambiguous" if doubts else "cause", sets, doubts)
+    twins = _list_twins(certain.causes, evidence.twins)
+    reasons = (*doubts, *(f"No recording of this kind tells {key} from {twin}." for key, twin in twins.items()))
+    sets = (certain.causes, *(tuple(twins.get(key, key) for key in certain.causes) for _ in twins))
+    return Claim("ambiguous" if reasons else "cause", sets, reasons)
+
+
+def _list_twins(causes: Causes, twins: Mapping[str, str]) -> dict[str, str]:
+    """Return the twins of these causes, but for those that are among them."""
+    return {key: twins[key] for key in causes if key in twins and twins[key] not in causes}
 
 
 def combine_claims(claims: Sequence[Claim], failures: Mapping[str, str], has_disturbances: bool) -> Claim:

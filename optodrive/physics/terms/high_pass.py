@@ -25,6 +25,7 @@ class HighPass(Term):
     cannot_add_heat = True
     signature = "a signal that falls while the drive is held, and undershoots after it"
     removes_zero = True
+    twin = "gas_leak"
     remedy = "couple the input DC, state coupling = DC in the runs and record again: what remains is the pixel."
 
     def record(self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray) -> FloatArray:

@@ -76,6 +76,13 @@ def test_without_repeats_nothing_is_certain():
     assert claim(replace(make_evidence(), repeats_differ=True)).verdict == "unexplained"
 
 
+def test_a_cause_with_a_twin_is_never_alone():
+    twins = {"gas_leak": "high_pass", "high_pass": "gas_leak"}
+    found = claim(replace(make_evidence(), twins=twins))
+    assert (found.verdict, found.sets) == ("ambiguous", (("gas_leak",), ("high_pass",)))
+    assert "tells gas_leak from high_pass" in found.reasons[0]
+
+
 def test_sets_that_explain_little_leave_an_ambiguity():
     evidence = make_evidence(0.8)
     assert claim(evidence).sets == (("gas_leak",), ("laser_droop",))
@@ -111,7 +118,7 @@ def draw_evidence(draw):
         )
         for keys in sorted(sets, key=lambda keys: -probabilities.causes[tuple(sorted(keys))])
     )
-    return Evidence(probabilities, alternatives, draw(st.booleans()), draw(st.integers(0, 9)) == 0)
+    return Evidence(probabilities, alternatives, {}, draw(st.booleans()), draw(st.integers(0, 9)) == 0)
 
 
 @given(draw_evidence())
