@@ -163,7 +163,7 @@ def _is_reached_fast(t_s: FloatArray, value: FloatArray, is_tie: BoolArray, quan
         return False
     dt_s = float(np.median(np.diff(t_s)))
     slow_s, usual_s = float(t_s[at] - t_s[last]), float(t_s[last] - t_s[second])
-    return slow_s <= SLOWING * usual_s + 1.5 * dt_s and length * dt_s >= 5.0 * slow_s
+    return slow_s <= SLOWING * usual_s + 2.5 * dt_s and length * dt_s >= 5.0 * slow_s
 
 
 def select_near_ceiling(value: FloatArray, ceiling: float) -> BoolArray:
