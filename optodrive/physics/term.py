@@ -229,14 +229,14 @@ class Term:
         free = tuple(self.free(name) for name in grid)
         return [Hypothesis(self.key, self.key, starts, free, self.is_linear, self.fit_every_start)]
 
-    def build_hypotheses_by_signal(self, scope: RecordingScope, start: float) -> list[Hypothesis]:
+    def build_hypotheses_by_signal(self, scope: RecordingScope, *starts: float) -> list[Hypothesis]:
         """Return the hypotheses of one number for all signals and of one for each, of a term with one per signal."""
         names = tuple(item.name for item in self.parameters)
         return [
             Hypothesis(
                 self.key,
                 f"{self.key} of {describe_signals(acting)}",
-                (dict.fromkeys(names, 0.0) | dict.fromkeys(acting, start),),
+                tuple(dict.fromkeys(names, 0.0) | dict.fromkeys(acting, start) for start in starts),
                 (self.free(*acting),),
                 is_linear=True,
             )

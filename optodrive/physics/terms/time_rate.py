@@ -3,7 +3,8 @@
 from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
 from optodrive.physics.term import BySignal, Term, TermValues
 
-START = 2e-3
+START, LARGE = 2e-3, 1e-2
+"""Rates from which a search begins; edges at the end of a train move by more than their width at the large ones."""
 
 
 class TimeRate(Term):
@@ -29,7 +30,7 @@ class TimeRate(Term):
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
         """Return a common rate of all clocks and, for a recording of several signals, one rate per signal."""
-        return self.build_hypotheses_by_signal(scope, START)
+        return self.build_hypotheses_by_signal(scope, START, LARGE, -LARGE)
 
 
 TERM = TimeRate()
