@@ -99,7 +99,7 @@ def _find_largest_hop(
     ]
     steps = [(*_measure_step(block, residual[block.part], time_s), block) for block in members]
     first, size, block = max(steps, key=lambda step: abs(step[1]))
-    return (block, first, size, score) if size else None
+    return (block, first, size, score) if abs(size) > find_resolution(data, item.kind) else None
 
 
 @dataclass(frozen=True, eq=False)
