@@ -198,12 +198,12 @@ class World:
 
     def __init__(self, seed):
         rng = self.rng = random.Random(seed)
-        self.rng_of_caps = random.Random(seed)
+        self.rng_of_caps = random.Random(seed)  # apart, so that the other draws of a seed stay what they are
         self.board_s, self.state, self.fault, self.link, self.silence_s = 100.0, "DISARMED", None, "up", 0.02
         self.inputs, self.is_paused, self.has_planner = SAFE_INPUTS, False, True
         self.laser_on_s, self.total, self.number = 3.0, 0, 0
         self.stages = rng.choice([0, 0, 2, 3])
-        self.hot_for_s = rng.choice([None, None, 59.0, 700.0])
+        self.hot_for_s = self.rng_of_caps.choice([None, None, 59.0, 700.0])
         self.plans, self.executed, self.upcoming = [], [], []
         self.page, self.caps, self.fingers, self.tracker = [], [], [], "none"
         self.height = self.absorber = self.peak = self.hottest = np.zeros(PIXELS)

@@ -72,6 +72,7 @@ SCENARIOS = {
     "plug-ins": (write_checkout, ["docs/how-to/add-a-pattern.md:Patterns of your own"]),
     "fits": (write_checkout, ["docs/how-to/show-stimuli.md:Whether it fits"]),
     "refusals": (write_recordings, ["docs/reference/recordings.md:Refusals"]),
+    "unusable": (write_recordings, ["docs/reference/recordings.md:What cannot be used"]),
     "quickstart": (write_checkout, ["docs/tutorials/quickstart.md:Quickstart"]),
     "configuration": (write_checkout, ["docs/how-to/write-a-configuration.md:A new one"]),
     "client": (write_checkout, ["docs/how-to/use-the-python-client.md:Python client"]),

@@ -181,7 +181,13 @@ class Daemon:
         environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(runtime or folder)}
         with self.errors.open("a") as errors:
             self.process = (subprocess.Popen if is_fresh else start_process)(
-                [OPTODRIVE, "serve", "--config", self.config, "--port", "0", *options],
+                [
+                    OPTODRIVE,
+                    "serve",
+                    "--config",
+                    self.config,
+                    *(options if "--port" in options else ("--port", "0", *options)),
+                ],
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env=environment,
