@@ -128,7 +128,7 @@ def simulate(
         else [compute_pixel_trace(true_display, incident, pixel, dt, post_pulse_s) for pixel in recorded]
     )
     if out is not None:
-        record_traces(out, display, executed, traces, instruments)
+        record_traces(out, display, executed, traces, instruments, true_terms)
     report = _build_report(display, planned_sequence, feasibility, incident, traces, true_display)
     report["truth"] = {"terms": true_terms, "ignored_terms": ignored_terms}
     report |= {"noise": None if out is None else noise, "repeats": repeats, "group": group}

@@ -8,6 +8,8 @@ from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from optodrive.core.types.measurements import PixelTrace, Run
     from optodrive.core.types.plans import ExecutedPulses
     from optodrive.planning.display_model import DisplayModel
@@ -62,15 +64,21 @@ def record_traces(
     executed: "ExecutedPulses",
     traces: "list[PixelTrace]",
     instruments: InstrumentSettings,
+    true_terms: "Sequence[str]",
 ) -> None:
-    """Write one recording with a run per pixel and repeat, each with the pulses during the pixel's trace."""
+    """Write one recording with a run per pixel and repeat, each with the pulses during the pixel's trace.
+
+    true_terms: of the simulated display and its instruments
+    """
     import numpy as np
 
     from optodrive.core.types.measurements import Measurement
     from optodrive.device.pixel_map import load_pixel_map
     from optodrive.lab.recording import write_recording
     from optodrive.link.simulator.instruments import measure
+    from optodrive.physics.terms import all_terms
 
+    coupling = "AC" if any(all_terms()[key].removes_zero for key in true_terms) else "DC"
     pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
     pixel_map, rng = load_pixel_map(display.config), np.random.default_rng(instruments.seed)
     aim_m = None if pixel_map is None else np.array([pixel_map.offset_x_m, pixel_map.offset_y_m])
@@ -82,16 +90,16 @@ def record_traces(
             measured = measure(item, pulses[within], display.ambient_k, width_m, instruments.noise, rng, aim_m).runs
             pixels = item.pixel.tolist()
             runs += [
-                _label_run(run, repeat, instruments, instruments.name_group(pixel, pixel_count))
+                _label_run(run, repeat, instruments, instruments.name_group(pixel, pixel_count), coupling)
                 for run, pixel in zip(measured, pixels, strict=True)
             ]
     write_recording(out, Measurement(tuple(runs)))
 
 
-def _label_run(run: "Run", repeat: int, instruments: InstrumentSettings, group: str | None) -> "Run":
-    """Return the run with the name of its repeat and with its group."""
+def _label_run(run: "Run", repeat: int, instruments: InstrumentSettings, group: str | None, coupling: str) -> "Run":
+    """Return the run with the name of its repeat, with its group and with the coupling of its instruments."""
     name = run.name if instruments.repeats == 1 else f"{run.name}-repeat-{repeat + 1}"
-    attributes = run.attributes if group is None else run.attributes | {"group": group}
+    attributes = run.attributes | {"coupling": coupling} | ({} if group is None else {"group": group})
     return replace(run, name=name, attributes=attributes)
 
 

@@ -50,7 +50,7 @@ def test_no_step_that_is_optional_takes_the_verdict_along(monkeypatch):
 def test_neither_does_the_search_for_an_unknown_term(monkeypatch, tmp_path):
     monkeypatch.setattr(pixel_discovery, "discover_in_pixel", fail)
     write_folder(tmp_path, lab(3, DROOP).runs, "")
-    output = _diagnose_jointly([tmp_path], None, "droop", 0, None, None, Provenance.capture([], [], None), True)
+    output = _diagnose_jointly([tmp_path], None, "droop", 0, None, None, Provenance.capture([], [], None), True, ())
     assert (output.document["verdict"], output.document["discovery"]) == ("cause", None)
     step = "the search for a term that no catalogue holds"
     assert output.document["omissions"] == {step: "LinAlgError: Singular matrix"}

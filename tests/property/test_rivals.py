@@ -11,8 +11,9 @@ from optodrive.lab.diagnosis import candidate_judgement
 from optodrive.lab.diagnosis.candidate_judgement import NOISE_CHI2, judge_candidates
 from optodrive.lab.diagnosis.detection import Detection, Score
 from optodrive.lab.diagnosis.evidence import Explanation, compute_probabilities, compute_score_evidence
-from optodrive.lab.diagnosis.model_selection import Verdict
+from optodrive.lab.diagnosis.model_selection import Selection, Verdict
 from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES
+from optodrive.lab.inference.claim import Claim
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -55,10 +56,9 @@ def judge(chi2, occam, refitted, noise_degrees, nominal_chi2=1e5):
         Score(item, {}, nominal_chi2 - fits[key], (1.0,), (0,), 1.0, 1.0) for key, item in hypotheses.items()
     )
     ranked = [keys[0] for keys, _ in found.ranked if refitted[KEYS.index(keys[0])]]
-    refits = tuple(SimpleNamespace(hypotheses=(hypotheses[key],), chi2=fits[key]) for key in ranked)
+    refits = tuple(SimpleNamespace(causes=(key,), hypotheses=(hypotheses[key],), chi2=fits[key]) for key in ranked)
     detection = Detection(scores, SimpleNamespace(), 0.0)
-    chosen = SimpleNamespace(hypotheses=())
-    verdict = Verdict("ambiguous", (), found, chosen, refits, detection, nominal_chi2)
+    verdict = Verdict(Claim("ambiguous"), Selection(found, refits, {}, detection, nominal_chi2, True))
     return {item.cause: item.verdict for item in judge_candidates(verdict, {})}, found
 
 
@@ -100,7 +100,8 @@ def test_a_rival_far_behind_is_ruled_out(is_refitted):
 def test_nothing_is_ruled_out_where_nothing_could_be_compared():
     found = Probabilities(0.005, 0.995, dict.fromkeys([(KEYS[0],)], 0.0))
     score = Score(Hypothesis(KEYS[0], KEYS[0], ({},), ()), {}, 500.0, (1.0,), (0,), 1.0, 1.0)
-    verdict = Verdict("unexplained", (), found, None, (), Detection((score,), SimpleNamespace(), 0.0), 1e5)
+    selection = Selection(found, (), {}, Detection((score,), SimpleNamespace(), 0.0), 1e5, True)
+    verdict = Verdict(Claim("unexplained"), selection)
     assert judge_candidates(verdict, {})[0].verdict == "possible"
 
 

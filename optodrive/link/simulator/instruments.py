@@ -40,7 +40,7 @@ def measure(
             )
             for name, values in exact.items()
         }
-        attributes: dict[str, str | float] = {"bridge_width_m": bridge_width_m, "sample": "simulated", "coupling": "DC"}
+        attributes: dict[str, str | float] = {"bridge_width_m": bridge_width_m, "sample": "simulated"}
         if aim_m is not None:
             attributes |= {"aim_x_m": float(aim_m[0, pixel]), "aim_y_m": float(aim_m[1, pixel])}
         runs.append(Run(f"pixel-{pixel}", ambient_k, pulses, signals, attributes))

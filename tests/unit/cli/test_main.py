@@ -5,6 +5,7 @@ import termios
 from importlib.metadata import version
 
 import pytest
+import typer
 
 from optodrive.cli import commands
 from optodrive.cli.main import run
@@ -61,9 +62,13 @@ def test_patterns_are_listed_with_their_bounds_and_units(capsys):
 
 
 def test_an_error_of_a_terminal_is_one_line(monkeypatch, capfd):
-    def fail(**options):
+    app = typer.Typer()
+
+    @app.command()
+    def status():
         raise termios.error(5, "Input/output error")
 
-    monkeypatch.setattr(commands, "build_app", lambda command: fail)
+    app.callback()(lambda: None)
+    monkeypatch.setattr(commands, "build_app", lambda command: app)
     assert commands.run_command(["status"], None) == 1
     assert capfd.readouterr().err == "optodrive: (5, 'Input/output error')\n"
