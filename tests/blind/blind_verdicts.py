@@ -226,7 +226,7 @@ def _judge_verdict(verdict, causes, hidden, names, near, twins, *, named: bool, 
     if verdict == "ambiguous":
         if hidden <= causes and (hidden or causes & names):
             return ("right", "in its set") if len(false - twins) <= 1 else ("allowed", f"in a set of {len(causes)}")
-        if causes <= near | INSTRUMENT_TERMS:
+        if causes <= near | INSTRUMENT_TERMS or (causes & names and causes <= near | twins):
             return "allowed", "suspects instruments"
         return "missed", "suspects " + "+".join(sorted(causes - near))
     if verdict == "unexplained":

@@ -136,6 +136,8 @@ ANSWERS = [
     ("time_rate", (), "none", [], "", "allowed"),
     ("high_pass", (), "ambiguous", ["gas_leak", "high_pass"], "", "right"),
     ("high_pass", (), "cause", ["gas_leak"], "", "wrong"),
+    ("high_pass", (), "ambiguous", ["gas_leak"], "", "missed"),
+    ("high_pass", ("radiation",), "ambiguous", ["gas_leak", "high_pass"], "", "allowed"),
     ("high_pass", ("gas_leak",), "cause", ["gas_leak"], "", "right"),
     ("quantised", (), "none", [], "", "right"),
     ("quantised", (), "undecided", [], "", "allowed"),
