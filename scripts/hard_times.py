@@ -75,13 +75,13 @@ def freeze(pid, duration_s):
             libc.ptrace(PTRACE_INTERRUPT, thread, None, None)
             frozen.append(thread)
     signals = {}
-    for thread in frozen:
+    for thread in reversed(frozen):  # the first thread of a process that was killed ends last
         with suppress(ChildProcessError):
             _, status = os.waitpid(thread, WALL)
             if os.WIFSTOPPED(status):  # a signal that arrived first is handed on at the end
                 signals[thread] = 0 if status >> 16 == EVENT_STOP else os.WSTOPSIG(status)
     time.sleep(duration_s)
-    for thread, number in reversed(signals.items()):  # the first thread ends last
+    for thread, number in signals.items():
         if libc.ptrace(PTRACE_DETACH, thread, None, number) != 0:  # killed meanwhile: its parent waits for this wait
             with suppress(ChildProcessError):
                 os.waitpid(thread, WALL)

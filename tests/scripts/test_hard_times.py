@@ -26,6 +26,9 @@ hard_times.time.sleep = lambda _: sys.stdin.read()
 hard_times.freeze(int(sys.argv[1]), 0.3)
 """
 
+LATE = "os.waitpid = lambda *arguments: (sys.stdin.read(), wait(*arguments))[1]"
+"""Waits for a thread only after its standard input has ended."""
+
 
 def read_states(process):
     """Return the states of a process's threads: t of a frozen one, T of a suspended one."""
@@ -85,6 +88,15 @@ def test_a_frozen_process_can_be_killed(frozen):
     process.kill()
     release()
     assert process.wait() == -signal.SIGKILL
+
+
+def test_a_process_that_is_killed_before_its_freeze_is_awaited_ends_it(process):
+    late = FREEZE.replace("import hard_times", "import os, hard_times\nwait = os.waitpid\n" + LATE, 1)
+    freezing = subprocess.Popen([sys.executable, "-c", late, str(process.pid)], stdin=subprocess.PIPE)
+    wait_for_states(process, {"t"})
+    process.kill()
+    freezing.stdin.close()
+    assert freezing.wait() == 0
 
 
 def test_the_status_is_that_of_the_command():
