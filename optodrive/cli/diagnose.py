@@ -247,8 +247,11 @@ def _diagnose_per_pixel(
 ) -> _DiagnosisOutput:
     """Diagnose many pixels independently."""
     from optodrive.cli.diagnose_display import diagnose_display
-    from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_display_narrative
-    from optodrive.lab.diagnosis.display_report import build_display_report
+    from optodrive.lab.diagnosis.display_report import (
+        build_display_answer,
+        build_display_narrative,
+        build_display_report,
+    )
     from optodrive.lab.diagnosis.model_file import build_model_toml
 
     announce_compilation()

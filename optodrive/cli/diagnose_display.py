@@ -29,6 +29,7 @@ def diagnose_display(
 
     Raises InputError where the diagnosis fails for every pixel.
     """
+    from optodrive.core.types.measurements import MIRRORS
     from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
     from optodrive.lab.diagnosis.display_diagnosis import (
         DisplayAnswer,
@@ -41,7 +42,7 @@ def diagnose_display(
     start_s = perf_counter()
     tasks = [PixelTask(item.pixel, item.read, seed, config, use) for item in runs.pixels]
     if runs.mirrors is not None:
-        tasks.append(PixelTask(None, runs.mirrors.read, seed, config, use))
+        tasks.append(PixelTask(MIRRORS, runs.mirrors.read, seed, config, use))
     if dask is None:
         compile_kernels()
     pixels: list[PixelAnswer] = []
@@ -52,12 +53,12 @@ def diagnose_display(
     ):
         for task, result, error in run_tasks(client, diagnose_pixel, tasks):
             answer = result or PixelAnswer(task.pixel, None, error)
-            if task.pixel is None:
+            if task.pixel == MIRRORS:
                 mirrors = answer
             else:
                 pixels.append(answer)
                 report_count(len(pixels))
-    pixels.sort(key=lambda item: item.pixel or 0)
+    pixels.sort(key=lambda item: item.pixel)
     if all(item.discrepancy is None for item in pixels):
         first = f"at least one; pixel {pixels[0].pixel}: {pixels[0].error}"
         raise InputError("diagnose", Unquoted(f"no answer for any of {len(pixels)} pixels"), first)

@@ -16,7 +16,7 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer
-from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_display_narrative, build_headline
+from optodrive.lab.diagnosis.display_report import build_display_answer, build_display_narrative, build_headline
 from optodrive.lab.diagnosis.estimates import describe_doubts
 from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative

@@ -12,7 +12,7 @@ from optodrive.lab.diagnosis import detection
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer
-from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_headline
+from optodrive.lab.diagnosis.display_report import build_display_answer, build_headline
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.report import build_report

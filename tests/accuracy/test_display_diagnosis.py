@@ -15,8 +15,12 @@ from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelTask, compile_kernels, diagnose_pixel
-from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_display_narrative, format_ranges
-from optodrive.lab.diagnosis.display_report import build_display_report
+from optodrive.lab.diagnosis.display_report import (
+    build_display_answer,
+    build_display_narrative,
+    build_display_report,
+    format_ranges,
+)
 from optodrive.lab.recording import DisplayRuns, read_recording, write_recording
 
 DROOP = {"laser_droop": {"share": 0.15, "time": 0.05, "spread": 1.0}}

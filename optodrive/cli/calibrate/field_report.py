@@ -79,25 +79,21 @@ def format_fit(stats: dict[str, Any], first_line: int) -> list[str]:
 
 
 def _write_report(path: Path, fit: "FieldFit", source: str, lines: list[str]) -> None:
+    from optodrive.core.document import Document, Figure, Markup, Section, Table
     from optodrive.core.files import write_text
-    from optodrive.core.html_page import render_page, render_table
     from optodrive.lab.calibration.fit_summary import draw_residuals, draw_sigma_map
 
-    geometry, width = fit.field.geometry._asdict(), fit.prior.sigma
-    rows = (
-        (escape(name), f"{value:.6g}", f"{sigma:.2g}")
-        for (name, value), sigma in zip(
-            geometry.items(), width * fit.covariance.diagonal()[: len(width)] ** 0.5, strict=True
-        )
-    )
-    body = [
-        f"<pre>{escape(chr(10).join(lines))}</pre>",
-        "<div class='grid'>",
-        f"<figure>{draw_residuals(fit)}<figcaption>Residual (measured minus fitted) by commanded position</figcaption>"
-        "</figure>",
-        f"<figure>{draw_sigma_map(fit)}<figcaption>Sigma of the beam position per axis</figcaption></figure>",
-        "</div>",
-        "<h2>Parameters</h2><p>Parameters are correlated: the field is better determined than its parameters.</p>",
-        render_table(("parameter", "value", "sigma"), rows, frozenset({1, 2}), "Parameters"),
+    sigmas = fit.prior.sigma * fit.covariance.diagonal()[: len(fit.prior.sigma)] ** 0.5
+    rows = [
+        (name, f"{value:.6g}", f"{sigma:.2g}")
+        for (name, value), sigma in zip(fit.field.geometry._asdict().items(), sigmas, strict=True)
     ]
-    write_text(path, render_page(f"Calibration from {source}", "field", ["Calibrated field"], body))
+    drawings = [
+        Figure(draw_residuals(fit), "Residual (measured minus fitted) by commanded position"),
+        Figure(draw_sigma_map(fit), "Sigma of the beam position per axis"),
+    ]
+    table = Table("Parameters", ("parameter", "value", "sigma"), rows, {1, 2})
+    hint = "Parameters are correlated: the field is better determined than its parameters."
+    fitted = Section("Fit", [Markup(f"<pre>{escape(chr(10).join(lines))}</pre>"), drawings])
+    body = [fitted, Section("Parameters", [hint, table])]
+    write_text(path, Document(f"Calibration from {source}", "field", ["Calibrated field"], body).to_html())

@@ -4,6 +4,9 @@ from dataclasses import dataclass, field
 
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 
+MIRRORS = -1
+"""Index of the mirrors where that of a pixel is asked for."""
+
 
 @dataclass(frozen=True, eq=False)
 class PixelTrace:

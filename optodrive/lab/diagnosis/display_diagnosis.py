@@ -23,12 +23,12 @@ MAX_JOINT_PIXELS = 4
 class PixelTask:
     """Diagnosis of one pixel, for any worker.
 
-    pixel: None for the mirrors
+    pixel: `MIRRORS` for the mirrors
     read: reads the pixel's runs
     use: kinds of findings of the inspection that leave nothing out
     """
 
-    pixel: int | None
+    pixel: int
     read: Callable[[], Measurement]
     seed: int = 0
     config: Config | None = None
@@ -39,10 +39,10 @@ class PixelTask:
 class PixelAnswer:
     """Diagnosis of one pixel without residual traces, or the error that prevented it.
 
-    width_m: if known
+    pixel: `MIRRORS` for the mirrors; width_m: if known
     """
 
-    pixel: int | None
+    pixel: int
     discrepancy: Discrepancy | None
     error: str = ""
     width_m: float | None = None
@@ -85,16 +85,12 @@ class PixelGroup:
     @property
     def doubtful(self) -> list[int]:
         """Indices of the pixels at which the size of a named cause is not established, sorted."""
-        return sorted(
-            item.pixel
-            for item in self.answers
-            if item.pixel is not None and item.discrepancy is not None and item.discrepancy.doubts
-        )
+        return sorted(item.pixel for item in self.answers if item.discrepancy is not None and item.discrepancy.doubts)
 
     @property
     def pixels(self) -> list[int]:
         """Pixel indices, sorted."""
-        return sorted(item.pixel for item in self.answers if item.pixel is not None)
+        return sorted(item.pixel for item in self.answers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +102,11 @@ class DisplayAnswer:
     elapsed_s: float
 
     @property
+    def discrepancies(self) -> list[Discrepancy]:
+        """Diagnoses of the pixels that have one."""
+        return [item.discrepancy for item in self.pixels if item.discrepancy is not None]
+
+    @property
     def failed(self) -> list[PixelAnswer]:
         """Answers that are errors."""
         return [item for item in self.pixels if item.discrepancy is None]
@@ -114,10 +115,8 @@ class DisplayAnswer:
         """Return the pixels grouped by verdict and causes, largest group first."""
         by_causes: dict[tuple[str, tuple[str, ...]], list[PixelAnswer]] = {}
         for item in self.pixels:
-            if item.discrepancy is not None:
-                by_causes.setdefault((item.discrepancy.verdict, tuple(sorted(item.discrepancy.causes))), []).append(
-                    item
-                )
+            if (found := item.discrepancy) is not None:
+                by_causes.setdefault((found.verdict, tuple(sorted(found.causes))), []).append(item)
         groups = [_build_group(*key, tuple(members)) for key, members in by_causes.items()]
         return sorted(groups, key=lambda item: (-len(item.answers), item.verdict, item.causes))
 

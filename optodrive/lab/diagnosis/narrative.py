@@ -1,17 +1,11 @@
 """Diagnosis as narrative text and as JSON."""
 
-from dataclasses import asdict
 from importlib.metadata import version
-from math import isfinite
 from typing import Any
 
+from optodrive.core.document import to_json
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.discrepancy import (
-    CandidateCause,
-    Discrepancy,
-    Estimate,
-    HeightError,
-)
+from optodrive.core.types.discrepancy import Discrepancy, Estimate, HeightError
 from optodrive.lab.inference.claim import NOTHING_FOUND, format_probability
 from optodrive.lab.inference.sentences import (
     describe_claim,
@@ -32,62 +26,64 @@ def _format_interval(item: Estimate) -> str:
     return f"{value} (95 %: {low} to {high})"
 
 
-def build_narrative(discrepancy: Discrepancy) -> list[str]:
+def build_narrative(found: Discrepancy) -> list[str]:
     """Return the lines of the narrative: headline, causes, gain, rejected causes, next experiment and remarks."""
-    lines = [*describe_claim(discrepancy, discover_terms()), *describe_omitted(discrepancy), ""]
-    if discrepancy.causes:
-        lines += [
-            f"- {discover_terms()[key].label} ({key}); visible in {discover_terms()[key].signature}."
-            for key in discrepancy.causes
-        ]
-        lines += [
-            f"  {name} = {_format_interval(item)}" for name, item in discrepancy.parameters.items() if "." in name
-        ]
+    terms = discover_terms()
+    lines = [*describe_claim(found, terms), *_describe_omitted(found), ""]
+    if found.causes:
+        lines += [f"- {terms[key].label} ({key}); visible in {terms[key].signature}." for key in found.causes]
+        lines += [f"  {name} = {_format_interval(item)}" for name, item in found.parameters.items() if "." in name]
         lines.append("")
-    lines += [f"{describe_disturbance(item)}; it was subtracted." for item in discrepancy.disturbances]
-    lines.append(describe_probabilities(discrepancy.probabilities))
-    if discrepancy.verdict in ("cause", "ambiguous"):
-        lines.append(f"This explains {discrepancy.explained_fraction:.1%} of the excess χ² of the nominal model.")
-    lines.append(_describe_height_error(discrepancy))
-    lines += _describe_locations(discrepancy)
-    lines += describe_gain(discrepancy.gain, discrepancy.verdict, len(discrepancy.held_out_runs))
-    lines += [f"To tell: {remedy}" for key in discrepancy.causes if (remedy := discover_terms()[key].remedy)]
-    if discrepancy.failures:
-        lines.append("Could not be computed, and may explain what was measured:")
-        lines += [f"- {label}: {reason}" for label, reason in discrepancy.failures.items()]
-    lines += [f"Left out, for it failed: {step} ({error})." for step, error in discrepancy.omissions.items()]
-    if discrepancy.verdict in NOTHING_FOUND:
-        lines += ["Detection limit of each effect:"]
-        lines += [f"- {item.label}: {item.detection_limit}" for item in _deduplicate_by_label(discrepancy.candidates)]
-    else:
-        ruled_out = [item for item in discrepancy.candidates if item.verdict == "ruled out"]
-        if ruled_out:
-            lines += ["Ruled out:"]
-            lines += [
-                f"- {item.label}, {format_probability(item.probability)} (alone it reduces χ² by {item.statistic:.0f})"
-                for item in ruled_out[:MAX_RULED_OUT]
-            ]
-        not_observable = [item.label for item in discrepancy.candidates if item.verdict == "not observable"]
-        if not_observable:
-            lines.append(f"Not observable in this data: {', '.join(not_observable)}.")
-    if discrepancy.verdict == "ambiguous" and len(discrepancy.causes) > 1 and discrepancy.next_experiment is None:
-        lines.append("No pulse or train, repeated up to 30 times, would separate them in any signal at this noise.")
-    if discrepancy.next_experiment is not None:
-        experiment = discrepancy.next_experiment
+    lines += [f"{describe_disturbance(item)}; it was subtracted." for item in found.disturbances]
+    lines.append(describe_probabilities(found.probabilities))
+    if found.verdict in ("cause", "ambiguous"):
+        lines.append(f"This explains {found.explained_fraction:.1%} of the excess χ² of the nominal model.")
+    lines.append(_describe_height_error(found))
+    lines += _describe_locations(found)
+    lines += describe_gain(found.gain, found.verdict, len(found.held_out_runs))
+    lines += [f"To tell: {remedy}" for key in found.causes if (remedy := terms[key].remedy)]
+    failures = [f"- {label}: {reason}" for label, reason in found.failures.items()]
+    lines += _list_under("Could not be computed, and may explain what was measured:", failures)
+    lines += [f"Left out, for it failed: {step} ({error})." for step, error in found.omissions.items()]
+    lines += _describe_candidates(found)
+    experiment = found.next_experiment
+    if experiment is not None:
         lines += [
             "",
             f"Measure next: {experiment.description}; about {experiment.lab_time_s:.0f} s in the lab, "
             f"χ² {experiment.separation:.0f} between them.",
         ]
-    lines += list(discrepancy.remarks)
-    return lines
+    elif found.verdict == "ambiguous" and len(found.causes) > 1:
+        lines.append("No pulse or train, repeated up to 30 times, would separate them in any signal at this noise.")
+    return [*lines, *found.remarks]
 
 
-def describe_omitted(discrepancy: Discrepancy) -> list[str]:
+def _list_under(heading: str, items: list[str]) -> list[str]:
+    return [heading, *items] if items else []
+
+
+def _describe_omitted(found: Discrepancy) -> list[str]:
     """Return the lines on data that the verdict does not rest on."""
-    omitted = [f"- {item.text}" for item in discrepancy.omitted_data]
-    failed = [f"- could not be inspected: {item}" for item in discrepancy.inspection_failures]
-    return ["Not used (--use KIND of diagnose uses it):", *omitted] * bool(omitted) + failed
+    omitted = [f"- {item.text}" for item in found.omitted_data]
+    failed = [f"- could not be inspected: {item}" for item in found.inspection_failures]
+    return _list_under("Not used (--use KIND of diagnose uses it):", omitted) + failed
+
+
+def _describe_candidates(found: Discrepancy) -> list[str]:
+    """Return the detection limits if no error was found, else the causes that are ruled out or not observable."""
+    if found.verdict in NOTHING_FOUND:
+        limits: dict[str, str] = {}
+        for item in found.candidates:
+            limits.setdefault(item.label, item.detection_limit)  # pixels come before mirrors
+        return ["Detection limit of each effect:", *(f"- {label}: {limits[label]}" for label in sorted(limits))]
+    ruled_out = [
+        f"- {item.label}, {format_probability(item.probability)} (alone it reduces χ² by {item.statistic:.0f})"
+        for item in found.candidates
+        if item.verdict == "ruled out"
+    ]
+    unseen = [item.label for item in found.candidates if item.verdict == "not observable"]
+    lines = _list_under("Ruled out:", ruled_out[:MAX_RULED_OUT])
+    return [*lines, f"Not observable in this data: {', '.join(unseen)}."] if unseen else lines
 
 
 def _describe_height_error(discrepancy: Discrepancy) -> str:
@@ -129,117 +125,45 @@ def _describe_locations(discrepancy: Discrepancy) -> list[str]:
     ]
 
 
-def _deduplicate_by_label(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
-    """Return the first candidate of each label, sorted. Pixels come before mirrors."""
-    first: dict[str, CandidateCause] = {}
-    for item in candidates:
-        first.setdefault(item.label, item)
-    return [first[label] for label in sorted(first)]
-
-
-def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
+def build_answer(found: Discrepancy) -> dict[str, Any]:
     """Return the diagnosis as JSON values."""
-    gain, experiment = discrepancy.gain, discrepancy.next_experiment
+    probabilities = found.probabilities
     return {
-        "verdict": discrepancy.verdict,
-        "causes": list(discrepancy.causes),
-        "reasons": list(discrepancy.reasons),
-        "disturbances": [
-            {
-                "signal": item.signal,
-                "form": item.form,
-                "size": item.size,
-                "unit": item.signal.rsplit("_", 1)[1],
-                "frequency_hz": item.frequency_hz,
-                "runs": item.runs,
-            }
-            for item in discrepancy.disturbances
-        ],
-        "data": [build_finding(item) for item in discrepancy.data_findings],
-        "omitted": [build_finding(item) for item in discrepancy.omitted_data],
-        "not_inspected": list(discrepancy.inspection_failures),
+        "verdict": found.verdict,
+        "causes": list(found.causes),
+        "reasons": list(found.reasons),
+        "disturbances": [to_json(item) | {"unit": item.signal.rsplit("_", 1)[1]} for item in found.disturbances],
+        "data": [build_finding(item) for item in found.data_findings],
+        "omitted": [build_finding(item) for item in found.omitted_data],
+        "not_inspected": list(found.inspection_failures),
         "probabilities": {
-            "no_effect": discrepancy.probabilities.no_effect,
-            "none_of_these": discrepancy.probabilities.none_of_these,
-            "causes": [
-                {"causes": list(keys), "probability": probability}
-                for keys, probability in discrepancy.probabilities.ranked
-            ],
+            "no_effect": probabilities.no_effect,
+            "none_of_these": probabilities.none_of_these,
+            "causes": [{"causes": list(keys), "probability": value} for keys, value in probabilities.ranked],
         },
         "parameters": {
             name: {"value": item.value, "unit": item.unit, "ci95": None if item.at_limit else [item.low, item.high]}
-            for name, item in discrepancy.parameters.items()
+            for name, item in found.parameters.items()
         },
-        "explained_fraction": discrepancy.explained_fraction,
-        "doubts": discrepancy.doubts,
-        "failures": discrepancy.failures,
-        "omissions": discrepancy.omissions,
+        "explained_fraction": found.explained_fraction,
+        "doubts": found.doubts,
+        "failures": found.failures,
+        "omissions": found.omissions,
         "height_error": {
-            "held_out": _height_error_to_json(discrepancy.height_error_held_out),
-            "fitted": _height_error_to_json(discrepancy.height_error_fitted),
+            "held_out": to_json(found.height_error_held_out),
+            "fitted": to_json(found.height_error_fitted),
         },
-        "gain": None
-        if gain is None
-        else {
-            "heldout_rmse_nominal": gain.nominal,
-            "heldout_rmse_extended": gain.extended,
-            "noise_floor": gain.noise_floor,
-            "reduction": gain.reduction,
-            "ci95": None if gain.interval is None else list(gain.interval),
-        },
-        "candidates": [
-            {
-                "cause": item.cause,
-                "hypothesis": item.label,
-                "statistic": item.statistic if isfinite(item.statistic) else None,
-                "probability": item.probability,
-                "heldout_gain": item.heldout_gain,
-                "verdict": item.verdict,
-                "detection_limit": item.detection_limit,
-            }
-            for item in discrepancy.candidates
-        ],
+        "gain": to_json(found.gain, nominal="heldout_rmse_nominal", extended="heldout_rmse_extended", interval="ci95"),
+        "candidates": to_json(found.candidates, label="hypothesis"),
         "rivals": [
-            {
-                "causes": list(item.causes),
-                "hypothesis": item.label,
-                "chi2_above_best": item.chi2,
-                "log_evidence": item.log_evidence,
-                "probability": item.probability,
-                "heldout_gain": item.heldout_gain,
-                "chosen": item.is_chosen,
-                "parameters": {name: {"value": value, "unit": unit} for name, (value, unit) in item.parameters.items()},
-            }
-            for item in discrepancy.rivals
+            to_json(item, label="hypothesis", chi2="chi2_above_best", is_chosen="chosen")
+            | {"parameters": {name: {"value": value, "unit": unit} for name, (value, unit) in item.parameters.items()}}
+            for item in found.rivals
         ],
-        "held_out": [
-            {
-                "group": item.group,
-                "signal": item.signal,
-                "runs": item.runs,
-                "rmse_nominal": item.nominal,
-                "rmse_extended": item.extended,
-                "noise_floor": item.noise_floor,
-            }
-            for item in discrepancy.held_out_errors
-        ],
-        "next_experiment": None
-        if experiment is None
-        else {
-            "description": experiment.description,
-            "pulses": experiment.pulses.tolist(),
-            "pixel": experiment.pixel,
-            "repeats": experiment.repeats,
-            "signals": list(experiment.signals),
-            "expected_separation": experiment.separation,
-            "duration_s": experiment.lab_time_s,
-        },
-        "runs": {"fitted": list(discrepancy.fitted_runs), "held_out": list(discrepancy.held_out_runs)},
-        "remarks": list(discrepancy.remarks),
-        "elapsed_s": discrepancy.elapsed_s,
+        "held_out": to_json(found.held_out_errors, nominal="rmse_nominal", extended="rmse_extended"),
+        "next_experiment": to_json(found.next_experiment, separation="expected_separation", lab_time_s="duration_s"),
+        "runs": {"fitted": list(found.fitted_runs), "held_out": list(found.held_out_runs)},
+        "remarks": list(found.remarks),
+        "elapsed_s": found.elapsed_s,
         "version": version("optodrive"),
     }
-
-
-def _height_error_to_json(error: HeightError | None) -> dict[str, Any] | None:
-    return None if error is None else asdict(error)

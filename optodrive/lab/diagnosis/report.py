@@ -1,17 +1,23 @@
-"""Diagnosis report: one self-contained HTML file built from the same data as the answer."""
+"""Diagnosis report: one self-contained HTML file built from the same data as the answer.
 
-from collections.abc import Iterator, Sequence
+It shows what the narrative states: what to run next, the probabilities, measured values beside the nominal and the
+extended model, their errors on planned heights and on held-out groups, and the evidence for each cause.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
-from math import isfinite
+from math import isfinite, log10
 
-from optodrive.core.html_page import render_page, render_table
+import numpy as np
+
+from optodrive.core.document import Document, Figure, Markup, Section, Table
 from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_number, format_quantity
-from optodrive.core.types.discrepancy import Discrepancy, Probabilities, ResidualTrace
+from optodrive.core.svg_plot import Axis, Series, draw_plot
+from optodrive.core.types.discrepancy import Discrepancy, ExampleTrace, Probabilities, ResidualTrace
 from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
 from optodrive.lab.diagnosis.narrative import build_narrative
 from optodrive.lab.diagnosis.next_steps import OUT, NextStep, list_next_steps
-from optodrive.lab.diagnosis.report_figures import draw_bar, draw_example, draw_residuals, draw_share
 from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.inference.claim import format_probability
 from optodrive.lab.inference.sentences import MIN_SHOWN
@@ -22,6 +28,16 @@ NAMED = ("identified", "indistinguishable")
 MEASURED = "<span class='key measured'>measured</span>"
 NOMINAL = "<span class='key nominal'>nominal model, refitted</span>"
 EXTENDED = "<span class='key extended'>extended model</span>"
+QUANTITIES = {
+    "absorber_temperature_K": "absorber above ambient",
+    "displacement_m": "displacement",
+    "force_N": "force",
+    "mirror_x_rad": "mirror x",
+    "mirror_y_rad": "mirror y",
+}
+TIME = Axis("time", "s")
+TRACE_HEIGHT, RESIDUAL_HEIGHT = 230, 150
+BAR_WIDTH, BAR_HEIGHT = 220, 26
 
 
 def build_report(
@@ -39,185 +55,234 @@ def build_report(
     sections: HTML that follows the probabilities
     """
     has_extension = bool(discrepancy.terms)
-    steps = SearchLog().attempt("next steps", list_next_steps, list[NextStep](), discrepancy, recordings, out, config)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
-    parts = [
+    steps = SearchLog().attempt("next steps", list_next_steps, list[NextStep](), discrepancy, recordings, out, config)
+    data = Markup("\n".join(build_section(discrepancy.data_findings, discrepancy.inspection_failures)))
+    body: list[Section | Markup] = [
         *_build_next_steps(steps),
-        *_build_probabilities(discrepancy.probabilities),
-        *sections,
-        "<h2>Measured against model</h2>",
-        f"<p>{MEASURED}, {models}. The nominal model has the R, C, τ<sub>g</sub>, κ and φ that fit these data best, "
-        "not those of a parameter set. Of each signal the run in which it is worst, and the median one; below, "
-        "measured minus model. The band is the noise of one sample, ± σ.</p>",
-        "<div class='grid'>",
-        *(draw_example(example, has_extension) for example in discrepancy.example_traces),
-        "</div>",
-        *_build_height_errors(discrepancy, has_extension),
-        *_build_held_out(discrepancy, models, has_extension),
-        "<h2>Evidence for each cause</h2>",
-        f"<p>Likelihood ratio against the nominal model, on a logarithmic scale. The dashed line is at "
-        f"{DETECTABLE_RATIO:g}: an effect of this ratio is detected nine times in ten.</p>",
-        _build_evidence_table(discrepancy),
+        _build_probabilities(discrepancy.probabilities),
+        *map(Markup, sections),
+        Section(
+            "Measured against model",
+            [
+                Markup(
+                    f"<p>{MEASURED}, {models}. The nominal model has the R, C, τ<sub>g</sub>, κ and φ that fit these "
+                    "data best, not those of a parameter set. Of each signal the run in which it is worst, and the "
+                    "median one; below, measured minus model. The band is the noise of one sample, ± σ.</p>"
+                ),
+                [draw_example(example, has_extension) for example in discrepancy.example_traces],
+            ],
+        ),
+        Section("Error of planned heights", _build_height_errors(discrepancy, has_extension)),
+        Section("Held-out groups", _build_held_out(discrepancy, models, has_extension)),
+        Section(
+            "Evidence for each cause",
+            [
+                "Likelihood ratio against the nominal model, on a logarithmic scale. The dashed line is at "
+                f"{DETECTABLE_RATIO:g}: an effect of this ratio is detected nine times in ten.",
+                _build_evidence_table(discrepancy),
+            ],
+        ),
         *_build_rivals(discrepancy),
-        "<h2>Parameters</h2>",
-        _build_parameter_table(discrepancy),
-        "<h2>Residuals by experiment</h2>",
-        f"<p>{models}; measured minus model in the first run of the groups with the largest residuals.</p>",
-        "<div class='grid'>",
-        *(draw_residuals(trace, has_extension) for trace in _select_traces(discrepancy.residual_traces)),
-        "</div>",
+        Section("Parameters", [_build_parameter_table(discrepancy)]),
+        Section(
+            "Residuals by experiment",
+            [
+                Markup(
+                    f"<p>{models}; measured minus model in the first run of the groups with the largest residuals.</p>"
+                ),
+                _draw_worst(discrepancy.residual_traces, has_extension),
+            ],
+        ),
     ]
-    data = [*build_section(discrepancy.data_findings, discrepancy.inspection_failures), "<h2>The answer</h2>"]
-    return render_page(title, discrepancy.verdict, build_narrative(discrepancy), parts, provenance, data)
+    opening: list[Section | Markup] = [data, Section("The answer", ())]
+    return Document(title, discrepancy.verdict, build_narrative(discrepancy), body, provenance, opening).to_html()
 
 
-def _build_probabilities(probabilities: Probabilities) -> list[str]:
+def _build_probabilities(probabilities: Probabilities) -> Section:
     """Return the section with the probability of every explanation above `MIN_SHOWN`, most probable first."""
     rows = [(" with ".join(keys), value) for keys, value in probabilities.causes.items() if value >= MIN_SHOWN]
     rows += [("none of these causes", probabilities.none_of_these), ("no effect", probabilities.no_effect)]
     cells = [
-        (escape(name), draw_share(value), format_probability(value))
-        for name, value in sorted(rows, key=lambda row: -row[1])
+        (name, draw_share(value), format_probability(value)) for name, value in sorted(rows, key=lambda row: -row[1])
     ]
-    return [
-        "<h2>Probabilities</h2>",
-        "<p>Of each cause alone, of causes that act together, of a cause that is in no catalogue, and of no effect, or "
+    text = (
+        "Of each cause alone, of causes that act together, of a cause that is in no catalogue, and of no effect, or "
         "none that this recording could show. They sum to one; what has less than "
-        f"{format_probability(MIN_SHOWN)} is not listed.</p>",
-        render_table(("explanation", "diagram", "probability"), cells, frozenset({2}), "Probabilities"),
-    ]
+        f"{format_probability(MIN_SHOWN)} is not listed."
+    )
+    table = Table("Probabilities", ("explanation", "diagram", "probability"), cells, {2})
+    return Section("Probabilities", [text, table])
 
 
-def _build_next_steps(steps: list[NextStep]) -> Iterator[str]:
-    """Return the section with the commands to run next."""
-    if not steps:
-        return
-    yield "<h2>Run next</h2>"
-    yield "<p>From the folder in which <code>diagnose</code> was run; frames.json and more recordings are your own.</p>"
-    rows = ((escape(step.reason), f"<code>{escape(step.command)}</code>") for step in steps)
-    yield render_table(("why", "command"), rows, label="Run next")
+def _build_next_steps(steps: list[NextStep]) -> list[Section]:
+    """Return the section with the commands to run next, if there are any."""
+    text = (
+        "<p>From the folder in which <code>diagnose</code> was run; frames.json and more recordings are your own.</p>"
+    )
+    rows = [(step.reason, Markup(f"<code>{escape(step.command)}</code>")) for step in steps]
+    return [Section("Run next", [Markup(text), Table("Run next", ("why", "command"), rows)])] if steps else []
 
 
-def _select_traces(traces: tuple[ResidualTrace, ...]) -> list[ResidualTrace]:
-    return sorted(traces, key=lambda item: -float((item.nominal**2).mean()))[:MAX_TRACES]
+def _draw_worst(traces: tuple[ResidualTrace, ...], has_extension: bool) -> list[Figure]:
+    worst = sorted(traces, key=lambda item: -float((item.nominal**2).mean()))[:MAX_TRACES]
+    return [draw_residuals(trace, has_extension) for trace in worst]
 
 
-def _build_height_errors(discrepancy: Discrepancy, has_extension: bool) -> Iterator[str]:
-    """Return the section on heights: the errors of plans made with either model, on recorded pushes."""
+def _build_height_errors(discrepancy: Discrepancy, has_extension: bool) -> Iterator[str | Table]:
+    """Return the errors of plans made with either model, on recorded pushes."""
     errors = (("held out of the fit", discrepancy.height_error_held_out), ("all", discrepancy.height_error_fitted))
-    yield "<h2>Error of planned heights</h2>"
     if discrepancy.height_error_fitted is None:
-        yield "<p>Unknown: no measured push is clear of the noise.</p>"
+        yield "Unknown: no measured push is clear of the noise."
         return
     yield (
-        "<p>Measured height against the height for which the model would have chosen the recorded drive. Pushes unlike "
-        "the recorded ones may be further off.</p>"
+        "Measured height against the height for which the model would have chosen the recorded drive. Pushes unlike "
+        "the recorded ones may be further off."
     )
-    rows = (
-        (
-            *(name, str(error.pushes), str(error.experiments), f"{error.nominal_rms:.1%}", f"{error.nominal_max:.1%}"),
-            *((f"{error.extended_rms:.1%}", f"{error.extended_max:.1%}") if has_extension else ()),
-            f"{error.noise:.1%}",
-        )
-        for name, error in errors
-        if error is not None
-    )
-    extended = ("extended, rms", "largest") if has_extension else ()
-    header = ("pushes", "number", "experiments", "nominal, rms", "largest", *extended, "noise")
-    yield render_table(header, rows, frozenset(range(1, len(header))), "Error of planned heights")
+    extended, header = ("extended, rms", "largest"), ["pushes", "number", "experiments", "nominal, rms", "largest"]
+    rows = []
+    for name, error in errors:
+        if error is not None:
+            shares = [error.nominal_rms, error.nominal_max, error.extended_rms, error.extended_max, error.noise]
+            shares = shares if has_extension else [*shares[:2], error.noise]
+            rows.append((name, str(error.pushes), str(error.experiments), *(f"{share:.1%}" for share in shares)))
+    header += [*(extended if has_extension else ()), "noise"]
+    yield Table("Error of planned heights", header, rows, range(1, len(header)))
 
 
-def _build_held_out(discrepancy: Discrepancy, models: str, has_extension: bool) -> Iterator[str]:
-    """Return the section on held-out groups: the errors of both models, which did not see them, and the residuals."""
-    yield "<h2>Held-out groups</h2>"
+def _build_held_out(
+    discrepancy: Discrepancy, models: str, has_extension: bool
+) -> Iterator[str | Table | Sequence[Figure]]:
+    """Return the errors of both models on groups that they did not see, and the residuals."""
     if not discrepancy.held_out_errors:
         yield (
-            "<p>No group was held out: every kind of experiment has fewer than three groups, or the effect shows in "
-            "the held-out ones alone, which were then fitted too.</p>"
+            "No group was held out: every kind of experiment has fewer than three groups, or the effect shows in "
+            "the held-out ones alone, which were then fitted too."
         )
         return
-    yield "<p>RMSE of models that were fitted without these groups, and the RMSE that noise alone would give.</p>"
+    yield "RMSE of models that were fitted without these groups, and the RMSE that noise alone would give."
     rows = []
     for item in discrepancy.held_out_errors:
         unit = item.signal.rsplit("_", 1)[1]
         values = [item.nominal, *([item.extended] if has_extension else []), item.noise_floor]
-        cells = (format_quantity(value, unit) for value in values)
-        rows.append((escape(item.group), escape(item.signal), str(item.runs), *cells))
+        rows.append((item.group, item.signal, str(item.runs), *(format_quantity(value, unit) for value in values)))
     header = ("group", "signal", "runs", "before", *(["after the extension"] if has_extension else []), "noise")
-    yield render_table(header, rows, frozenset(range(2, len(header))), "Held-out groups")
-    yield f"<p>{models}</p><div class='grid'>"
-    yield from (draw_residuals(trace, has_extension) for trace in _select_traces(discrepancy.held_out_traces))
-    yield "</div>"
+    yield Table("Held-out groups", header, rows, range(2, len(header)))
+    yield Markup(f"<p>{models}</p>")
+    yield _draw_worst(discrepancy.held_out_traces, has_extension)
 
 
-def _build_evidence_table(discrepancy: Discrepancy) -> str:
+def _build_evidence_table(discrepancy: Discrepancy) -> Table:
     strongest = sorted(discrepancy.candidates, key=lambda item: -item.statistic)
     max_ratio = max((item.statistic for item in strongest if isfinite(item.statistic)), default=0.0)
     rows = (
         (
-            escape(item.label),
+            item.label,
             draw_bar(min(item.statistic, max_ratio), max_ratio, DETECTABLE_RATIO, item.verdict in NAMED),
             format_number(item.statistic),
             format_probability(item.probability),
             _format_gain(item.heldout_gain),
-            f"<span class='nowrap'>{escape(item.verdict)}</span>",
-            f"<span class='nowrap'>{escape(item.detection_limit)}</span>",
+            *(Markup(f"<span class='nowrap'>{escape(text)}</span>") for text in (item.verdict, item.detection_limit)),
         )
         for item in strongest
     )
-    header = (
-        "cause",
-        "likelihood ratio",
-        "ratio",
-        "probability",
-        "held-out gain",
-        "verdict",
-        "smallest visible effect",
-    )
-    return render_table(header, rows, frozenset({2, 3, 4}), "Evidence for each cause")
+    header = "cause", "likelihood ratio", "ratio", "probability", "held-out gain", "verdict", "smallest visible effect"
+    return Table("Evidence for each cause", header, rows, {2, 3, 4})
 
 
-def _build_rivals(discrepancy: Discrepancy) -> list[str]:
+def _build_rivals(discrepancy: Discrepancy) -> list[Section]:
     if not discrepancy.rivals:
         return []
-    rows = (
+    rows = [
         (
-            escape(item.label),
+            item.label,
             f"{item.chi2:+.0f}",
             f"{item.log_evidence:.1f}".replace("-", "−"),
             format_probability(item.probability),
             _format_gain(item.heldout_gain),
-            "<br>".join(
-                f"{escape(name)} = {escape(format_quantity(value, unit))}"
-                for name, (value, unit) in item.parameters.items()
-            ),
+            _stack(f"{name} = {format_quantity(value, unit)}" for name, (value, unit) in item.parameters.items()),
         )
         for item in discrepancy.rivals
-    )
-    chosen = frozenset(number for number, item in enumerate(discrepancy.rivals) if item.is_chosen)
-    return [
-        "<h3>Rivals, refitted</h3>",
-        "<p>χ² above the best rival's, logarithm of the marginal likelihood below the best one's, and the probability "
-        "of exactly these causes, which counts other forms of their effect too; bold: the model of later steps.</p>",
-        render_table(
-            ("causes", "χ²", "log evidence", "probability", "held-out gain", "parameters"),
-            rows,
-            frozenset({1, 2, 3, 4}),
-            "Rivals",
-            chosen,
-        ),
     ]
+    text = (
+        "χ² above the best rival's, logarithm of the marginal likelihood below the best one's, and the probability "
+        "of exactly these causes, which counts other forms of their effect too; bold: the model of later steps."
+    )
+    header = "causes", "χ²", "log evidence", "probability", "held-out gain", "parameters"
+    chosen = [number for number, item in enumerate(discrepancy.rivals) if item.is_chosen]
+    return [Section("Rivals, refitted", [text, Table("Rivals", header, rows, range(1, 5), chosen)], level=3)]
+
+
+def _stack(lines: Iterable[str]) -> Markup:
+    """Return the lines of one cell below each other."""
+    return Markup("<br>".join(map(escape, lines)))
 
 
 def _format_gain(gain: float | None) -> str:
     return "" if gain is None else f"{gain:.0%}".replace("-", "−")
 
 
-def _build_parameter_table(discrepancy: Discrepancy) -> str:
+def _build_parameter_table(discrepancy: Discrepancy) -> Table:
     rows = (
-        (escape(name), format_quantity(item.value, item.unit), "limit of the range, no estimate", "")
+        (name, format_quantity(item.value, item.unit), "limit of the range, no estimate", "")
         if item.at_limit
-        else (escape(name), *(format_quantity(value, item.unit) for value in (item.value, item.low, item.high)))
+        else (name, *(format_quantity(value, item.unit) for value in (item.value, item.low, item.high)))
         for name, item in discrepancy.parameters.items()
     )
-    return render_table(("parameter", "value", "95 % from", "to"), rows, frozenset({1, 2, 3}), "Parameters")
+    return Table("Parameters", ("parameter", "value", "95 % from", "to"), rows, {1, 2, 3})
+
+
+def draw_example(example: ExampleTrace, has_extension: bool) -> Figure:
+    """Draw a run's measured values with the models, and below them the residuals."""
+    trace = example.trace
+    unit = trace.signal.rsplit("_", 1)[1]
+    title = f"{example.role} run of {trace.signal}: {trace.run}"
+    series = [
+        Series(trace.measured, "measured", is_dotted=True),
+        Series(trace.compute_model(trace.nominal), "nominal"),
+        *([Series(trace.compute_model(trace.extended), "extended")] if has_extension else []),
+    ]
+    axis = Axis(QUANTITIES.get(trace.signal, trace.signal), unit)
+    plot = draw_plot(f"{title}, measured and model", trace.t_s, TIME, axis, series, TRACE_HEIGHT)
+    return Figure(
+        plot + draw_residual_plot(trace, has_extension, title),
+        f"{example.role.capitalize()} run of {trace.signal}: {trace.run} ({trace.group}); the nominal model is "
+        f"{trace.rms_nominal:.1f} σ rms off, σ = {format_quantity(trace.sigma, unit)}",
+    )
+
+
+def draw_residuals(trace: ResidualTrace, has_extension: bool) -> Figure:
+    """Draw the residuals of a group."""
+    nominal, extended = (float(np.sqrt(np.mean(values**2))) for values in (trace.nominal, trace.extended))
+    caption = f"{trace.signal}, {trace.group}: nominal {nominal:.1f} σ rms"
+    caption += f", extended {extended:.1f} σ" if has_extension else ""
+    return Figure(draw_residual_plot(trace, has_extension, f"{trace.signal} of {trace.group}"), caption)
+
+
+def draw_residual_plot(trace: ResidualTrace, has_extension: bool, title: str) -> str:
+    """Draw measured minus model over time, with a band of one σ of the noise on either side of zero."""
+    axis = Axis("measured − model", trace.signal.rsplit("_", 1)[1], trace.sigma)
+    series = [Series(trace.sigma * trace.nominal, "nominal")]
+    if has_extension:
+        series.append(Series(trace.sigma * trace.extended, "extended"))
+    return draw_plot(f"{title}, residuals", trace.t_s, TIME, axis, series, RESIDUAL_HEIGHT)
+
+
+def draw_bar(ratio: float, max_ratio: float, threshold: float, is_named: bool) -> Markup:
+    """Draw a likelihood ratio as a bar on a logarithmic scale, with a line at the threshold."""
+    scale = (BAR_WIDTH - 2) / log10(1.0 + max(max_ratio, 2.0 * threshold))
+    width, line = (scale * log10(1.0 + max(0.0, value)) for value in (ratio, threshold))
+    threshold_line = f"<line class='threshold' x1='{line:.1f}' x2='{line:.1f}' y1='0' y2='{BAR_HEIGHT}'/>"
+    return _draw_horizontal_bar("bar" if is_named else "other", width, threshold_line)
+
+
+def draw_share(share: float) -> Markup:
+    """Draw a share of one as a bar."""
+    return _draw_horizontal_bar("bar", share * BAR_WIDTH)
+
+
+def _draw_horizontal_bar(css_class: str, width: float, more: str = "") -> Markup:
+    return Markup(
+        f"<svg class='bars' viewBox='0 0 {BAR_WIDTH} {BAR_HEIGHT}' style='width:{BAR_WIDTH}px' aria-hidden='true'>"
+        f"<rect class='{css_class}' x='0' y='7' width='{width:.1f}' height='12'/>{more}</svg>"
+    )

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from html import escape
 from typing import Any
 
-from optodrive.core.html_page import render_table
+from optodrive.core.document import render_table
 from optodrive.core.types.measurements import DataFinding
 from optodrive.lab.inspection.work import count, list_names
 

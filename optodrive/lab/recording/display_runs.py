@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.types.measurements import Measurement, Run
+from optodrive.core.types.measurements import MIRRORS, Measurement, Run
 from optodrive.lab.recording import checks
 from optodrive.lab.recording.index import RecordingIndex
 from optodrive.lab.recording.reader import read_runs
@@ -37,17 +37,17 @@ class RecordingPart:
 class PixelRuns:
     """References to the runs of one pixel, small enough to be sent to a worker.
 
-    pixel: None for the mirrors
+    pixel: `MIRRORS` for the mirrors
     """
 
-    pixel: int | None
+    pixel: int
     parts: tuple[RecordingPart, ...]
 
     def read(self) -> Measurement:
         """Read the runs with this pixel's signals only. Raise InputError if the data are invalid."""
         runs = [self._select_signals(part, run) for part in self.parts for run in _read_part(part)]
         values = [signal.value for run in runs for signal in run.signals.values()]
-        subject = "mirrors" if self.pixel is None else f"pixel {self.pixel}"
+        subject = "mirrors" if self.pixel == MIRRORS else f"pixel {self.pixel}"
         checks.check_sample_count(
             f"{self.parts[0].path}: {subject}", sum(int(np.isfinite(value).sum()) for value in values)
         )
@@ -57,11 +57,7 @@ class PixelRuns:
         signals = {
             name: signal
             for name, signal in run.signals.items()
-            if (
-                name in MIRROR_SIGNALS
-                if self.pixel is None
-                else name not in MIRROR_SIGNALS and signal.pixel == self.pixel
-            )
+            if self.pixel == (MIRRORS if name in MIRROR_SIGNALS else signal.pixel)
         }
         return replace(run, name=f"{part.prefix}{run.name}", signals=signals)
 
@@ -89,7 +85,7 @@ class DisplayRuns:
                 mirrors.append(RecordingPart(path.absolute(), prefix, mirror_runs, stamp))
         return cls(
             tuple(PixelRuns(pixel, tuple(pixels[pixel])) for pixel in sorted(pixels)),
-            PixelRuns(None, tuple(mirrors)) if mirrors else None,
+            PixelRuns(MIRRORS, tuple(mirrors)) if mirrors else None,
         )
 
 
