@@ -10,9 +10,9 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.optimize import least_squares
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.lab.inference.fit import Prior, fit_residuals
 from optodrive.lab.servo_identification.effects import (
     EFFECTS,
     FORMS,
@@ -179,16 +179,14 @@ def fit_linear(records: list[ServoRecord], omega: float) -> FloatArray:
         return np.asarray(target - model @ np.linalg.lstsq(model, target, rcond=None)[0])
 
     period_s = 2.0 * np.pi / omega
-    low, high = [np.log(omega / 6.0), 0.02, 0.0], [np.log(omega * 6.0), 3.0, period_s]
+    low, high = np.array([np.log(omega / 6.0), 0.02, 0.0]), np.array([np.log(omega * 6.0), 3.0, period_s])
     starts = [np.array([np.log(omega * factor), 0.6, 0.03 * period_s]) for factor in START_FACTORS]
     starts.sort(key=lambda each: float((residual(each) ** 2).sum()))
     found = [
-        least_squares(
-            residual, each, bounds=(low, high), x_scale=[0.1, 0.1, 0.02 * period_s], diff_step=1e-4, max_nfev=30
-        )
+        fit_residuals(residual, each, (low, high), np.array([1e-4, 1e-4, 1e-4 * period_s]), evaluations=30)
         for each in starts[:STARTS_REFINED]
     ]
-    return np.asarray(min(found, key=lambda each: float(each.cost)).x)
+    return min(found, key=lambda each: each.chi2).x
 
 
 def find_effect(records: list[ServoRecord], omega: float) -> Linearity:
@@ -298,29 +296,17 @@ class EffectFits:
         def residual(x: FloatArray) -> FloatArray:
             simulated = self.train.simulate(form, *unpack(x), self.scales["angle"], stride=self.stride)
             if not np.abs(simulated).max() < UNSTABLE:
-                return np.append(self.y, x[:3] * 1e3)
+                return np.asarray(self.y * UNSTABLE)
             simulated = simulated - self.q @ (self.q.T @ simulated)
             left = self.y - simulated @ np.linalg.lstsq(simulated, self.y, rcond=1e-8)[0]
-            return np.append(left, x[:3] / PRIOR * np.sqrt(len(left)))
+            return np.asarray(left)
 
+        prior = Prior(np.zeros(5), np.append(PRIOR / np.sqrt(len(self.y)), [np.inf, np.inf]))
         best = min(starts, key=lambda each: float((residual(each) ** 2).sum()))
-        if free.any():
-            best = np.clip(best, low + 1e-6, np.maximum(high - 1e-6, low + 1e-6))
-
-            def expand(part: FloatArray) -> FloatArray:
-                whole = best.copy()
-                whole[free] = part
-                return whole
-
-            found = least_squares(
-                lambda part: residual(expand(part)),
-                best[free],
-                bounds=(low[free] - 1e-6, high[free] + 1e-6),
-                x_scale=np.array([0.1, 0.1, 0.03, 0.2, 0.2])[free],
-                diff_step=1e-3,
-                max_nfev=25 if completely else 6,
-            )
-            best = expand(found.x)
+        found = fit_residuals(
+            residual, best, (low, high), 1e-3, free=free, prior=prior, evaluations=25 if completely else 6
+        )
+        best = found.x
         base, effect = unpack(best)
         core = float(base[0]), float(base[1]), float(base[2])
         return FormFit(form, core, effect, self.scales["angle"], self._misfit2(form, base, effect))

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
+from optodrive.lab.inference.fit import fit_residuals
 from optodrive.lab.servo_identification.effect_fit import Linearity, ServoData, ServoRecord
 from optodrive.lab.servo_identification.effects import FORMS, LINEAR_FORM, SLEW, SLEW_LIMIT
 from optodrive.lab.servo_identification.step_response import Steps, step_response_rad
@@ -20,7 +20,7 @@ from optodrive.lab.servo_identification.step_trace import AXES, GAIN_TOLERANCE, 
 LOWER_BOUNDS = np.array([np.log(50.0), 0.05, 0.0, 1e-6])
 UPPER_BOUNDS = np.array([np.log(3e4), 0.999, 0.01, 1.0])
 """Of the fitted parameters: logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
-SCALE = np.array([0.1, 0.1, 1e-5, 1e-3])
+DERIVATIVE_STEPS = np.array([1e-5, 1e-5, 1e-9, 1e-7])
 START_SAMPLES_MAX = 3000
 """Maximum number of samples for the comparison of starting points."""
 FIT_SAMPLES_MAX = 100_000
@@ -189,23 +189,9 @@ def _fit_residual(
     compute: Callable[[FloatArray], FloatArray], start: FloatArray, free: BoolArray
 ) -> tuple[FloatArray, float, FloatArray]:
     """Fit from a starting point. Return parameters, cost, and covariance with zeros for fixed parameters."""
-
-    def expand(part: FloatArray) -> FloatArray:
-        packed = start.copy()
-        packed[free] = part * SCALE[free]
-        return packed
-
-    residual: Callable[[FloatArray], FloatArray] = lambda part: compute(expand(part))  # noqa: E731
-    low, high = LOWER_BOUNDS[free] / SCALE[free], UPPER_BOUNDS[free] / SCALE[free]
-    initial = np.clip(start[free] / SCALE[free], low + 1e-9, high - 1e-9)
-    solution = least_squares(residual, initial, bounds=(low, high), jac="3-point", x_scale="jac", max_nfev=80)
-    degrees_of_freedom = max(1, len(solution.fun) - len(initial) - 2)
-    variance = 2.0 * solution.cost / degrees_of_freedom
-    covariance = np.zeros((4, 4))
-    inverse = np.linalg.pinv(solution.jac.T @ solution.jac) * variance
-    fitted = np.flatnonzero(free)
-    covariance[np.ix_(fitted, fitted)] = inverse * np.outer(SCALE[free], SCALE[free])
-    return expand(solution.x), float(solution.cost), covariance
+    found = fit_residuals(compute, start, (LOWER_BOUNDS, UPPER_BOUNDS), DERIVATIVE_STEPS, free=free, evaluations=80)
+    degrees_of_freedom = max(1, len(found.residual) - int(free.sum()) - 2)
+    return found.x, 0.5 * found.chi2, found.covariance * (found.chi2 / degrees_of_freedom)
 
 
 def _generate_starts(trace: StepTrace) -> Iterator[FloatArray]:
