@@ -11,9 +11,8 @@ from optodrive.core.numeric_tables import write_columns
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.field_prior import FieldPrior
-from optodrive.lab.calibration.field_writer import write_field
-from optodrive.lab.calibration.spots import MeasuredSpots
+from optodrive.lab.calibration.field_output import write_field
+from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 from optodrive.link.simulator.true_geometry import CENTRE_CODE, GroundTruthGeometry
 
 GEOMETRIES, POINTS = 10, 1_000_000

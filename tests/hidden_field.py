@@ -5,9 +5,8 @@ import numpy as np
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import load_config
 from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.field_prior import FieldPrior
-from optodrive.lab.calibration.field_writer import write_field
-from optodrive.lab.calibration.spots import MeasuredSpots
+from optodrive.lab.calibration.field_output import write_field
+from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 from optodrive.link.simulator.true_geometry import CENTRE_CODE, GroundTruthGeometry
 
 CONFIG = load_config()

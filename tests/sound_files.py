@@ -17,7 +17,7 @@ from optodrive.device.config_file import MirrorsFile, apply_measured_servo, load
 from optodrive.device.field_file import _FieldFile, load_field
 from optodrive.device.field_geometry import FieldGeometry
 from optodrive.device.pixel_map import _PixelMapFile, load_pixel_map, replace_pixel_map
-from optodrive.lab.calibration.camera.folder import _PicturesFile, read_picture_folder
+from optodrive.lab.calibration.pictures import _PicturesFile, read_picture_folder
 from optodrive.lab.calibration.spot_checks import check_spots
 from optodrive.lab.calibration.spots import COLUMNS, read_spots
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry

@@ -13,7 +13,7 @@ from optodrive.core.errors import MISSING, InputError, LinkError
 
 if TYPE_CHECKING:
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-    from optodrive.lab.commissioning.spot_reader import SpotReader
+    from optodrive.lab.commissioning.sensor import SpotReader
 
 SENSOR_BAUD = 115_200
 
@@ -54,8 +54,7 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
     from optodrive.core.clock import MonotonicClock
     from optodrive.device.config_file import DEFAULT_CONFIG, load_config
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-    from optodrive.lab.commissioning.spot_reader import SpotReader
-    from optodrive.lab.commissioning.spot_sensor_client import SpotSensorClient
+    from optodrive.lab.commissioning.sensor import SpotReader, SpotSensorClient
     from optodrive.link.board_setup import build_port_settings
     from optodrive.link.transport.registry import build_bench_transport
     from optodrive.link.transport.serial_port import SerialPort

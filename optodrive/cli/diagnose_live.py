@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from optodrive.core.types.discrepancy import Discrepancy
     from optodrive.core.types.measurements import Measurement
     from optodrive.device.config import Config
-    from optodrive.lab.live_diagnosis.campaign import CampaignResult, CampaignStep
+    from optodrive.lab.live_diagnosis import CampaignResult, CampaignStep
 
 RECORDING = "recording.h5"
 DEFAULT_OUT = Path("live-diagnosis")
@@ -65,11 +65,9 @@ def measure_live(request: LiveRequest, quiet: bool) -> "CampaignResult":
 
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.files import create_folder
-    from optodrive.lab.commissioning.pixel_reader import PixelReader
+    from optodrive.lab.commissioning.sensor import PixelReader
     from optodrive.lab.commissioning.worker_process import WorkerProcess
-    from optodrive.lab.live_diagnosis.board_bench import BoardBench
-    from optodrive.lab.live_diagnosis.campaign import CampaignRecording, run_campaign
-    from optodrive.lab.live_diagnosis.experiments import find_pixels
+    from optodrive.lab.live_diagnosis import BoardBench, CampaignRecording, find_pixels, run_campaign
 
     confirm_emission(request.yes, "this arms the board and pulses one pixel and its neighbour at up to full power")
     create_folder(request.out)

@@ -115,7 +115,7 @@ def _check_codes(points: Path, table: "FloatArray") -> None:
 
 
 def _export(calibrated_field: "CalibratedField", export: Path) -> dict[str, Any]:
-    from optodrive.lab.calibration.correction_grid import write_correction_grid
+    from optodrive.lab.calibration.field_output import write_correction_grid
 
     write_correction_grid(export, calibrated_field)
     return {"out": str(export)}
@@ -125,8 +125,8 @@ def _import(grid: Path, out: Path, config: str | None) -> dict[str, Any]:
     from optodrive.core.files import write_text
     from optodrive.device.config_file import load_config
     from optodrive.device.field_file import format_field, strip_toml_specials
-    from optodrive.lab.calibration.correction_grid import fit_correction_grid
-    from optodrive.lab.calibration.field_prior import FieldPrior
+    from optodrive.lab.calibration.field_output import fit_correction_grid
+    from optodrive.lab.calibration.spots import FieldPrior
 
     calibrated_field = fit_correction_grid(grid, FieldPrior.from_config(load_config(config)))
     metadata: dict[str, str | float | int] = {

@@ -29,8 +29,8 @@ def first_light(
     """Check the board, centre the mirrors and emit single weak pulses there. The board ends disarmed in every case."""
     from optodrive.cli.board_access import open_board
     from optodrive.device.config_file import load_config
-    from optodrive.lab.commissioning.first_light import PULSES_MAX, default_power_w, emit_first_light
-    from optodrive.lab.commissioning.spot_bounds import check_spot_power, spot_width_s
+    from optodrive.lab.commissioning.exclusive_board import check_spot_power, spot_width_s
+    from optodrive.lab.commissioning.homing import PULSES_MAX, default_power_w, emit_first_light
 
     loaded = load_config(config).select_stage(stage)
     power_w = default_power_w(loaded) if power_mw is None else power_mw * 1e-3

@@ -22,8 +22,8 @@ def home(
 ) -> None:
     """Centre the mirrors. Check travel, position outputs, interlock, key, emergency stop and indicator."""
     from optodrive.cli.board_access import open_board
+    from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.homing import Homing
-    from optodrive.lab.commissioning.spot_bounds import check_spot_power
 
     with report_steps("home", json) as report_step, open_board(config, stage=stage) as (board, spot_reader):
         if spot_power_mw:

@@ -50,8 +50,8 @@ def show(
     from optodrive.core.files import check_output
     from optodrive.lab.inspection.inspection import inspect_recording
     from optodrive.lab.inspection.page import build_finding, build_lines
-    from optodrive.lab.recording.merge import read_recording_or_session
-    from optodrive.lab.recording.summary import build_summary
+    from optodrive.lab.recording.reader import read_recording_or_session
+    from optodrive.lab.recording.show import build_summary
     from optodrive.lab.recording.trials import read_trials_if_any
 
     check_output("--out", out, ".png")
@@ -97,7 +97,7 @@ def merge(
     """Merge the executed pulses of a session with signals measured meanwhile into a recording for `diagnose`."""
     from optodrive.core.files import check_output
     from optodrive.lab.recording import write_recording
-    from optodrive.lab.recording.merge import merge_session
+    from optodrive.lab.recording.reader import merge_session
     from optodrive.lab.recording.storage import HDF5_SUFFIXES
 
     check_output("--out", out, *HDF5_SUFFIXES, folder=True)
@@ -112,7 +112,7 @@ GROUP.command()(trials)
 
 
 def _draw_signals(out: Path, measurement: "Measurement") -> int:
-    from optodrive.lab.recording.plot import write_plot
+    from optodrive.lab.recording.show import write_plot
 
     return write_plot(out, measurement)
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.lab.calibration.camera.folder import GridSection, OriginSection
-from optodrive.lab.calibration.camera.grid import find_grid, grid_corners_m, orient_to_marks
-from optodrive.lab.calibration.camera.plane import fit_plane
+from optodrive.lab.calibration.picture_plane import find_grid, fit_plane, grid_corners_m, orient_to_marks
+from optodrive.lab.calibration.pictures import GridSection, OriginSection
 from rendered import CAMERA, FIRST_M, GRID, SIZE, TILTED, TURN_RAD, Camera, corners_m, grid_light, marks_px, taken
 
 DOTS = GRID | {"kind": "circles"}

@@ -14,12 +14,11 @@ from labs import lab
 from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.diagnosis.dataset import build_dataset
+from optodrive.lab.diagnosis.dataset import build_dataset, build_hypotheses
 from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.fitting import fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
-from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.diagnosis.model_selection import compare_from_single_causes
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative

@@ -58,7 +58,7 @@ def list_children(pid):
 
 def find_clusters(pid):
     """Return the process id of the local cluster of a diagnosis, once it runs."""
-    return [child for child in list_children(pid) if "local_cluster" in read_proc(child, "cmdline")]
+    return [child for child in list_children(pid) if "dask_workers" in read_proc(child, "cmdline")]
 
 
 def find_workers(pid):

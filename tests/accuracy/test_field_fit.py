@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from hidden_field import CONFIG, NOISE_M, PRIOR, field_errors_m, grid_codes, measure_spots, random_codes
-from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.next_spot import select_next_spot
+from optodrive.lab.calibration.field_fit import fit_field, select_next_spot
 from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 

@@ -6,13 +6,13 @@ import pytest
 
 from labs import lab
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.recording import sandboxed_probe, write_recording
+from optodrive.lab.recording import hdf5, write_recording
 
 
 @pytest.mark.slow
 def test_a_sound_file_of_many_runs_may_take_its_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
+    monkeypatch.setattr(hdf5, "CPU_LIMIT_S", 1)
     (run,) = lab(1, {}, groups=("weak",), repeats=1).runs
     runs = tuple(replace(run, name=f"run-{number}") for number in range(900))
     write_recording(tmp_path / "many.h5", Measurement(runs))
-    sandboxed_probe.probe_in_sandbox(tmp_path / "many.h5")
+    hdf5.probe_in_sandbox(tmp_path / "many.h5")

@@ -16,7 +16,7 @@ from optodrive.lab.diagnosis.evidence import compute_bin_evidence, temper
 from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
-from optodrive.lab.diagnosis.next_experiment import propose_experiment
+from optodrive.lab.diagnosis.next_steps import propose_experiment
 from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES, MAX_DEGREES, NoiseCertainty, count_noise_degrees
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal

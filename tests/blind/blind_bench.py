@@ -14,7 +14,7 @@ from blind_session import SAMPLES_S3, build_session_runs, draw_sample_times, mea
 from blind_session import Experiment as BlindExperiment
 from optodrive.core.types.measurements import Run, Signal
 from optodrive.device.config_file import load_config
-from optodrive.lab.live_diagnosis.experiments import Experiment
+from optodrive.lab.live_diagnosis import Experiment
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import limit
 

@@ -10,7 +10,7 @@ from optodrive.cli.options import load_run_config
 from optodrive.core.errors import InputError
 from optodrive.daemon.api.tokens import create_tokens, read_private_tokens
 from optodrive.device.config_file import list_shipped_configs, locate_shipped
-from optodrive.lab.calibration.camera.folder import read_picture_folder
+from optodrive.lab.calibration.pictures import read_picture_folder
 from optodrive.link.simulator.board_limits import load_settings
 from optodrive.link.simulator.script import load_script
 from optodrive.planning.display_model import DisplayModel

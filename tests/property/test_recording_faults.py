@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.lab.recording import RecordingIndex, read_recording, reader, sandboxed_probe, write_recording
+from optodrive.lab.recording import RecordingIndex, hdf5, read_recording, reader, write_recording
 from optodrive.lab.recording.storage import SIGNALS
 
 T_S = np.linspace(0.0, 1.0, 20)
@@ -114,7 +114,7 @@ def assert_in_order(run):
 @given(st.data())
 def test_bytes_changed_or_cut_off(valid, path, data):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sandboxed_probe, "CPU_LIMIT_S", 2)
+        patch.setattr(hdf5, "CPU_LIMIT_S", 2)
         content = bytearray((valid / "r.h5").read_bytes())
         for _ in range(data.draw(st.integers(0, 8))):
             content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))

@@ -10,7 +10,7 @@ import pytest
 from optodrive.device.config_file import load_config
 from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.spots import read_spots
-from optodrive.lab.commissioning.predicted_error import build_code_grid
+from optodrive.lab.commissioning.measurement_loop import build_code_grid
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 from rig import wait_for

@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from hidden_field import calibrate_hidden_field
-from optodrive.lab.live_diagnosis.experiments import FIRST_ORDER
+from optodrive.lab.live_diagnosis import FIRST_ORDER
 from optodrive.lab.recording import read_recording
 from rig import wait_for
 from signalled_processes import assert_dark_within_lease

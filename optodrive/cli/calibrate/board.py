@@ -102,7 +102,7 @@ def spots_path_for(out: Path) -> Path:
 
 def delete_session(out: Path) -> None:
     """Delete the session of an output file, so that the next calibration starts without spots."""
-    from optodrive.lab.commissioning.calibration_session import session_path_for
+    from optodrive.lab.commissioning.measurement_loop import session_path_for
 
     session_path_for(out).unlink(missing_ok=True)
 
@@ -117,10 +117,9 @@ def measure_on_board(
     """
     from optodrive.cli.board_access import open_board
     from optodrive.core.clock import MonotonicClock
-    from optodrive.lab.calibration.field_prior import FieldPrior
-    from optodrive.lab.commissioning.calibration_session import CalibrationSession
-    from optodrive.lab.commissioning.measurement_loop import MeasurementLoop, fit_and_warm_up
-    from optodrive.lab.commissioning.spot_bounds import check_spot_power
+    from optodrive.lab.calibration.spots import FieldPrior
+    from optodrive.lab.commissioning.exclusive_board import check_spot_power
+    from optodrive.lab.commissioning.measurement_loop import CalibrationSession, MeasurementLoop, fit_and_warm_up
     from optodrive.lab.commissioning.spot_locator import ManualLocator, SensorLocator
     from optodrive.lab.commissioning.worker_process import WorkerProcess
 

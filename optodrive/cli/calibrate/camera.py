@@ -19,7 +19,7 @@ from optodrive.core.units import m_to_um
 
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import BoolArray
-    from optodrive.lab.calibration.camera.measure import CameraMeasurement
+    from optodrive.lab.calibration.picture_spots import CameraMeasurement
 
 NAMES_LISTED_MAX = 6
 
@@ -44,12 +44,11 @@ def calibrate_by_camera(folder: Path, config: str | None) -> FieldCalibration:
     Raises InputError for a folder, a picture or spots that cannot be used.
     """
     from optodrive.device.config_file import load_config
-    from optodrive.lab.calibration.camera.folder import SPOTS_FILE
-    from optodrive.lab.calibration.camera.measure import measure_folder
     from optodrive.lab.calibration.field_fit import fit_field
-    from optodrive.lab.calibration.field_prior import FieldPrior
+    from optodrive.lab.calibration.picture_spots import measure_folder
+    from optodrive.lab.calibration.pictures import SPOTS_FILE
     from optodrive.lab.calibration.spot_checks import check_fit, check_spots
-    from optodrive.lab.calibration.spots import write_spots
+    from optodrive.lab.calibration.spots import FieldPrior, write_spots
 
     if not folder.is_dir():
         raise InputError("FOLDER", str(folder), "a folder with pictures.toml")

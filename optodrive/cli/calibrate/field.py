@@ -25,9 +25,8 @@ def field(
     """Fit the field to a file of measured spots."""
     from optodrive.device.config_file import load_config
     from optodrive.lab.calibration.field_fit import fit_field
-    from optodrive.lab.calibration.field_prior import FieldPrior
     from optodrive.lab.calibration.spot_checks import check_fit, check_spots
-    from optodrive.lab.calibration.spots import read_spots
+    from optodrive.lab.calibration.spots import FieldPrior, read_spots
 
     check_calibration_outputs(out, report)
     prior = FieldPrior.from_config(load_config(config))

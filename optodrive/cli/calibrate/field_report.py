@@ -40,8 +40,7 @@ def check_calibration_outputs(out: Path | None, report: Path | None) -> None:
 
 def write_calibration(calibration: FieldCalibration, out: Path | None, report: Path | None, json: bool) -> None:
     """Write the field and the report where requested, and print the fit's statistics."""
-    from optodrive.lab.calibration.field_writer import write_field
-    from optodrive.lab.calibration.fit_summary import summarize_fit
+    from optodrive.lab.calibration.field_output import summarize_fit, write_field
     from optodrive.lab.calibration.spots import find_first_line
 
     source = str(calibration.spots_file)
@@ -81,7 +80,7 @@ def format_fit(stats: dict[str, Any], first_line: int) -> list[str]:
 def _write_report(path: Path, fit: "FieldFit", source: str, lines: list[str]) -> None:
     from optodrive.core.document import Document, Figure, Markup, Section, Table
     from optodrive.core.files import write_text
-    from optodrive.lab.calibration.fit_summary import draw_residuals, draw_sigma_map
+    from optodrive.lab.calibration.field_output import draw_residuals, draw_sigma_map
 
     sigmas = fit.prior.sigma * fit.covariance.diagonal()[: len(fit.prior.sigma)] ** 0.5
     rows = [

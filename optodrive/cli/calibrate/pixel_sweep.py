@@ -10,7 +10,7 @@ from optodrive.core.quantity import format_quantity
 
 if TYPE_CHECKING:
     from optodrive.device.config import Config
-    from optodrive.lab.calibration.pixels.sweep import Aim
+    from optodrive.lab.calibration.pixel_sweep import Aim
 
 PULSE_FIELDS = ("pulse_width_s", "power_w")
 README = "README.txt"
@@ -22,7 +22,7 @@ def write_sweep(folder: Path, config: str | None, json: bool) -> None:
     Raises InputError where a cell is too small for the offsets or the folder cannot be created.
     """
     from optodrive.core.files import check_output, write_text
-    from optodrive.lab.calibration.pixels.sweep import compute_pulse
+    from optodrive.lab.calibration.pixel_sweep import compute_pulse
 
     check_output("--sweep", folder, folder=True)
     loaded, aims, counts = write_sweep_files(folder, config)
@@ -54,7 +54,7 @@ def write_sweep_files(folder: Path, config: str | None) -> "tuple[Config, list[A
     from optodrive.core.types.stimuli import FrameSequence
     from optodrive.device.field_loader import load_scan_field
     from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
-    from optodrive.lab.calibration.pixels.sweep import (
+    from optodrive.lab.calibration.pixel_sweep import (
         build_aim_map,
         build_sweep,
         compute_pitch_min_m,

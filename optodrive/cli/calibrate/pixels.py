@@ -44,8 +44,8 @@ def fit_pixel_map(recordings: list[Path], out: Path | None, config: str | None, 
     from optodrive.core.files import check_output
     from optodrive.device.field_file import strip_toml_specials
     from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
-    from optodrive.lab.calibration.pixels.map_fit import PixelMapFitter, compute_stats
-    from optodrive.lab.diagnosis.plausible_units import check_recording_units
+    from optodrive.lab.calibration.pixel_map_fit import PixelMapFitter, compute_stats
+    from optodrive.lab.diagnosis.recording_checks import check_recording_units
     from optodrive.lab.recording import read_recording
     from optodrive.physics.parameters import load_parameters
     from optodrive.physics.thermal_state import build_cold_state

@@ -29,7 +29,7 @@ def servo(
     import_extra("scipy")
     from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
-    from optodrive.lab.diagnosis.plausible_units import check_recording_units
+    from optodrive.lab.diagnosis.recording_checks import check_recording_units
     from optodrive.lab.recording import read_recording
     from optodrive.lab.servo_identification.common_servo import find_common_servo
     from optodrive.lab.servo_identification.effect_fit import find_effect

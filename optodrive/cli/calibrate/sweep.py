@@ -11,7 +11,7 @@ from optodrive.cli.output import print_answer, show_progress
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
-    from optodrive.lab.calibration.pixels.sweep import Aim
+    from optodrive.lab.calibration.pixel_sweep import Aim
     from optodrive.lab.commissioning.sweep_player import AimPlan
     from optodrive.planning.display_model import DisplayModel
 
@@ -32,8 +32,7 @@ def sweep(
     from optodrive.cli.board_access import open_board
     from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
-    from optodrive.lab.calibration.pixels.sweep import list_aims
-    from optodrive.lab.calibration.pixels.sweep_journal import SweepJournal, build_runs
+    from optodrive.lab.calibration.pixel_sweep import SweepJournal, build_runs, list_aims
     from optodrive.lab.commissioning.sweep_player import plan_aims, play_aims
     from optodrive.lab.recording import write_recording
 

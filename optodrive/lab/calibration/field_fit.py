@@ -1,4 +1,4 @@
-"""Maximum a posteriori fit of a field to spots, with outlier rejection and uncertainty.
+"""Maximum a posteriori fit of a field to spots, with outliers, uncertainty and the most informative next spot.
 
 Every parameter is in units of its prior's sigma: the prior of z is the standard normal distribution.
 """
@@ -12,8 +12,7 @@ from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.device.calibrated_field import CalibratedField
 from optodrive.device.field_geometry import CENTRE_CODE, FieldGeometry, beam_position_m, compute_parameter_derivatives
 from optodrive.device.field_surface import TERM_COUNT, compute_prior_widths, evaluate_terms
-from optodrive.lab.calibration.field_prior import FieldPrior
-from optodrive.lab.calibration.spots import MeasuredSpots
+from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 
 GEOMETRY_COUNT = len(FieldGeometry._fields)
 PARAMETER_COUNT = GEOMETRY_COUNT + 2 * TERM_COUNT
@@ -33,6 +32,8 @@ NOISE_LOG_SIGMA, SURFACE_LOG_SIGMA = 0.7, 0.5
 """Prior sigma of the natural logarithms of noise and surface."""
 SIGMA_GRID_NODES = 17
 """Nodes per side of the grid on which the field's sigma is stored."""
+SAMPLES_PER_SIDE = 9
+"""Samples of the display per side at which the variance is evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,3 +263,21 @@ def _sigma_m(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     variance = np.einsum("anu,uv,anv->n", jacobian, covariance, jacobian, optimize=True) / 2.0
     sigma_m: FloatArray = np.sqrt(variance)
     return sigma_m
+
+
+def select_next_spot(fit: FieldFit, candidates: FloatArray) -> int:
+    """Return the row of candidates [k, 2], x_code and y_code, that most reduces the mean variance over the display."""
+    display_jacobian = fit.jacobian_m(*fit.prior.display_extent.build_grid(SAMPLES_PER_SIDE))
+    parameter_count = display_jacobian.shape[-1]
+    display_jacobian = display_jacobian.reshape(-1, parameter_count)
+    candidate_jacobian = fit.jacobian_m(candidates[:, 0], candidates[:, 1]).transpose(1, 0, 2)
+    # One more spot with Jacobian A reduces the covariance C by C Aᵀ (A C Aᵀ + σ²)⁻¹ A C.
+    candidate_covariance = candidate_jacobian @ fit.covariance
+    cross_covariance = candidate_covariance @ display_jacobian.T
+    measurement_covariance = candidate_covariance @ candidate_jacobian.transpose(0, 2, 1) + fit.noise_m**2 * np.eye(2)
+    variance_reduction = np.trace(
+        np.linalg.solve(measurement_covariance, cross_covariance @ cross_covariance.transpose(0, 2, 1)),
+        axis1=1,
+        axis2=2,
+    )
+    return int(np.argmax(variance_reduction))

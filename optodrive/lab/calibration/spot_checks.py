@@ -14,8 +14,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config_sections import Wiring
 from optodrive.device.field_geometry import CENTRE_CODE
 from optodrive.lab.calibration.field_fit import FieldFit, fit_field
-from optodrive.lab.calibration.field_prior import FieldPrior
-from optodrive.lab.calibration.spots import MeasuredSpots
+from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 
 SPOTS_MIN = 6
 """Smallest number of spots, and of inliers, for a fit."""

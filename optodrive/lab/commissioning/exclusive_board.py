@@ -1,34 +1,222 @@
 """Exclusive access to a board for one task: it is armed once and executes points and plans that the limiter has passed.
 
+`ArmedBoard` arms a board, keeps it armed and disarms it. `close` sends ABORT. If the board does not receive it, the
+closed port and the lease turn the gate off.
+
 Points are limited as those of the daemon are: accounted to one timeline of heat, encoded, decoded and proven again. A
 point whose pixel is unknown counts for the one that it would heat most. The timeline begins with the heat that the
 display's record states, and the record gets what is left of it at the end.
 """
 
+import sys
 from collections.abc import Callable
-from math import inf
+from math import ceil, inf, pi
+from typing import Self
 
 import numpy as np
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import BoardFaultError, InputError, LocalProtocolError, OverBudgetError
-from optodrive.core.quantity import format_quantity
+from optodrive.core.errors import (
+    BoardFaultError,
+    InputError,
+    LinkError,
+    LocalProtocolError,
+    NotReadyError,
+    OverBudgetError,
+    Unquoted,
+)
+from optodrive.core.garbage import settle_memory
+from optodrive.core.quantity import format_number, format_quantity
+from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config, build_pixel_layout
-from optodrive.lab.commissioning.armed_board import FIELD_MARGIN_M, LOOP_STEP_S, ArmedBoard, ignore_reports
-from optodrive.lab.commissioning.spot_bounds import check_spot_power, max_settling_s, spot_width_s
+from optodrive.link.board_setup import build_bench_requirements
 from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX, WirePoints, decode, quantise
+from optodrive.link.protocol.states import BoardState
+from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
+from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.heat_record import BOARDS, HeatRecord, join_uids
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
 
+LOOP_STEP_S = 0.002
+SWITCH_INTERVAL_S = 2e-4
+"""As in the engine: a computing thread must not delay the lease."""
+FIELD_MARGIN_M = 4e-3
+"""Permitted margin beyond the outermost pixels; the error of an uncorrected beam is smaller."""
+ARM_TIMEOUT_S = 4.0
+STATUS_TIMEOUT_S = 2.0
+POINT_TIMEOUT_S = 3.0
+FAULT_NAME_TIMEOUT_S = 0.5
+SPOT_POWER_MAX_W = 0.05
+"""Maximum power of a spot: 2 % of a pixel's drive power; steady on one absorber it adds a few kelvin."""
+SPOT_SHARE_MAX = 0.05
+"""Maximum power of a spot relative to the laser's power."""
+SPOT_WIDTH_S = 0.02
+SETTLING_TIME_CONSTANTS = 15.0
+"""Settling time after a move in time constants of the servo."""
 HALF_TRAVEL_MIN_M = 3e-3
 """Shortest way of a mirror from the centre that shows its travel; a smaller display is left by as much."""
 START_LEAD_S = 0.03
+
+
+def ignore_reports(job: PlanJob) -> None:
+    """Do nothing with the reports of a job."""
+
+
+class ArmedBoard:
+    """A board, its session and its lease.
+
+    Methods raise LinkError, BoardFaultError or NotReadyError when the task must end.
+    """
+
+    def __init__(self, config: Config, transport: Transport, clock: Clock) -> None:
+        self.requirements = build_bench_requirements(config, FIELD_MARGIN_M)
+        self.session = BoardSession(transport, clock, self.requirements)
+        self._clock = clock
+        self._arm_requested = self._armed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        self.close()
+
+    def connect(self) -> None:
+        """Open the link and begin a session with the lease's priority."""
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        set_realtime_priority(LIGHT)
+        settle_memory()
+        self.session.connect()
+        until_s = self._clock.now_s() + STATUS_TIMEOUT_S
+        while self.session.board.temperature_c is None:  # until the first STATUS, which has faults and inputs
+            self.session.step(LOOP_STEP_S, renew_lease=False)
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"{self.session.port}: the board sent no STATUS within {STATUS_TIMEOUT_S:g} s")
+
+    def close(self) -> None:
+        """Send ABORT and close the link."""
+        self._arm_requested = self._armed = False
+        self.session.close()
+
+    def step(self) -> None:
+        """Renew the lease and process messages for LOOP_STEP_S.
+
+        Raise BoardFaultError if the board left its armed states, NotReadyError if it refused a message.
+        """
+        self.session.step(LOOP_STEP_S, renew_lease=True)
+        board, refusal = self.session.board, self.session.pop_refusal()
+        if board.state == BoardState.FAULT and self._arm_requested:
+            raise self._build_fault_error()
+        if refusal is not None:
+            raise NotReadyError(f"the board refuses: {refusal}")
+        if self._armed and board.state in (BoardState.DISARMED, BoardState.ARMING):
+            raise BoardFaultError(f"the board went to {board.state} by itself: {self.session.last_event_reason}")
+
+    def _build_fault_error(self) -> BoardFaultError:
+        """Build the error with the fault's name, which a STATUS reports soon after the ACK that reported FAULT."""
+        until_s = self._clock.now_s() + FAULT_NAME_TIMEOUT_S
+        while not self.session.board.fault and self._clock.now_s() < until_s:
+            self.session.step(LOOP_STEP_S, renew_lease=False)
+        fault = self.session.board.fault
+        return BoardFaultError(f"the board went to FAULT {fault}: {get_fault_hint(fault)}")
+
+    def wait(self, duration_s: float) -> None:
+        """Wait and keep the lease."""
+        until_s = self._clock.now_s() + duration_s
+        while self._clock.now_s() < until_s:
+            self.step()
+
+    def arm(self) -> float:
+        """Arm the board and return the time from the request to ARMED, s.
+
+        The indicator is on for two seconds of it.
+        """
+        start_s = self._clock.now_s()
+        self.session.arm()
+        self._arm_requested = True
+        while self.session.board.state != BoardState.ARMED:
+            self.step()
+            if self._clock.now_s() - start_s > ARM_TIMEOUT_S:
+                raise NotReadyError(f"the board did not arm within {ARM_TIMEOUT_S:g} s: {self.session.board.state}")
+        self._armed = True
+        return self._clock.now_s() - start_s
+
+    def disarm(self) -> None:
+        """Disarm, acknowledge a fault, and wait for DISARMED. Raise NotReadyError if the board refuses."""
+        self._arm_requested = self._armed = False
+        self.session.disarm()
+        until_s = self._clock.now_s() + ARM_TIMEOUT_S
+        while self.session.board.state != BoardState.DISARMED:
+            self.session.step(LOOP_STEP_S, renew_lease=False)
+            refusal = self.session.pop_refusal()
+            if refusal is not None:
+                raise NotReadyError(f"the board refuses to disarm: {refusal}")
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"the board does not report DISARMED: {self.session.board.state}")
+
+    def _require_ready(self) -> None:
+        """Wait until a job may start. Raise NotReadyError if the board is not armed."""
+        if not self._armed:
+            raise NotReadyError(f"the board is not armed: {self.session.board.state}")
+        until_s = self._clock.now_s() + POINT_TIMEOUT_S
+        while not self.session.is_ready:
+            self.step()
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"{self.session.port}: the board was not ready within {POINT_TIMEOUT_S:g} s")
+
+    def _run_job(
+        self, points: WirePoints, start_s: float, on_reported: Callable[[PlanJob], None] = ignore_reports
+    ) -> PlanJob:
+        """Stream points and wait until the board has reported all of them."""
+        job = self.session.begin(points, start_s)
+        duration_s = float(points.compute_end_ticks()[-1]) * self.session.scale.tick_s
+        until_s = self._clock.now_s() + duration_s + POINT_TIMEOUT_S
+        reported = 0
+        while not job.is_finished:
+            self.step()
+            if job.executed_count > reported:
+                reported = job.executed_count
+                on_reported(job)
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"{self.session.port}: a point was not reported within {POINT_TIMEOUT_S:g} s")
+        return job
+
+
+def max_settling_s(config: Config) -> float:
+    """Return the gate-off time in which any move settles, s, rounded up to milliseconds."""
+    scanner = config.scanner
+    ramp_s = 2.0 * scanner.range_rad / scanner.slew_rad_per_s
+    constant_s = 1.0 / (2.0 * pi * scanner.bandwidth_hz * scanner.damping)
+    return ceil(1e3 * (scanner.delay_s + ramp_s + SETTLING_TIME_CONSTANTS * constant_s)) * 1e-3
+
+
+def spot_width_s(config: Config) -> float:
+    """Return the width of a spot's pulse, s: whole PWM periods within the configured maximum."""
+    pwm_hz = config.laser.pwm_hz
+    periods = max(1, int(min(SPOT_WIDTH_S, config.limits.pulse_width_max_s) * pwm_hz * (1 + 1e-9)))
+    return round(periods / pwm_hz * 1e6) * 1e-6
+
+
+def max_spot_power_w(config: Config) -> float:
+    """Return the maximum power of a spot, W."""
+    return min(SPOT_POWER_MAX_W, SPOT_SHARE_MAX * config.laser.max_power_w)
+
+
+def check_spot_power(config: Config, power_w: float, option: str = "--spot-power-mw") -> None:
+    """Raise InputError, naming the option, for a power outside the range of a spot."""
+    max_w, threshold_w = max_spot_power_w(config), config.laser.threshold_w
+    if 0.0 < power_w < threshold_w:
+        expected = f"at least laser.threshold_w, {format_number(threshold_w * 1e3)} mW, below which nothing is emitted"
+        raise InputError(option, Unquoted(f"{power_w * 1e3:g} mW"), expected)
+    if not 0.0 < power_w <= max_w:
+        raise InputError(
+            option, Unquoted(f"{power_w * 1e3:g} mW"), f"more than 0 and at most {format_number(max_w * 1e3)} mW"
+        )
 
 
 class ExclusiveBoard(ArmedBoard):

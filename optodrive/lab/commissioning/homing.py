@@ -1,17 +1,19 @@
-"""Homing: a table of steps that ends with centred mirrors and a disarmed board, or with the reason for a refusal.
+"""Homing and first light: tables of steps that end with a disarmed board, or with the reason for a refusal.
 
-The gate stays off unless a spot power is given. The mirrors are observed by their position outputs, by the spot, or not
-at all; without observation only the board's reports are checked, and the result says so.
+Homing ends with centred mirrors. The gate stays off unless a spot power is given. The mirrors are observed by their
+position outputs, by the spot, or not at all; without observation only the board's reports are checked, and the result
+says so. First light emits single weak pulses at the centre after the steps of homing that need no light.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from optodrive.core.errors import RefusedError
+from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.quantity import format_quantity
-from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-from optodrive.lab.commissioning.spot_reader import SpotReader
+from optodrive.device.config import Config
+from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, max_spot_power_w
+from optodrive.lab.commissioning.sensor import SpotReader
 from optodrive.link.protocol.messages import INPUTS
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 from optodrive.link.protocol.states import BoardState
@@ -32,6 +34,10 @@ OUTPUT_TOLERANCE, SPOT_TOLERANCE = 0.05, 0.1
 ZERO_TOLERANCE_RAD = 2e-3
 """Permitted error of the position outputs at the centre."""
 AXES = "xy"
+DUTY_SHARE = 0.01
+"""Default power as a share of the laser's: at less, the gate's readback of the reference board detects no light."""
+PULSES_MAX = 100
+PULSE_INTERVAL_S = 1.0
 
 
 class HomingPosition(NamedTuple):
@@ -269,3 +275,30 @@ STEPS: tuple[Step, ...] = (
     ("zero again", Homing.return_to_zero),
 )
 """Steps in order; each one starts from the result of the step before."""
+
+
+def default_power_w(config: Config) -> float:
+    """Return the lowest power that is emitted and that the reference board's readback detects, at most a spot's, W."""
+    lowest_w = max(DUTY_SHARE * config.laser.max_power_w, config.laser.threshold_w)
+    return min(lowest_w, max_spot_power_w(config))
+
+
+def emit_first_light(
+    board: ExclusiveBoard, power_w: float, pulses: int, acknowledge: bool, on_step: Callable[[HomingResult], None]
+) -> None:
+    """Check link, state, inputs and indicator, centre the mirrors, emit the pulses one per second, and disarm.
+
+    Raises InputError for a power beyond that of a spot or a number of pulses outside 1 to PULSES_MAX, RefusedError for
+    a failed check, and errors of the board as ExclusiveBoard.
+    """
+    if not 1 <= pulses <= PULSES_MAX:
+        raise InputError("--pulses", pulses, f"1 to {PULSES_MAX}")
+    Homing(board, None, 0.0, acknowledge).run(on_step, DARK_STEPS)
+    board.move_to(CENTRE_CODE, CENTRE_CODE)
+    for number in range(1, pulses + 1):
+        if number > 1:
+            board.wait(PULSE_INTERVAL_S)
+        board.fire_spot(CENTRE_CODE, CENTRE_CODE, power_w)
+        on_step(HomingResult("light", f"pulse {number} of {pulses} executed", {"pulse": number}))
+    board.disarm()
+    on_step(HomingResult("end", "gate off, DISARMED", {"board": str(board.session.board.state)}))

@@ -1,28 +1,35 @@
 """Closed-loop calibration: measure the most informative spot, fit, and repeat until the field is accurate enough.
 
-A `SpotLocator`, a sensor or a person, offers candidate positions and measures the spot at the chosen one.
+A `SpotLocator`, a sensor or a person, offers candidate positions and measures the spot at the chosen one. The spots are
+saved after each one so that an interrupted calibration can be resumed.
 """
 
+import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import NotReadyError, RefusedError
+from optodrive.core.errors import InputError, NotReadyError, RefusedError
+from optodrive.core.files import atomic_write
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.units import m_to_um
-from optodrive.lab.calibration.field_fit import FieldFit, fit_field
-from optodrive.lab.calibration.field_prior import FieldPrior
-from optodrive.lab.calibration.next_spot import select_next_spot
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.lab.calibration.field_fit import FieldFit, fit_field, select_next_spot
 from optodrive.lab.calibration.spot_checks import check_fit, check_spots
-from optodrive.lab.calibration.spots import MeasuredSpots
-from optodrive.lab.commissioning.calibration_session import CalibrationSession, SpotRow, save_text
+from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-from optodrive.lab.commissioning.predicted_error import predicted_rms_m
 from optodrive.lab.commissioning.worker_process import WorkerProcess
+from optodrive.link.protocol.quantisation import CENTRE_CODE
 
+GRID_SIDE = 15
+"""Grid points per side at which the uncertainty is averaged."""
+FORMAT = "optodrive-calibration-session"
+VERSION = 1
 WORKER_TIMEOUT_S = 30.0
 """Time limit of a computation, during which the board stays armed."""
 CONSECUTIVE_MISSES_MAX = 3
@@ -37,6 +44,95 @@ RECHECKS_MAX = 2
 """Maximum number of spots that a resumed calibration measures again."""
 RECHECK_SIGMAS = 5.0
 """Two measurements of a spot differ if they are more sigmas apart than this."""
+
+
+def build_code_grid(config: Config, margin_m: float, side: int) -> FloatArray:
+    """Build a grid of nominal codes over the display and a margin, [side², 2], by rows from the bottom."""
+    layout = build_pixel_layout(config.display)
+    code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
+    x, y = (
+        CENTRE_CODE + np.linspace(-1.0, 1.0, side) * (float(np.abs(axis).max()) + margin_m) / code_m
+        for axis in (layout.x_m, layout.y_m)
+    )
+    return np.column_stack([np.tile(x, side), np.repeat(y, side)])
+
+
+def predicted_rms_m(fit: FieldFit, config: Config) -> float:
+    """Return the predicted rms length of the field's error over the display, m."""
+    sigma_m = fit.field.sigma_m(*build_code_grid(config, 0.0, GRID_SIDE).T)
+    return float(np.sqrt(2.0 * np.mean(sigma_m**2)))
+
+
+class SpotRow(NamedTuple):
+    """One spot: commanded codes and measured position, m."""
+
+    x_code: float
+    y_code: float
+    x_m: float
+    y_m: float
+
+
+class CalibrationSession:
+    """The spots of one calibration and their file beside the output file."""
+
+    def __init__(self, path: Path, header: dict[str, Any], rows: list[SpotRow]) -> None:
+        self.path, self.rows = path, rows
+        self._header = header
+
+    @classmethod
+    def load_or_create(cls, out: Path, config: Config) -> Self:
+        """Load the session of an output file, or create one. Raise InputError for a session of another display."""
+        path = session_path_for(out)
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "display": config.name,
+            "focal_length_m": config.scanner.focal_length_m,
+            "rad_per_code": config.scanner.rad_per_code,
+        }
+        return cls(path, header, _read_rows(path, header) if path.exists() else [])
+
+    @property
+    def spots(self) -> MeasuredSpots:
+        """All spots, in order of measurement."""
+        return MeasuredSpots.from_table(np.array(self.rows, dtype=np.float64))
+
+    def to_json(self) -> str:
+        """Return the content of the file."""
+        return json.dumps({**self._header, "spots": self.rows}) + "\n"
+
+
+def session_path_for(out: Path) -> Path:
+    """Return the path of an output file's session."""
+    return out.with_name(out.name + ".session.json")
+
+
+def save_text(path: Path, text: str) -> None:
+    """Replace the file and flush it to disk."""
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _read_rows(path: Path, header: dict[str, Any]) -> list[SpotRow]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+    except (ValueError, RecursionError):
+        raise InputError(str(path), "not JSON", "a calibration's session; delete it to start again") from None
+    for key, value in header.items():
+        stored = document.get(key) if isinstance(document, dict) else None
+        if stored != value:
+            raise InputError(f"{path}: {key}", stored, f"{value!r}; delete the file to start again")
+    try:
+        rows = [SpotRow(*(float(number) for number in row)) for row in document["spots"]]
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: spots", "something else", "rows of x_code, y_code, x_m, y_m") from None
+    if not np.all(np.isfinite(np.array(rows, dtype=np.float64))):
+        raise InputError(f"{path}: spots", "a number that is not finite", "finite numbers")
+    return rows
 
 
 class SpotLocator(Protocol):

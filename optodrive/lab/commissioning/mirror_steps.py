@@ -12,8 +12,7 @@ import numpy as np
 from optodrive.core.errors import InputError, LinkError
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import PulsePlan
-from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, find_weakest_pixel
-from optodrive.lab.commissioning.spot_bounds import max_settling_s
+from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, find_weakest_pixel, max_settling_s
 from optodrive.link.protocol.quantisation import CENTRE_CODE, GATE_OFF_STEP_TICKS, TICKS_MAX, WirePoints, WireScale
 from optodrive.planning.limiter.limiter import galvo_feasible_prefix
 

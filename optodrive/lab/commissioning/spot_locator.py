@@ -12,10 +12,9 @@ from optodrive.core.units import um_to_m
 from optodrive.device.config import build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.lab.calibration.spots import MeasuredSpots
-from optodrive.lab.commissioning.calibration_session import SpotRow
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-from optodrive.lab.commissioning.predicted_error import build_code_grid
-from optodrive.lab.commissioning.spot_reader import SpotReader
+from optodrive.lab.commissioning.measurement_loop import SpotRow, build_code_grid
+from optodrive.lab.commissioning.sensor import SpotReader
 
 GRID_SIDE = 11
 """Candidate positions per side for a sensor."""

@@ -7,8 +7,7 @@ from dataclasses import dataclass, fields
 from optodrive.core.errors import RefusedError
 from optodrive.core.types.plans import LimitedPlan, PulsePlan
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.lab.calibration.pixels.sweep import Aim, build_sweep, is_reachable
-from optodrive.lab.calibration.pixels.sweep_journal import SweepJournal, SweepPulse
+from optodrive.lab.calibration.pixel_sweep import Aim, SweepJournal, SweepPulse, build_sweep, is_reachable
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.planning.display_model import DisplayModel

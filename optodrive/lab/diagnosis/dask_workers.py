@@ -1,4 +1,11 @@
-"""Execution of many tasks on Dask, in local processes or on a cluster, with recovery from lost workers."""
+"""Execution of many tasks on Dask, in local processes or on a cluster, with recovery from lost workers.
+
+The local cluster is a process of its own, `python -m optodrive.lab.diagnosis.dask_workers WORKERS FOLDER`. It prints
+the address of its scheduler at once. It kills itself and its workers, all of one process group, when its stdin ends, as
+it does with the process that started it.
+
+A task whose worker was lost runs again alone after all others; if that costs another worker, the task is at fault.
+"""
 
 import logging
 import os
@@ -7,13 +14,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Timer
 from typing import Any, TypeVar
-from uuid import uuid4
 
 from optodrive.core.errors import InputError, OptodriveError
 from optodrive.core.extras import import_extra
@@ -31,6 +37,22 @@ ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLOSE_TIMEOUT_S = 0.5
 WORKER_TIMEOUT_S, LOCAL_TIMEOUT_S = 30.0, 120.0
 """Times within which a scheduler must have a worker, and a local one after its start."""
+LOST_AGAIN = "the worker died each time, the last time with no other task running: out of memory?"
+SETTINGS = {
+    # A task whose worker was lost returns at once and runs again alone, which shows whether it is at fault.
+    "distributed.scheduler.allowed-failures": 0,
+    "distributed.scheduler.worker-saturation": 1.0,
+    # A worker that a signal has stopped is replaced after this time, and its task runs again elsewhere.
+    "distributed.scheduler.worker-ttl": "10s",
+    # Results are small: spilling frees no memory, and a paused worker would never resume.
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+    "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
+    "distributed.admin.system-monitor.gil.enabled": False,
+}
+"""Dask's settings of the local cluster."""
 
 
 @contextmanager
@@ -65,7 +87,7 @@ def _start_local_cluster(workers: int) -> Iterator[str]:
     """Yield the address of a cluster of local processes, which are killed at the end of the block."""
     with TemporaryDirectory(prefix="optodrive-") as folder, (Path(folder) / "errors").open("w+") as errors:
         cluster = subprocess.Popen(
-            [sys.executable, "-P", "-m", "optodrive.lab.diagnosis.local_cluster", str(workers), folder],
+            [sys.executable, "-P", "-m", "optodrive.lab.diagnosis.dask_workers", str(workers), folder],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
@@ -117,52 +139,47 @@ def _connect(distributed: Any, address: str, stack: ExitStack, worker_timeout_s:
 def run_tasks(
     client: Any, function: Callable[[Task], Result], tasks: list[Task]
 ) -> Iterator[tuple[Task, Result | None, str]]:
-    """Yield each task with its result, or with a one-line error, in the order of completion.
-
-    A task whose worker was lost runs again alone after all others; if that costs another worker, the task is at fault.
-    """
+    """Yield each task with its result, or with a one-line error, in the order of completion."""
     from distributed import KilledWorker
 
-    run = uuid4().hex[:12]
-    futures = {client.submit(function, task, key=f"{run}-{number}"): task for number, task in enumerate(tasks)}
-    lost: list[Task] = []
+    lost = []
+    for task, result, error in _run_at_once(client, function, tasks):
+        if isinstance(error, KilledWorker):
+            lost.append(task)
+        else:
+            yield task, result, _format_error(error)
+    for task in lost:
+        for _, result, error in _run_at_once(client, function, [task]):
+            yield task, result, LOST_AGAIN if isinstance(error, KilledWorker) else _format_error(error)
+
+
+def _run_at_once(
+    client: Any, function: Callable[[Task], Result], tasks: list[Task]
+) -> Iterator[tuple[Task, Result | None, Exception | None]]:
+    """Yield each task with its result or exception. Raise OptodriveError if the scheduler is lost or suspended."""
+    from distributed import as_completed
+
+    futures = {client.submit(function, task, pure=False): task for task in tasks}
+    completed, check_at_s = as_completed(list(futures), loop=client.loop), time.monotonic() + CHECK_PERIOD_S
+    timeout_s = IMPORT_TIMEOUT_S
     try:
-        for future in _iterate_completed(client, futures):
+        while futures:
+            while not completed.has_ready():
+                time.sleep(POLL_S)
+                if time.monotonic() > check_at_s:
+                    _check_scheduler(client, timeout_s)
+                    timeout_s, check_at_s = CHECK_TIMEOUT_S, time.monotonic() + CHECK_PERIOD_S
+            future = next(completed)
+            error = future.exception()
+            while future.status == "lost":  # a worker died with the result, which another computes again
+                error = future.exception()
+            if future.status == "cancelled":
+                raise OptodriveError("the Dask scheduler was lost before all tasks ended; no file is written")
             task = futures.pop(future)
-            error = _wait_for_error(future)
-            if isinstance(error, KilledWorker):
-                lost.append(task)
-            else:
-                yield (task, future.result(), "") if error is None else (task, None, _format_error(error))
-        for number, task in enumerate(lost):
-            future = client.submit(function, task, key=f"{run}-again-{number}")
-            futures[future] = task
-            (future,) = _iterate_completed(client, [future])
-            error = _wait_for_error(future)
-            del futures[future]
-            if isinstance(error, KilledWorker):
-                yield task, None, "the worker died each time, the last time with no other task running: out of memory?"
-            else:
-                yield (task, future.result(), "") if error is None else (task, None, _format_error(error))
+            yield task, None if error is not None else future.result(), error
     finally:
         if futures:
             client.cancel(list(futures), force=True)
-
-
-def _iterate_completed(client: Any, futures: Iterable[Any]) -> Iterator[Any]:
-    """Yield futures as they end. Raise OptodriveError if the scheduler is suspended or hangs."""
-    from distributed import as_completed
-
-    completed, check_at_s = as_completed(list(futures), loop=client.loop), time.monotonic() + CHECK_PERIOD_S
-    timeout_s = IMPORT_TIMEOUT_S
-    while not completed.is_empty():
-        while not completed.has_ready():
-            time.sleep(POLL_S)
-            if time.monotonic() > check_at_s:
-                _check_scheduler(client, timeout_s)
-                timeout_s = CHECK_TIMEOUT_S
-                check_at_s = time.monotonic() + CHECK_PERIOD_S
-        yield next(completed)
 
 
 def _check_scheduler(client: Any, timeout_s: float) -> None:
@@ -175,15 +192,30 @@ def _check_scheduler(client: Any, timeout_s: float) -> None:
             ) from None
 
 
-def _wait_for_error(future: Any) -> Exception | None:
-    """Return the exception of a future. Raise OptodriveError if the scheduler is lost."""
-    error: Exception | None = future.exception()
-    while future.status == "lost":  # a worker died with the result, which another computes again
-        error = future.exception()
-    if future.status == "cancelled":
-        raise OptodriveError("the Dask scheduler was lost before all tasks ended; no file is written")
-    return error
+def _format_error(error: Exception | None) -> str:
+    return "" if error is None else " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _format_error(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
+def main(workers: int, folder: str) -> None:
+    """Run a cluster of processes with one thread each on loopback, with its files in a folder, until stdin ends."""
+    import dask
+    from distributed import LocalCluster
+
+    with dask.config.set(SETTINGS):
+        cluster = LocalCluster(
+            n_workers=0,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address=None,
+            worker_dashboard_address=None,
+            local_directory=folder,
+            silence_logs=logging.CRITICAL,
+        )
+        cluster.scale(workers)  # without waiting: a worker that does not start is missing alone
+        print(cluster.scheduler_address, flush=True)  # noqa: T201
+        sys.stdin.read()
+    os.killpg(0, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), sys.argv[2])

@@ -1,4 +1,4 @@
-"""Recording as one vector of finite samples, divided into blocks of one signal of one run each."""
+"""Recording as one vector of finite samples, in blocks of one signal of one run each, and its hypotheses."""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +9,9 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import Measurement, Run
 from optodrive.lab.inspection.start_times import read_start_times
+from optodrive.physics.hypothesis import Hypothesis, RecordingScope
 from optodrive.physics.pixel_ode import PixelExperiment
+from optodrive.physics.terms import discover_terms
 
 SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad", "mirror_y_rad")
 """Signal kinds by number; the first three belong to a pixel, the others to the mirrors."""
@@ -20,6 +22,8 @@ COMMAND_DIGITS = 6
 """Digits of mirror commands, s and rad, within which they are equal."""
 EDGE_EXCLUSION_S = 6e-5
 """Temperature samples closer to a gate edge are excluded: timing jitter acts nonlinearly on the kink there."""
+CLOCKS = ("temperature", "displacement", "force", "mirrors", "mirrors")
+"""Clock of each kind of signal, in the order of `dataset.SIGNALS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,3 +249,22 @@ def _compute_doses_j(runs: tuple[Run, ...], order: IntArray) -> tuple[dict[int, 
         for _, width_s, power_w, pixel in runs[number].pulses.tolist():
             accumulated_j[int(pixel)] = accumulated_j.get(int(pixel), 0.0) + width_s * power_w
     return accumulated_j, before_j
+
+
+def build_hypotheses(data: Dataset) -> list[Hypothesis]:
+    """Return every hypothesis that this recording can show."""
+    scope = _describe_scope(data)
+    terms = (term for term in discover_terms().values() if term.signature and scope.subsystem in term.subsystems)
+    return [hypothesis for term in terms for hypothesis in term.build_hypotheses(scope)]
+
+
+def _describe_scope(data: Dataset) -> RecordingScope:
+    return RecordingScope(
+        signals=tuple(dict.fromkeys(CLOCKS[kind] for kind in data.kinds)),
+        pixels=tuple(data.pixels),
+        illuminated=frozenset(int(pixel) for run in data.runs for pixel in run.pulses[:, 3]),
+        has_neighbour_pulses=any(
+            bool((experiment.pulses[:, 3] != experiment.pixel).any()) for experiment, _ in data.experiments
+        ),
+        power_levels=len({round(float(power_w), 3) for run in data.runs for power_w in run.pulses[:, 2]}),
+    )

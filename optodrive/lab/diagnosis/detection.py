@@ -17,8 +17,10 @@ from optodrive.lab.diagnosis.fitting import (
     ModelFit,
     compute_jacobian,
     compute_jitter_sensitivity,
+    compute_normal_equations,
+    project_out,
+    solve,
 )
-from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE, SearchLog

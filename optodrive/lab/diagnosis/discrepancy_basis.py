@@ -14,8 +14,14 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import Dataset
-from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
-from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
+from optodrive.lab.diagnosis.fitting import (
+    FitProblem,
+    ModelFit,
+    compute_jacobian,
+    compute_jitter_sensitivity,
+    compute_normal_equations,
+    solve,
+)
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE
 from optodrive.physics.hypothesis import Hypothesis

@@ -7,8 +7,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import HeldOutError, HeldOutGain
 from optodrive.lab.diagnosis.dataset import SIGNALS, Dataset
-from optodrive.lab.diagnosis.fitting import FitProblem, compute_jitter_sensitivity
-from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
+from optodrive.lab.diagnosis.fitting import FitProblem, compute_jitter_sensitivity, compute_normal_equations
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus_by_group
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 from optodrive.lab.inference.claim import HeldOutChange

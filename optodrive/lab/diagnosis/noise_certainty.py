@@ -17,9 +17,8 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
-from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity, compute_normal_equations
 from optodrive.lab.diagnosis.noise_model import NoiseModel
-from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 
 PRIOR_DEGREES, KNOWN_DEGREES = 6, 10_000
 """Degrees of freedom of what is known of jitters beforehand; degrees of freedom of noise that counts as known."""

@@ -14,9 +14,8 @@ from scipy.linalg import cho_factor, cho_solve
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.evidence import BinEvidence, compute_bin_evidence
-from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity
+from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity, project_out
 from optodrive.lab.diagnosis.noise_model import whiten
-from optodrive.lab.diagnosis.normal_equations import project_out
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS
 
 EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)

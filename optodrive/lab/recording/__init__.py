@@ -1,8 +1,14 @@
 """Recordings of measured data in format "optotactile-recording", version 1: one HDF5 file or a folder of CSV files."""
 
-from optodrive.lab.recording.display_runs import DisplayRuns, PixelRuns
-from optodrive.lab.recording.index import RecordingIndex, RunIndex, SignalIndex
-from optodrive.lab.recording.reader import read_recording, read_runs
+from optodrive.lab.recording.reader import (
+    DisplayRuns,
+    PixelRuns,
+    RecordingIndex,
+    RunIndex,
+    SignalIndex,
+    read_recording,
+    read_runs,
+)
 from optodrive.lab.recording.storage import FORMAT, SIGNALS, VERSION
 from optodrive.lab.recording.writer import convert_recording, write_recording
 

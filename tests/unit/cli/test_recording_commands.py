@@ -9,7 +9,7 @@ from PIL import Image
 
 from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.lab.recording import plot, read_recording, write_recording
+from optodrive.lab.recording import read_recording, show, write_recording
 from recording_samples import assert_same, recording
 
 ONE = recording().runs[0]
@@ -75,7 +75,7 @@ def test_the_picture_shows_pulses_curves_and_what_is_missing(path, tmp_path):
     assert run(["recording", "show", str(path), "--out", str(out)]) == 0
     with Image.open(out) as image:
         colours = {colour for _, colour in image.convert("RGB").getcolors(100_000)}
-    for expected in (plot.PULSE_COLOUR, plot.CURVE_COLOUR, plot.MISSING_COLOUR):
+    for expected in (show.PULSE_COLOUR, show.CURVE_COLOUR, show.MISSING_COLOUR):
         assert tuple(bytes.fromhex(expected[1:])) in colours
 
 
@@ -90,7 +90,7 @@ def test_the_picture_takes_any_finite_numbers(tmp_path):
     runs = tuple(Run(f"ламбда{k}", 293.0, pulses, signals, {"group": "g" * 99}) for k in range(401))
     write_recording(tmp_path / "r.h5", Measurement(runs[:2]))
     assert run(["recording", "show", str(tmp_path / "r.h5"), "--out", str(tmp_path / "p.png")]) == 0
-    assert plot.write_plot(tmp_path / "all.png", Measurement(runs)) == 400
+    assert show.write_plot(tmp_path / "all.png", Measurement(runs)) == 400
     with Image.open(tmp_path / "all.png") as image:
         assert image.height < 20_000
 

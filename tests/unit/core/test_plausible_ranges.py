@@ -15,8 +15,8 @@ from optodrive.device.config_file import MirrorsFile
 from optodrive.device.field_file import _FieldFile
 from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
 from optodrive.device.pixel_map import _PixelMapFile
-from optodrive.lab.calibration.camera.folder import _PicturesFile
-from optodrive.lab.diagnosis.plausible_units import LENGTHS
+from optodrive.lab.calibration.pictures import _PicturesFile
+from optodrive.lab.diagnosis.recording_checks import LENGTHS
 from optodrive.lab.recording.storage import SAMPLE_COLUMNS, SIGNALS, TABLE_COLUMNS
 from optodrive.physics.parameters import PARAMETER_UNITS, Bridge, ParameterSet
 from optodrive.physics.terms import discover_terms

@@ -7,7 +7,7 @@ from hidden_field import CODE_M, CONFIG, PRIOR, grid_codes, measure_spots
 from optodrive.core.errors import InputError
 from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.field_writer import write_field
+from optodrive.lab.calibration.field_output import write_field
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 FIT = fit_field(measure_spots(GroundTruthGeometry.sample(0, CONFIG), grid_codes(9), np.random.default_rng(0))[0], PRIOR)

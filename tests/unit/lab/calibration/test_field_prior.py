@@ -5,7 +5,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.device.config import Config
 from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
-from optodrive.lab.calibration.field_prior import FieldPrior
+from optodrive.lab.calibration.spots import FieldPrior
 
 
 @pytest.mark.parametrize("name", ["display-1", "display-1511"])

@@ -5,8 +5,12 @@ import pytest
 
 from exclusive_rig import ExclusiveRig, limited
 from optodrive.core.errors import BoardFaultError, InputError, NotReadyError, RefusedError
-from optodrive.lab.commissioning.exclusive_board import find_weakest_pixel
-from optodrive.lab.commissioning.spot_bounds import max_settling_s, max_spot_power_w, spot_width_s
+from optodrive.lab.commissioning.exclusive_board import (
+    find_weakest_pixel,
+    max_settling_s,
+    max_spot_power_w,
+    spot_width_s,
+)
 from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
 

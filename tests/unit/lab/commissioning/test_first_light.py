@@ -7,8 +7,8 @@ import pytest
 from exclusive_rig import ExclusiveRig
 from optodrive.cli.main import run
 from optodrive.core.errors import BoardFaultError, InputError, RefusedError
-from optodrive.lab.commissioning.first_light import default_power_w, emit_first_light
-from optodrive.lab.commissioning.spot_bounds import max_spot_power_w, spot_width_s
+from optodrive.lab.commissioning.exclusive_board import max_spot_power_w, spot_width_s
+from optodrive.lab.commissioning.homing import default_power_w, emit_first_light
 from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX
 from optodrive.planning.display_model import DisplayModel
 

@@ -11,10 +11,9 @@ from exclusive_rig import ExclusiveRig
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
 from optodrive.device.config import Config
 from optodrive.lab.calibration.spots import MeasuredSpots
-from optodrive.lab.commissioning.calibration_session import CalibrationSession, SpotRow, save_text, session_path_for
+from optodrive.lab.commissioning.measurement_loop import CalibrationSession, SpotRow, save_text, session_path_for
+from optodrive.lab.commissioning.sensor import SpotReader, SpotReading, SpotSensorClient, robust_mean
 from optodrive.lab.commissioning.spot_locator import SensorLocator
-from optodrive.lab.commissioning.spot_reader import SpotReader, robust_mean
-from optodrive.lab.commissioning.spot_sensor_client import SpotReading, SpotSensorClient
 from optodrive.lab.commissioning.worker_process import WorkerProcess
 from optodrive.link.transport.serial_port import SerialPort
 from optodrive.planning.display_model import DisplayModel

@@ -5,9 +5,7 @@ import pytest
 
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError, RefusedError
-from optodrive.lab.commissioning.pixel_reader import LATE_MAX_S, PixelReader
-from optodrive.lab.commissioning.spot_reader import SpotReader
-from optodrive.lab.commissioning.spot_sensor_client import SpotSensorClient
+from optodrive.lab.commissioning.sensor import LATE_MAX_S, PixelReader, SpotReader, SpotSensorClient
 
 
 class Board:

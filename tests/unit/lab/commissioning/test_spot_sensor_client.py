@@ -3,7 +3,7 @@
 import pytest
 
 from optodrive.core.errors import LinkError
-from optodrive.lab.commissioning.spot_sensor_client import SHOWN_MAX, SpotSensorClient
+from optodrive.lab.commissioning.sensor import SHOWN_MAX, SpotSensorClient
 
 
 class Wire:

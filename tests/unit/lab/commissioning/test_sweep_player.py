@@ -13,19 +13,21 @@ from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from optodrive.device.field_loader import load_scan_field
-from optodrive.lab.calibration.pixels.sweep import (
+from optodrive.lab.calibration.pixel_sweep import (
+    PRE_PULSE_S,
     Aim,
+    SweepJournal,
     build_aim_map,
+    build_runs,
     build_sweep,
     compute_pulse,
     is_reachable,
     list_aims,
 )
-from optodrive.lab.calibration.pixels.sweep_journal import PRE_PULSE_S, SweepJournal, build_runs
 from optodrive.lab.commissioning import sweep_player
 from optodrive.lab.commissioning.sweep_player import plan_aims, play_aims
 from optodrive.lab.recording import write_recording
-from optodrive.lab.recording.merge import merge_session
+from optodrive.lab.recording.reader import merge_session
 from optodrive.link.protocol.quantisation import DUTY_MAX
 
 DISPLAY = DISPLAYS["display-16"]
@@ -159,7 +161,7 @@ def test_a_full_disk_ends_the_sweep_dark(displays, tmp_path, monkeypatch):
     def fail(file, data):
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr("optodrive.lab.calibration.pixels.sweep_journal.os.write", fail)
+    monkeypatch.setattr("optodrive.lab.calibration.pixel_sweep.os.write", fail)
 
     def play_to_the_end():
         play(displays, journal)

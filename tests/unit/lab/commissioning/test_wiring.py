@@ -11,9 +11,8 @@ from hidden_field import CONFIG, calibrate_hidden_field, config_with_field, grid
 from optodrive.core.errors import InputError, LocalProtocolError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.field_loader import load_scan_field
-from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.spot_checks import check_spots
-from optodrive.lab.calibration.spots import MeasuredSpots
+from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 from optodrive.lab.commissioning.mirror_steps import plan_step_runs, play_step_runs
 from optodrive.link.board_setup import build_scales
 from optodrive.link.dac.encoding import PointScale, encode

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from labs import lab
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.diagnosis.copied_runs import check_copied_runs
 from optodrive.lab.diagnosis.diagnose import diagnose
+from optodrive.lab.diagnosis.recording_checks import check_copied_runs
 
 
 def copy_first(measurement):

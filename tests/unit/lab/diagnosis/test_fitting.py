@@ -5,10 +5,9 @@ import json
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.lab.diagnosis.dataset import build_dataset
+from optodrive.lab.diagnosis.dataset import build_dataset, build_hypotheses
 from optodrive.lab.diagnosis.detection import detect
 from optodrive.lab.diagnosis.fitting import fit
-from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.prediction import ParameterPoint
 from optodrive.lab.diagnosis.priors import build_prior

@@ -5,10 +5,9 @@ import pytest
 
 from labs import PIXEL, lab
 from optodrive.lab.diagnosis.dataset import build_dataset
-from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity
+from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, whiten
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
-from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.replicate_contrasts import compute_contrasts
 
 NOISE = ColouredNoise(white=0.3, sigma=(0.2, 0.4), tau_s=(0.01, 0.05), omega_rad_per_s=300.0)

@@ -9,15 +9,18 @@ from displays import DISPLAYS
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.types.discrepancy import Discrepancy, NextExperiment, Probabilities
 from optodrive.core.types.measurements import Run, Signal
-from optodrive.lab.live_diagnosis.campaign import REPEATS_MAX, CampaignRecording, name_probabilities, run_campaign
-from optodrive.lab.live_diagnosis.experiments import (
+from optodrive.lab.live_diagnosis import (
     FIRST_ORDER,
     LEAD_S,
     POWER_MIN,
+    REPEATS_MAX,
+    CampaignRecording,
     find_pixels,
+    name_probabilities,
     plan_experiment,
     plan_first_experiments,
     plan_proposal,
+    run_campaign,
 )
 from optodrive.planning.limiter.limiter import limit
 

@@ -9,7 +9,7 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.lab.recording import convert_recording, read_recording, reader, sandboxed_probe, write_recording
+from optodrive.lab.recording import convert_recording, hdf5, read_recording, reader, write_recording
 from optodrive.lab.recording.hdf5 import Hdf5Tree
 from optodrive.lab.recording.storage import natural_sort_key
 from optodrive.lab.recording.trials import read_trials
@@ -330,24 +330,24 @@ def test_truncated_files_are_refused(path, share):
 
 
 def test_a_process_that_hangs_or_crashes_is_refused(path, monkeypatch):
-    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
+    monkeypatch.setattr(hdf5, "CPU_LIMIT_S", 1)
     for program in ("_limit_resources(1)\nwhile True: pass", "import os; os.abort()"):
         monkeypatch.setattr(
-            sandboxed_probe,
+            hdf5,
             "_PROGRAM",
-            f"from optodrive.lab.recording.sandboxed_probe import _limit_resources\n{program}",
+            f"from optodrive.lab.recording.hdf5 import _limit_resources\n{program}",
         )
         assert "hangs or crashes" in refusal(path)
 
 
 def test_a_file_is_tried_out_once(path, monkeypatch):
     read_recording(path)
-    monkeypatch.setattr(sandboxed_probe, "_PROGRAM", "import os; os.abort()")
+    monkeypatch.setattr(hdf5, "_PROGRAM", "import os; os.abort()")
     read_recording(path)
 
 
 def test_damage_on_which_hdf5_2_0_searches_for_ever_comes_to_an_end(path, monkeypatch):
-    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
+    monkeypatch.setattr(hdf5, "CPU_LIMIT_S", 1)
     content = bytearray(path.read_bytes())
     content[content.index(b"GCOL") + 24] = 255  # the length of the first text of the file
     path.write_bytes(content)
@@ -416,9 +416,9 @@ def count_opens(monkeypatch, path):
             opened.append(path)
             super().__init__(path)
 
-    monkeypatch.setattr(sandboxed_probe, "Hdf5Tree", CountingTree)
-    monkeypatch.setattr(sandboxed_probe, "_extend_cpu_limit", lambda limit_s: None)
-    sandboxed_probe._read_all(path, 5)
+    monkeypatch.setattr(hdf5, "Hdf5Tree", CountingTree)
+    monkeypatch.setattr(hdf5, "_extend_cpu_limit", lambda limit_s: None)
+    hdf5._read_all(path, 5)
     return len(opened)
 
 

@@ -15,9 +15,8 @@ from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import read_recording, write_recording
-from optodrive.lab.recording.merge import merge_session
-from optodrive.lab.recording.session_recorder import QUEUE_MAX, SessionRecorder
-from optodrive.lab.recording.session_writer import COLD_AFTER_S
+from optodrive.lab.recording.reader import merge_session
+from optodrive.lab.recording.session import COLD_AFTER_S, QUEUE_MAX, SessionRecorder
 
 ABOUT = {"display": "d", "optodrive": "0", "ambient_K": 293.15, "bridge_width_m": 4e-4, "config": "{}"}
 

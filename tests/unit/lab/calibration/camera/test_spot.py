@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from optodrive.core.errors import InputError
-from optodrive.lab.calibration.camera.spot import RIVAL_FRACTION_MAX, find_spot
+from optodrive.lab.calibration.picture_spots import RIVAL_FRACTION_MAX, find_spot
 
 ROWS, COLUMNS = 240, 320
 Y, X = np.mgrid[:ROWS, :COLUMNS]

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Run, Signal
-from optodrive.lab.calibration.pixels.fit import Optics, fit_pixel
-from optodrive.lab.calibration.pixels.map_fit import PixelMapFitter, compute_stats
-from optodrive.lab.calibration.pixels.response import PixelResponse, compute_response
-from optodrive.lab.calibration.pixels.sweep import compute_pulse, list_aims
+from optodrive.lab.calibration.pixel_fit import Optics, PixelResponse, compute_response, fit_pixel
+from optodrive.lab.calibration.pixel_map_fit import PixelMapFitter, compute_stats
+from optodrive.lab.calibration.pixel_sweep import compute_pulse, list_aims
 
 DISPLAY = DISPLAYS["display-16"]
 CONFIG, OPTICS = DISPLAY.config, Optics.from_config(DISPLAY.config)

@@ -1,11 +1,15 @@
-"""Plausible units of a recording: each signal and drive against the response of a pixel, before anything is fitted.
+"""Checks of a recording before anything is fitted: finite numbers, repeats that are no copies, plausible units.
 
-The times are judged by the shape of a signal and not by its size: a time axis in ms beside pulses in s shows a response
-where there is no drive. The values are judged by their size once the shape agrees, within a factor of `MAX_RATIO`,
-which no pixel of the kind reaches and no wrong unit stays below. A signal without a response, such as that of a dead
-pixel, is judged by absolute limits alone.
+Limits of the numbers keep the diagnosis finite in time and free of overflow. Copies among the runs would pass for
+repeats with very little noise.
+
+Units are judged by the response of a pixel. The times are judged by the shape of a signal and not by its size: a time
+axis in ms beside pulses in s shows a response where there is no drive. The values are judged by their size once the
+shape agrees, within a factor of `MAX_RATIO`, which no pixel of the kind reaches and no wrong unit stays below. A signal
+without a response, such as that of a dead pixel, is judged by absolute limits alone.
 """
 
+from hashlib import sha256
 from typing import NamedTuple, NoReturn
 
 import numpy as np
@@ -18,8 +22,22 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS
+from optodrive.lab.diagnosis.noise_model import estimate_resolution
 from optodrive.physics.pixel import Pixel
 
+MAX_MAGNITUDE = 1e9
+"""Largest magnitude of a sample or of a pulse's power, SI; statistics hold fourth powers of it."""
+MAX_TIME_S = 1e4
+"""Latest end of a pulse or command, and longest duration of all runs together: each of some thousand predictions
+integrates it in steps of milliseconds."""
+MIN_SPACING_S = 1e-9
+"""Shortest time between two samples."""
+MIN_NOISE = 3.0
+"""Noise of equal samples, in resolutions, from which they are a copy: a simulation without noise stays below it."""
+MIN_WHITENESS = 0.5
+"""Third differences of neighbouring samples over those of every second one: 1 for white noise, 1/8 if smooth."""
+MIN_SAMPLES, MAX_INTERVAL_S = 20, 2e-3
+"""Minimum number of samples of a signal whose noise is estimated; their maximum interval, shorter than a response."""
 MIRROR_SIGNALS = tuple(SIGNALS[kind] for kind in MIRROR_KINDS)
 UNITS = {name: name.rpartition("_")[2] for name in SIGNALS}
 PLAUSIBLE = RECORDING
@@ -48,6 +66,74 @@ CLOCK_OFFSETS_S = np.linspace(-5e-3, 5e-3, 21)
 SAMPLES_MAX, PULSES_MAX = 300, 100
 RESISTANCE_FACTORS = (0.5, 1.0, 2.0)
 """Thermal resistances tried, relative to the reference pixel's."""
+
+
+def check_numeric_limits(measurement: Measurement) -> None:
+    """Raise InputError for a number that a diagnosis cannot compute with."""
+    for run in measurement.runs:
+        place = f"/runs/{run.name}"
+        if len(run.pulses):
+            _check_magnitude(f"{place}/pulses: start_s", run.pulses[:, 0], MAX_TIME_S, "s")
+            _check_magnitude(f"{place}/pulses: width_s", run.pulses[:, 1], MAX_TIME_S, "s")
+            _check_magnitude(f"{place}/pulses: power_W", run.pulses[:, 2], MAX_MAGNITUDE, "W")
+        if run.commands is not None and len(run.commands):
+            _check_magnitude(f"{place}/commands: t_s", run.commands[:, 0], MAX_TIME_S, "s")
+            _check_magnitude(f"{place}/commands", run.commands[:, 1:], MAX_MAGNITUDE, "rad")
+        for name, signal in run.signals.items():
+            finite = signal.value[np.isfinite(signal.value)]
+            _check_magnitude(f"{place}/{name}", finite, MAX_MAGNITUDE, name.rsplit("_", 1)[1])
+            _check_magnitude(f"{place}/{name}/t_s", signal.t_s, MAX_TIME_S, "s")
+            spacing_s = float(np.diff(signal.t_s).min(initial=np.inf))
+            if not spacing_s >= MIN_SPACING_S:
+                found = Unquoted(f"samples {spacing_s:.3g} s apart")
+                raise InputError(
+                    f"{place}/{name}/t_s", found, f"{MIN_SPACING_S:g} s at least; time stamps of SI seconds"
+                )
+    _check_duration(measurement.runs)
+
+
+def _check_magnitude(place: str, numbers: FloatArray, limit: float, unit: str) -> None:
+    magnitude = np.abs(numbers)
+    if len(numbers) and not magnitude.max() <= limit:
+        worst = float(numbers.reshape(-1)[magnitude.argmax()])
+        raise InputError(place, worst, f"a magnitude of at most {limit:g} {unit}")
+
+
+def _check_duration(runs: tuple[Run, ...]) -> None:
+    ends_s = [max((float(signal.t_s[-1]) for signal in run.signals.values()), default=0.0) for run in runs]
+    if sum(ends_s) > MAX_TIME_S:
+        longest = int(np.argmax(ends_s))
+        found = f"{sum(ends_s):.0f} s of runs, {ends_s[longest]:.0f} s of them in {runs[longest].name}"
+        raise InputError("recording", Unquoted(found), f"at most {MAX_TIME_S:g} s from the starts to the last samples")
+
+
+def check_copied_runs(measurement: Measurement) -> None:
+    """Raise InputError if a run with noise is a copy of another one: the same pulses, samples and signals."""
+    first: dict[bytes, Run] = {}
+    for run in measurement.runs:
+        content = sha256(run.pulses.tobytes())
+        for name in sorted(run.signals):
+            content.update(run.signals[name].value.tobytes())
+        twin = first.setdefault(content.digest(), run)
+        if twin is not run and any(_has_noise(signal) for signal in run.signals.values()):
+            raise InputError(
+                f"recording: {run.name}", Unquoted(f"a copy of {twin.name}"), "a repeat that was recorded on its own"
+            )
+
+
+def _has_noise(signal: Signal) -> bool:
+    """Return whether neighbouring samples differ as noise does: above the resolution, and as much as distant ones."""
+    finite = signal.value[np.isfinite(signal.value)]
+    if len(finite) < MIN_SAMPLES or float(np.median(np.diff(signal.t_s))) > MAX_INTERVAL_S:
+        return False
+    near, far = _estimate_noise_of_thirds(finite, 1), _estimate_noise_of_thirds(finite, 2)
+    return near > MIN_NOISE * estimate_resolution(finite, float(np.ptp(finite))) and near > MIN_WHITENESS * far
+
+
+def _estimate_noise_of_thirds(value: FloatArray, stride: int) -> float:
+    """Return the standard deviation of white noise by third differences, which are small where a signal is smooth."""
+    differences = value[3 * stride :] - 3.0 * (value[2 * stride : -stride] - value[stride : -2 * stride])
+    return float(1.4826 * np.median(np.abs(differences - value[: -3 * stride])) / np.sqrt(20.0))
 
 
 class _TimeUnits(NamedTuple):

@@ -1,23 +1,26 @@
-"""Reader of pictures.toml, which describes the pictures of a folder and the codes of the beam in each."""
+"""Pictures of a grid and of the beam: pictures.toml, which describes a folder of them, and their reading."""
 
 import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field as Item
 from pydantic import model_validator
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import MISSING, InputError
+from optodrive.core.extras import import_extra
 from optodrive.core.numeric_tables import open_table
 from optodrive.core.plausibility import PlausibleRange, check_plausible
 from optodrive.core.toml_file import read_toml
 from optodrive.core.toml_model import Section, check_format, parse_table
 from optodrive.device.field_geometry import CODE_MAX
 
-FORMAT = "optodrive-pictures"
-VERSION = 2
+PICTURES_FORMAT = "optodrive-pictures"
+PICTURES_VERSION = 2
 DESCRIPTION_FILE = "pictures.toml"
 COLUMNS = ("file", "x_code", "y_code")
 CODES_IN_NAME = re.compile(r"(\d+)[_,-](\d+)\.[A-Za-z]+$")
@@ -31,6 +34,13 @@ PITCH = PlausibleRange(0.2e-3, 0.1, "m")
 Finite = Annotated[float, Item(allow_inf_nan=False)]
 FinitePair = tuple[Finite, Finite]
 FileName = Annotated[str, Item(min_length=1)]
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+MEDIAN_PICTURES_MAX = 15
+"""Largest number of spot pictures whose median is the background; each spot lies elsewhere."""
+MEDIAN_PICTURES_MIN = 3
+"""Smallest number of spot pictures whose median is the background."""
+MEDIAN_BLOCK_ROWS = 200
+"""Rows per block of the median."""
 
 
 class GridSection(Section):
@@ -108,7 +118,7 @@ def read_picture_folder(folder: Path) -> PictureFolder:
     """Read FOLDER/pictures.toml and check that every picture exists. Raise InputError with file, key and value."""
     path = folder / DESCRIPTION_FILE
     table = read_toml(path)
-    check_format(path, table, FORMAT, VERSION)
+    check_format(path, table, PICTURES_FORMAT, PICTURES_VERSION)
     content = parse_table(path, table, _PicturesFile)
     check_plausible(f"{path}: grid.pitch_m", content.grid.pitch_m, PITCH)
     if 1 < len(content.grid.pictures) < VIEWS_MIN:
@@ -164,3 +174,69 @@ def _check_code(where: str, code: float) -> float:
     if not 0.0 <= code <= CODE_MAX:
         raise InputError(where, code, f"a code, 0 to {CODE_MAX}")
     return code
+
+
+def import_opencv() -> Any:
+    """Import OpenCV. Raise InputError (missing_extra) if it is not installed."""
+    return import_extra("cv2", "OpenCV", "camera")
+
+
+def read_image(path: Path) -> Image:
+    """Read a picture as [rows, columns], 8 or 16 bits.
+
+    Of a colour picture it is the blue channel, which holds the beam.
+    Raises InputError if OpenCV cannot read it.
+    """
+    cv2 = import_opencv()
+    try:
+        raw = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable picture") from None
+    # Ignore the orientation tag: marks_px refer to the picture as the camera stored it.
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(raw, flags) if len(raw) else None
+    except cv2.error:
+        image = None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise InputError(str(path), "no picture", "a picture that OpenCV reads, 8 or 16 bits (PNG, TIFF, JPEG)")
+    blue: Image = image if image.ndim == 2 else np.ascontiguousarray(image[..., 0])
+    return blue
+
+
+class PictureReader:
+    """Reads the pictures of one folder, all of one size and depth."""
+
+    def __init__(self, pictures: PictureFolder) -> None:
+        self._first = pictures.grid_views[0]
+        first = read_image(self._first)
+        self.rows, self.columns = first.shape
+        self._depth = first.dtype
+
+    def __call__(self, path: Path) -> Image:
+        """Read a picture. Raise InputError if its size or depth differs from the first."""
+        image = read_image(path)
+        if image.shape != (self.rows, self.columns):
+            size = f"{image.shape[1]} × {image.shape[0]} pixels"
+            raise InputError(str(path), size, f"{self.columns} × {self.rows}, as {self._first.name}")
+        if image.dtype != self._depth:
+            raise InputError(str(path), str(image.dtype), f"{self._depth}, as {self._first.name}")
+        return image
+
+    def read_background(self, pictures: PictureFolder) -> Image:
+        """Return the plane without the beam: the dark picture, or the median of pictures of spots."""
+        if pictures.dark is not None:
+            return self(pictures.dark)
+        if len(pictures.spot_pictures) < MEDIAN_PICTURES_MIN:
+            found = f"{len(pictures.spot_pictures)} spots"
+            raise InputError(
+                f"{pictures.path}: dark", MISSING, f"a picture without the beam, required with only {found}"
+            )
+        chosen = np.unique(np.linspace(0, len(pictures.spot_pictures) - 1, MEDIAN_PICTURES_MAX).astype(int))
+        stack = np.stack([self(pictures.spot_pictures[at].path) for at in chosen])
+        background: Image = np.empty_like(stack[0])
+        for first in range(0, self.rows, MEDIAN_BLOCK_ROWS):
+            background[first : first + MEDIAN_BLOCK_ROWS] = np.median(
+                stack[:, first : first + MEDIAN_BLOCK_ROWS].astype(np.float32), axis=0
+            )
+        return background

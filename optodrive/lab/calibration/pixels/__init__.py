@@ -1,1 +1,0 @@
-"""Per-pixel gain and beam offset from measured heights."""
