@@ -7,9 +7,7 @@ from pydantic.json_schema import models_json_schema
 
 from optodrive.core.types.push_options import Policy
 from optodrive.daemon.api.openapi_bodies import LIVE_FRAME_SCHEMA
-from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal
-from optodrive.daemon.responses.hold import HoldReport
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, FrameResult, HoldReport
 from optodrive.daemon.responses.telemetry import EVENTS
 
 REF_TEMPLATE = "#/components/schemas/{model}"

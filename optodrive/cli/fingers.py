@@ -121,7 +121,7 @@ def _send(reports: Iterable["FingerReport"], url: str) -> None:
     """Send reports with their ages, until there is no other."""
     from optodrive.client.display import Display
     from optodrive.core.errors import BusyError
-    from optodrive.daemon.responses.fingers import AGE_MAX_S, FINGERS_MAX
+    from optodrive.daemon.responses.messages import AGE_MAX_S, FINGERS_MAX
 
     count, begin_s = 0, time.monotonic()
     with Display(url) as display, display.fingers() as connection:

@@ -12,15 +12,15 @@ if TYPE_CHECKING:
     from optodrive.client.display import Display
     from optodrive.client.plan import Plan
     from optodrive.client.stream import Stream
+    from optodrive.daemon.responses.messages import FrameResult
     from optodrive.daemon.responses.state import StateReport
-    from optodrive.daemon.responses.stream import FrameResult
 
 __all__ = ["AsyncDisplay", "AsyncStream", "Display", "FrameResult", "Plan", "StateReport", "Stream"]
 _MODULES = {
     "AsyncDisplay": "optodrive.client.async_display",
     "AsyncStream": "optodrive.client.async_stream",
     "Display": "optodrive.client.display",
-    "FrameResult": "optodrive.daemon.responses.stream",
+    "FrameResult": "optodrive.daemon.responses.messages",
     "Plan": "optodrive.client.plan",
     "StateReport": "optodrive.daemon.responses.state",
     "Stream": "optodrive.client.stream",

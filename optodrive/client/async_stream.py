@@ -26,7 +26,7 @@ from optodrive.client.http import PROBE, PROBE_PERIOD_S, PROBE_TIMEOUT_S
 from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_connection
 from optodrive.core.errors import LinkError
 from optodrive.core.types.push_options import Policy, check_keywords
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FrameResult
 from optodrive.device.config import PixelLayout
 
 

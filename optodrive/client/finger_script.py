@@ -10,7 +10,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.numeric_tables import read_columns
 from optodrive.core.toml_model import build_input_error
 from optodrive.core.types.fingers import FingerPlace, FingerReport
-from optodrive.daemon.responses.fingers import FINGERS_MAX, FingerMessage
+from optodrive.daemon.responses.messages import FINGERS_MAX, FingerMessage
 
 COLUMNS = ("time_s", "number", "x_m", "y_m", "radius_m")
 LIFTED_S = 0.05

@@ -15,7 +15,7 @@ from optodrive.client.socket_connection import open_connection
 from optodrive.core.errors import LinkError, NotReadyError, OptodriveError
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.core.types.push_options import check_keywords
-from optodrive.daemon.responses.fingers import FingersRefusal, validate_fingers
+from optodrive.daemon.responses.messages import FingersRefusal, validate_fingers
 
 PATH = "/v1/fingers"
 

@@ -7,7 +7,7 @@ from urllib.parse import urlencode
 from optodrive.client.problems import build_error
 from optodrive.core.errors import LinkError, NotReadyError, RefusedError
 from optodrive.core.types.push_options import Policy
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FrameResult
 
 RESULTS_MAX = 1000
 """Results that are kept for a caller who does not read them; the oldest are dropped first."""

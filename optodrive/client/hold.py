@@ -11,7 +11,7 @@ from optodrive.client.loop_thread import LoopThread
 from optodrive.client.problems import build_error
 from optodrive.client.socket_connection import open_connection
 from optodrive.core.errors import NotReadyError, OptodriveError
-from optodrive.daemon.responses.hold import HoldReport
+from optodrive.daemon.responses.messages import HoldReport
 
 HOLD_PATH = "/v1/hold"
 BEAT = "beat"

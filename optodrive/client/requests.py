@@ -11,7 +11,7 @@ from optodrive.client.api_request import ApiRequest
 from optodrive.client.body import encode_body
 from optodrive.client.plan import Plan
 from optodrive.core.types.push_options import PushOptions
-from optodrive.daemon.responses.patterns import PatternList
+from optodrive.daemon.responses.plan import PatternList
 from optodrive.daemon.responses.state import StateReport
 from optodrive.planning.effective_config import EffectiveConfig
 

@@ -9,7 +9,7 @@ from optodrive.client.frame_results import RESULT_TIMEOUT_S, FrameCounts
 from optodrive.client.heights import HeightsLike
 from optodrive.client.loop_thread import LoopThread
 from optodrive.core.types.push_options import Policy, check_keywords
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FrameResult
 from optodrive.device.config import PixelLayout
 
 

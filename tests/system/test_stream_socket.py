@@ -12,7 +12,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FrameResult
 from rig import TOKEN, wait_for
 
 PIXELS = 437

@@ -20,8 +20,7 @@ from optodrive.daemon.api.route_table import STOP, Route, RouteTable
 from optodrive.daemon.api.socket_token import is_websocket_request, read_subprotocol_token
 from optodrive.daemon.api.static_files import is_page_request, read_cookie_token
 from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
-from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.problem import Problem, build_problem
+from optodrive.daemon.responses.problem import Problem, build_error_problem, build_problem
 from optodrive.device.config_sections import DaemonSection
 
 PLACE_OF_FILE = "the daemon names the file of its tokens at its start"

@@ -40,13 +40,9 @@ from optodrive.daemon.api.telemetry_hub import DEFAULT_RATE_HZ, EventStream
 from optodrive.daemon.api.tokens import Token
 from optodrive.daemon.engine.metrics import CONTENT_TYPE
 from optodrive.daemon.push import Push
-from optodrive.daemon.responses.caller import CallerReport
-from optodrive.daemon.responses.health import HealthReport
-from optodrive.daemon.responses.patterns import PatternList
-from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.plan import PatternList, PlanReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
-from optodrive.daemon.responses.reload import ReloadReport
-from optodrive.daemon.responses.state import StateReport
+from optodrive.daemon.responses.state import CallerReport, HealthReport, ReloadReport, StateReport
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
 

@@ -12,8 +12,7 @@ from starlette.websockets import WebSocket
 
 from optodrive.core.errors import BusyError, InputError, OptodriveError
 from optodrive.daemon.api.request_limits import BodyTooLargeError
-from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
+from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_error_problem, build_problem
 
 
 def add_error_handlers(app: FastAPI) -> None:

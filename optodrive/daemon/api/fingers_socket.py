@@ -9,8 +9,8 @@ from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.socket_token import select_subprotocol
-from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal, validate_fingers
+from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, validate_fingers
+from optodrive.daemon.responses.problem import build_error_problem
 from optodrive.planning.stimuli.json_values import decode_json
 
 FORWARD_PERIOD_S = 0.005

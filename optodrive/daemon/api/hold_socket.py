@@ -10,8 +10,8 @@ from optodrive.core.errors import InputError, OptodriveError
 from optodrive.daemon.api.daemon_client import LinkClient
 from optodrive.daemon.api.scope_keys import ARRIVED_S
 from optodrive.daemon.api.socket_token import select_subprotocol
-from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.hold import HoldReport
+from optodrive.daemon.responses.messages import HoldReport
+from optodrive.daemon.responses.problem import build_error_problem
 
 NORMAL_CLOSURE, POLICY_VIOLATION = 1000, 1008
 BEAT = "beat"

@@ -11,11 +11,9 @@ from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.socket_token import select_subprotocol
 from optodrive.daemon.push import Push
-from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.responses.plan_status import PlanStatus
-from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FrameResult
+from optodrive.daemon.responses.plan import PlanReport, PlanStatus
+from optodrive.daemon.responses.problem import Problem, build_error_problem
 from optodrive.planning.stimuli.sequence_codec import encode_sequence
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 

@@ -8,10 +8,8 @@ from pydantic.json_schema import models_json_schema
 from optodrive.core.json_model import JsonModel
 from optodrive.daemon.api.openapi_bodies import BODY_SCHEMAS
 from optodrive.daemon.api.route_table import RouteTable
-from optodrive.daemon.responses.fingers import FingersMessage, FingersRefusal
-from optodrive.daemon.responses.hold import HoldReport
+from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, FrameResult, HoldReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
-from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.responses.telemetry import EVENTS
 
 REF_TEMPLATE = "#/components/schemas/{model}"

@@ -7,7 +7,7 @@ from typing import Any
 
 from optodrive.core.errors import NotReadyError
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.responses.reload import ReloadReport
+from optodrive.daemon.responses.state import ReloadReport
 
 TIMEOUT_S = 30.0
 REQUEST, RESULT = "reload_request", "reload_result"

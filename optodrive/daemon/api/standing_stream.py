@@ -14,10 +14,9 @@ from typing import Any
 from optodrive.core.errors import BusyError
 from optodrive.daemon.api.live_stream import Frame, LiveStream, report_planned
 from optodrive.daemon.push import Push
-from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.messages import FrameResult, RefreshReport
+from optodrive.daemon.responses.plan import PlanReport, PlanStatus
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.responses.stream import FrameResult, RefreshReport
 
 REFRESH_MIN_S, REFRESH_MAX_S = 0.008, 0.04
 CAPS_PERIOD_S = 1.0

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.daemon.responses.state import (
     BoardReport,
     ControlReport,

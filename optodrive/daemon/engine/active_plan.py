@@ -9,7 +9,7 @@ import numpy as np
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses, concatenate_executed
 from optodrive.daemon.engine.plan_record import Execution, LargestTarget, PlanRecord
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.listed_pulses import ListedPulses

@@ -24,7 +24,7 @@ from optodrive.core.errors import InputError, NotReadyError
 from optodrive.core.types.plans import BudgetState
 from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import LEASED_STATES
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel

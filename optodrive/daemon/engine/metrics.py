@@ -7,7 +7,7 @@ from typing import Any
 from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.responses.plan_status import ENDS, PlanStatus
+from optodrive.daemon.responses.plan import ENDS, PlanStatus
 from optodrive.daemon.responses.state import PlannerState
 from optodrive.device.config import Config
 from optodrive.link.protocol.states import BoardState

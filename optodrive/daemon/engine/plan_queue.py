@@ -39,7 +39,7 @@ from optodrive.daemon.engine.queue_stream import STREAM_RESTART_S, STREAM_START_
 from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.epoch import DISARM, STOP
 from optodrive.link.service.remote_session import RemoteSession

@@ -9,8 +9,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.core.units import m_to_um
-from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport, PlanStatus
 from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.timing_error import TimingError
 from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses, UInt8Array

@@ -2,7 +2,7 @@
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 
 
 def simulate_plan(plan: ActivePlan, status: PlanStatus, error: str | None) -> None:

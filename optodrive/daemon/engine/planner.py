@@ -21,8 +21,7 @@ from optodrive.daemon.engine.planning_time import FACTOR, PlanningTime, StreamHo
 from optodrive.daemon.engine.queue_stream import GROWTH_MARGIN_S
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.push import Push
-from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanReport, PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
 
 STALL_TIMEOUT_S = 2.0

@@ -21,10 +21,9 @@ from optodrive.daemon.engine.request_body import BuiltRequest, build_request
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
 from optodrive.daemon.message_loop import MessageServer
 from optodrive.daemon.push import Push
-from optodrive.daemon.responses.error_problem import build_error_problem
+from optodrive.daemon.responses.messages import RefreshReport
 from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.responses.problem import build_problem
-from optodrive.daemon.responses.stream import RefreshReport
+from optodrive.daemon.responses.problem import build_error_problem, build_problem
 from optodrive.planning.stimuli.sequence_codec import decode_sequence
 
 STATE_PERIOD_S = 0.5

@@ -19,7 +19,7 @@ from optodrive.daemon.engine.plan_restart import RestartedPlan, restart_plans
 from optodrive.daemon.engine.progress import PlanRun, find_emitted
 from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.thermal_estimate import estimate_before_rest
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.stage_loss import LostStage
 from optodrive.planning.display_model import DisplayModel

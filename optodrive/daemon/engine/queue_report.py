@@ -4,7 +4,7 @@ from typing import Any
 
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.daemon.responses.state import QueuedPlan, QueueReport, RecentPlan
 
 

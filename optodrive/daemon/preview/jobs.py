@@ -13,8 +13,8 @@ from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.request_body import BuiltRequest, build_request
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.push import Push
-from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.problem import build_error_problem
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.stimuli.sequence_codec import encode_sequence

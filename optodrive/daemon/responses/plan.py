@@ -1,9 +1,46 @@
-"""The response of the routes that submit, read or cancel a plan."""
+"""The responses of the routes that submit, read or cancel a plan, the status of a plan, and the list of patterns."""
+
+from enum import StrEnum
 
 from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel
-from optodrive.daemon.responses.plan_status import PlanStatus
 from optodrive.link.session.timing_error import TimingError
+from optodrive.planning.stimuli.pattern import PatternDescription
 from optodrive.planning.summary_schema import PlanSummary, PulseColumns
+
+
+class PlanStatus(StrEnum):
+    """The status of a plan. That of a dry run stays `planned`.
+
+    stopped: STOP or disarm ended it; failed: a fault, a lost link or a lost caller did
+    """
+
+    PLANNED = "planned"
+    QUEUED = "queued"
+    RUNNING = "running"
+    PAUSED = "paused"
+    DONE = "done"
+    SUPERSEDED = "superseded"
+    STOPPED = "stopped"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the status is final."""
+        return self in ENDS
+
+    def may_become(self, status: "PlanStatus") -> bool:
+        """Return whether another status may follow this one."""
+        return status in TRANSITIONS[self]
+
+
+ENDS = (PlanStatus.DONE, PlanStatus.SUPERSEDED, PlanStatus.STOPPED, PlanStatus.FAILED, PlanStatus.CANCELLED)
+TRANSITIONS: dict[PlanStatus, frozenset[PlanStatus]] = {
+    PlanStatus.PLANNED: frozenset({PlanStatus.QUEUED, PlanStatus.RUNNING}),  # running at once: spliced behind another
+    PlanStatus.QUEUED: frozenset({PlanStatus.RUNNING, *ENDS}),
+    PlanStatus.RUNNING: frozenset({PlanStatus.PAUSED, *ENDS}),
+    PlanStatus.PAUSED: frozenset({PlanStatus.RUNNING, *ENDS}),
+} | dict.fromkeys(ENDS, frozenset())
 
 
 class PlanLatency(JsonModel):
@@ -119,3 +156,12 @@ class PlanReport(JsonModel):
         """Whether the whole sequence fits on the beam, or None if that was not requested (a stream)."""
         feasibility = self.summary.feasibility
         return None if feasibility is None else feasibility.fits
+
+
+class PatternList(JsonModel):
+    """The named patterns and their parameters.
+
+    patterns: in the order in which `optodrive patterns` lists them
+    """
+
+    patterns: list[PatternDescription]

@@ -1,11 +1,48 @@
-"""The response of GET /v1/state, and of arm, disarm and stop."""
+"""The responses on the daemon itself: health, caller, reload, and the state, which arm, disarm and stop return too."""
 
 from typing import Literal
 
 from optodrive.core.json_model import JsonModel
-from optodrive.daemon.responses.plan_status import PlanStatus
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import ARMED_STATES, BoardState
 from optodrive.link.session.timing_error import TimingError
+
+
+class HealthReport(JsonModel):
+    """Whether the daemon runs, and its version.
+
+    status: ok, as the daemon answers
+    version: of optodrive
+    """
+
+    status: Literal["ok"] = "ok"
+    version: str
+
+
+class CallerReport(JsonModel):
+    """The token that the request presented.
+
+    refused: the routes that its role may not call, method and path template → the role that they require
+    name: of the token
+    role: of the token
+    """
+
+    name: str
+    role: str
+    refused: dict[str, str]
+
+
+class ReloadReport(JsonModel):
+    """The effect of a reload.
+
+    message: in one line, as in the log; applied: keys that apply from now on; waiting: changed keys that need a restart
+    revoked: names of tokens that are no longer valid
+    """
+
+    message: str
+    applied: list[str]
+    waiting: list[str]
+    revoked: list[str]
 
 
 class LinkReport(JsonModel):

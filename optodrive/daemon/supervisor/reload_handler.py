@@ -7,8 +7,8 @@ from optodrive.daemon.api.reload_requests import REQUEST, RESULT
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import ConfigReloader, ReloadResult
-from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.reload import ReloadReport
+from optodrive.daemon.responses.problem import build_error_problem
+from optodrive.daemon.responses.state import ReloadReport
 from optodrive.daemon.supervisor.supervisor import Supervisor
 
 

@@ -1,7 +1,7 @@
 """Results of a stream's frames, and the counts that lose none."""
 
 from optodrive.client.frame_results import RESULTS_MAX, FrameCounts, ResultBuffer
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FrameResult
 
 
 def test_counts_lose_no_frame_that_the_reader_leaves():

@@ -36,8 +36,8 @@ from optodrive.core.errors import (
     RefusedError,
 )
 from optodrive.daemon.api.error_handlers import build_error_problem
-from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.problem import build_problem
+from optodrive.daemon.responses.state import HealthReport
 
 HEALTH = ApiRequest("GET", "/v1/health", parse_as(HealthReport), idempotent=True)
 PUSH = build_push_request({}, {}, dry_run=False)

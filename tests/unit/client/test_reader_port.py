@@ -11,7 +11,7 @@ import pytest
 from optodrive.client.humanware import NAMED_KEYS, CellLine
 from optodrive.client.reader_channels import SerialChannel
 from optodrive.client.reader_port import FRAME_S, ReaderPort
-from optodrive.daemon.responses.stream import FrameResult
+from optodrive.daemon.responses.messages import FrameResult
 from rig import wait_for
 
 PIXELS = [{dot: dot - 1 for dot in range(1, 7)}]

@@ -15,7 +15,7 @@ from optodrive.client.exchange import ExchangePolicy
 from optodrive.client.http import DaemonClient
 from optodrive.client.requests import parse_as
 from optodrive.core.errors import LinkError
-from optodrive.daemon.responses.health import HealthReport
+from optodrive.daemon.responses.state import HealthReport
 
 READ = ApiRequest("GET", "/v1/read", parse_as(HealthReport), idempotent=True)
 ACT = ApiRequest("POST", "/v1/act", parse_as(HealthReport))

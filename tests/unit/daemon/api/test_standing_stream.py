@@ -10,8 +10,8 @@ from optodrive.core.errors import BusyError, LinkError, NotReadyError, StoppedEr
 from optodrive.daemon.api import standing_stream
 from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.standing_stream import StandingStream
-from optodrive.daemon.responses.error_problem import build_error_problem
-from optodrive.daemon.responses.stream import RefreshReport
+from optodrive.daemon.responses.messages import RefreshReport
+from optodrive.daemon.responses.problem import build_error_problem
 from planner_rig import PlannerRig, build_frame
 
 PLANNED, BUSY = None, BusyError("too many requests wait: 8 before this one; try again later")

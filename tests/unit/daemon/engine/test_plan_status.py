@@ -5,7 +5,7 @@ from itertools import product
 import pytest
 
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.responses.plan_status import ENDS, TRANSITIONS, PlanStatus
+from optodrive.daemon.responses.plan import ENDS, TRANSITIONS, PlanStatus
 
 FORBIDDEN = [pair for pair in product(PlanStatus, PlanStatus) if pair[1] not in TRANSITIONS[pair[0]]]
 

@@ -3,7 +3,7 @@
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.daemon.responses.fingers import FINGERS_MAX, validate_fingers
+from optodrive.daemon.responses.messages import FINGERS_MAX, validate_fingers
 
 FINGER = {"number": 1, "x_m": 0.0, "y_m": 0.0, "radius_m": 0.004}
 

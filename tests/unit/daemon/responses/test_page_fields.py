@@ -11,12 +11,11 @@ import pytest
 from pydantic import BaseModel
 
 import optodrive.daemon
-from optodrive.daemon.responses.caller import CallerReport
-from optodrive.daemon.responses.hold import HoldReport
-from optodrive.daemon.responses.patterns import PatternList
-from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.messages import HoldReport
+from optodrive.daemon.responses.plan import PatternList, PlanReport
 from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.state import (
+    CallerReport,
     ControlReport,
     PulseTotals,
     QueuedPlan,

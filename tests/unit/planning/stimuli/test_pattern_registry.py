@@ -12,7 +12,7 @@ from PIL import Image
 
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
-from optodrive.daemon.responses.patterns import PatternList
+from optodrive.daemon.responses.plan import PatternList
 from optodrive.device.config_file import load_config
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.stimuli.pattern_registry import PATTERNS, build_pattern, describe_patterns, find_pattern
