@@ -61,15 +61,16 @@ def braille(
     from optodrive.client.display import Display
     from optodrive.client.dotpad import CellGrid
     from optodrive.client.humanware import CellLine
-    from optodrive.client.reader_channels import (
+    from optodrive.client.reader_port import (
         HOST,
+        CellProtocol,
         ReaderChannel,
+        ReaderPort,
         SerialChannel,
         SocketChannel,
         parse_number,
         read_key,
     )
-    from optodrive.client.reader_port import CellProtocol, ReaderPort
     from optodrive.link.simulator.pseudo_terminal import check_link_path
 
     is_server = protocol is ReaderProtocol.BRLAPI

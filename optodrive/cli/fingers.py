@@ -43,7 +43,7 @@ def fingers(
 ) -> None:
     """Report fingertips, for which standing frames are refreshed first."""
     from optodrive.cli.signals import end_as_interrupted
-    from optodrive.client.finger_script import read_finger_script
+    from optodrive.client.fingers import read_finger_script
 
     sources = [
         name for name, given in (("FILE.csv", script), ("--film", film), ("--camera", camera)) if given is not None

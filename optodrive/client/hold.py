@@ -7,9 +7,8 @@ from typing import Self
 from websockets.exceptions import ConnectionClosed
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.loop_thread import LoopThread
-from optodrive.client.problems import build_error
-from optodrive.client.socket_connection import open_connection
+from optodrive.client.exchange import build_error
+from optodrive.client.sockets import LoopThread, open_connection
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.daemon.responses.messages import HoldReport
 

@@ -3,11 +3,10 @@
 from collections.abc import Callable
 from typing import Self
 
-from optodrive.client.async_stream import AsyncStream
+from optodrive.client.async_stream import RESULT_TIMEOUT_S, AsyncStream, FrameCounts
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.frame_results import RESULT_TIMEOUT_S, FrameCounts
 from optodrive.client.heights import HeightsLike
-from optodrive.client.loop_thread import LoopThread
+from optodrive.client.sockets import LoopThread
 from optodrive.core.types.push_options import Policy, check_keywords
 from optodrive.daemon.responses.messages import FrameResult
 from optodrive.device.config import PixelLayout

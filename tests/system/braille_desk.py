@@ -13,7 +13,7 @@ from braille_reader import BrlttyProcess, Writer, drive_lines, drive_serial
 from dotpad_reader import DotPadReader
 from forked_process import OPTODRIVE, start_process
 from optodrive.client.cell_places import draw_cells, find_cell_lines, join_lines
-from optodrive.client.reader_channels import FIRST_PORT, HOST
+from optodrive.client.reader_port import FIRST_PORT, HOST
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from rig import TOKEN, running, wait_for

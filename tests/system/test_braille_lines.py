@@ -10,7 +10,7 @@ import braille_reader
 from braille_desk import COUNT, ServedLines, draw_text, find_raised, is_dark, running_desk
 from braille_reader import ROUTING_KEY
 from forked_process import OPTODRIVE
-from optodrive.client.reader_channels import FIRST_PORT, HOST
+from optodrive.client.reader_port import FIRST_PORT, HOST
 from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII
 from rig import wait_for
 from shared_screen import SharedScreen

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.client.body import encode_body
-from optodrive.client.requests import build_dim_request, build_play_request, build_push_request
+from optodrive.client.requests import build_dim_request, build_play_request, build_push_request, encode_body
 from optodrive.core.errors import InputError
 
 NOWHERE = "http://127.0.0.1:9"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from optodrive.client.finger_script import LIFTED_S, read_finger_script
+from optodrive.client.fingers import LIFTED_S, read_finger_script
 from optodrive.core.errors import InputError
 from optodrive.core.types.fingers import FingerPlace
 

@@ -15,7 +15,14 @@ from optodrive.client import api_request
 from optodrive.client.api_request import ApiRequest
 from optodrive.client.async_http import AsyncHttp
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import STOP_LOST_TIMEOUTS_S, ExchangePolicy, parse_response, run_blocking
+from optodrive.client.exchange import (
+    STOP_LOST_TIMEOUTS_S,
+    ExchangePolicy,
+    build_error,
+    parse_problem,
+    parse_response,
+    run_blocking,
+)
 from optodrive.client.hold import SILENCE_MAX_S
 from optodrive.client.http import (
     PROBE_PERIOD_S,
@@ -24,9 +31,8 @@ from optodrive.client.http import (
     BlockingHttp,
 )
 from optodrive.client.plan import report_loss
-from optodrive.client.problems import build_error, parse_problem
 from optodrive.client.requests import READ_STATE, STOP, build_push_request, parse_as
-from optodrive.client.socket_connection import OPEN_TIMEOUT_S, open_connection
+from optodrive.client.sockets import OPEN_TIMEOUT_S, open_connection
 from optodrive.core.errors import (
     BoardFaultError,
     InputError,

@@ -15,7 +15,7 @@ import pytest
 from websockets.asyncio.server import serve
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.loop_thread import LoopThread
+from optodrive.client.sockets import LoopThread
 from optodrive.client.stream import Stream
 from optodrive.core.errors import LinkError, NotReadyError
 from optodrive.device.config import PixelLayout

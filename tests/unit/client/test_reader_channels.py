@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from optodrive.client.brlapi import CellPage
-from optodrive.client.reader_channels import FIRST_PORT, HOST, SocketChannel
+from optodrive.client.reader_port import FIRST_PORT, HOST, SocketChannel
 from optodrive.core.errors import InputError
 
 KEY = b"key"

@@ -9,8 +9,7 @@ from contextlib import suppress
 import pytest
 
 from optodrive.client.humanware import NAMED_KEYS, CellLine
-from optodrive.client.reader_channels import SerialChannel
-from optodrive.client.reader_port import FRAME_S, ReaderPort
+from optodrive.client.reader_port import FRAME_S, ReaderPort, SerialChannel
 from optodrive.daemon.responses.messages import FrameResult
 from rig import wait_for
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optodrive.client.finger_script import read_finger_script
+from optodrive.client.fingers import read_finger_script
 from optodrive.core.errors import InputError
 from optodrive.core.numeric_tables import escape_formula, open_table, read_columns
 from optodrive.lab.calibration.pictures import SpotsSection, _list_by_table
