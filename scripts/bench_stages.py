@@ -11,7 +11,7 @@ import time
 import numpy as np
 from measuring import build_frames, measure_times_s
 
-from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.device.config_file import load_config
 from optodrive.device.config_sections import StageSection
 from optodrive.device.neighbours import Neighbours

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from rest_reference import build_openapi_text, build_rest_reference
 
-from optodrive.core.field_docstrings import read_field_docstrings
+from optodrive.core.toml_model import read_field_docstrings
 from optodrive.device.config import VERSION, Config
 from optodrive.physics.term_reference import build_example, describe_term
 from optodrive.physics.terms import discover_terms

@@ -8,7 +8,7 @@ import socket
 import subprocess
 from pathlib import Path
 
-from optodrive.core.forking import die_with_parent
+from optodrive.core.child_process import die_with_parent
 from rig import wait_for
 
 BRLAPI = "libbrlapi.so.0.8"

@@ -6,7 +6,7 @@ from math import log
 import numpy as np
 from hypothesis import strategies as st
 
-from optodrive.core.units import m_to_um
+from optodrive.core.quantity import m_to_um
 
 
 @st.composite

@@ -10,8 +10,7 @@ import numpy as np
 from hidden_field import CONFIG as FIELD_CONFIG
 from hidden_field import PRIOR, grid_codes, measure_spots
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import OTHER_UNITS, PlausibleRange, collect_ranges
-from optodrive.core.plausible_ranges import FRAMES
+from optodrive.core.plausibility import FRAMES, OTHER_UNITS, PlausibleRange, collect_ranges
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import MirrorsFile, apply_measured_servo, load_config, locate_shipped
 from optodrive.device.field_file import _FieldFile, load_field

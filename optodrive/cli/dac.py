@@ -230,7 +230,7 @@ def _summarize_playback(
     verified: "VerifiedChunks",
     playback: "PlaybackReport",
 ) -> dict[str, Any]:
-    from optodrive.core.units import m_to_um
+    from optodrive.core.quantity import m_to_um
     from optodrive.link.dac.encoding import PointScale
 
     pulses, plan = verified.pulses, planned_sequence.plan

@@ -15,7 +15,7 @@ from optodrive.cli.direct_stop import stop_directly
 from optodrive.cli.signals import end_by_ctrl_c, leave, report_interruption, was_interrupted
 from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import OptodriveError
-from optodrive.core.garbage import collect_seldom, skip_last_collection
+from optodrive.core.processes import collect_seldom, skip_last_collection
 
 
 def main(arguments: list[str] | None = None) -> None:

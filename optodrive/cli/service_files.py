@@ -13,7 +13,7 @@ from typing import Literal, Self
 from optodrive.cli.service_program import check_program
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.files import lock_folder, read_regular_file, write_text
-from optodrive.core.toml_file import parse_toml
+from optodrive.core.toml_model import parse_toml
 from optodrive.device.config import Config
 from optodrive.device.config_file import DEFAULT_CONFIG, build_config, list_named_files, load_config, locate_shipped
 from optodrive.device.config_sections import BoardSection

@@ -182,7 +182,7 @@ def _build_report(
     traces: "list[PixelTrace]",
     true_display: "ThermalState",
 ) -> dict[str, Any]:
-    from optodrive.core.units import m_to_um
+    from optodrive.core.quantity import m_to_um
     from optodrive.planning.listed_pulses import ListedPulses
     from optodrive.planning.plan_summary import summarize_plan
 

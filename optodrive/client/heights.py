@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import um_to_m
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.units import um_to_m
 from optodrive.device.config import PixelLayout
 from optodrive.planning.stimuli.binary_frame import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
 

@@ -1,9 +1,25 @@
-"""Packages that the installation has with an extra alone."""
+"""Packages that only an extra installs, and optional modules that a library takes for not installed."""
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
 from optodrive.core.errors import MISSING, InputError
+
+
+@contextmanager
+def hide_modules(*names: str) -> Iterator[None]:
+    """Make imports of modules fail that are not imported yet. A library then does without them, and starts earlier."""
+    modules: dict[str, Any] = sys.modules
+    hidden = [name for name in names if name not in modules]
+    modules.update(dict.fromkeys(hidden))
+    try:
+        yield
+    finally:
+        for name in hidden:
+            del modules[name]
 
 
 def import_extra(module: str, name: str = "", extra: str = "analysis") -> Any:

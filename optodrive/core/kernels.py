@@ -23,7 +23,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from optodrive.core.absent_modules import hide_modules
+from optodrive.core.extras import hide_modules
 
 with hide_modules("scipy", "yaml"):  # numba asks for a version, and reads a file of settings that nobody has
     import numba

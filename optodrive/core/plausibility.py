@@ -1,4 +1,9 @@
-"""Plausible ranges of quantities, and the unit that a value outside its range is probably in."""
+"""Plausible ranges of quantities, and the unit that a value outside its range is probably in.
+
+The ranges at the end are those of absolute values in recordings and sequences; those of a TOML file stand at the fields
+of its models. A place is the dotted key, without the indices of lists. A longest time of a day refuses nothing by
+itself: times are judged against each other, or against the response.
+"""
 
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -8,8 +13,7 @@ from typing import Any, NamedTuple, get_args
 from pydantic import BaseModel
 
 from optodrive.core.errors import InputError
-from optodrive.core.quantity import format_range
-from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.core.quantity import ZERO_CELSIUS_K, format_range
 
 
 class OtherUnit(NamedTuple):
@@ -145,3 +149,40 @@ def _check_value(where: str, key: str, place: str, value: object, ranges: Mappin
         plausible = ranges.get(key)
         if plausible is not None and abs(value) < inf:
             check_plausible(f"{where}: {place}", value, plausible)
+
+
+TEMPERATURE = PlausibleRange(150.0, 3000.0, "K")
+MIRROR_ANGLE = PlausibleRange(0.0, 0.9, "rad")
+DAY = PlausibleRange(0.0, 86_400.0, "s")
+
+RECORDING = {
+    "ambient_K": PlausibleRange(150.0, 600.0, "K"),
+    "bridge_width_m": PlausibleRange(1e-5, 5e-3, "m"),
+    "aim_x_m": PlausibleRange(0.0, 5e-3, "m"),
+    "aim_y_m": PlausibleRange(0.0, 5e-3, "m"),
+    "pulses.start_s": DAY,
+    "pulses.width_s": DAY,
+    "pulses.power_W": PlausibleRange(0.0, 60.0, "W"),
+    "commands.t_s": DAY,
+    "commands.x_rad": MIRROR_ANGLE,
+    "commands.y_rad": MIRROR_ANGLE,
+    "signal.t_s": DAY,
+    "absorber_temperature_K": TEMPERATURE,
+    "displacement_m": PlausibleRange(1e-8, 5e-3, "m"),
+    "force_N": PlausibleRange(1e-5, 5.0, "N"),
+    "mirror_x_rad": MIRROR_ANGLE,
+    "mirror_y_rad": MIRROR_ANGLE,
+}
+FRAMES = {
+    "frames.show_at_s": DAY,
+    "frames.duration_s": DAY,
+    "frames.target_um": PlausibleRange(1.0, 10_000.0, "µm"),
+    "trains.start_s": DAY,
+    "trains.duration_s": DAY,
+    "trains.pulse_width_s": PlausibleRange(1e-7, 0.07, "s"),
+    "trains.gap_s": PlausibleRange(1e-7, 60.0, "s"),
+    "trains.period_s": PlausibleRange(1e-6, 60.0, "s"),
+    "trains.power_w": PlausibleRange(1e-4, 60.0, "W"),
+    "trains.target_um": PlausibleRange(1.0, 10_000.0, "µm"),
+    "trains.peak_to_peak_um": PlausibleRange(0.5, 10_000.0, "µm"),
+}

@@ -1,9 +1,31 @@
-"""Text of a quantity: digits, SI prefix and unit.
+"""Text of a quantity, with digits, SI prefix and unit, and conversions of units for interfaces.
 
-For what the program reports. The expected value of an input field stays in the unit of the field, as the user types it.
+Internally all quantities are in SI units. The expected value of an input field stays in the unit of the field, as the
+user types it.
 """
 
 from math import floor, isfinite, log10
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+Number = TypeVar("Number", float, "NDArray[np.float64]")
+
+ZERO_CELSIUS_K = 273.15
+
+
+def um_to_m(value_um: Number) -> Number:
+    """Convert micrometres to metres, a number or an array."""
+    return value_um * 1e-6
+
+
+def m_to_um(value_m: Number) -> Number:
+    """Convert metres to micrometres, a number or an array."""
+    return value_m * 1e6
+
 
 PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 SMALL_PREFIX_UNITS = ("m", "s", "W", "J", "N", "rad", "V", "A")

@@ -6,8 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
-from optodrive.core.unix_listener import open_unix_listener
+from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket, open_unix_listener
 
 BACKLOG = 64
 CLIENTS_MAX = 16

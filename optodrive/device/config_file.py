@@ -10,8 +10,7 @@ from pydantic import Field
 
 from optodrive.core.errors import InputError
 from optodrive.core.plausibility import PlausibleRange, check_table, collect_ranges
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format, parse_table, validate_table
+from optodrive.core.toml_model import Section, check_format, parse_table, read_toml, validate_table
 from optodrive.device.config import FORMAT, VERSION, Config
 from optodrive.device.config_sections import ServoSection
 

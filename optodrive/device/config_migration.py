@@ -5,9 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from optodrive.core.errors import MISSING, InputError
-from optodrive.core.field_docstrings import read_field_docstrings
-from optodrive.core.toml_file import parse_toml, read_toml
-from optodrive.core.toml_model import Section
+from optodrive.core.toml_model import Section, parse_toml, read_field_docstrings, read_toml
 from optodrive.device.config import FORMAT, VERSION, Config
 from optodrive.device.config_file import RENAMED_KEYS, build_config
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from optodrive.core.errors import InputError
 from optodrive.core.plausibility import PlausibleRange, collect_ranges, describe_likely_unit
-from optodrive.core.toml_file import parse_toml
+from optodrive.core.toml_model import parse_toml
 from optodrive.device.config import Config
 from optodrive.device.config_file import build_config, load_config, locate_shipped
 

@@ -11,8 +11,7 @@ from pydantic import Field as Item
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.files import write_text
 from optodrive.core.plausibility import PlausibleRange
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format, parse_table
+from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.core.types.arrays import BoolArray, FloatArray, StrArray, freeze_arrays
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 from optodrive.device.config_sections import DisplaySection, Pitch

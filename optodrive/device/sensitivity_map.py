@@ -10,8 +10,7 @@ from pydantic import Field as Item
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import write_text
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format, parse_table
+from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import BYTES_MAX, MappedDisplay, check_mapped_display, format_map_head, read_change

@@ -11,8 +11,7 @@ from pydantic import Field, model_validator
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.plausibility import PlausibleRange, guess_unit
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format, parse_table
+from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_file import locate_shipped

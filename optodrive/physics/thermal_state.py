@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from typing import Protocol, Self
 
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
-from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config import Config
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.nominal_display import DisplayState, NominalThermalState, PulsePeaks, ignore_progress

@@ -6,7 +6,7 @@ from math import exp, pi, sqrt
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.device.config import Config
 from optodrive.device.field_loader import build_settling_table
 from optodrive.device.neighbours import Neighbours

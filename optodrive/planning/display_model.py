@@ -6,10 +6,10 @@ from functools import cached_property
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.pixel_map import build_aim_layout, load_pixel_map

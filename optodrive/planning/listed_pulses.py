@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
+from optodrive.core.quantity import m_to_um
 from optodrive.core.types.arrays import FloatArray, StrArray
-from optodrive.core.units import m_to_um
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.summary_schema import PulseColumns
 

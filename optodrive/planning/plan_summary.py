@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.files import atomic_write
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, m_to_um
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.core.units import m_to_um
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FeasibilityReport
 from optodrive.planning.planned_sequence import PlannedSequence, Shortfall, TrainPeaks, describe_lateness

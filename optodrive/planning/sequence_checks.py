@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, m_to_um
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.core.units import m_to_um
 from optodrive.planning.display_model import DisplayModel
 
 

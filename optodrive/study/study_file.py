@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from optodrive.core.errors import InputError
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import ConflictError, Name, Section, check_format, parse_table
+from optodrive.core.toml_model import ConflictError, Name, Section, check_format, parse_table, read_toml
 from optodrive.study.threshold import Procedure
 
 FORMAT, VERSION = "optodrive-study", 1

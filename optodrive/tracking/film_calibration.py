@@ -15,8 +15,7 @@ from pydantic import Field
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.files import write_text
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format, parse_table
+from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.tracking.contacts import Contact

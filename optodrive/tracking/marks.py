@@ -14,8 +14,7 @@ from pydantic import Field
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.extras import import_extra
 from optodrive.core.plausibility import PlausibleRange
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format, parse_table
+from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.core.types.arrays import FloatArray
 
 FORMAT = "optodrive-marks"

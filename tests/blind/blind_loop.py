@@ -11,8 +11,8 @@ import numpy as np
 
 from blind_display import simulate_signals
 from blind_lab import Case
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.model_file import build_model_toml

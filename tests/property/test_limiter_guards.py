@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
-from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model

@@ -1,7 +1,7 @@
 """Nominal models and worst parameters of the shipped displays, for the true display of `thermal_display`."""
 
 from displays import DISPLAYS
-from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model, build_nominal_panel

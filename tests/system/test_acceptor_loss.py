@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from optodrive.core.beat import BeatWriter
-from optodrive.core.ipc import IpcError, MessageSocket
-from optodrive.core.unix_listener import open_unix_listener
+from optodrive.core.child_process import BeatWriter
+from optodrive.core.ipc import IpcError, MessageSocket, open_unix_listener
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.tokens import Token, Tokens

@@ -15,7 +15,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from optodrive.core.scheduling import LIGHT, PLANNING
+from optodrive.core.processes import LIGHT, PLANNING
 from optodrive.daemon.server import acceptor
 from optodrive.daemon.server.acceptor import UNOPENED_MAX
 from optodrive.daemon.server.request_head import Rank

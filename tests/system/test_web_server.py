@@ -11,7 +11,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from optodrive.core.beat import BeatWriter
+from optodrive.core.child_process import BeatWriter
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.scope_keys import ARRIVED_S, CALLER, EARLIEST_S
 from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens

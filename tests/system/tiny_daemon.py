@@ -14,11 +14,10 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from optodrive.core import forking
-from optodrive.core.beat import BeatWriter
+from optodrive.core import child_process
+from optodrive.core.child_process import BeatWriter, fork_with_beat
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
-from optodrive.core.forking import fork_with_beat
 from optodrive.core.ipc import IpcError, Message, MessageSocket
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
@@ -32,7 +31,7 @@ STATUS = {"connected": True, "port": "tty", "board": {"state": "DISARMED"}}
 MUTANTS = {
     "no STOP before the end": lambda: setattr(LinkView, "stop_and_wait", lambda self, timeout_s: None),
     "no death of a hung child": lambda: setattr(Child, "find_hang", lambda self, now_s: None),
-    "no death with the supervisor": lambda: setattr(forking, "PR_SET_PDEATHSIG", 0),
+    "no death with the supervisor": lambda: setattr(child_process, "PR_SET_PDEATHSIG", 0),
 }
 
 

@@ -19,7 +19,7 @@ from optodrive.cli.calibrate.field_report import (
 )
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.core.errors import MISSING, InputError
-from optodrive.core.units import m_to_um, um_to_m
+from optodrive.core.quantity import m_to_um, um_to_m
 
 if TYPE_CHECKING:
     from optodrive.lab.commissioning.measurement_loop import MeasurementResult

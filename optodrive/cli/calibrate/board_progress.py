@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from optodrive.core.units import m_to_um
+from optodrive.core.quantity import m_to_um
 
 if TYPE_CHECKING:
     from optodrive.lab.commissioning.measurement_loop import MeasurementProgress

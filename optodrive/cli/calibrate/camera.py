@@ -15,7 +15,7 @@ from optodrive.cli.calibrate.field_report import (
 )
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.core.errors import InputError
-from optodrive.core.units import m_to_um
+from optodrive.core.quantity import m_to_um
 
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import BoolArray

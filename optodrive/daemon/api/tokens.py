@@ -13,8 +13,7 @@ from pydantic import Field, ValidationError
 
 from optodrive.core.errors import MISSING, InputError
 from optodrive.core.files import write_private_text
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.core.toml_model import Section, build_input_error, check_format, read_toml
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES, Role
 
 ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"

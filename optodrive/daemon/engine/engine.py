@@ -14,7 +14,7 @@ import numpy as np
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError
-from optodrive.core.scheduling import use_usual_priority
+from optodrive.core.processes import use_usual_priority
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer

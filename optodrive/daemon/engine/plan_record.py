@@ -6,9 +6,9 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from optodrive.core.quantity import m_to_um
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses
-from optodrive.core.units import m_to_um
 from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport, PlanStatus
 from optodrive.link.session.clock_reading import ClockReading
 from optodrive.link.session.timing_error import TimingError

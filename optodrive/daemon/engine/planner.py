@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import BusyError, InputError, LinkError, NotReadyError, StoppedError
-from optodrive.core.scheduling import PLANNING, set_realtime_priority, use_usual_priority
+from optodrive.core.processes import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.plan_growth import build_rest_frame, grow_plan

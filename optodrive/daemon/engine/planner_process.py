@@ -4,9 +4,9 @@ import signal
 from contextlib import ExitStack
 from pathlib import Path
 
-from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.child_process import BeatWriter, SupervisorGoneError
 from optodrive.core.clock import MonotonicClock
-from optodrive.core.scheduling import PLANNING, set_realtime_priority
+from optodrive.core.processes import PLANNING, set_realtime_priority
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.planner_server import PlannerServer
 from optodrive.daemon.engine.session_recording import start_session_recorder

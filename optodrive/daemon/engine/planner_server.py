@@ -12,7 +12,7 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.json_model import iterate_json
-from optodrive.core.scheduling import use_usual_priority
+from optodrive.core.processes import use_usual_priority
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.daemon.engine.dry_run import build_dry_run_start
 from optodrive.daemon.engine.engine import Engine

@@ -7,7 +7,7 @@ import signal
 import time
 from dataclasses import dataclass
 
-from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.child_process import BeatWriter, SupervisorGoneError
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.daemon.message_loop import MessageLoop, MessageServer

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from optodrive.core.child_process import describe_end, fork_child
 from optodrive.core.errors import InputError, OptodriveError
-from optodrive.core.forking import describe_end, fork_child
 from optodrive.core.ipc import Message, MessageDecoder, MessageSocket, encode_message
 from optodrive.daemon.preview.jobs import build_refusal
 

@@ -12,10 +12,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.child_process import BeatWriter, SupervisorGoneError
 from optodrive.core.clock import MonotonicClock
-from optodrive.core.scheduling import LIGHT, set_nice, set_realtime_priority
-from optodrive.core.unix_listener import open_unix_listener
+from optodrive.core.ipc import open_unix_listener
+from optodrive.core.processes import LIGHT, set_nice, set_realtime_priority
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.reload_message import apply_reload
 from optodrive.daemon.api.tokens import Tokens

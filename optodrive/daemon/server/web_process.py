@@ -11,7 +11,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
+from optodrive.core.child_process import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.app import build_app
 from optodrive.daemon.api.audit import AuditLog

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-from optodrive.core.beat import BEAT, FAILED, PACKET_MAX_BYTES, READY
+from optodrive.core.child_process import BEAT, FAILED, PACKET_MAX_BYTES, READY, describe_end
 from optodrive.core.clock import Clock
-from optodrive.core.forking import describe_end
 
 HANG_S = 2.0
 """A child counts as hung after this time without a beat."""

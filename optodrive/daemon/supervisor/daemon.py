@@ -10,12 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from optodrive.core.beat import BeatWriter
+from optodrive.core.child_process import BeatWriter, execute_module, fork_with_beat
 from optodrive.core.clock import MonotonicClock
-from optodrive.core.forking import execute_module, fork_with_beat
-from optodrive.core.garbage import settle_memory
-from optodrive.core.scheduling import set_nice
-from optodrive.core.unix_listener import open_unix_listener
+from optodrive.core.ipc import open_unix_listener
+from optodrive.core.processes import set_nice, settle_memory
 from optodrive.daemon.api.roles import PERMISSIONS, ROLES
 from optodrive.daemon.api.tokens import Tokens, load_daemon_tokens
 from optodrive.daemon.log import open_daemon_log

@@ -15,8 +15,7 @@ from optodrive.core.errors import MISSING, InputError
 from optodrive.core.extras import import_extra
 from optodrive.core.numeric_tables import open_table
 from optodrive.core.plausibility import PlausibleRange, check_plausible
-from optodrive.core.toml_file import read_toml
-from optodrive.core.toml_model import Section, check_format, parse_table
+from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.device.field_geometry import CODE_MAX
 
 PICTURES_FORMAT = "optodrive-pictures"

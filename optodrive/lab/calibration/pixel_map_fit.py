@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import m_to_um
 from optodrive.core.types.measurements import Run
-from optodrive.core.units import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import DEAD, GAIN_MAX, GAIN_MIN, MEASURED, NOT_MEASURED, PixelMap
 from optodrive.lab.calibration.pixel_fit import (

@@ -6,9 +6,8 @@ from queue import Empty, SimpleQueue
 import numpy as np
 
 from optodrive.core.errors import InputError, RefusedError
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, um_to_m
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.core.units import um_to_m
 from optodrive.device.config import build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.lab.calibration.spots import MeasuredSpots

@@ -11,8 +11,8 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any, Self
 
+from optodrive.core.child_process import die_with_parent
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
-from optodrive.core.forking import die_with_parent
 from optodrive.core.processes import is_suspended
 
 NICE = 5

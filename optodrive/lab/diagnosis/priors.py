@@ -2,8 +2,7 @@
 
 from math import log
 
-from optodrive.core.plausibility import check_plausible
-from optodrive.core.plausible_ranges import RECORDING
+from optodrive.core.plausibility import RECORDING, check_plausible
 from optodrive.core.types.measurements import Measurement
 from optodrive.device.config import Config
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior

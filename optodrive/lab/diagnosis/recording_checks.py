@@ -15,12 +15,10 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.plausibility import check_plausible
-from optodrive.core.plausible_ranges import RECORDING
-from optodrive.core.quantity import format_quantity
+from optodrive.core.plausibility import RECORDING, check_plausible
+from optodrive.core.quantity import ZERO_CELSIUS_K, format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS
 from optodrive.lab.diagnosis.noise_model import estimate_resolution
 from optodrive.physics.pixel import Pixel

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.plausible_ranges import RECORDING
+from optodrive.core.plausibility import RECORDING
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.measurements import DataFinding, Measurement, Run, Signal

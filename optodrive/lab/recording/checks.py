@@ -5,8 +5,7 @@ from difflib import get_close_matches
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError, Unquoted, suggest_nearest
-from optodrive.core.plausibility import guess_unit
-from optodrive.core.plausible_ranges import RECORDING
+from optodrive.core.plausibility import RECORDING, guess_unit
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.storage import (
     COMMANDS,

@@ -12,7 +12,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.numeric_tables import CsvTable, open_table
-from optodrive.core.toml_file import read_toml
+from optodrive.core.toml_model import read_toml
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run, Signal
 from optodrive.lab.recording.storage import (

@@ -10,7 +10,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted, abbreviate
-from optodrive.core.toml_file import INTEGER_MAX, INTEGER_MIN, KEY_MAX
+from optodrive.core.toml_model import INTEGER_MAX, INTEGER_MIN, KEY_MAX
 from optodrive.core.types.arrays import FloatArray
 
 Attributes = dict[str, str | float]

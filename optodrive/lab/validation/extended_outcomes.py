@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.lab.validation.paper_outcomes import FULL_POWER_W, GAS_J_PER_K, LONG_PULSE_S
 from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
 from optodrive.physics.parameters import ParameterSet

@@ -8,8 +8,7 @@ import struct
 from contextlib import suppress
 from pathlib import Path
 
-from optodrive.core.ipc import MESSAGE_MAX_BYTES, IpcError, MessageSocket, encode_message
-from optodrive.core.unix_listener import open_unix_listener
+from optodrive.core.ipc import MESSAGE_MAX_BYTES, IpcError, MessageSocket, encode_message, open_unix_listener
 from optodrive.link.service.link_service import LinkService
 
 CLIENTS_MAX = 32

@@ -14,12 +14,10 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
+from optodrive.core.child_process import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError, die_with_parent
 from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import InputError, OptodriveError
-from optodrive.core.forking import die_with_parent
-from optodrive.core.garbage import settle_memory
-from optodrive.core.scheduling import LIGHT, set_realtime_priority
+from optodrive.core.processes import LIGHT, set_realtime_priority, settle_memory
 from optodrive.link.service.client_sockets import ClientSockets
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.service.settings import BoardSettings, LinkSettings

@@ -4,7 +4,7 @@ from math import inf
 
 from optodrive.core.clock import Clock
 from optodrive.core.ipc import Message
-from optodrive.core.scheduling import has_realtime_priority
+from optodrive.core.processes import has_realtime_priority
 from optodrive.link.service.control import Control
 from optodrive.link.service.epoch import Epoch
 from optodrive.link.service.pauses import Pauses

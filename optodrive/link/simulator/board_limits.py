@@ -6,7 +6,7 @@ from re import fullmatch
 from typing import Any
 
 from optodrive.core.errors import InputError, suggest_nearest
-from optodrive.core.toml_file import read_toml
+from optodrive.core.toml_model import read_toml
 from optodrive.link.protocol.messages import POINTS_MAX, Limits
 
 DEFAULT_LIMITS = Limits(

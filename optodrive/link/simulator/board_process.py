@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from optodrive.core.errors import InputError
-from optodrive.core.scheduling import LIGHT, set_realtime_priority
+from optodrive.core.processes import LIGHT, set_realtime_priority
 from optodrive.link.simulator.board_clock import BoardClock
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings, load_settings

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.link.simulator.galvos import SimulatedGalvos
 from optodrive.link.simulator.instruments import measure

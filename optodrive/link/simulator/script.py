@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from optodrive.core.errors import MISSING, InputError, suggest_nearest
-from optodrive.core.toml_file import read_toml
+from optodrive.core.toml_model import read_toml
 from optodrive.link.protocol.messages import INPUTS
 
 SENSOR_ACTIONS = ("stick_x", "stick_y", "invert_readback", "blind_sensor", "unplug_sensor")

@@ -52,7 +52,7 @@ def build_optics(options: argparse.Namespace, settings: BoardSettings) -> "Simul
     if options.geometry < 0:
         raise InputError("--geometry", options.geometry, "a seed, 0 or more")
     # These imports take half a second, which a board without a sensor does not need.
-    from optodrive.core.units import um_to_m
+    from optodrive.core.quantity import um_to_m
     from optodrive.device.config_file import load_config
     from optodrive.link.simulator.simulated_optics import SimulatedOptics
 

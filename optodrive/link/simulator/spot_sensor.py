@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.units import m_to_um
+from optodrive.core.quantity import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.link.simulator.galvos import SimulatedGalvos
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry

@@ -1,8 +1,7 @@
 """One-line messages about the first violation and the nearest feasible variants."""
 
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, m_to_um
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.core.units import m_to_um
 from optodrive.planning.feasibility.report import NearestFeasible, SequenceReduction
 from optodrive.planning.feasibility.violation import Violation
 from optodrive.planning.limiter.caps import CAPS_BY_KEY

@@ -21,7 +21,7 @@ from typing import Any
 
 import numba
 
-from optodrive.core.forking import die_with_parent
+from optodrive.core.child_process import die_with_parent
 from optodrive.core.kernels import CACHED, is_cached
 from optodrive.core.types.plans import BudgetState
 from optodrive.planning.limiter.budget import Budget

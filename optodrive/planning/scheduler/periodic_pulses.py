@@ -17,10 +17,9 @@ from math import ceil
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, m_to_um
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import HeightTrain
-from optodrive.core.units import m_to_um
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState
 

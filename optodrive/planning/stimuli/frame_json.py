@@ -5,11 +5,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError, Unquoted
-from optodrive.core.plausibility import guess_unit
-from optodrive.core.plausible_ranges import FRAMES
+from optodrive.core.plausibility import FRAMES, guess_unit
+from optodrive.core.quantity import m_to_um, um_to_m
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import TactileFrame
-from optodrive.core.units import m_to_um, um_to_m
 from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.json_values import require_number, require_object, require_priority, require_time
 

@@ -19,10 +19,9 @@ from math import floor
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.quantity import format_quantity
+from optodrive.core.quantity import format_quantity, m_to_um, um_to_m
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import HeightTrain
-from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
 from optodrive.device.sensitivity_map import load_sensitivity_map, replace_sensitivity_map

@@ -6,8 +6,8 @@ import numpy as np
 
 from optodrive.core.errors import InputError, build_nothing_raised_error
 from optodrive.core.files import read_bounded
+from optodrive.core.quantity import m_to_um
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
-from optodrive.core.units import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.planning.stimuli.frame_json import parse_frames
 from optodrive.planning.stimuli.intensity import IntensityModel

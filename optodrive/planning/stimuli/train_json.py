@@ -7,11 +7,10 @@ from math import ceil
 import numpy as np
 
 from optodrive.core.errors import InputError, Unquoted
-from optodrive.core.plausibility import describe_likely_unit, guess_unit
-from optodrive.core.plausible_ranges import FRAMES
+from optodrive.core.plausibility import FRAMES, describe_likely_unit, guess_unit
+from optodrive.core.quantity import m_to_um, um_to_m
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain, Train
-from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.frame_json import TARGET_KEYS, parse_intensity, select_target_key
 from optodrive.planning.stimuli.intensity import IntensityModel

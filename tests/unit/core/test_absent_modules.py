@@ -5,7 +5,7 @@ from importlib import import_module
 
 import pytest
 
-from optodrive.core.absent_modules import hide_modules
+from optodrive.core.extras import hide_modules
 
 
 def test_a_module_is_hidden_unless_it_is_imported_already_and_only_for_a_while(monkeypatch):

@@ -3,7 +3,7 @@ import socket
 
 import pytest
 
-from optodrive.core.beat import PACKET_MAX_BYTES, BeatWriter, SupervisorGoneError
+from optodrive.core.child_process import PACKET_MAX_BYTES, BeatWriter, SupervisorGoneError
 from optodrive.core.clock import ManualClock
 
 

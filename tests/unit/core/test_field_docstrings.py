@@ -1,7 +1,6 @@
 """Docstrings of fields, which the reference and the schema show."""
 
-from optodrive.core.field_docstrings import read_field_docstrings
-from optodrive.core.toml_model import Section
+from optodrive.core.toml_model import Section, read_field_docstrings
 
 
 class Base(Section):

@@ -3,11 +3,11 @@
 import subprocess
 import sys
 
-from optodrive.core.garbage import COMMAND_THRESHOLD, USUAL_THRESHOLDS
+from optodrive.core.processes import COMMAND_THRESHOLD, USUAL_THRESHOLDS
 
 CODE = """
 import gc
-from optodrive.core.garbage import collect_seldom, settle_memory
+from optodrive.core.processes import collect_seldom, settle_memory
 class Node: pass
 collect_seldom()
 print(gc.get_threshold()[0])

@@ -100,10 +100,10 @@ def test_everything_that_a_kernel_refers_to_changes_its_stamp(other, kernel):
 
 
 def test_a_constant_read_through_a_module_of_the_package_changes_the_stamp(monkeypatch):
-    kernel = "from optodrive.core import units\n\n\ndef total(x: float) -> float:\n    return units.FACTOR * x\n"
-    monkeypatch.setattr("optodrive.core.units.FACTOR", 1.0, raising=False)
+    kernel = "from optodrive.core import quantity\n\n\ndef total(x: float) -> float:\n    return quantity.FACTOR * x\n"
+    monkeypatch.setattr("optodrive.core.quantity.FACTOR", 1.0, raising=False)
     before = stamp(kernel=kernel)
-    monkeypatch.setattr("optodrive.core.units.FACTOR", 2.0, raising=False)
+    monkeypatch.setattr("optodrive.core.quantity.FACTOR", 2.0, raising=False)
     assert stamp(kernel=kernel) != before
 
 

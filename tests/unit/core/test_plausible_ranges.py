@@ -8,8 +8,15 @@ import pytest
 from pydantic import BaseModel
 
 from optodrive.core.errors import InputError
-from optodrive.core.plausibility import OTHER_UNITS, PlausibleRange, check_plausible, check_table, collect_ranges
-from optodrive.core.plausible_ranges import FRAMES, RECORDING
+from optodrive.core.plausibility import (
+    FRAMES,
+    OTHER_UNITS,
+    RECORDING,
+    PlausibleRange,
+    check_plausible,
+    check_table,
+    collect_ranges,
+)
 from optodrive.device.config import Config
 from optodrive.device.config_file import MirrorsFile
 from optodrive.device.field_file import _FieldFile

@@ -8,7 +8,7 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_regular_file
-from optodrive.core.toml_file import BYTES_MAX, DEPTH_MAX, read_toml
+from optodrive.core.toml_model import BYTES_MAX, DEPTH_MAX, read_toml
 
 SPARSE_BYTES = 200_000_000
 

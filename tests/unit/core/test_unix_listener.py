@@ -6,7 +6,7 @@ import stat
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.core.unix_listener import open_unix_listener
+from optodrive.core.ipc import open_unix_listener
 
 
 def listen(path):

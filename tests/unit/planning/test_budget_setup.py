@@ -5,8 +5,8 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
+from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.plans import PulsePlan
-from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config_sections import PanelSection
 from optodrive.physics.parameters import Parameter, load_parameters
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals

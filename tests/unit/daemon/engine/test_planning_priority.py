@@ -6,7 +6,7 @@ from math import inf
 
 import pytest
 
-from optodrive.core.scheduling import PLANNING, set_realtime_priority, use_usual_priority
+from optodrive.core.processes import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.daemon.engine import planner
 from planner_rig import build_frame
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from displays import DISPLAYS
-from optodrive.core.beat import BeatWriter
+from optodrive.core.child_process import BeatWriter
 from optodrive.core.errors import BusyError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.daemon.engine import request_body

@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 
 import pytest
 
-from optodrive.core.beat import BeatWriter
+from optodrive.core.child_process import BeatWriter
 from optodrive.core.ipc import MessageSocket
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.tokens import Token, Tokens

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from optodrive.core.beat import BEAT, READY
+from optodrive.core.child_process import BEAT, READY
 from optodrive.core.clock import ManualClock
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier

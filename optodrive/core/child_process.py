@@ -1,19 +1,93 @@
-"""Start of child processes: forks of a loaded process, and modules in a fresh interpreter.
+"""Child processes: their start, forked from a loaded process or in a fresh interpreter, and their channel upwards.
 
-No child outlives the process that watches it: the kernel ends it with its parent, also when that is killed.
+No child outlives the process that watches it: the kernel ends it with its parent, also when that is killed. Over the
+channel to the supervisor beats and reports go up, and control messages come down. It is a socket pair that preserves
+message boundaries; each packet is one JSON object with a `kind`. Its end of file tells a child that the supervisor is
+dead.
 """
 
 import ctypes
+import json
 import os
 import signal
+import socket
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from typing import Any
 
-from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.core.errors import OptodriveError
+
+BEAT_INTERVAL_S = 0.1
+PACKET_MAX_BYTES = 256_000
+BEAT, READY, FAILED = "beat", "ready", "failed"
+OUT_OF_MEMORY = "out of memory"
+"""Reported by a process that could not allocate memory, which ends it."""
+
+
+class SupervisorGoneError(OptodriveError):
+    """The supervisor has ended, so its children end too."""
+
+    code = "supervisor_gone"
+
+
+class BeatWriter:
+    """The child's end. Its methods never block.
+
+    descriptor: inherited descriptor of the socket, owned from now on; now_s: monotonic clock
+    """
+
+    def __init__(self, descriptor: int, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._socket = socket.socket(fileno=descriptor)
+        self._socket.setblocking(False)
+        self._now_s = now_s
+        self._beaten_s = -float("inf")
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable for a control message, or when the supervisor is dead."""
+        return self._socket.fileno()
+
+    def beat(self) -> None:
+        """Prove that the caller's loop runs. Call it in every iteration. At most one packet per interval is sent."""
+        now_s = self._now_s()
+        if now_s - self._beaten_s >= BEAT_INTERVAL_S:
+            self._beaten_s = now_s
+            self.send({"kind": BEAT})
+
+    def report_ready(self) -> None:
+        """Report that the process serves its callers."""
+        self.send({"kind": READY})
+
+    def report_failure(self, message: str, exit_status: int = 1) -> None:
+        """Report in one line why the process cannot serve. It ends afterwards."""
+        self.send({"kind": FAILED, "message": message, "exit_status": exit_status})
+
+    def send(self, fields: dict[str, Any]) -> None:
+        """Send a message, or drop it while the supervisor does not read."""
+        with suppress(OSError):
+            self._socket.send(json.dumps(fields).encode())
+
+    def receive(self) -> list[dict[str, Any]]:
+        """Return the control messages that have arrived. Raise SupervisorGoneError at the end of file."""
+        messages: list[dict[str, Any]] = []
+        while True:
+            try:
+                packet = self._socket.recv(PACKET_MAX_BYTES)
+            except BlockingIOError:
+                return messages
+            except OSError:
+                packet = b""
+            if not packet:
+                raise SupervisorGoneError("the supervisor has ended")
+            messages.append(json.loads(packet))
+
+    def close(self) -> None:
+        """Close the channel."""
+        self._socket.close()
+
 
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15
 IGNORED_SIGNALS = (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE, signal.SIGXFSZ)
