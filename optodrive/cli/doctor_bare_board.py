@@ -10,9 +10,9 @@ from optodrive.core.errors import InputError, LinkError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.describe import describe_reset_cause
-from optodrive.link.session.board_requirements import FRAME_BYTES, PROTOCOL_MAJOR, TICK_HZ
+from optodrive.link.session.arming import FRAME_BYTES, PROTOCOL_MAJOR, TICK_HZ
+from optodrive.link.session.board_view import get_fault_hint
 from optodrive.link.session.clock_sync import DRIFT_MAX
-from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.transport.base import Transport
 
 ANSWER_MAX_S = 3.0

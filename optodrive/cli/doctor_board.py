@@ -6,7 +6,7 @@ from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import Config
 from optodrive.link.board_setup import build_board_requirements, build_port_settings
 from optodrive.link.protocol.messages import INPUTS
-from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.board_view import get_fault_hint
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning.display_model import DisplayModel

@@ -12,7 +12,7 @@ from optodrive.device.pixel_map import build_aim_layout
 from optodrive.device.scan_field import list_adjacent_pixels
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
-from optodrive.link.session.board_requirements import TICK_HZ, BoardRequirements, ConfiguredValues
+from optodrive.link.session.arming import TICK_HZ, BoardRequirements, ConfiguredValues
 from optodrive.link.session.plan_job import RETIMING_MAX_TICKS
 from optodrive.link.transport.port_settings import PortSettings
 

@@ -12,8 +12,8 @@ from session_rig import configured
 from virtual_rig import VirtualRig, run_fault_sessions
 from wire_format import HOST
 
-from optodrive.link.session import board_link, board_requirements
-from optodrive.link.session.board_requirements import BITS_PER_BYTE, FRAME_BYTES
+from optodrive.link.session import arming, board_link
+from optodrive.link.session.arming import BITS_PER_BYTE, FRAME_BYTES
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 
 FAULT_RATES = [(1, 0.05), (2, 0.15)]
@@ -248,7 +248,7 @@ def test_an_abort_takes_effect_5_ms_after_the_data_in_flight(make_rig, baud, mom
 
 
 def test_a_host_that_keeps_more_in_flight_is_detected(monkeypatch):
-    monkeypatch.setattr(board_requirements, "MAX_IN_FLIGHT_S", 0.1)
+    monkeypatch.setattr(arming, "MAX_IN_FLIGHT_S", 0.1)
     assert off_after_abort_s(VirtualRig, 115_200, (3, 19)) > abort_bound_s(115_200)
 
 

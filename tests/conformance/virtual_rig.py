@@ -7,7 +7,7 @@ from session_rig import SessionRig, configured
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import LinkError
 from optodrive.link.board_setup import build_board_requirements
-from optodrive.link.session.board_requirements import BITS_PER_BYTE
+from optodrive.link.session.arming import BITS_PER_BYTE
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings

@@ -37,10 +37,10 @@ from optodrive.daemon.responses.state import LimitsReport, PlannerReport, Planne
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.states import ARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
-from optodrive.link.session.clock_reading import ClockReading
-from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.board_view import get_fault_hint
+from optodrive.link.session.clock_sync import ClockReading
+from optodrive.link.session.group_state import LostStage
 from optodrive.link.session.link_watch import LinkCause
-from optodrive.link.session.stage_loss import LostStage
 from optodrive.planning.display_model import DisplayModel
 
 LOOP_WAIT_S = 0.05

@@ -43,7 +43,7 @@ from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.epoch import DISARM, STOP
 from optodrive.link.service.remote_session import RemoteSession
-from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.board_view import get_fault_hint
 from optodrive.planning.display_model import DisplayModel
 
 

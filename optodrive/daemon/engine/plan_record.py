@@ -10,8 +10,7 @@ from optodrive.core.quantity import m_to_um
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport, PlanStatus
-from optodrive.link.session.clock_reading import ClockReading
-from optodrive.link.session.timing_error import TimingError
+from optodrive.link.session.clock_sync import ClockReading, TimingError
 from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses, UInt8Array
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.summary_schema import PlanSummary

@@ -7,7 +7,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import BoolArray
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.link.session.stage_loss import LostStage
+from optodrive.link.session.group_state import LostStage
 from optodrive.link.session.staged_job import StagedJob
 
 

@@ -5,7 +5,7 @@ from collections import deque
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
 from optodrive.link.service.remote_session import RemoteSession
-from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
+from optodrive.link.session.clock_sync import TimingTotals, compute_timing_error
 
 EVENTS_MAX = 4000
 """Maximum number of events without a reader, 20 s at least. An event keeps its plan in memory."""

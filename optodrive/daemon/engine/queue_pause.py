@@ -21,7 +21,7 @@ from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.thermal_estimate import estimate_before_rest
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
-from optodrive.link.session.stage_loss import LostStage
+from optodrive.link.session.group_state import LostStage
 from optodrive.planning.display_model import DisplayModel
 
 START_LEAD_S = 0.05

@@ -3,7 +3,7 @@
 from enum import StrEnum
 
 from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel
-from optodrive.link.session.timing_error import TimingError
+from optodrive.link.session.clock_sync import TimingError
 from optodrive.planning.stimuli.pattern import PatternDescription
 from optodrive.planning.summary_schema import PlanSummary, PulseColumns
 

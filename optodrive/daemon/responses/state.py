@@ -5,7 +5,7 @@ from typing import Literal
 from optodrive.core.json_model import JsonModel
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import ARMED_STATES, BoardState
-from optodrive.link.session.timing_error import TimingError
+from optodrive.link.session.clock_sync import TimingError
 
 
 class HealthReport(JsonModel):

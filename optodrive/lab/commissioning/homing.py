@@ -17,7 +17,7 @@ from optodrive.lab.commissioning.sensor import SpotReader
 from optodrive.link.protocol.messages import INPUTS
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.board_view import get_fault_hint
 
 INDICATOR_S = 2.0
 READINGS_PER_SPOT = 3

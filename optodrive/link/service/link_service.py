@@ -48,7 +48,7 @@ from optodrive.link.service.settings import OnWebLoss
 from optodrive.link.service.status import StatusPublisher
 from optodrive.link.service.waiters import StateWaiters
 from optodrive.link.session.board_group import BoardGroup
-from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.board_view import get_fault_hint
 
 UNATTENDED_MAX_S = 5.0
 """Time for which an armed board without points may be without a web process, which starts again within 3 s."""

@@ -8,11 +8,11 @@ from typing import Any
 
 from optodrive.core.clock import Clock
 from optodrive.core.histogram import Histogram
+from optodrive.link.session.arming import AGE_BUCKETS_S
 from optodrive.link.session.board_view import BoardView
-from optodrive.link.session.clock_reading import ClockReading
-from optodrive.link.session.lease_renewal import AGE_BUCKETS_S
+from optodrive.link.session.clock_sync import ClockReading
+from optodrive.link.session.group_state import LostStage
 from optodrive.link.session.link_watch import LinkCause
-from optodrive.link.session.stage_loss import LostStage
 
 NO_EPOCH = 0
 """Epoch while the link process is not reached. No request carries it."""

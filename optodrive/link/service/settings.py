@@ -7,8 +7,8 @@ from typing import Any, Literal, Self
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import WireScale
-from optodrive.link.session.board_requirements import BoardRequirements, ConfiguredValues
-from optodrive.link.session.stage_loss import OnStageLoss
+from optodrive.link.session.arming import BoardRequirements, ConfiguredValues
+from optodrive.link.session.group_state import OnStageLoss
 from optodrive.link.transport.port_settings import PortSettings
 
 OnWebLoss = Literal["dark", "finish"]

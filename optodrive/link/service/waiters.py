@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from optodrive.core.errors import BoardFaultError, LinkError, NotReadyError, OptodriveError
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
 from optodrive.link.session.board_group import BoardGroup
-from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.board_view import get_fault_hint
 
 TIMEOUT_S = 5.0
 AWAITED_STATES = {

@@ -38,11 +38,10 @@ from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES
-from optodrive.link.session.group_state import GroupState, describe_end
+from optodrive.link.session.group_state import LEASE_TRANSIT_MAX_S, GroupState, LostStage, OnStageLoss, describe_end
 from optodrive.link.session.host_time import SEND_AHEAD_MAX_S
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
-from optodrive.link.session.stage_loss import LEASE_TRANSIT_MAX_S, LostStage, OnStageLoss
 from optodrive.link.session.staged_job import StagedJob
 
 

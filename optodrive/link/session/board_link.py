@@ -23,10 +23,9 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.states import LEASED_STATES
-from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.arming import RENEWAL_FRACTION, BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import CLOCK_INTERVAL_S, ClockSync
-from optodrive.link.session.lease_renewal import RENEWAL_FRACTION
 from optodrive.link.session.link_watch import BOARD_COUNTER_MODULUS, LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.point_stream import PointStream
 from optodrive.link.session.report_check import FalseReportError, ReportCheck

@@ -1,4 +1,4 @@
-"""State of the boards of several stages as that of one.
+"""State of the boards of several stages as that of one, and the loss of one after which the others go on.
 
 `board_group.py` says why they act as one.
 """
@@ -6,18 +6,42 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from math import inf
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import LinkError, OptodriveError
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, LEASED_STATES, BoardState
+from optodrive.link.session.arming import LeaseRenewal
 from optodrive.link.session.board_connector import BoardConnector
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.host_time import HostTime
-from optodrive.link.session.lease_renewal import LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.session import BoardSession
-from optodrive.link.session.stage_loss import LostStage
+
+OnStageLoss = Literal["all_dark", "that_stage"]
+LEASE_TRANSIT_MAX_S = 0.06
+"""Longest time from the host's last write to a board until its last lease begins there, and the skew of its clock.
+
+Bytes in flight take 10 ms, twice that with a retransmission; USB adapters and drivers hold bytes for up to 16 ms.
+"""
+
+
+class LostStage(NamedTuple):
+    """A stage that was lost while all were armed.
+
+    reason: for people, without the stage's name
+    dark_s: host time from which its board is dark for certain, even if nothing has reached it since: its lease has
+    ended
+    """
+
+    stage: int
+    reason: str
+    dark_s: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields of the status."""
+        return self._asdict()
+
 
 SUMS = ("done_index", "queued", "underruns", "crc_errors", "format_errors", "seq_errors", "laser_on_s")
 STATE_ORDER = (

@@ -31,13 +31,11 @@ from optodrive.core.errors import NotReadyError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, LEASED_STATES, BoardState
-from optodrive.link.session.arming import Arming
+from optodrive.link.session.arming import RENEWAL_FRACTION, Arming, BoardRequirements, LeaseRenewal
 from optodrive.link.session.board_link import BoardLink
-from optodrive.link.session.board_requirements import BoardRequirements
-from optodrive.link.session.fault_hints import get_fault_hint
-from optodrive.link.session.lease_renewal import RENEWAL_FRACTION, LeaseRenewal
+from optodrive.link.session.board_view import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob, PointTiming
-from optodrive.link.session.point_drain import PointDrain
+from optodrive.link.session.point_stream import PointDrain
 from optodrive.link.transport.base import Transport
 
 WAIT_MIN_S, WAIT_MAX_S = 0.001, 0.01

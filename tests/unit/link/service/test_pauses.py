@@ -8,7 +8,7 @@ from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.pauses import PAUSE_MAX_S
 from optodrive.link.service.remote_job import EXECUTED_RECORD
-from optodrive.link.session.point_drain import PointDrain
+from optodrive.link.session.point_stream import PointDrain
 from wire_points import build_points
 
 DUTY = 20_000

@@ -16,15 +16,17 @@ from test_session import CONFIG, Rig, plan
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol import messages as m
-from optodrive.link.session.likely_cause import (
+from optodrive.link.session.link_watch import (
+    EVIDENCE_WINDOW_S,
     STALL_LEASE_FRACTION,
+    LinkErrorCounts,
     LinkEvidence,
+    LinkWatch,
     describe_restart,
     diagnose_lease_expiry,
     diagnose_link_loss,
     diagnose_port,
 )
-from optodrive.link.session.link_watch import EVIDENCE_WINDOW_S, LinkErrorCounts, LinkWatch
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.faulty_link import FaultyLink
 from optodrive.link.transport.port_state import PortHolder, PortState

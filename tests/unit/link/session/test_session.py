@@ -17,8 +17,8 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder, encode_frame
 from optodrive.link.protocol.quantisation import quantise
 from optodrive.link.session.board_link import BOOT_MAX_S, CONNECT_TIMEOUT_S, SILENCE_TIMEOUT_S
+from optodrive.link.session.board_view import FAULT_HINTS, get_fault_hint
 from optodrive.link.session.clock_sync import DRIFT_MAX, ClockSync
-from optodrive.link.session.fault_hints import FAULT_HINTS, get_fault_hint
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
