@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from optodrive.device.config_file import load_config
-from optodrive.link.simulator.traces import compute_traces
+from optodrive.link.simulator.true_display import compute_traces
 from optodrive.link.simulator.virtual_run import execute
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence

@@ -11,7 +11,7 @@ from optodrive.link.service.link_service import LinkService
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.simulator.virtual_run import MemoryLink
 
 CONFIG = load_config("display-16")
 REQUIREMENTS = build_board_requirements(CONFIG)

@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.cli.main import run
 from optodrive.device.config_file import load_config
 from optodrive.device.pixel_map import load_pixel_map, replace_pixel_map
-from optodrive.link.simulator.true_pixels import GroundTruthPixels
+from optodrive.link.simulator.true_display import GroundTruthPixels
 
 COOLDOWN_S = 5.0
 """Duration after which every pixel is cold again, s."""

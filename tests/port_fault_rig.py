@@ -12,7 +12,7 @@ import serial
 import usb.core
 
 from optodrive.link.simulator.board_clock import BoardClock
-from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.link.transport import port_state, serial_port
 from optodrive.link.transport.serial_port import SerialPort
 

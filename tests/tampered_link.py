@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
-from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.simulator.virtual_run import MemoryLink
 
 NAMES = {
     "HELLO_REPLY": "major minor host_nonce session firmware uid capabilities tick_hz queue_points rx_window cell_codes "

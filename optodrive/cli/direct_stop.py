@@ -5,7 +5,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from optodrive.daemon.runtime_folder import find_link_socket
-from optodrive.link.service.operator_client import stop_board
+from optodrive.link.service.link_connection import stop_board
 
 SERVICE_SOCKET = Path("/run/optodrive/optodrive.sock")
 SERVICE_PORT = 8450

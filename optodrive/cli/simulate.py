@@ -87,9 +87,13 @@ def simulate(
     """Plan frames, run them on the simulated board, and simulate the measurement of the pixels."""
     from optodrive.core.files import check_output
     from optodrive.lab.recording.storage import HDF5_SUFFIXES
-    from optodrive.link.simulator.traces import compute_pixel_trace, compute_traces
-    from optodrive.link.simulator.true_display import build_true_display, select_true_terms
-    from optodrive.link.simulator.true_pixels import GroundTruthPixels
+    from optodrive.link.simulator.true_display import (
+        GroundTruthPixels,
+        build_true_display,
+        compute_pixel_trace,
+        compute_traces,
+        select_true_terms,
+    )
     from optodrive.link.simulator.virtual_run import execute
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility

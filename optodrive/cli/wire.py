@@ -131,7 +131,7 @@ def _run_replay(file: Path, board: str, seed: int | None, limits: Path | None, b
     from optodrive.link.session.replay import Replay, clock_shift_s
     from optodrive.link.simulator.board_core import BoardCore
     from optodrive.link.simulator.board_limits import BoardSettings, load_settings
-    from optodrive.link.simulator.memory_link import MemoryLink
+    from optodrive.link.simulator.virtual_run import MemoryLink
     from optodrive.link.transport.link_capture import LinkCapture
     from optodrive.link.transport.serial_port import SerialPort
 

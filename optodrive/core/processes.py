@@ -1,4 +1,4 @@
-"""What a process asks of the system and the interpreter: priority of threads, seldom collections, others' state."""
+"""Priority of threads, rare collections of garbage, and the state of other processes."""
 
 import gc
 import os

@@ -14,7 +14,7 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
 from optodrive.link.session.arming import TICK_HZ, BoardRequirements, ConfiguredValues
 from optodrive.link.session.plan_job import RETIMING_MAX_TICKS
-from optodrive.link.transport.port_settings import PortSettings
+from optodrive.link.transport.base import PortSettings
 
 CAP_MARGIN = 1.05
 """Ratio of the board's caps to the limiter's. The board is the second line of defence behind the limiter."""

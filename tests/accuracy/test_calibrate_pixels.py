@@ -11,7 +11,7 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.device.config_file import load_config
-from optodrive.link.simulator.true_pixels import GroundTruthPixels
+from optodrive.link.simulator.true_display import GroundTruthPixels
 from pixel_lab import calibrate_map, map_errors, measured_um, record_sweep, run_json
 
 TARGET_UM = 80.0

@@ -9,7 +9,7 @@ from displays import DISPLAYS
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
-from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from planner_rig import PlannerRig
 

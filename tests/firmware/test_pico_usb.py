@@ -18,7 +18,7 @@ from wire_format import HOST, MessageReader, body_of, frame
 
 from optodrive.cli.doctor_bare_board import check_bare_board
 from optodrive.core.clock import ManualClock
-from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.simulator.virtual_run import MemoryLink
 
 BUS_LOST_US = 4000
 """The board notices within this time that no frame begins any more."""

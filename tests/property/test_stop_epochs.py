@@ -17,8 +17,7 @@ import pytest
 from link_service_rig import OPERATOR, PLANNER, REQUIREMENTS, SUPERVISOR, WEB, CuttableLink, ServiceRig
 from optodrive.core.ipc import IpcError
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.service.epoch import Epoch
-from optodrive.link.service.pauses import Pauses
+from optodrive.link.service.control import Epoch, Pauses
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 from wire_points import build_points

@@ -9,8 +9,8 @@ from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.push import Push
 from optodrive.link.board_setup import build_scales
+from optodrive.link.service.link_connection import build_error
 from optodrive.link.service.remote_session import RemoteSession
-from optodrive.link.service.results import build_error
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import warm_up
 from rig import PATIENT_LEASE_S, wait_for

@@ -15,7 +15,7 @@ from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_scales
 from optodrive.link.service.link_settings_builder import build_link_settings
 from optodrive.link.service.remote_session import RemoteSession
-from optodrive.link.transport.port_settings import PortSettings
+from optodrive.link.transport.base import PortSettings
 
 CONFIG = load_config("display-16")
 BEAT_INTERVAL_S = 0.05

@@ -7,7 +7,7 @@ import pytest
 
 from forked_process import run_process
 from optodrive.daemon.runtime_folder import find_link_socket
-from optodrive.link.service.operator_client import stop_board
+from optodrive.link.service.link_connection import stop_board
 from rig import OPTODRIVE, TOKEN, long_train, running, wait_for
 
 

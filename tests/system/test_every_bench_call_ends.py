@@ -10,8 +10,7 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.session import BoardSession
-from optodrive.link.transport.capturing_transport import CapturingTransport
-from optodrive.link.transport.link_capture import LinkCaptureWriter
+from optodrive.link.transport.link_capture import CapturingTransport, LinkCaptureWriter
 from optodrive.link.transport.port_state import find_holders
 from optodrive.link.transport.serial_port import SerialPort
 from rig import Board, Command, config_text, is_alive, read_proc, wait_for

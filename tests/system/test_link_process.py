@@ -14,7 +14,7 @@ from link_process_rig import LinkProcess
 from optodrive.core.errors import LinkError
 from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.service.operator_client import stop_board
+from optodrive.link.service.link_connection import stop_board
 from rig import PATIENT_LEASE_S, wait_for
 from wire_points import build_stage_points
 

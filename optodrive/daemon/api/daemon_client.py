@@ -21,8 +21,7 @@ from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.link.service.link_connection import NO_REQUEST
-from optodrive.link.service.results import build_error
+from optodrive.link.service.link_connection import NO_REQUEST, build_error
 from optodrive.link.session.board_connector import CONNECTING
 from optodrive.planning.display_model import DisplayModel
 

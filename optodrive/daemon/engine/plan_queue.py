@@ -41,7 +41,7 @@ from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
-from optodrive.link.service.epoch import DISARM, STOP
+from optodrive.link.service.control import DISARM, STOP
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.board_view import get_fault_hint
 from optodrive.planning.display_model import DisplayModel

@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.core.types.plans import BudgetState
 from optodrive.daemon.engine.active_plan import ActivePlan, RefreshCycle
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.link.protocol.point_cut import PointCut
+from optodrive.link.protocol.stage_points import PointCut
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import commit_until, shift_state

@@ -23,7 +23,7 @@ from optodrive.daemon.engine.progress import PlanRun
 from optodrive.daemon.engine.queued_plans import QueuedPlans
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.plan import PlanStatus
-from optodrive.link.protocol.point_cut import PointCut
+from optodrive.link.protocol.stage_points import PointCut
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.session import SPLICE_LEAD_S
 from optodrive.planning.display_model import DisplayModel

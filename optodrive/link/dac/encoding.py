@@ -17,7 +17,7 @@ from optodrive.device.config_sections import DAC_HALF_RANGE_CODES
 from optodrive.device.field_loader import build_settling_table
 from optodrive.link.dac.formats.base import CHUNK_MAX_S, Chunk, DacFormat, PointTable
 from optodrive.link.dac.formats.registry import find_format
-from optodrive.link.protocol.dac_codes import DacScale
+from optodrive.link.protocol.quantisation import DacScale
 
 TICKS_PER_PLAN_S = 1_000_000
 """Plans have whole microseconds."""

@@ -1,13 +1,42 @@
-"""Connection to the link process of everyone whose loop polls: planner, acceptor, supervisor, an operator's command."""
+"""Connection to the link process of everyone whose loop polls: planner, acceptor, supervisor, an operator's command.
+
+Results of requests carry an error as fields of a message, which becomes the error again at the caller. STOP of an
+operator's command goes directly to the link process: it needs neither the web process nor the planner.
+"""
 
 import select
+import time
 from collections.abc import Callable, Mapping
 from math import inf
 from pathlib import Path
 from typing import Any
 
-from optodrive.core.clock import Clock
+from optodrive.core import errors
+from optodrive.core.clock import Clock, MonotonicClock
+from optodrive.core.errors import LinkError, OptodriveError
 from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
+
+
+def build_result(request_id: int, error: OptodriveError | None, fields: dict[str, Any]) -> Message:
+    """Return the result of a request.
+
+    error: None if it was carried out; fields: further fields
+    """
+    error_fields = None
+    if error is not None:
+        error_fields = {"code": error.code, "message": str(error), "type": type(error).__name__}
+    return Message("result", {"id": request_id, "error": error_fields, **fields})
+
+
+def build_error(fields: dict[str, Any]) -> OptodriveError:
+    """Return the error of a result, of its own type if that needs nothing but a message."""
+    kind = getattr(errors, str(fields["type"]), OptodriveError)
+    if not (isinstance(kind, type) and issubclass(kind, OptodriveError)) or kind.__init__ is not Exception.__init__:
+        kind = OptodriveError
+    error: OptodriveError = kind(fields["message"])
+    error.code = fields["code"]
+    return error
+
 
 RETRY_S = 0.1
 """Interval of the attempts to connect."""
@@ -148,3 +177,37 @@ class LinkConnection:
             self._socket.close()
             self._socket, self.end_reason = None, reason
             self.on_lost()
+
+
+STOP_TIMEOUT_S = 7.0
+"""Longest wait for the result. The link process itself gives the board less."""
+STOP_RETRY_S = 0.005
+
+
+def stop_board(path: Path, timeout_s: float = STOP_TIMEOUT_S) -> dict[str, Any] | None:
+    """Switch the gate off, drop everything queued and disarm. Return the result with the fields `board` and `epoch`.
+
+    Return None if no link process listens at the path or this user may not open it: nothing was sent then. Raise the
+    error of the link process, or LinkError if it does not answer.
+    """
+    clock = MonotonicClock()
+    deadline_s = clock.now_s() + timeout_s
+    connection = LinkConnection(path, "operator", clock)
+    while True:
+        try:
+            connection.open()
+            break
+        except BlockingIOError:  # others connect
+            if clock.now_s() > deadline_s:
+                return None
+            time.sleep(STOP_RETRY_S)
+        except OSError:
+            return None
+    result = connection.request("stop", {}, deadline_s - clock.now_s())
+    connection.close()
+    if result is None:
+        reason = connection.end_reason
+        raise LinkError(f"stop was not answered at {path} ({reason}): use the emergency stop or the key")
+    if result["error"] is not None:
+        raise build_error(result["error"])
+    return result

@@ -39,11 +39,9 @@ from optodrive.core.errors import InputError, LinkError, NotReadyError, Optodriv
 from optodrive.core.ipc import IpcError, Message
 from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES
 from optodrive.link.service.clients import Clients
-from optodrive.link.service.control import Control
-from optodrive.link.service.epoch import DISARM, STOP, Epoch
-from optodrive.link.service.pauses import PAUSE_MAX_S, Pauses
+from optodrive.link.service.control import DISARM, PAUSE_MAX_S, STOP, Control, Epoch, Pauses
+from optodrive.link.service.link_connection import build_result
 from optodrive.link.service.point_handover import PointHandover
-from optodrive.link.service.results import build_result
 from optodrive.link.service.settings import OnWebLoss
 from optodrive.link.service.status import StatusPublisher
 from optodrive.link.service.waiters import StateWaiters

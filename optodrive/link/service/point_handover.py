@@ -34,9 +34,8 @@ from optodrive.core.ipc import Message
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.stage_points import DAMAGED_POINTS, StagePoints
 from optodrive.link.protocol.states import ARMED_STATES
-from optodrive.link.service.epoch import Epoch
-from optodrive.link.service.pauses import Pauses
-from optodrive.link.service.results import build_result
+from optodrive.link.service.control import Epoch, Pauses
+from optodrive.link.service.link_connection import build_result
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.staged_job import StagedJob
 

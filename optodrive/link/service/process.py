@@ -24,8 +24,7 @@ from optodrive.link.service.settings import BoardSettings, LinkSettings
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport, guard_opening
-from optodrive.link.transport.capturing_transport import CapturingTransport
-from optodrive.link.transport.link_capture import LinkCaptureWriter
+from optodrive.link.transport.link_capture import CapturingTransport, LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.link.transport.threaded_transport import ThreadedTransport
 

@@ -9,7 +9,7 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.session.arming import BoardRequirements, ConfiguredValues
 from optodrive.link.session.group_state import OnStageLoss
-from optodrive.link.transport.port_settings import PortSettings
+from optodrive.link.transport.base import PortSettings
 
 OnWebLoss = Literal["dark", "finish"]
 

@@ -5,9 +5,7 @@ from math import inf
 from optodrive.core.clock import Clock
 from optodrive.core.ipc import Message
 from optodrive.core.processes import has_realtime_priority
-from optodrive.link.service.control import Control
-from optodrive.link.service.epoch import Epoch
-from optodrive.link.service.pauses import Pauses
+from optodrive.link.service.control import Control, Epoch, Pauses
 from optodrive.link.session.board_group import BoardGroup
 
 INTERVAL_S = 0.1

@@ -1,4 +1,4 @@
-"""What a configuration requires of a board, its arming, and the lease that keeps it armed.
+"""Requirements of a configuration on a board, its arming, and the lease that keeps it armed.
 
 Requirements are plain numbers: limits to tighten to, and capabilities that the board must have. An arming is requested
 once, followed by the board's reports, and lost when they contradict it. Renewals of the lease have a schedule and

@@ -19,9 +19,8 @@ from optodrive.link.protocol.states import (
     find_transition,
 )
 from optodrive.link.simulator.board_limits import BoardSettings, tighten
-from optodrive.link.simulator.execution_records import ExecutionRecord, ExecutionRecords
 from optodrive.link.simulator.guards import EmissionGuards
-from optodrive.link.simulator.point_queue import BoardJob, PointQueue, QueuedPoint
+from optodrive.link.simulator.point_queue import BoardJob, ExecutionRecord, ExecutionRecords, PointQueue, QueuedPoint
 
 INDICATOR_US = 2_000_000
 ARMING_TIMEOUT_US = 10_000_000

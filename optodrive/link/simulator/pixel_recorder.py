@@ -1,4 +1,7 @@
-"""Simulated recorder of one pixel: temperature and displacement of a hidden display, by the lines of SENSOR.md."""
+"""Simulated recorder of one pixel: temperature and displacement of a hidden display, by the lines of SENSOR.md.
+
+The instruments are a thermal camera, an interferometer and a load cell, with their noise.
+"""
 
 from collections import deque
 from typing import NamedTuple
@@ -7,11 +10,53 @@ import numpy as np
 
 from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.measurements import Measurement, PixelTrace, Run, Signal
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.link.simulator.galvos import SimulatedGalvos
-from optodrive.link.simulator.instruments import measure
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 from optodrive.physics.thermal_state import ThermalState
+
+INSTRUMENT_SIGMA = {"absorber_temperature_K": 1.0, "displacement_m": 0.25e-6, "force_N": 0.1e-3}
+"""Standard deviation of each instrument's noise."""
+
+
+def measure(
+    trace: PixelTrace,
+    pulses: FloatArray,
+    ambient_k: float,
+    bridge_width_m: float,
+    noise: float,
+    seed: int | np.random.Generator,
+    aim_m: FloatArray | None = None,
+) -> Measurement:
+    """Measure a trace: one run per pixel, named after it. noise: factor on each instrument's noise.
+
+    pulses: [n, 4] as in a recording
+    aim_m: [2, pixels of the display] beam aim relative to each pixel's centre, m; None for the centre
+    """
+    rng = np.random.default_rng(seed)
+    runs = []
+    for column, pixel in enumerate(trace.pixel.tolist()):
+        exact = {
+            "absorber_temperature_K": ambient_k + trace.absorber_k[:, column],
+            "displacement_m": trace.displacement_m[:, column],
+            "force_N": trace.force_n[:, column],
+        }
+        signals = {
+            name: Signal(
+                pixel=pixel,
+                t_s=trace.t_s,
+                value=values + noise * INSTRUMENT_SIGMA[name] * rng.standard_normal(len(values)),
+                sigma=noise * INSTRUMENT_SIGMA[name] if noise else None,
+            )
+            for name, values in exact.items()
+        }
+        attributes: dict[str, str | float] = {"bridge_width_m": bridge_width_m, "sample": "simulated"}
+        if aim_m is not None:
+            attributes |= {"aim_x_m": float(aim_m[0, pixel]), "aim_y_m": float(aim_m[1, pixel])}
+        runs.append(Run(f"pixel-{pixel}", ambient_k, pulses, signals, attributes))
+    return Measurement(tuple(runs))
+
 
 SIGNALS = ("absorber_temperature_K", "displacement_m")
 SAMPLES_MAX = 4000

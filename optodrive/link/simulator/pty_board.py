@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 from optodrive.link.simulator.board_clock import EXACT_CLOCK, BoardClock
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
-from optodrive.link.simulator.faulty_link import FaultyLink
-from optodrive.link.simulator.line_rate import READ_MAX, LineRate
+from optodrive.link.simulator.line import READ_MAX, FaultyLink, LineRate
 from optodrive.link.simulator.pseudo_terminal import open_pty, remove_link
 from optodrive.link.simulator.script import SENSOR_ACTIONS, ScriptStep
 

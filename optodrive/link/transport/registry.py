@@ -7,8 +7,7 @@ from pkgutil import iter_modules
 
 from optodrive.core.errors import InputError
 from optodrive.link import transport
-from optodrive.link.transport.base import Transport, TransportKind
-from optodrive.link.transport.port_settings import PortSettings
+from optodrive.link.transport.base import PortSettings, Transport, TransportKind
 from optodrive.link.transport.simulated import SimulatedBoard
 
 

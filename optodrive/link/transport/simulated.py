@@ -7,8 +7,7 @@ import time
 from pathlib import Path
 
 from optodrive.core.errors import LinkError
-from optodrive.link.transport.base import TransportKind, guard_opening
-from optodrive.link.transport.port_settings import PortSettings
+from optodrive.link.transport.base import PortSettings, TransportKind, guard_opening
 from optodrive.link.transport.serial_port import SerialPort
 
 START_TIMEOUT_S = 15.0

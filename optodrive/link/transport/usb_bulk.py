@@ -7,8 +7,7 @@ import usb.core
 import usb.util
 
 from optodrive.core.errors import MISSING, InputError, LinkError
-from optodrive.link.transport.base import TransportKind, guard_opening, guard_port
-from optodrive.link.transport.port_settings import PortSettings
+from optodrive.link.transport.base import PortSettings, TransportKind, guard_opening, guard_port
 from optodrive.link.transport.usb_device import find_device, timeout_ms
 
 WRITE_TIMEOUT_S = 0.5

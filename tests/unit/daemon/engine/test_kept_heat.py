@@ -11,7 +11,7 @@ from link_service_rig import WEB
 from optodrive.core.errors import InputError, NotReadyError
 from optodrive.daemon.engine.kept_heat import KeptHeat
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.planning import heat_record
 from planner_rig import InlineExecutor
 

@@ -8,7 +8,7 @@ from optodrive.core.errors import NotReadyError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.service.pauses import PAUSE_MAX_S
+from optodrive.link.service.control import PAUSE_MAX_S
 from planner_rig import build_frame, build_train
 
 KEPT_INTERRUPT = ActivePlan.interrupt

@@ -8,9 +8,8 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.link.board_setup import build_scales
-from optodrive.link.protocol.point_cut import PointCut
 from optodrive.link.protocol.quantisation import GATE_OFF_STEP_TICKS, TICKS_MAX
-from optodrive.link.protocol.stage_points import StagePoints, decode_stages
+from optodrive.link.protocol.stage_points import PointCut, StagePoints, decode_stages
 from optodrive.planning.pipeline import plan_sequence
 from stage_rig import build_stages
 from wire_points import build_points

@@ -10,10 +10,10 @@ from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service import control
 from optodrive.link.service.control import HOLD_MAX_S
+from optodrive.link.service.link_connection import build_error
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.service.point_handover import EXECUTED
-from optodrive.link.service.remote_job import EXECUTED_RECORD
-from optodrive.link.service.results import build_error
+from optodrive.link.service.remote_session import EXECUTED_RECORD
 from optodrive.link.session.session import BoardSession
 from wire_points import build_points
 

@@ -6,8 +6,8 @@ import pytest
 from link_service_rig import OPERATOR, PLANNER, STEP_S, WEB, ServiceRig
 from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.service.pauses import PAUSE_MAX_S
-from optodrive.link.service.remote_job import EXECUTED_RECORD
+from optodrive.link.service.control import PAUSE_MAX_S
+from optodrive.link.service.remote_session import EXECUTED_RECORD
 from optodrive.link.session.point_stream import PointDrain
 from wire_points import build_points
 

@@ -9,7 +9,7 @@ from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session import board_link
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.simulator.virtual_run import MemoryLink
 
 NO_ANSWER = "is open, but no board answers"
 STARTS_S = [2.5, 5.0, 8.0]

@@ -11,13 +11,13 @@ from optodrive.link.protocol.transcript import Transcript
 from optodrive.link.session.replay import Replay, clock_shift_s, compare_traces
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.link.transport.capturing_transport import CapturingTransport
+from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.link.transport.link_capture import (
     CLOSED,
     FROM_BOARD,
     TO_BOARD,
     CaptureEntry,
+    CapturingTransport,
     LinkCapture,
     LinkCaptureWriter,
 )

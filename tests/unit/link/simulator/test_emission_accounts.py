@@ -7,8 +7,8 @@ from pathlib import Path
 from optodrive.link.simulator import board_machine as machine_module
 from optodrive.link.simulator.board_core import TICK_HZ
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
-from optodrive.link.simulator.execution_records import RING_RECORDS
 from optodrive.link.simulator.guards import DUTY_FULL, WINDOW_US, EmissionGuards, energy_uj
+from optodrive.link.simulator.point_queue import RING_RECORDS
 
 
 def test_the_timing_of_the_contract():

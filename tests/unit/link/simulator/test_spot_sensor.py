@@ -5,7 +5,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
-from optodrive.link.simulator.spot_sensor import FIELD_MARGIN_M, PULSE_MEMORY_US, SimulatedSpotSensor
+from optodrive.link.simulator.simulated_optics import FIELD_MARGIN_M, PULSE_MEMORY_US, SimulatedSpotSensor
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 CONFIG = DISPLAYS["display-437"].config

@@ -13,8 +13,7 @@ from optodrive.core.errors import InputError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.link.transport.capturing_transport import CapturingTransport
+from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.link.transport.link_capture import (
     CLOSED,
     CRC,
@@ -28,6 +27,7 @@ from optodrive.link.transport.link_capture import (
     TO_BOARD,
     VERSION,
     CaptureEntry,
+    CapturingTransport,
     LinkCapture,
     LinkCaptureWriter,
     pack_entry,

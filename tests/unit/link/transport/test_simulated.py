@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from optodrive.link.transport.port_settings import PortSettings
+from optodrive.link.transport.base import PortSettings
 from optodrive.link.transport.simulated import SimulatedBoard
 
 
