@@ -6,7 +6,7 @@ from typing import get_args
 from pydantic.json_schema import models_json_schema
 
 from optodrive.core.types.push_options import Policy
-from optodrive.daemon.api.openapi_bodies import LIVE_FRAME_SCHEMA
+from optodrive.daemon.api.openapi import LIVE_FRAME_SCHEMA
 from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, FrameResult, HoldReport
 from optodrive.daemon.responses.telemetry import EVENTS
 

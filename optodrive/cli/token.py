@@ -39,9 +39,8 @@ def add(
     """Add a token with a random secret, which is shown once on the terminal or written to a file for its holder."""
     from optodrive.core.errors import suggest_nearest
     from optodrive.core.files import check_output
-    from optodrive.daemon.api.roles import ROLES
     from optodrive.daemon.api.token_file import add_token, create_token, write_holder_file
-    from optodrive.daemon.api.tokens import read_private_tokens
+    from optodrive.daemon.api.tokens import ROLES, read_private_tokens
 
     known = {each: each for each in ROLES}
     if role not in known:

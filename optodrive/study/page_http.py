@@ -10,8 +10,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from optodrive.daemon.api.host_check import check_host_and_origin
 from optodrive.daemon.api.problem_response import send_problem
-from optodrive.daemon.api.request_limits import App, Receive, Scope, Send
-from optodrive.daemon.api.request_line import join_headers
+from optodrive.daemon.api.request_limits import App, Receive, Scope, Send, join_headers
 from optodrive.daemon.api.static_files import MEDIA_TYPES, SECURITY_HEADERS
 
 SHARED_FILES = ("colours.css", "announcer.js")

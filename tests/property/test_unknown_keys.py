@@ -13,8 +13,8 @@ import optodrive
 from optodrive.core.errors import InputError
 from optodrive.core.json_model import JsonModel
 from optodrive.core.toml_model import Section
-from optodrive.daemon.api.fingers_socket import parse_fingers
-from optodrive.daemon.api.openapi_bodies import SEQUENCE_EXAMPLE
+from optodrive.daemon.api.client_sockets import parse_fingers
+from optodrive.daemon.api.openapi import SEQUENCE_EXAMPLE
 from optodrive.device.config_file import load_config
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.stimuli.sequence_file import parse_sequence

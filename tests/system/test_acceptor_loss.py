@@ -14,8 +14,7 @@ from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.server import acceptor_client
-from optodrive.daemon.server.acceptor_client import AcceptorClient
-from optodrive.daemon.server.acceptor_protocol import BEAT
+from optodrive.daemon.server.acceptor_client import BEAT, AcceptorClient
 from optodrive.daemon.server.web_process import WebProcess
 from optodrive.device.config_file import load_config
 from optodrive.device.config_sections import DaemonSection

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 from board_fixtures import board_disarmed, daemon_disarmed  # noqa: F401 - fixtures
 from optodrive.client import AsyncDisplay, Display
 from optodrive.core.errors import NotReadyError
-from optodrive.daemon.api.hold_socket import CLIENT_LEFT
+from optodrive.daemon.api.client_sockets import CLIENT_LEFT
 from optodrive.link.service.control import HOLD_MAX_S
 from rig import OPTODRIVE, TOKEN, long_train, read_role_tokens, wait_for
 

@@ -20,10 +20,9 @@ from optodrive.core.errors import NotReadyError, RefusedError
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.app import build_app
 from optodrive.daemon.api.daemon_client import DaemonClient
-from optodrive.daemon.api.roles import ROLES
 from optodrive.daemon.api.route_table import ARMING, STOP, RouteTable
 from optodrive.daemon.api.static_files import LOGIN_PATHS, is_page_request
-from optodrive.daemon.api.tokens import Token, Tokens
+from optodrive.daemon.api.tokens import ROLES, Token, Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel

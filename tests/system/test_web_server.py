@@ -13,9 +13,9 @@ from websockets.sync.client import connect
 
 from optodrive.core.child_process import BeatWriter
 from optodrive.daemon.api.access_policy import AccessPolicy
-from optodrive.daemon.api.scope_keys import ARRIVED_S, CALLER, EARLIEST_S
+from optodrive.daemon.api.request_limits import ARRIVED_S, CALLER, EARLIEST_S
 from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
-from optodrive.daemon.server import bounded_websocket, connections
+from optodrive.daemon.server import bounded_protocols, connections
 from optodrive.daemon.server.acceptor import Acceptor
 from optodrive.daemon.server.acceptor_client import AcceptorClient
 from optodrive.daemon.server.listeners import open_tcp_listener
@@ -403,9 +403,9 @@ def send_and_get_close_code(stream, message):
 def test_a_message_has_a_maximum_size_and_no_compression(port):
     with open_websocket(port) as stream:
         assert "sec-websocket-extensions" not in stream.response.headers
-        stream.send("x" * bounded_websocket.MESSAGE_MAX_BYTES)
-        assert stream.recv() == str(bounded_websocket.MESSAGE_MAX_BYTES)
-        assert send_and_get_close_code(stream, "x" * (bounded_websocket.MESSAGE_MAX_BYTES + 1)) in (1009, None)
+        stream.send("x" * bounded_protocols.MESSAGE_MAX_BYTES)
+        assert stream.recv() == str(bounded_protocols.MESSAGE_MAX_BYTES)
+        assert send_and_get_close_code(stream, "x" * (bounded_protocols.MESSAGE_MAX_BYTES + 1)) in (1009, None)
 
 
 @pytest.mark.parametrize("fragment", ["", "x" * 10_000])
@@ -449,13 +449,13 @@ MESSAGE, ECHO = b"\x81\x81\x00\x00\x00\x00x", b"\x81\x011"
 
 
 def test_pings_are_paced_and_delay_no_other_client(open_client, monkeypatch):
-    monkeypatch.setattr(bounded_websocket, "FRAMES_PER_S", 1.0 / LONG_S)
+    monkeypatch.setattr(bounded_protocols, "FRAMES_PER_S", 1.0 / LONG_S)
     stream = open_client()
     stream.send(HANDSHAKE)
     assert stream.receive().startswith(b"HTTP/1.1 101 ")
     stream.send(PING * 2500)  # what the sockets hold beyond this would block this thread
     received = b""
-    while len(received) < len(PONG) * bounded_websocket.FRAMES_BURST:
+    while len(received) < len(PONG) * bounded_protocols.FRAMES_BURST:
         received += stream.receive()
     for _ in range(20):
         assert open_client().ask(STOP)
@@ -463,12 +463,12 @@ def test_pings_are_paced_and_delay_no_other_client(open_client, monkeypatch):
     with suppress(BlockingIOError):
         while True:
             received += stream.receive()
-    slice_frames = bounded_websocket.SLICE_BYTES // len(PING) + 1
-    assert len(received) <= len(PONG) * (bounded_websocket.FRAMES_BURST + slice_frames)
+    slice_frames = bounded_protocols.SLICE_BYTES // len(PING) + 1
+    assert len(received) <= len(PONG) * (bounded_protocols.FRAMES_BURST + slice_frames)
 
 
 def test_messages_wait_for_the_pings_before_them(open_client, monkeypatch):
-    monkeypatch.setattr(bounded_websocket, "FRAMES_PER_S", 1000.0)
+    monkeypatch.setattr(bounded_protocols, "FRAMES_PER_S", 1000.0)
     stream = open_client()
     stream.send(HANDSHAKE)
     stream.receive()

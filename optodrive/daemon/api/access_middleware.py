@@ -12,18 +12,18 @@ from starlette.requests import ClientDisconnect
 from optodrive.daemon.api.access_policy import AccessPolicy, RequestContext
 from optodrive.daemon.api.problem_response import send_login_page, send_problem
 from optodrive.daemon.api.request_limits import (
+    CALLER,
     App,
     BoundedBody,
     RateLimitedFrames,
     Receive,
     Scope,
     Send,
+    join_headers,
     receive_empty_body,
 )
-from optodrive.daemon.api.request_line import join_headers
 from optodrive.daemon.api.revocation import RequestInProgress, build_revoked_problem
 from optodrive.daemon.api.route_table import ARMING, STOP, RouteTable
-from optodrive.daemon.api.scope_keys import CALLER
 from optodrive.daemon.api.static_files import is_page_request
 from optodrive.daemon.responses.problem import Problem, build_problem
 

@@ -5,23 +5,53 @@ checked, because a STOP that is refused leaves the laser on.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from urllib.parse import parse_qsl
 
 from optodrive.core.errors import InputError, Unquoted, suggest_nearest
-from optodrive.daemon.api.audit import AuditLog
+from optodrive.daemon.api.audit import AuditLog, RefusalAudit
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES, TEXT_MAX, check_host_and_origin
-from optodrive.daemon.api.rate_limit import RateLimiter
-from optodrive.daemon.api.refusal_audit import RefusalAudit
 from optodrive.daemon.api.revocation import RequestsInProgress
-from optodrive.daemon.api.roles import is_role_sufficient
 from optodrive.daemon.api.route_table import STOP, Route, RouteTable
 from optodrive.daemon.api.socket_token import is_websocket_request, read_subprotocol_token
 from optodrive.daemon.api.static_files import is_page_request, read_cookie_token
-from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
+from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens, is_role_sufficient
 from optodrive.daemon.responses.problem import Problem, build_error_problem, build_problem
 from optodrive.device.config_sections import DaemonSection
+
+CALLERS_MAX = 1024
+"""The number of callers with a bucket; the bucket of the caller with the oldest request is dropped first."""
+
+
+@dataclass
+class _Bucket:
+    tokens: float
+    updated_s: float
+
+
+class RateLimiter:
+    """Limits each caller to `per_s` requests per second on average and `burst` at once."""
+
+    def __init__(self, per_s: float, burst: float) -> None:
+        self._per_s = per_s
+        self._burst = max(burst, 1.0)
+        self._buckets: OrderedDict[Hashable, _Bucket] = OrderedDict()
+
+    def acquire(self, caller: Hashable, now_s: float) -> float:
+        """Take one token: return 0 if there is one, else the time until there is, s."""
+        bucket = self._buckets.pop(caller, None) or _Bucket(self._burst, now_s)
+        bucket.tokens = min(self._burst, bucket.tokens + (now_s - bucket.updated_s) * self._per_s)
+        bucket.updated_s = now_s
+        self._buckets[caller] = bucket
+        while len(self._buckets) > CALLERS_MAX:
+            self._buckets.popitem(last=False)
+        if bucket.tokens < 1.0:
+            return (1.0 - bucket.tokens) / self._per_s
+        bucket.tokens -= 1.0
+        return 0.0
+
 
 PLACE_OF_FILE = "the daemon names the file of its tokens at its start"
 

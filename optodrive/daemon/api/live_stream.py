@@ -8,7 +8,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.core.types.push_options import Policy
 from optodrive.daemon.api.daemon_client import DaemonClient
-from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
+from optodrive.daemon.api.request_limits import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.socket_token import select_subprotocol
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.messages import FrameResult

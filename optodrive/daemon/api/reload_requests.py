@@ -1,4 +1,7 @@
-"""Reloads that callers request: the web process passes them to the supervisor, which reads the files, as for SIGHUP."""
+"""Reloads: requests of callers, and the supervisor's message on changed tokens or settings, as the processes apply it.
+
+The web process passes a request to the supervisor, which reads the files, as for SIGHUP.
+"""
 
 import asyncio
 import secrets
@@ -6,8 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 from optodrive.core.errors import NotReadyError
+from optodrive.daemon.api.access_policy import AccessPolicy
+from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.state import ReloadReport
+from optodrive.device.config_sections import DaemonSection
 
 TIMEOUT_S = 30.0
 REQUEST, RESULT = "reload_request", "reload_result"
@@ -44,3 +50,11 @@ class ReloadRequests:
             future.set_result(Problem.model_validate(fields["problem"]))
         else:
             future.set_result(ReloadReport.model_validate(fields["report"]))
+
+
+def apply_reload(
+    policy: AccessPolicy, daemon: DaemonSection, fields: dict[str, Any]
+) -> tuple[DaemonSection, tuple[Token, ...]]:
+    """Apply a reload to the policy. Return the changed settings and the revoked tokens. fields: of the message."""
+    daemon = daemon.model_copy(update=fields["daemon"] | {"hosts": tuple(fields["daemon"]["hosts"])})
+    return daemon, policy.update(Tokens(Token(*entry) for entry in fields["tokens"]), daemon)

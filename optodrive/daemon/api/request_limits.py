@@ -1,9 +1,39 @@
-"""Limits of a request's input: the size of its body, the rate of a stream's frames."""
+"""A request as every check reads it: path, headers, keys of its scope, and the limits of its body and its frames."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, MutableMapping
+import re
+from collections.abc import Awaitable, Callable, Iterable, MutableMapping
 from hashlib import sha256
 from typing import Any
+
+CALLER = "optodrive.caller"
+"""Key in the ASGI scope of the token that the request presented, ANONYMOUS without one."""
+ARRIVED_S = "arrived_s"
+"""Key in the state of an ASGI scope, and in a WebSocket's message, of the monotonic time at which it arrived."""
+EARLIEST_S = "earliest_s"
+"""Key in a WebSocket's message of the earliest monotonic time at which it may have arrived."""
+
+
+STOP_PATH = "/v1/stop"
+AUTHORITY = re.compile(r"https?://[^/]*", re.IGNORECASE)
+
+
+def normalise_path(path: str) -> str:
+    """Return the path of a decoded request target: without scheme and host, and STOP's without a slash at its end."""
+    authority = AUTHORITY.match(path)
+    if authority is not None:
+        path = path[authority.end() :] or "/"
+    return STOP_PATH if path == STOP_PATH + "/" else path
+
+
+def join_headers(lines: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return the headers by lower-case name, the values of a repeated one as a list, which no Host or Origin is."""
+    headers: dict[str, str] = {}
+    for name, value in lines:
+        key = name.lower()
+        headers[key] = f"{headers[key]}, {value}" if key in headers else value
+    return headers
+
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]

@@ -15,7 +15,7 @@ from starlette.routing import BaseRoute, WebSocketRoute, compile_path
 from starlette.routing import Route as HttpRoute
 
 from optodrive.core.errors import suggest_near_name
-from optodrive.daemon.api.roles import Role, is_role_sufficient
+from optodrive.daemon.api.tokens import Role, is_role_sufficient
 
 STOP = "POST /v1/stop"
 ARMING = ("POST /v1/arm", "WEBSOCKET /v1/hold")

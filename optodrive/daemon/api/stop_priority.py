@@ -8,8 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from urllib.parse import quote
 
-from optodrive.daemon.api.request_limits import App, Receive, Scope, Send
-from optodrive.daemon.api.request_line import STOP_PATH, normalise_path
+from optodrive.daemon.api.request_limits import STOP_PATH, App, Receive, Scope, Send, normalise_path
 
 HOLD_MAX_S = 0.1
 """The longest time that one STOP delays other requests; STOP itself takes seconds if the board does not answer."""

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import lock_folder, read_regular_file
-from optodrive.daemon.api.roles import Role
 from optodrive.daemon.api.tokens import (
     EXPECTED_VALUES,
     FILE_MAX_BYTES,
     FORMAT,
     NAME_PATTERN,
     VERSION,
+    Role,
     Token,
     read_private_tokens,
     read_tokens,

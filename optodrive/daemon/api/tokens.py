@@ -7,14 +7,29 @@ import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, ValidationError
 
 from optodrive.core.errors import MISSING, InputError
 from optodrive.core.files import write_private_text
 from optodrive.core.toml_model import Section, build_input_error, check_format, read_toml
-from optodrive.daemon.api.roles import PERMISSIONS, ROLES, Role
+
+Role = Literal["viewer", "operator", "armer"]
+"""Each role includes those before it. A viewer reads and stops, an operator submits plans, an armer arms."""
+PERMISSIONS: dict[Role, str] = {
+    "viewer": "reads and stops",
+    "operator": "also plays, pauses and dims",
+    "armer": "also arms",
+}
+"""What each role may do besides what those before it may."""
+ROLES: tuple[Role, ...] = get_args(Role)
+
+
+def is_role_sufficient(role: Role, min_role: Role) -> bool:
+    """Return whether a role includes the role that a route requires."""
+    return ROLES.index(role) >= ROLES.index(min_role)
+
 
 ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
 FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"

@@ -17,10 +17,10 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.core.ipc import open_unix_listener
 from optodrive.core.processes import LIGHT, set_nice, set_realtime_priority
 from optodrive.daemon.api.access_policy import AccessPolicy
-from optodrive.daemon.api.reload_message import apply_reload
+from optodrive.daemon.api.reload_requests import apply_reload
 from optodrive.daemon.api.tokens import Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
-from optodrive.daemon.server.acceptor_protocol import BEAT, NUMBER, send_connection
+from optodrive.daemon.server.acceptor_client import BEAT, NUMBER, send_connection
 from optodrive.daemon.server.listeners import raise_descriptor_limit
 from optodrive.daemon.server.request_head import Rank, parse_head, peek_head, rank_request
 from optodrive.daemon.server.waiting_room import Waiting, WaitingRoom

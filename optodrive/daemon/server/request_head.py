@@ -5,7 +5,7 @@ from enum import IntEnum
 from urllib.parse import unquote
 
 from optodrive.daemon.api.access_policy import AccessPolicy, RequestContext
-from optodrive.daemon.api.request_line import STOP_PATH, join_headers, normalise_path
+from optodrive.daemon.api.request_limits import STOP_PATH, join_headers, normalise_path
 
 HEAD_MAX_BYTES = 4096
 """A longer head counts as complete: what precedes its end decides."""

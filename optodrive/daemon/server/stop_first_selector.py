@@ -9,9 +9,9 @@ import socket
 import time
 from collections.abc import Callable, Iterable
 
-from optodrive.daemon.api.request_line import STOP_PATH
+from optodrive.daemon.api.request_limits import STOP_PATH
+from optodrive.daemon.server.listeners import TimedSocket
 from optodrive.daemon.server.request_head import peek_head
-from optodrive.daemon.server.timed_socket import TimedSocket
 
 CLIENTS_PER_TURN = 6
 STOP = STOP_PATH.encode()

@@ -16,8 +16,7 @@ from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.app import build_app
 from optodrive.daemon.api.audit import AuditLog
 from optodrive.daemon.api.daemon_client import DaemonClient
-from optodrive.daemon.api.reload_message import apply_reload
-from optodrive.daemon.api.reload_requests import RESULT
+from optodrive.daemon.api.reload_requests import RESULT, apply_reload
 from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.runtime_folder import RuntimeFolder

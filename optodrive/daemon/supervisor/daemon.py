@@ -14,8 +14,7 @@ from optodrive.core.child_process import BeatWriter, execute_module, fork_with_b
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.ipc import open_unix_listener
 from optodrive.core.processes import set_nice, settle_memory
-from optodrive.daemon.api.roles import PERMISSIONS, ROLES
-from optodrive.daemon.api.tokens import Tokens, load_daemon_tokens
+from optodrive.daemon.api.tokens import PERMISSIONS, ROLES, Tokens, load_daemon_tokens
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import ConfigReloader

@@ -9,8 +9,7 @@ import pytest
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.app import build_app
 from optodrive.daemon.api.daemon_client import DaemonClient
-from optodrive.daemon.api.roles import ROLES
-from optodrive.daemon.api.tokens import Token, Tokens
+from optodrive.daemon.api.tokens import ROLES, Token, Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.device.config_file import load_config
 from optodrive.device.config_sections import DaemonSection

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from optodrive.core.ipc import Message
+from optodrive.daemon.api.client_sockets import CLIENT_LEFT, HoldSocket
 from optodrive.daemon.api.daemon_client import LinkClient
-from optodrive.daemon.api.hold_socket import CLIENT_LEFT, HoldSocket
 from optodrive.daemon.api.peer import Peer
 
 

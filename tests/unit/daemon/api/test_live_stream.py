@@ -8,7 +8,7 @@ import pytest
 
 from optodrive.daemon.api import live_stream
 from optodrive.daemon.api.live_stream import FRAME_AGE_MAX_S, LiveStream
-from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
+from optodrive.daemon.api.request_limits import ARRIVED_S, EARLIEST_S
 
 FRAME = '{"target_um": {"1": 100}}'
 

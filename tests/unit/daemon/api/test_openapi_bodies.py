@@ -4,7 +4,7 @@ import jsonschema_rs
 import pytest
 
 from displays import DISPLAYS
-from optodrive.daemon.api.openapi_bodies import SEQUENCE_EXAMPLE, SEQUENCE_SCHEMA
+from optodrive.daemon.api.openapi import SEQUENCE_EXAMPLE, SEQUENCE_SCHEMA
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optodrive.daemon.api.rate_limit import CALLERS_MAX, RateLimiter
+from optodrive.daemon.api.access_policy import CALLERS_MAX, RateLimiter
 
 
 def test_a_burst_then_the_rate():

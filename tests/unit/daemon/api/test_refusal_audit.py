@@ -4,9 +4,8 @@ import json
 import pytest
 
 from optodrive.core.clock import ManualClock
-from optodrive.daemon.api import refusal_audit
-from optodrive.daemon.api.audit import AuditLog
-from optodrive.daemon.api.refusal_audit import ENTRIES_MAX, PERIOD_S, RefusalAudit
+from optodrive.daemon.api import audit as audit_module
+from optodrive.daemon.api.audit import ENTRIES_MAX, PERIOD_S, AuditLog, RefusalAudit
 
 
 @pytest.fixture
@@ -46,7 +45,7 @@ def test_a_flood_of_one_kind_is_counted_and_hides_no_other_kind(audit, read):
 
 
 def test_the_count_is_written_when_the_period_ends_without_another_refusal(audit, read, monkeypatch):
-    monkeypatch.setattr(refusal_audit, "PERIOD_S", 0.05)
+    monkeypatch.setattr(audit_module, "PERIOD_S", 0.05)
 
     async def flood():
         refusals = RefusalAudit(audit)

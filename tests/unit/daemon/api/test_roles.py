@@ -2,9 +2,9 @@ import pytest
 from fastapi import FastAPI
 from starlette.routing import Mount
 
-from optodrive.daemon.api.roles import ROLES, is_role_sufficient
 from optodrive.daemon.api.route_table import ARMING, STOP, RoleRoutes, RouteTable
 from optodrive.daemon.api.static_files import LOGIN_PATHS
+from optodrive.daemon.api.tokens import ROLES, is_role_sufficient
 
 
 @pytest.fixture

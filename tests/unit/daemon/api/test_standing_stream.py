@@ -8,7 +8,7 @@ import pytest
 
 from optodrive.core.errors import BusyError, LinkError, NotReadyError, StoppedError
 from optodrive.daemon.api import standing_stream
-from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
+from optodrive.daemon.api.request_limits import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.api.standing_stream import StandingStream
 from optodrive.daemon.responses.messages import RefreshReport
 from optodrive.daemon.responses.problem import build_error_problem

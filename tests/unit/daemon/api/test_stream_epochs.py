@@ -10,7 +10,7 @@ from optodrive.core.errors import NotReadyError
 from optodrive.core.ipc import Message
 from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.live_stream import LiveStream
-from optodrive.daemon.api.scope_keys import ARRIVED_S, EARLIEST_S
+from optodrive.daemon.api.request_limits import ARRIVED_S, EARLIEST_S
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel

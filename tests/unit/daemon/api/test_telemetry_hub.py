@@ -9,8 +9,7 @@ import pytest
 from optodrive.core.errors import NotReadyError
 from optodrive.core.ipc import Message
 from optodrive.daemon.api import telemetry_hub
-from optodrive.daemon.api.peak_hold import COLUMNS, decode_peaks
-from optodrive.daemon.api.telemetry_hub import TelemetryHub
+from optodrive.daemon.api.telemetry_hub import COLUMNS, TelemetryHub, decode_peaks
 from optodrive.daemon.engine.telemetry_events import build_display_event
 from optodrive.daemon.responses.state import StateReport
 from optodrive.daemon.responses.telemetry import DisplayEvent, PulsesEvent

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from link_service_rig import OPERATOR
-from optodrive.daemon.server.timed_socket import _TIMESPEC, SO_TIMESTAMPNS, TimedSocket
+from optodrive.daemon.server.listeners import _TIMESPEC, SO_TIMESTAMPNS, TimedSocket
 from planner_rig import PlannerRig, build_frame, build_train
 
 STEPS_S = (0.0, 86_400.0, -86_400.0, 3600.0, -1e9, 0.5, -0.5)
