@@ -149,7 +149,7 @@ def measure_virtual(display, heights_um, lines, speed, seconds, lead_s):
     from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
     from optodrive.daemon.push import Push
     from optodrive.link.board_setup import build_scales
-    from optodrive.planning.limiter.usage import compute_panel_k, compute_usage
+    from optodrive.planning.limiter.cap_checks import compute_panel_k, compute_usage
 
     clock, hand = VirtualClock(), ReadingHand(lines, speed)
     scales, built = build_scales(display.config), BuiltRequest(build_frames([1e-6 * heights_um], 60.0))

@@ -11,8 +11,8 @@ from measuring import build_frames
 
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.cap_checks import compute_panel_k
 from optodrive.planning.limiter.limiter import shift_state
-from optodrive.planning.limiter.usage import compute_panel_k
 from optodrive.planning.pipeline import plan_sequence
 
 ROOMS_C = (23.0, 30.0)

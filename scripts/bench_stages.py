@@ -14,7 +14,7 @@ from measuring import build_frames, measure_times_s
 from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.device.config_file import load_config
 from optodrive.device.config_sections import StageSection
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model, build_nominal_panel
 from optodrive.planning.display_model import DisplayModel

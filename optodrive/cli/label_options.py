@@ -15,7 +15,7 @@ LabelOption = Annotated[
 
 def parse_label_options(options: list[str]) -> dict[str, str | int | float | bool]:
     """Return labels. Numbers, true and false are values of their own. Raise InputError for one without a key."""
-    from optodrive.planning.stimuli.labels import parse_labels
+    from optodrive.planning.stimuli.json_values import parse_labels
 
     labels: dict[str, object] = {}
     for option in options:

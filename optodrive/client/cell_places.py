@@ -8,8 +8,7 @@ from optodrive.client.humanware import CELLS_MAX
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config import PixelLayout
-from optodrive.planning.stimuli.cell_slots import CellSlot, Spacing, find_line_slots
-from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.planning.stimuli.pixel_lattice import CellSlot, Lattice, Spacing, find_line_slots
 
 SPACING = Spacing(dot_step=1, cell_gap=1, line_gap=1)
 LINE_ROWS = 4

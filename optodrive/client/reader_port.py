@@ -25,7 +25,7 @@ from optodrive.client.humanware import NAMED_KEYS
 from optodrive.client.stream import Stream
 from optodrive.core.errors import InputError
 from optodrive.link.simulator.pseudo_terminal import check_link_path, open_pty, remove_link
-from optodrive.planning.stimuli.cell_slots import CellSlot
+from optodrive.planning.stimuli.pixel_lattice import CellSlot
 
 READ_BYTES = 4096
 MISSING_READER_S = 0.05

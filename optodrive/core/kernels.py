@@ -114,7 +114,8 @@ def _collect_value(value: Any, names: list[str], parts: list[str], visited: set[
     elif isinstance(value, type) and hasattr(value, "_fields"):
         if id(value) not in visited:
             visited.add(id(value))
-            parts.append(f"{value.__qualname__} {value._fields}")
+            # The index of cached code names the class by its module, and cannot be read when that has moved.
+            parts.append(f"{value.__module__} {value.__qualname__} {value._fields}")
             for annotation in value.__annotations__.values():
                 _collect_value(annotation, names, parts, visited)
     elif isinstance(value, tuple):

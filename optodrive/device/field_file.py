@@ -9,10 +9,9 @@ from pydantic import Field as Item
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import PlausibleRange
 from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
-from optodrive.device.calibrated_field import CalibratedField
+from optodrive.device.calibrated_field import ORDER, TERM_COUNT, CalibratedField, Extent
 from optodrive.device.config_sections import FocalLength, Wiring
 from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
-from optodrive.device.field_surface import ORDER, TERM_COUNT, Extent
 
 FORMAT = "optodrive-field"
 VERSION = 2

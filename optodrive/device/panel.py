@@ -1,8 +1,13 @@
-"""The panel of a display: its configuration, completed by estimates from its size and materials."""
+"""The panel of a display, completed by estimates from its size and materials, and neighbours of its pixels."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from optodrive.device.config import Config
+import numpy as np
+
+from optodrive.core.types.arrays import IntArray, freeze_arrays
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.config_sections import DisplaySection
 
 RIM_M = 0.01
 """Width of the rim around the pixels."""
@@ -33,3 +38,35 @@ def complete_panel(config: Config) -> Panel:
         panel.resistance_k_per_w or 1.0 / (LOSS_W_PER_M2_K * area_m2),
         panel.capacity_j_per_k or CAPACITY_J_PER_M2_K * area_m2,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Pixels that share an edge with each pixel.
+
+    indices: [p, 4] left, right, below and above, −1 for none; frame_edges: [p] number of edges on the frame, at the rim
+    of the lattice. No heat crosses the edge to a missing place.
+    """
+
+    indices: IntArray
+    frame_edges: IntArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def __len__(self) -> int:
+        return len(self.frame_edges)
+
+    @classmethod
+    def from_display(cls, display: DisplaySection) -> "Neighbours":
+        """Return the neighbours on a display's lattice."""
+        layout = build_pixel_layout(display)
+        index = np.full((display.rows + 2, display.columns + 2), -1, dtype=np.int64)
+        index[layout.row + 1, layout.column + 1] = np.arange(len(layout))
+        row, column = layout.row + 1, layout.column + 1
+        indices = np.stack(
+            [index[row, column - 1], index[row, column + 1], index[row - 1, column], index[row + 1, column]], axis=1
+        )
+        at_rim = [layout.column == 0, layout.column == display.columns - 1]
+        at_rim += [layout.row == 0, layout.row == display.rows - 1]
+        return cls(indices, np.sum(at_rim, axis=0).astype(np.int64))

@@ -9,7 +9,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.physics.extended_pulse_for_height import find_shortest_pulse
 from optodrive.physics.extended_pulses import (
     EventStates,

@@ -7,7 +7,7 @@ from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.device.config import Config
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.physics.nominal_display import DisplayState, NominalThermalState, PulsePeaks, ignore_progress
 from optodrive.physics.parameters import ParameterSet, PixelArray, build_display_pixels
 from optodrive.physics.pulse_for_height import DriveRange

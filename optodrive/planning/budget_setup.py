@@ -9,8 +9,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.device.config import Config
 from optodrive.device.field_loader import build_settling_table
-from optodrive.device.neighbours import Neighbours
-from optodrive.device.panel import complete_panel
+from optodrive.device.panel import Neighbours, complete_panel
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
 from optodrive.physics.terms import all_terms

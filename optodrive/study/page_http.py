@@ -1,17 +1,46 @@
-"""HTTP of a study's pages: their files, and the check of Host and Origin before every request."""
+"""HTTP of a study's pages: their address and files, and the check of Host and Origin before every request."""
 
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.resources import files
+from ipaddress import ip_address
+from typing import NamedTuple
 
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.websockets import WebSocketDisconnect
 
-from optodrive.daemon.api.host_check import check_host_and_origin
+from optodrive.core.errors import InputError
+from optodrive.daemon.api.host_check import LOOPBACK_NAMES, check_host_and_origin
 from optodrive.daemon.api.problem_response import send_problem
 from optodrive.daemon.api.request_limits import App, Receive, Scope, Send, join_headers
 from optodrive.daemon.api.static_files import MEDIA_TYPES, SECURITY_HEADERS
+
+LOOPBACK = "127.0.0.1"
+
+
+class PageAddress(NamedTuple):
+    """Where the pages are served. port: 0 for any free one."""
+
+    host: str
+    port: int
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only programs of this computer reach it, which may also call it by another name."""
+        return self.host in LOOPBACK_NAMES
+
+
+def parse_page_address(option: str, text: str) -> PageAddress:
+    """Parse `PORT`, on loopback, or `HOST:PORT`. Raise InputError."""
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit() and int(port) <= 65535) or ":" in host:
+        raise InputError(option, text, "PORT or HOST:PORT, a port from 0 to 65535")
+    with suppress(ValueError):
+        if ip_address(host).is_unspecified:
+            raise InputError(option, text, "the address by which the participant's device reaches this computer")
+    return PageAddress(host or LOOPBACK, int(port))
+
 
 SHARED_FILES = ("colours.css", "announcer.js")
 """Files of the daemon's page."""

@@ -28,8 +28,7 @@ from optodrive.core.errors import InputError, OptodriveError
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES
 from optodrive.daemon.api.socket_token import read_subprotocol_token, select_subprotocol
 from optodrive.daemon.server.bounded_protocols import Utf8WebSocket
-from optodrive.study.page_address import PageAddress
-from optodrive.study.page_http import HostCheck, build_response, read_files
+from optodrive.study.page_http import HostCheck, PageAddress, build_response, read_files
 from optodrive.study.page_messages import (
     MESSAGE_MAX_BYTES,
     OPERATOR_MESSAGES,

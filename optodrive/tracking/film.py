@@ -1,10 +1,14 @@
-"""Fingertips from a multitouch film."""
+"""Fingertips from a multitouch film, and touches at known pixels, of which its calibration is made."""
 
 import time
 from collections.abc import Iterable, Iterator
 
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.fingers import FingerReport
-from optodrive.tracking.contacts import ContactDecoder, ContactReport, decode_contacts
+from optodrive.device.config import PixelLayout
+from optodrive.tracking.contacts import Contact, ContactDecoder, ContactReport, decode_contacts
 from optodrive.tracking.evdev_film import EvdevFilm
 from optodrive.tracking.film_calibration import FilmCalibration
 from optodrive.tracking.film_recording import FilmRecorder, FilmRecording
@@ -50,3 +54,32 @@ def locate_contacts(reports: Iterable[ContactReport], calibration: FilmCalibrati
     """Yield the fingertips on the display that make the contacts of a film."""
     for report in reports:
         yield FingerReport(report.at_s, calibration.locate(report.contacts))
+
+
+TOUCH_MIN_S = 0.2
+"""Shortest time of a touch. A shorter contact is the brush of a hand."""
+
+
+def choose_corner_pixels(layout: PixelLayout) -> tuple[int, ...]:
+    """Return the pixels nearest to the corners of a display, around it: one that is nearest to two, once."""
+    x_m, y_m = layout.x_m, layout.y_m
+    corners_m = [(x_m.min(), y_m.min()), (x_m.max(), y_m.min()), (x_m.max(), y_m.max()), (x_m.min(), y_m.max())]
+    nearest = (int(np.hypot(x_m - corner[0], y_m - corner[1]).argmin()) for corner in corners_m)
+    return tuple(dict.fromkeys(nearest))
+
+
+def iterate_touches(reports: Iterable[ContactReport]) -> Iterator[FloatArray]:
+    """Yield the middle [2] of every touch on a film when it ends, in units of the film.
+
+    A touch is one contact from its begin to its end, of TOUCH_MIN_S or more, with no other beside it.
+    """
+    touch: list[tuple[float, Contact]] = []
+    is_alone = True
+    for report in reports:
+        if touch and touch[0][1].number not in {contact.number for contact in report.contacts}:
+            if is_alone and report.at_s - touch[0][0] >= TOUCH_MIN_S:
+                yield np.median([contact[1:] for _, contact in touch], axis=0)
+            touch, is_alone = [], True
+        if report.contacts:
+            is_alone = is_alone and len(report.contacts) == 1
+            touch.append((report.at_s, report.contacts[0]))

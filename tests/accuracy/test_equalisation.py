@@ -16,7 +16,7 @@ from optodrive.planning.stimuli.sequence_file import parse_sequence
 from optodrive.study.matching import MatchingModel
 from optodrive.study.observers import Observer, Participant
 from optodrive.study.presenter import Presentation
-from optodrive.study.sensitivity_results import write_sensitivity
+from optodrive.study.results import write_sensitivity
 from optodrive.study.session import SimulatedRespondent, build_matching_model, draw_order, run_session
 from optodrive.study.study_file import load_study
 from optodrive.study.trial_log import TrialLog

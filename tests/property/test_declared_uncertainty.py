@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.device.config_sections import DisplaySection, UncertaintySection
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
 from optodrive.planning.limiter.nominal_model import (

@@ -7,7 +7,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.quantity import ZERO_CELSIUS_K
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model
 from optodrive.planning.limiter.budget import Budget

@@ -9,7 +9,7 @@ import pytest
 from optodrive.core.errors import RefusedError
 from optodrive.core.types.plans import PulsePlan
 from optodrive.device.config import DisplaySection
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.heat_bound import panel_rise_by_others_k
 from optodrive.planning.limiter.limiter import build_cold_budget_state, concatenate, limit

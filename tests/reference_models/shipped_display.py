@@ -2,7 +2,7 @@
 
 from displays import DISPLAYS
 from optodrive.core.quantity import ZERO_CELSIUS_K
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model, build_nominal_panel
 from optodrive.planning.limiter.nominal_model import Uncertainty

@@ -11,7 +11,7 @@ import numpy as np
 from optodrive.core.kernels import array_kernel
 from optodrive.core.types.plans import EMPTY_PLAN, PulsePlan
 from optodrive.device.config_sections import DisplaySection
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.planning.limiter.budget import select_galvo
 from optodrive.planning.limiter.caps import CapValues
 from optodrive.planning.limiter.nominal_model import (

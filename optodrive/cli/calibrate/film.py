@@ -34,8 +34,8 @@ def film(
     from optodrive.core.files import check_output
     from optodrive.device.config import build_pixel_layout
     from optodrive.device.config_file import load_config
+    from optodrive.tracking.film import choose_corner_pixels, iterate_touches
     from optodrive.tracking.film_calibration import fit_film, write_film_calibration
-    from optodrive.tracking.film_touches import choose_corner_pixels, iterate_touches
 
     check_output("--out", out, ".toml", may_exist=True)
     layout = build_pixel_layout(load_config(config).display)

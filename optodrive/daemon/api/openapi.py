@@ -13,8 +13,7 @@ from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.telemetry import EVENTS
 from optodrive.planning.stimuli.binary_frame import FRAME_NUMBER_MAX
 from optodrive.planning.stimuli.frame_json import ID_MAX, TARGET_KEYS
-from optodrive.planning.stimuli.json_values import PRIORITY_MAX, TIME_MAX_S
-from optodrive.planning.stimuli.labels import KEY_MAX, LABELS_MAX, NUMBER_MAX, TEXT_MAX
+from optodrive.planning.stimuli.json_values import KEY_MAX, LABELS_MAX, NUMBER_MAX, PRIORITY_MAX, TEXT_MAX, TIME_MAX_S
 from optodrive.planning.stimuli.pattern_registry import PATTERNS
 from optodrive.planning.stimuli.sequence_file import FRAMES_MAX, TRAINS_MAX
 

@@ -14,8 +14,8 @@ from optodrive.daemon.engine.progress import PlanProgress
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.physics.nominal_display import DisplayState
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.cap_checks import Usage, compute_panel_k, compute_usage
 from optodrive.planning.limiter.limiter import commit_executed, shift_state
-from optodrive.planning.limiter.usage import Usage, compute_panel_k, compute_usage
 
 
 class EmittedPulses(NamedTuple):

@@ -7,8 +7,7 @@ from typing import NamedTuple, Never
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.stimuli.json_values import decode_json
-from optodrive.planning.stimuli.labels import parse_labels
+from optodrive.planning.stimuli.json_values import decode_json, parse_labels
 from optodrive.planning.stimuli.pattern_registry import build_pattern, find_pattern
 from optodrive.planning.stimuli.sequence_file import parse_request
 

@@ -17,7 +17,7 @@ from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.plan_simulation import compute_simulated_m
 from optodrive.daemon.log import DaemonLog
 from optodrive.lab.recording.session import SessionRecorder
-from optodrive.link.session.clock_reading import ClockReading
+from optodrive.link.session.clock_sync import ClockReading
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.effective_config import build_effective_config
 from optodrive.planning.stimuli.train_json import train_to_json

@@ -11,8 +11,8 @@ from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PageEvent, PulseBatch
 from optodrive.device.config_sections import LimitsSection
 from optodrive.physics.nominal_display import DisplayState
+from optodrive.planning.limiter.cap_checks import Usage
 from optodrive.planning.limiter.caps import CAPS_BY_KEY
-from optodrive.planning.limiter.usage import Usage
 
 HEIGHT_UNIT_M = 1e-7
 TEMPERATURE_UNIT_K = 0.1

@@ -9,9 +9,8 @@ from math import log, pi
 import numpy as np
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
-from optodrive.device.calibrated_field import CalibratedField
+from optodrive.device.calibrated_field import TERM_COUNT, CalibratedField, compute_prior_widths, evaluate_terms
 from optodrive.device.field_geometry import CENTRE_CODE, FieldGeometry, beam_position_m, compute_parameter_derivatives
-from optodrive.device.field_surface import TERM_COUNT, compute_prior_widths, evaluate_terms
 from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 
 GEOMETRY_COUNT = len(FieldGeometry._fields)

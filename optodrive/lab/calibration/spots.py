@@ -13,10 +13,10 @@ import numpy as np
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.numeric_tables import read_columns, read_comments, write_columns
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.device.calibrated_field import Extent
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.config_sections import DIRECT_WIRING, Wiring
 from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, FieldGeometry
-from optodrive.device.field_surface import Extent
 
 COLUMNS = ("x_code", "y_code", "x_m", "y_m")
 ORIGIN = "optodrive spots of "

@@ -25,16 +25,15 @@ from optodrive.core.errors import (
     OverBudgetError,
     Unquoted,
 )
-from optodrive.core.garbage import settle_memory
+from optodrive.core.processes import LIGHT, set_realtime_priority, settle_memory
 from optodrive.core.quantity import format_number, format_quantity
-from optodrive.core.scheduling import LIGHT, set_realtime_priority
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.link.board_setup import build_bench_requirements
 from optodrive.link.protocol.quantisation import CENTRE_CODE, DUTY_MAX, WirePoints, decode, quantise
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.board_view import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport

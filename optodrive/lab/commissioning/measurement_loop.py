@@ -16,8 +16,8 @@ import numpy as np
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, NotReadyError, RefusedError
 from optodrive.core.files import atomic_write
+from optodrive.core.quantity import m_to_um
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.core.units import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit, fit_field, select_next_spot
 from optodrive.lab.calibration.spot_checks import check_fit, check_spots

@@ -12,8 +12,8 @@ import numpy as np
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, RefusedError
+from optodrive.core.quantity import um_to_m
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.units import um_to_m
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.recording.storage import MIRROR_SIGNALS, SIGNALS
 from optodrive.link.transport.base import Transport

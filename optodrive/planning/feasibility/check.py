@@ -1,9 +1,10 @@
-"""Feasibility check of a sequence, and the plan of a variant that fits.
+"""Feasibility check of a sequence, the plan of a variant that fits, and the nearest lower or longer variants.
 
-A feasible sequence costs one plan.
+A feasible sequence costs one plan. Each variant is confirmed by a plan.
 """
 
 from dataclasses import dataclass, replace
+from math import ceil, sqrt
 
 from optodrive.core.errors import OverBudgetError, RefusedError
 from optodrive.core.types.plans import BudgetState
@@ -11,7 +12,6 @@ from optodrive.core.types.push_options import FitMode, Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.feasibility.nearest_feasible import find_height_factor, find_time_factor
 from optodrive.planning.feasibility.order_search import ORDERS_MAX, Orders, OrderSearch, count_orders
 from optodrive.planning.feasibility.reduction import reduce_sequence
 from optodrive.planning.feasibility.report import FeasibilityReport, NearestFeasible, Proof
@@ -20,11 +20,58 @@ from optodrive.planning.feasibility.report_builder import (
     build_infeasible_report,
     build_reduction,
 )
-from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence
+from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence, stretch_sequence
 from optodrive.planning.feasibility.violation import Violation, deadlines_s, find_first_violation
 from optodrive.planning.pipeline import Progress, plan_sequence
 from optodrive.planning.planned_sequence import PlannedSequence, explain_nothing_raised
 from optodrive.planning.sequence_checks import first_unreachable, remove_dead_pixels
+
+TIME_FACTOR_MAX = 64.0
+"""Largest time factor tried."""
+TIME_FACTOR_STEP = 1.01
+"""Ratio of the bracket's ends at which the search for the time factor stops."""
+
+
+def find_height_factor(search: OrderSearch, sequence: FrameSequence) -> tuple[float, Orders] | None:
+    """Find the largest factor on all heights and powers that fits, by bisection in hundredths.
+
+    Returns the factor and the visiting orders, or None if no factor fits.
+    """
+    best: tuple[float, Orders] | None = None
+    low, high = 0, 100
+    while high - low > 1:
+        middle = (low + high) // 2
+        orders = search.find_orders(scale_sequence(sequence, middle / 100))
+        if orders is None:
+            high = middle
+        else:
+            low, best = middle, (middle / 100, orders)
+    return best
+
+
+def find_time_factor(search: OrderSearch, sequence: FrameSequence) -> tuple[float, Orders] | None:
+    """Find the smallest factor on all times that fits, by doubling and bisection to within 1 %.
+
+    Returns the factor and the visiting orders, or None if no factor up to TIME_FACTOR_MAX fits.
+    """
+    low, high = 1.0, 2.0
+    orders = search.find_orders(stretch_sequence(sequence, high))
+    while orders is None:
+        low, high = high, 2.0 * high
+        if high > TIME_FACTOR_MAX or search.is_exhausted:
+            return None
+        orders = search.find_orders(stretch_sequence(sequence, high))
+    while high > TIME_FACTOR_STEP * low and not search.is_exhausted:
+        middle = ceil(100 * sqrt(low * high)) / 100
+        if middle >= high:
+            break
+        shorter_orders = search.find_orders(stretch_sequence(sequence, middle))
+        if shorter_orders is None:
+            low = middle
+        else:
+            high, orders = middle, shorter_orders
+    return high, orders
+
 
 PLANS_MAX = 1_000
 """Plans tried at most per kind of nearest feasible variant."""

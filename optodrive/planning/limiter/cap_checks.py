@@ -1,4 +1,7 @@
-"""The computations of every cap: the largest power that it allows a pulse, and how much of it is in use. Kernels."""
+"""The computations of every cap: the largest power that it allows a pulse, and how much of it is in use at a moment.
+
+Kernels compute them.
+"""
 
 from typing import NamedTuple
 
@@ -9,9 +12,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState
 from optodrive.planning.limiter.budget import TOLERANCE, Budget, select_galvo
 from optodrive.planning.limiter.caps import CAP_NUMBERS, CAPS, WRONG_ORDER
-from optodrive.planning.limiter.energy_windows import max_window_power_w
-from optodrive.planning.limiter.galvo_load import mean_square_bound
-from optodrive.planning.limiter.galvo_moves import galvo_after_move, is_move
+from optodrive.planning.limiter.galvo_load import galvo_after_move, is_move, mean_square_bound
 from optodrive.planning.limiter.heat_bound import (
     absorber_after_k,
     advance_pixel,
@@ -20,7 +21,7 @@ from optodrive.planning.limiter.heat_bound import (
     wall_bound_k,
 )
 from optodrive.planning.limiter.slow_nodes import PulseRequest, slow_node_limits_w, wall_peak_k
-from optodrive.planning.limiter.workspace import LimiterWorkspace, open_workspace
+from optodrive.planning.limiter.workspace import LimiterWorkspace, max_window_power_w, open_workspace
 
 BISECTIONS = 32
 
@@ -185,3 +186,32 @@ def _fill_levels(budget: Budget, workspace: LimiterWorkspace, at_s: float, level
         touch_k += heat.touch_per_panel * panel_k
         levels[TOUCH_TEMPERATURE, pixel] = max(touch_k, levels[WALL_TEMPERATURE, pixel])
         levels[SPOT_ENERGY, pixel] = max(0.0, workspace.budgets.bucket_j[pixel] - off_s * budget.caps.pixel_mean_w)
+
+
+class Usage(NamedTuple):
+    """Use of one cap, in the unit of its `CapValues` field.
+
+    pixel: the one with the highest use, None per display
+    """
+
+    cap: str
+    used: float
+    limit: float
+    pixel: int | None
+
+
+def compute_usage(state: BudgetState, budget: Budget, at_s: float) -> tuple[Usage, ...]:
+    """Return the use of every gauged cap at `at_s`, on the state's time line, with the gate off since the state."""
+    levels = compute_levels(state, budget, at_s)
+    usages = []
+    for cap in CAPS:
+        if cap.is_gauged:
+            level = levels[CAP_NUMBERS[cap.key]]
+            pixel = int(level.argmax()) if cap.is_per_pixel else None
+            usages.append(Usage(cap.key, float(level.max()), getattr(budget.caps, cap.field), pixel))
+    return tuple(usages)
+
+
+def compute_panel_k(state: BudgetState, budget: Budget, at_s: float) -> float:
+    """Return the bound on the panel's rise at `at_s`, K, with the gate off since the state, or zero without a panel."""
+    return float(panel_peak_k(budget.heat, state.panel_k, at_s - state.panel_at_s, 0.0))

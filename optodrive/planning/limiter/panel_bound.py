@@ -1,6 +1,7 @@
-"""Worst-case coefficients of the panel, on which all walls and touch surfaces stand."""
+"""Worst-case coefficients of the panel, on which all walls and touch surfaces stand, and of values within a range."""
 
 from dataclasses import dataclass
+from math import e, log
 
 import numpy as np
 
@@ -8,7 +9,6 @@ from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.planning.limiter.nominal_model import NominalThermalModel, Uncertainty
-from optodrive.planning.limiter.specht import specht_ratio
 
 PANEL_LAG_RATIO = 4.0
 
@@ -96,3 +96,17 @@ def build_panel_bound(
         k_per_s=k_per_s,
         floor_k=per_wall * k_per_s * wall_lag_s,
     )
+
+
+def specht_ratio(ratio: float) -> float:
+    """Return the factor by which a sum of responses (1/c) e^(−t/rc) can exceed its larger value at the ends of c.
+
+    ratio: larger over smaller end of c.
+
+    With s = 1/c each response is s e^(−xs). For s between its ends, with weights linear in s, e^(−xs) is the weighted
+    geometric mean of its end values, and no mean of two values exceeds the larger one. s itself exceeds the weighted
+    geometric mean of its ends by at most Specht's ratio.
+    """
+    if ratio == 1.0:
+        return 1.0
+    return float((ratio - 1) * ratio ** (1 / (ratio - 1)) / (e * log(ratio)))

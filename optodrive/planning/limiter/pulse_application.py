@@ -5,8 +5,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.planning.limiter.budget import TOLERANCE, Budget
 from optodrive.planning.limiter.cap_checks import PixelStartState, absorber_peak_k, max_power_w
 from optodrive.planning.limiter.caps import NO_CAP
-from optodrive.planning.limiter.energy_windows import append
-from optodrive.planning.limiter.galvo_moves import galvo_after_move, is_move, store_move
+from optodrive.planning.limiter.galvo_load import galvo_after_move, is_move, store_move
 from optodrive.planning.limiter.heat_bound import (
     absorber_after_k,
     advance_pixel,
@@ -19,7 +18,7 @@ from optodrive.planning.limiter.heat_bound import (
     warm_panel,
 )
 from optodrive.planning.limiter.slow_nodes import PulseRequest, wall_credited_peak_k
-from optodrive.planning.limiter.workspace import LimiterWorkspace
+from optodrive.planning.limiter.workspace import LimiterWorkspace, append
 
 TRIM, STOP, COUNT_ONLY = range(3)
 """Treatment of a pulse above a cap: reduce its power, stop before it, or count it regardless."""

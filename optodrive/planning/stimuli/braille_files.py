@@ -17,7 +17,7 @@ from optodrive.core.errors import InputError, Unquoted, build_nothing_raised_err
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.braille import Cell
-from optodrive.planning.stimuli.cell_slots import Spacing
+from optodrive.planning.stimuli.pixel_lattice import Spacing
 from optodrive.planning.stimuli.text import PAGES_MAX, Lines, show_pages, translate
 
 FileFormat = Literal["auto", "braille", "text"]

@@ -1,8 +1,9 @@
-"""The paper's six perceptual experiments (Text S5) as pulse trains.
+"""The paper's six perceptual experiments (Text S5) as pulse trains, a comparison of two places, and bring-up waveforms.
 
 docs/how-to/show-stimuli.md lists what the paper leaves open. Directions are as seen from above: right is +x, up is +y.
 `centre` None is the display's middle pixel. `where` names the caller in errors. Every function raises InputError
-(does_not_fit) if the display lacks a pixel at a required place.
+(does_not_fit) if the display lacks a pixel at a required place. A comparison shows two places one after the other.
+Waveforms for an oscilloscope on the converter's outputs, for the bring-up of a board, are weak pulses in turn.
 """
 
 from collections.abc import Iterable, Sequence
@@ -10,10 +11,13 @@ from math import ceil
 
 import numpy as np
 
-from optodrive.core.types.stimuli import FrameSequence, PulseTrain
+from optodrive.core.errors import InputError
+from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain
 from optodrive.device.config import Config, PixelLayout
 from optodrive.device.gate_timing import build_servo_range
+from optodrive.device.sensitivity_map import replace_sensitivity_map
 from optodrive.device.settling_bound import bound_settling_s
+from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 DIRECTIONS = {"left": (0, -1), "right": (0, 1), "up": (1, 0), "down": (-1, 0)}
@@ -159,3 +163,81 @@ def compute_finger_places(digit: int, pitch_m: float) -> list[tuple[int, int]]:
 
 def _build_sequence(trains: Iterable[PulseTrain]) -> FrameSequence:
     return FrameSequence(trains=tuple(trains))
+
+
+DURATION_S, PAUSE_S, PERIOD_S = 0.4, 0.4, 0.04
+
+
+def build_comparison(
+    config: Config,
+    where: str,
+    first: int | None,
+    second: int | None,
+    first_intensity: float,
+    second_intensity: float,
+) -> FrameSequence:
+    """Build two vibrations of 0.4 s at 25 Hz, 0.4 s apart, by default both in the middle of the display.
+
+    Intensities are those of a person of sensitivity 1 everywhere, because a comparison measures the sensitivity. Raises
+    InputError (target_unreachable).
+    """
+    (middle,) = Lattice.from_config(config).pixels_around(None, [(0, 0)], where, "a place for the stimulus")
+    model = IntensityModel(replace_sensitivity_map(config, None))
+    trains = []
+    for number, (pixel, name, intensity) in enumerate(
+        ((first, "first", first_intensity), (second, "second", second_intensity))
+    ):
+        place = middle if pixel is None else pixel
+        target_m = model.solve_train_m(place, PERIOD_S, DURATION_S, intensity, f"{where}: {name}_intensity")
+        trains.append(HeightTrain(place, number * (DURATION_S + PAUSE_S), DURATION_S, PERIOD_S, target_m))
+    return FrameSequence(trains=tuple(trains))
+
+
+WAVEFORMS = ("steps-x", "steps-y", "square", "ramp-x", "ramp-y")
+PULSE_S = 1e-3
+
+
+def build_scope_waveform(
+    config: Config, where: str, waveform: str, dwell_s: float, power_w: float, seconds: float
+) -> FrameSequence:
+    """Build a waveform: one pulse of PULSE_S per place, dwell_s apart, for `seconds`.
+
+    The mirrors leave a place when its pulse ends, so the outputs step every dwell_s. Raises InputError (does_not_fit)
+    for a display with a single pixel along the waveform.
+    """
+    places = _list_places(Lattice.from_config(config), waveform)
+    if len(places) < 2:
+        raise InputError(
+            f"{where}: waveform", waveform, f"a display with several pixels along it, not {config.name}", "does_not_fit"
+        )
+    width_s = max(1, round(PULSE_S * config.laser.pwm_hz)) / config.laser.pwm_hz
+    period_s = len(places) * dwell_s
+    duration_s = max(1, round(seconds / period_s)) * period_s
+    power_w = min(power_w, config.laser.max_power_w)
+    return FrameSequence(
+        (),
+        tuple(
+            PulseTrain(pixel, round(k * dwell_s, 6), duration_s, width_s, period_s - width_s, power_w)
+            for k, pixel in enumerate(places)
+        ),
+    )
+
+
+def _list_places(lattice: Lattice, waveform: str) -> list[int]:
+    """Return the pixels of a waveform in the order of the visit, without repetitions."""
+    layout, middle = lattice.layout, lattice.middle_pixel()
+    row = [int(pixel) for pixel in lattice.index[layout.row[middle]] if pixel >= 0]
+    column = [int(pixel) for pixel in lattice.index[:, layout.column[middle]] if pixel >= 0]
+    match waveform:
+        case "ramp-x":
+            return row
+        case "ramp-y":
+            return column
+        case "steps-x":
+            return list(dict.fromkeys((row[0], row[-1])))
+        case "steps-y":
+            return list(dict.fromkeys((column[0], column[-1])))
+    diagonal_m = {  # distance along the diagonals; the outermost pixels are the corners of the square
+        signs: signs[0] * layout.x_m + signs[1] * layout.y_m for signs in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    }
+    return list(dict.fromkeys(int(distance_m.argmax()) for distance_m in diagonal_m.values()))

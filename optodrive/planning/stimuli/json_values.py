@@ -1,4 +1,7 @@
-"""Check single values of decoded JSON, with errors that name the place, the value and the expected value."""
+"""Check single values of decoded JSON, with errors that name the place, the value and the expected value.
+
+A caller's labels, such as subject, block and trial, are recorded and never interpreted.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -98,3 +101,32 @@ def require_time(value: object, where: str, expected: str, code: str, *, positiv
         bound = f" (at most {TIME_MAX_S:.0f} s)" if time_s > TIME_MAX_S else ""
         raise InputError(where, value, expected + bound, code=code)
     return time_s
+
+
+Labels = dict[str, str | int | float | bool]
+
+LABELS_MAX = 32
+KEY_MAX = 64
+TEXT_MAX = 256
+NUMBER_MAX = 2**53
+EXPECTED_VALUE = f"text of at most {TEXT_MAX} printable characters, a finite number up to 2^53, true or false"
+
+
+def parse_labels(value: object, where: str) -> Labels:
+    """Return labels of decoded JSON. Raise InputError (bad_label, too_many) beyond their bounds."""
+    if not isinstance(value, dict):
+        raise InputError(where, value, "an object of labels", code="bad_label")
+    if len(value) > LABELS_MAX:
+        raise InputError(where, len(value), f"at most {LABELS_MAX} labels", code="too_many")
+    for key, item in value.items():
+        if not (0 < len(key) <= KEY_MAX and key.isprintable()):
+            raise InputError(where, key[:KEY_MAX], f"keys of 1 to {KEY_MAX} printable characters", code="bad_label")
+        if not _is_label(item):
+            raise InputError(f"{where}.{key}", item, EXPECTED_VALUE, code="bad_label")
+    return dict(value)
+
+
+def _is_label(item: object) -> bool:
+    if isinstance(item, str):
+        return len(item) <= TEXT_MAX and (item.isprintable() or not item)
+    return isinstance(item, bool | int | float) and abs(item) <= NUMBER_MAX  # false for NaN

@@ -12,10 +12,10 @@ from pydantic import TypeAdapter
 from optodrive.core.errors import InputError, OptodriveError, build_nothing_raised_error, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
-from optodrive.planning.stimuli import bring_up, experiments, images, shapes
+from optodrive.planning.stimuli import experiments, images, shapes
 from optodrive.planning.stimuli.braille_files import build_braille_file
-from optodrive.planning.stimuli.comparison import build_comparison
 from optodrive.planning.stimuli.drawings import build_drawing
+from optodrive.planning.stimuli.experiments import build_comparison
 from optodrive.planning.stimuli.intensity import IntensityModel
 from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
 from optodrive.planning.stimuli.sequence_file import (
@@ -24,7 +24,7 @@ from optodrive.planning.stimuli.sequence_file import (
     sequence_to_json,
     validate_sequence,
 )
-from optodrive.planning.stimuli.showcase import build_showcase
+from optodrive.planning.stimuli.shapes import build_showcase
 from optodrive.planning.stimuli.text import build_text
 
 _CENTRE_PARAMETER = PatternParameter(
@@ -312,12 +312,12 @@ _PATTERN_LIST = (
         "scope",
         "a waveform on the converter's outputs for an oscilloscope, with weak pulses of 1 ms",
         (
-            _choice_parameter("waveform", "steps-x", "steps, square or ramp", bring_up.WAVEFORMS),
+            _choice_parameter("waveform", "steps-x", "steps, square or ramp", experiments.WAVEFORMS),
             PatternParameter("dwell_s", "number", 0.02, "time at each place", "s", min=0.005, max=1.0),
             PatternParameter("power_mw", "number", 25.0, "power of the pulses", "mW", min=0.1, max=50.0),
             PatternParameter("seconds", "number", 10.0, "duration, in whole periods", "s", min=0.1, max=60.0),
         ),
-        bring_up.build_scope_waveform,
+        experiments.build_scope_waveform,
         "Steps are between the ends of the middle row or column, the square between the corners of the display; a ramp "
         "visits the middle row or column pixel by pixel.",
     ),

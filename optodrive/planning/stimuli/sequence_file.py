@@ -11,8 +11,7 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.planning.stimuli.frame_json import parse_frames
 from optodrive.planning.stimuli.intensity import IntensityModel
-from optodrive.planning.stimuli.json_values import decode_json, require_list, require_object
-from optodrive.planning.stimuli.labels import Labels, parse_labels
+from optodrive.planning.stimuli.json_values import Labels, decode_json, parse_labels, require_list, require_object
 from optodrive.planning.stimuli.train_json import check_trains, parse_train, train_to_json, validate_train
 
 FRAMES_MAX = 10_000

@@ -1,4 +1,9 @@
-"""Static and moving shapes as frames. A picture holds the heights of all pixels, [p], m."""
+"""Static and moving shapes as frames, and a short sequence that demonstrates the display.
+
+A picture holds the heights of all pixels, [p], m.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +12,10 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
+from optodrive.planning.stimuli.experiments import build_two_fingers
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.refresh import BeamTimeEstimator, build_steps, hold_picture
+from optodrive.planning.stimuli.refresh import BeamTimeEstimator, build_steps, hold_picture, sequence_end_s
+from optodrive.planning.stimuli.text import build_text
 
 RING_RADIUS_FRACTION = 0.6
 """Default radius of rings and half side of squares, as a fraction of the distance from the middle to the border."""
@@ -123,3 +130,33 @@ def _too_large_error(config: Config, where: str, value_mm: float) -> InputError:
     width_mm, height_mm = (1e3 * display.pitch_m * (places - 1) for places in (display.columns, display.rows))
     expected = f"a size that meets pixels of {config.name}, {width_mm:g} × {height_mm:g} mm from centre to centre"
     return InputError(where, round(value_mm, 3), expected, code="does_not_fit")
+
+
+PAUSE_S = 0.3
+"""Pause between two parts, s."""
+
+
+def build_showcase(config: Config, where: str) -> FrameSequence:
+    """Build a dot along a ring, the ring, "hello" in braille, and two pairs of fingers, in about eight seconds.
+
+    Raises InputError (does_not_fit) on a display too small for a hand.
+    """
+    return concatenate_sequences(
+        build_moving_dot(config, where, radius_m=None, height_m=200e-6, step_s=0.06, turns=1),
+        build_ring(config, where, radius_m=None, height_m=100e-6, seconds=1.5),
+        build_text(config, where, "hello", height_m=150e-6, seconds=2.0),
+        build_two_fingers(config, where, "2-4", centre=None),
+        build_two_fingers(config, where, "3-5", centre=None),
+    )
+
+
+def concatenate_sequences(*sequences: FrameSequence) -> FrameSequence:
+    """Concatenate sequences in time, with a pause between them."""
+    concatenated, start_s = FrameSequence(), 0.0
+    for sequence in sequences:
+        concatenated = FrameSequence(
+            frames=concatenated.frames + tuple(replace(f, show_at_s=f.show_at_s + start_s) for f in sequence.frames),
+            trains=concatenated.trains + tuple(replace(t, start_s=t.start_s + start_s) for t in sequence.trains),
+        )
+        start_s = sequence_end_s(concatenated) + PAUSE_S
+    return concatenated

@@ -99,6 +99,15 @@ def test_everything_that_a_kernel_refers_to_changes_its_stamp(other, kernel):
     assert stamp(other, kernel) != stamp()
 
 
+def test_a_named_tuple_that_moves_to_another_module_changes_the_stamp():
+    """Else a newer version finds machine code whose index names a module that is gone, and ends with a traceback."""
+    before = stamp()
+    function = sys.modules["kernel_main"].total
+    pair = function.__annotations__["pair"]
+    pair.__module__ = "kernel_elsewhere"
+    assert code_stamp(function) != before
+
+
 def test_a_constant_read_through_a_module_of_the_package_changes_the_stamp(monkeypatch):
     kernel = "from optodrive.core import quantity\n\n\ndef total(x: float) -> float:\n    return quantity.FACTOR * x\n"
     monkeypatch.setattr("optodrive.core.quantity.FACTOR", 1.0, raising=False)

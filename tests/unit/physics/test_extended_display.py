@@ -5,7 +5,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.errors import DivergedError
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.physics import extended_display
 from optodrive.physics.extended_display import ExtendedThermalState
 from optodrive.physics.extended_pulses import peak_after_off_m

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optodrive.device.config_file import load_config
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.panel import Neighbours
 from optodrive.physics.extended_display import ExtendedThermalState
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import build_display_pixels, load_parameters

@@ -9,7 +9,7 @@ from optodrive.device.sensitivity_map import load_sensitivity_map, replace_sensi
 from optodrive.study.matching import MatchingModel, spread_places
 from optodrive.study.observers import Observer, Participant, draw_sensitivity
 from optodrive.study.presenter import VirtualPresenter
-from optodrive.study.sensitivity_results import compute_variation, write_sensitivity
+from optodrive.study.results import compute_variation, write_sensitivity
 from optodrive.study.session import SimulatedRespondent, build_matching_model, draw_order, run_session
 from optodrive.study.study_file import EXPERIMENTS, load_study
 from optodrive.study.trial_log import TrialLog

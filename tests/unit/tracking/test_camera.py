@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError, LinkError
-from optodrive.tracking.camera import BACKGROUND_PICTURES, LIFTED_S, Camera, follow_fingertips
-from optodrive.tracking.finger_numbers import MISSED_MAX_S, FingerNumbers
+from optodrive.tracking.camera import (
+    BACKGROUND_PICTURES,
+    LIFTED_S,
+    MISSED_MAX_S,
+    Camera,
+    FingerNumbers,
+    follow_fingertips,
+)
 from optodrive.tracking.marks import load_marks
 from rendered_hand import ABOVE, PITCH_M, SIZE, Finger, render, write_marks, write_video
 

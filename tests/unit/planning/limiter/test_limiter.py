@@ -11,7 +11,6 @@ from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedEr
 from optodrive.core.types.plans import PulsePlan
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.caps import CAPS
-from optodrive.planning.limiter.energy_windows import PulseHistory, WindowChains, append, max_window_power_w
 from optodrive.planning.limiter.limiter import (
     build_cold_budget_state,
     commit_until,
@@ -21,7 +20,8 @@ from optodrive.planning.limiter.limiter import (
     verify,
 )
 from optodrive.planning.limiter.nominal_model import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
-from optodrive.planning.limiter.specht import specht_ratio
+from optodrive.planning.limiter.panel_bound import specht_ratio
+from optodrive.planning.limiter.workspace import PulseHistory, WindowChains, append, max_window_power_w
 from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import NO_CAPS
 

@@ -8,8 +8,8 @@ import pytest
 from optodrive.device.config_file import load_config
 from optodrive.device.panel import complete_panel
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.cap_checks import compute_panel_k, compute_usage
 from optodrive.planning.limiter.limiter import build_cold_budget_state, commit_executed, shift_state
-from optodrive.planning.limiter.usage import compute_panel_k, compute_usage
 
 DISPLAY = DisplayModel.from_config(load_config("display-16"))
 BUDGET = DISPLAY.budget

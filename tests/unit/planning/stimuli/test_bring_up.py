@@ -6,7 +6,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.planning.feasibility.check import check_feasibility
-from optodrive.planning.stimuli.bring_up import WAVEFORMS
+from optodrive.planning.stimuli.experiments import WAVEFORMS
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 

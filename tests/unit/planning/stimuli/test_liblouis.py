@@ -13,9 +13,8 @@ from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import liblouis
-from optodrive.planning.stimuli.cell_slots import Spacing, find_line_slots
 from optodrive.planning.stimuli.liblouis import LIBRARY, _find_table, list_tables, translate_lines
-from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.planning.stimuli.pixel_lattice import Lattice, Spacing, find_line_slots
 from optodrive.planning.stimuli.text import build_text, translate
 
 

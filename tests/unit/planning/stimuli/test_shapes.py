@@ -24,11 +24,12 @@ from optodrive.planning.stimuli.shapes import (
     build_moving_dot,
     build_moving_edge,
     build_ring,
+    build_showcase,
     build_single_pixel,
     build_square_outline,
+    concatenate_sequences,
     find_ring_pixels,
 )
-from optodrive.planning.stimuli.showcase import build_showcase, concatenate_sequences
 
 CONFIG = load_config("display-437")
 LAYOUT = Lattice.from_config(CONFIG).layout

@@ -8,8 +8,7 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import list_shipped_configs, load_config
 from optodrive.planning.stimuli.braille import SPACE, encode_word
-from optodrive.planning.stimuli.cell_slots import Spacing, find_line_slots
-from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.planning.stimuli.pixel_lattice import Lattice, Spacing, find_line_slots
 from optodrive.planning.stimuli.text import build_text, wrap_words
 
 CONFIG = load_config("display-437")
