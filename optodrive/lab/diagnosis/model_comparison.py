@@ -140,6 +140,7 @@ def _list_pushes(
         near_m = shape_m[near]
         measured_m = height_m * float(near_m @ problem.data.value[rows][near]) / float(near_m @ near_m)
         jitter_m = noise.power_sigma * float(np.abs(power[rows][near]).mean())
-        noise_m = float(np.sqrt(coloured.white**2 / len(near_m) + slow2 + jitter_m**2))
+        white2 = coloured.compute_mean_variance(block.t_s, len(near_m))
+        noise_m = float(np.sqrt(white2 + slow2 + jitter_m**2))
         out.append((number, _Push(measured_m, float(nominal_m.max()), height_m, noise_m)))
     return out

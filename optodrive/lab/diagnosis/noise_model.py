@@ -8,7 +8,8 @@ that is fitted to the residuals would absorb the effect that is sought.
 
 Way out. Runs are repeated. Contrasts between the runs of one group contain no pixel at all, of any physics, so
 everything here is estimated from them (`replicate_contrasts.py`); only without repeats are residuals used, and the
-model says so (`from_replicates`).
+model says so (`from_replicates`). A program that averages or filters leaves noise that is smooth from sample to sample,
+which no process below describes: such a signal is compared by its means over the length of that noise.
 
 Model. Per signal kind Σ = white + σ₁² exp(−|Δt| / τ₁) + σ₂² exp(−|Δt| / τ₂) cos(ω Δt): drift, and a slower or
 oscillating part such as hum. Both parts are Markov processes (Ornstein-Uhlenbeck, and a damped rotation in two states),
@@ -40,7 +41,15 @@ from scipy.optimize import minimize
 from optodrive.core.kernels import array_kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
-from optodrive.lab.diagnosis.replicate_contrasts import Contrast, build_residual_contrasts, compute_contrasts
+from optodrive.lab.diagnosis.replicate_contrasts import (
+    Contrast,
+    Windows,
+    average_windows,
+    build_residual_contrasts,
+    compute_contrasts,
+    find_window,
+    find_windows,
+)
 
 EPS = 1e-12
 RESOLUTION_SHARE = 5e-5
@@ -60,13 +69,20 @@ MIN_QUANTA = 8
 class ColouredNoise:
     """White noise and two exponentially correlated parts, the second of which may oscillate.
 
-    white, sigma: standard deviations; tau_s: correlation times; omega_rad_per_s: angular frequency of the second part
+    white, sigma: standard deviations; tau_s: correlation times; omega_rad_per_s: angular frequency of the second part;
+    windows: over which samples are averaged first, where noise is smooth; all other numbers then are of the means
     """
 
     white: float
     sigma: tuple[float, float]
     tau_s: tuple[float, float]
     omega_rad_per_s: float = 0.0
+    windows: Windows = ()
+
+    def compute_mean_variance(self, t_s: FloatArray, count: float) -> float:
+        """Return the variance of the mean of this number of samples, at intervals as of t_s, by its white part."""
+        window = find_window(t_s, self.windows)
+        return self.white**2 * min(1.0, (1 if window is None else window.count) / count)
 
 
 @dataclass(frozen=True)
@@ -147,7 +163,8 @@ def _whiten(
 
 
 def whiten(t_s: FloatArray, columns: FloatArray, noise: ColouredNoise) -> tuple[FloatArray, float]:
-    """Return the columns [n, k] of one block with unit white noise, and ln |Σ|."""
+    """Return the columns [n, k] of one block, or their means in windows, with unit white noise, and ln |Σ|."""
+    t_s, columns = average_windows(t_s, columns, noise.windows)
     out = np.empty_like(columns, order="C")
     logdet = _whiten(
         np.ascontiguousarray(t_s),
@@ -174,11 +191,12 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
     repeats_differ = any(item.value.any() for item in contrasts)
     for kind in data.kinds:
         members = [item for item in contrasts if item.kind == kind]
+        windows = find_windows(members) if kind in PIXEL_KINDS else ()
         if not members:
             members = build_residual_contrasts(data, residual, power, timing, kind)
         values, span = _collect_values(data, data.value - residual, kind)
         quanta[kind] = _find_quantum(values)
-        coloured[kind] = _fit_coloured(members, estimate_resolution(values, span))
+        coloured[kind] = _fit_coloured(members, estimate_resolution(values, span), windows)
     if not contrasts:
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
     power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(contrasts, coloured, data.kinds)
@@ -212,7 +230,7 @@ def _compute_excess(contrast: Contrast, model: NoiseModel) -> tuple[float, Float
     size = np.array([model.power_sigma, model.timing_sigma_s, model.baseline_sigma[contrast.kind]])
     columns = np.column_stack([contrast.value, contrast.jitter * size])
     whitened, _ = whiten(contrast.t_s, columns, model.coloured[contrast.kind])
-    gram, count = whitened.T @ whitened, len(contrast.value)
+    gram, count = whitened.T @ whitened, len(whitened)
     inner = gram[1:, 1:] + np.eye(len(size))
     jitter = np.linalg.solve(inner, gram[0, 1:])
     values = whitened[:, 0] - whitened[:, 1:] @ jitter
@@ -257,8 +275,9 @@ def _find_quantum(values: FloatArray) -> float:
     return float(steps.min()) if float(np.abs(count - np.round(count)).max()) < 0.05 else 0.0
 
 
-def _fit_coloured(contrasts: list[Contrast], resolution: float) -> ColouredNoise:
+def _fit_coloured(contrasts: list[Contrast], resolution: float, windows: Windows) -> ColouredNoise:
     """Fit the noise of one signal kind, white noise of at least the resolution, with the jitters projected out."""
+    contrasts = [_average(item, windows) for item in contrasts]
     differences = np.concatenate([np.diff(item.value) for item in contrasts])
     std = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
     std = max(std, resolution)
@@ -295,7 +314,14 @@ def _fit_coloured(contrasts: list[Contrast], resolution: float) -> ColouredNoise
     smooth = _minimize(cost, smooth_start, 0.7, 220)
     oscillatory_start = np.array([-0.1, -1.5, -0.7, 2.0, 2.5, log(_find_dominant_omega(contrasts, dt_s))])
     oscillatory = _minimize(cost, oscillatory_start, 0.4, 260)
-    return decode(oscillatory) if cost(oscillatory) < cost(smooth) - 6.0 else decode(smooth)
+    best = oscillatory if cost(oscillatory) < cost(smooth) - 6.0 else smooth
+    return replace(decode(best), windows=windows)
+
+
+def _average(contrast: Contrast, windows: Windows) -> Contrast:
+    columns = np.column_stack([contrast.value, contrast.jitter])
+    t_s, means = average_windows(contrast.t_s, columns, windows)
+    return replace(contrast, t_s=t_s, value=means[:, 0], jitter=means[:, 1:])
 
 
 def _find_dominant_omega(contrasts: list[Contrast], dt_s: float) -> float:

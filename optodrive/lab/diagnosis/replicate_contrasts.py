@@ -1,4 +1,8 @@
-"""Contrasts between repeats: differences between runs of one group hold noise and jitters but no model."""
+"""Contrasts between repeats: differences between runs of one group hold noise and jitters but no model.
+
+What jitters of power and timing do to them follows from a fit plus its mean residual over the repeats, which is the
+measured trace: a fit without the effect that bends this trace at its edges would let repeats seem to differ.
+"""
 
 from dataclasses import dataclass
 from math import sqrt
@@ -11,6 +15,11 @@ from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
 MIRROR_SETTLED_S = 4e-3
 MIN_COMMON = 16
 """Smallest number of samples of a contrast."""
+MIN_GROWTH = 1.7
+"""Growth of the variance of second differences with twice the step, from which neighbours hold no noise of their own:
+it is 1 for white noise, and 2 for a mean of many samples."""
+MAX_WINDOW = 64
+"""Largest number of samples that are averaged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +65,11 @@ def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, ti
                 weights = [*([scale / later] * later), -scale]
                 rows = [member.part.start + picked for member, picked in zip(members, common, strict=True)]
                 value = sum(w * residual[r] for w, r in zip(weights, rows, strict=True))
-                last, block = rows[-1], blocks[number, kind, pixel]
-                jitter = np.stack([power[last], timing[last], np.ones(len(last))], axis=1)
-                contrasts.append(Contrast(pair, kind, block, members[-1].t_s[common[-1]], value, jitter))
+                last, block, t_s = rows[-1], blocks[number, kind, pixel], members[-1].t_s[common[-1]]
+                mean = np.mean([residual[r] for r in rows], axis=0)
+                missed = np.gradient(mean, t_s)
+                jitter = np.stack([power[last] + mean, timing[last] - missed, np.ones(len(last))], axis=1)
+                contrasts.append(Contrast(pair, kind, block, t_s, value, jitter))
                 used = True
             pair += used
     return contrasts
@@ -102,6 +113,74 @@ def _match_nearest(first: FloatArray, times: FloatArray) -> IntArray:
     is_near = distance[best][at] <= 0.51 * float(np.median(np.diff(first)))
     rows[owners[is_near]] = best[at][is_near]
     return rows
+
+
+@dataclass(frozen=True)
+class NoiseWindow:
+    """Number of samples over which noise is smooth, of a signal that is sampled at this interval [s]."""
+
+    interval_s: float
+    count: int
+
+
+Windows = tuple[NoiseWindow, ...]
+
+
+def find_windows(contrasts: list[Contrast]) -> Windows:
+    """Return the windows of one signal kind for each of its sampling intervals.
+
+    A program that averages, or filters both ways, leaves noise that no process of few states describes, and that is a
+    matter of samples where they are averaged. Means over the length of that noise are nearly independent again.
+    """
+    classes: dict[int, list[tuple[float, FloatArray]]] = {}
+    for item in contrasts:
+        interval_s = float(np.median(np.diff(item.t_s)))
+        values = item.value - item.jitter @ np.linalg.lstsq(item.jitter, item.value, rcond=None)[0]
+        classes.setdefault(round(4.0 * np.log2(interval_s)), []).append((interval_s, values))
+    return tuple(
+        NoiseWindow(float(np.median([interval_s for interval_s, _ in members])), _count_smooth(members))
+        for members in classes.values()
+    )
+
+
+def _count_smooth(members: list[tuple[float, FloatArray]]) -> int:
+    """Return the number of samples, a power of two, at which the noise of these contrasts stops to be smooth."""
+    count, longest = 1, max(len(values) for _, values in members)
+    while count < min(MAX_WINDOW, longest // 8):
+        steps = (count, 2 * count)
+        spreads = [
+            [float(np.mean((v[2 * step :] - 2.0 * v[step:-step] + v[: -2 * step]) ** 2)) for step in steps]
+            for _, v in members
+            if len(v) > 8 * count
+        ]
+        before, after = np.sum(spreads, axis=0)
+        if not after > MIN_GROWTH * before:
+            break
+        count *= 2
+    return count
+
+
+def average_windows(t_s: FloatArray, columns: FloatArray, windows: Windows) -> tuple[FloatArray, FloatArray]:
+    """Return times and means of columns [n, k] in their windows.
+
+    Times count windows, in units of the shortest one, because noise that was averaged by samples follows their number.
+    """
+    window = find_window(t_s, windows)
+    if window is None or max(item.count for item in windows) == 1:
+        return t_s, columns
+    label = ((t_s - t_s[0]) / (window.count * window.interval_s) + 1e-6).astype(np.int64)
+    starts = np.flatnonzero(np.diff(label, prepend=-1))
+    counts = np.diff(np.append(starts, len(t_s)))
+    unit_s = min(item.count * item.interval_s for item in windows)
+    return label[starts] * unit_s, np.add.reduceat(columns, starts, axis=0) / counts[:, None]
+
+
+def find_window(t_s: FloatArray, windows: Windows) -> NoiseWindow | None:
+    """Return the window for samples at these times."""
+    if not windows or len(t_s) < 2:
+        return None
+    interval_s = float(np.median(np.diff(t_s)))
+    return min(windows, key=lambda item: abs(np.log(item.interval_s / interval_s)))
 
 
 def build_residual_contrasts(

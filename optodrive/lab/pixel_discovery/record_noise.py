@@ -74,4 +74,5 @@ def _compute_covariance(signal: BinnedSignal, noise: ColouredNoise) -> FloatArra
     coloured += noise.sigma[1] ** 2 * np.exp(-apart_s / noise.tau_s[1]) * np.cos(noise.omega_rad_per_s * apart_s)
     _, begins, counts = np.unique(signal.sampled_rows, return_index=True, return_counts=True)
     means = np.add.reduceat(np.add.reduceat(coloured, begins, axis=0), begins, axis=1) / np.outer(counts, counts)
-    return np.asarray(means / signal.repeats + np.diag(noise.white**2 / signal.counts))
+    white = [noise.compute_mean_variance(signal.sampled_s, count) for count in signal.counts.tolist()]
+    return np.asarray(means / signal.repeats + np.diag(white))

@@ -1,14 +1,20 @@
 """The noise model agrees with dense matrices and recovers known noise from repeats."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import butter, filtfilt
 
 from labs import PIXEL, lab
+from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, compute_normal_equations, project_out, solve
+from optodrive.lab.diagnosis.model_selection import MAX_INTRA_PULSE_POWER_EXCESS, MAX_REPLICATE_EXCESS
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, whiten
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
-from optodrive.lab.diagnosis.replicate_contrasts import compute_contrasts
+from optodrive.lab.diagnosis.replicate_contrasts import Contrast, average_windows, compute_contrasts, find_windows
 
 NOISE = ColouredNoise(white=0.3, sigma=(0.2, 0.4), tau_s=(0.01, 0.05), omega_rad_per_s=300.0)
 
@@ -108,3 +114,66 @@ def test_an_effect_that_repeats_share_leaves_the_noise_as_it_is():
     for kind, item in plain.coloured.items():
         assert drooping.coloured[kind].white == pytest.approx(item.white, rel=0.02)
         assert sum(np.square(drooping.coloured[kind].sigma)) < 1.2 * sum(np.square(item.sigma))
+
+
+def smooth_twice(value, rate=1000.0):
+    return filtfilt(*butter(3, 31.0, fs=rate), value)
+
+
+def relax(noise, step, share=3.0):
+    """Add noise that relaxes within 1 / step samples."""
+    slow = np.zeros(len(noise))
+    kick = share * np.sqrt(1.0 - np.exp(-2.0 * step)) * np.random.default_rng(8).standard_normal(len(noise))
+    for row in range(1, len(noise)):
+        slow[row] = np.exp(-step) * slow[row - 1] + kick[row]
+    return noise + slow
+
+
+@pytest.mark.parametrize(
+    ("change", "low", "high"),
+    [
+        (lambda value: value, 1, 1),
+        (lambda value: relax(value, 0.4), 1, 1),
+        (lambda value: relax(value, 0.005), 1, 1),
+        (lambda value: uniform_filter1d(value, 7), 4, 16),
+        (lambda value: uniform_filter1d(value, 21, origin=10), 8, 32),
+        (smooth_twice, 8, 64),
+    ],
+)
+def test_only_smooth_noise_is_averaged_over_its_length_for_each_interval(change, low, high):
+    rng, contrasts = np.random.default_rng(6), []
+    for number, interval_s in enumerate([5e-4, 5e-4, 2e-3]):
+        t_s = interval_s * np.arange(1500)
+        jitter = np.stack([t_s, np.sin(30.0 * t_s), np.ones(1500)], axis=1)
+        value = change(rng.standard_normal(1500)) + jitter @ [50.0, 20.0, 3.0]
+        contrasts.append(Contrast(number, 0, number, t_s, value, jitter))
+    windows = find_windows(contrasts)
+    assert sorted(item.interval_s for item in windows) == pytest.approx([5e-4, 2e-3])
+    assert all(low <= item.count <= high for item in windows)
+    columns = rng.standard_normal((1500, 2))
+    columns[700:720] = columns[700]
+    kept = np.delete(np.arange(1500), [3, 40, 41, 42, 700])
+    t_s, means = average_windows(contrasts[0].t_s[kept], columns[kept], windows)
+    count = next(item.count for item in windows if item.interval_s < 1e-3)
+    if count == 1:
+        assert means == pytest.approx(columns[kept])
+    else:
+        assert len(t_s) == -(-1500 // count)
+        assert means[5] == pytest.approx(columns[kept][kept // count == 5].mean(axis=0))
+        assert (np.diff(t_s) > 0.0).all()
+
+
+@pytest.mark.parametrize("change", [lambda value, rate: uniform_filter1d(value, 21, origin=10), smooth_twice])
+@pytest.mark.parametrize("terms", [{}, {"bridge_conductivity": {"exponent": 0.6}}])
+def test_a_smoothed_signal_does_not_let_repeats_differ(change, terms):
+    runs = []
+    for rate, group in ((5000.0, ("weak", "middle", "strong")), (400.0, ("train",))):
+        for run in lab(9, terms, groups=group, rate=rate).runs:
+            signal = run.signals["displacement_m"]
+            there = np.isfinite(signal.value)
+            value = change(np.interp(signal.t_s, signal.t_s[there], signal.value[there]), rate)
+            signals = {**run.signals, "displacement_m": replace(signal, value=value)}
+            runs.append(replace(run, signals=signals))
+    noise = fit_nominal(build_dataset(Measurement(tuple(runs))))[0].noise
+    assert noise.replicate_excess < MAX_REPLICATE_EXCESS
+    assert noise.intra_pulse_power_excess < MAX_INTRA_PULSE_POWER_EXCESS
