@@ -116,13 +116,17 @@ class ActivePlan:
         planned = np.concatenate([self.planned.plan.pixel, np.array(skipped, dtype=np.int64)])
         return np.setdiff1d(np.flatnonzero(self.planned.sequence_target_m), planned)
 
-    def begin_later(self, heat: ThermalState, budget: BudgetState) -> None:
-        """Let a plan that has not begun start from the heat and budget of a later time than it was made for.
+    def begin_from(self, heat: ThermalState, budget: BudgetState) -> None:
+        """Let a plan that has not begun start from less heat than it was made for: later, or after less light.
 
-        The budget after it stays the bound for the earlier time.
+        The budget after it stays the bound for what it was made for.
         """
         self.heat_before, self.budget_before = heat, budget
-        rows, after = self.planned.plan, heat.copy()
+        self.predict_heat()
+
+    def predict_heat(self) -> None:
+        """Compute the heat after all rows from the heat before the plan."""
+        rows, after = self.planned.plan, self.heat_before.copy()
         after.apply_pulses(rows.pixel, rows.start_s, rows.width_s, rows.power_w)
         self.planned = replace(self.planned, heat=after)
 

@@ -10,10 +10,10 @@ strong.
 Invariants. `thermal.estimate` is the state after everything that runs or waits, and is replaced by a new object
 whenever it changes. A snapshot holds that object; `commit` accepts a plan only if it is still the same one, so one
 comparison finds every change, and the planner plans again otherwise. An estimate may be too warm (a plan that was cut
-short), never too cold: heat is taken back only by recomputing it from executed pulses (`rewind`). Plans run in the
-order of acceptance. What has left for the board is never withdrawn, except by turning the gate off (`flush`), which
-ends all running plans. Every pulse is counted exactly once: as executed, dropped, or left in the plan that waits for
-its rest.
+short), never too cold: heat is taken back only by recomputing it from executed pulses (`rewind`), also for the plans
+that wait. Plans run in the order of acceptance. What has left for the board is never withdrawn, except by turning the
+gate off (`flush`), which ends all running plans. Every pulse is counted exactly once: as executed, dropped, or left in
+the plan that waits for its rest.
 
 Lateness. A plan may start later than it was planned for, because the heat that it relied on can only have decayed; all
 plans behind it are then delayed by as much (`delay_all`). It may not start so much later that a bump comes out lower
@@ -110,7 +110,7 @@ class PlanQueue(QueuedPlans):
                 if start_s > record.start_s:
                     if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > cooling_max_m:
                         return False
-                    plan.begin_later(*snapshot.thermal.shift_to_plan(start_s))
+                    plan.begin_from(*snapshot.thermal.shift_to_plan(start_s))
                 record.start_s = start_s
                 self.waiting.append(plan)
             elif snapshot.cut is None or not self.stream.splice(plan, snapshot.predecessor, snapshot.cut):
@@ -197,8 +197,8 @@ class PlanQueue(QueuedPlans):
             is_partial = record.dropped or run.plan.growth is not None
             self.conclude(run, PlanStatus.SUPERSEDED if is_partial else PlanStatus.DONE, None)
             self.delay_all(record.delay_s)
-            if run.plan.is_cut_short and not self.is_busy:  # a pause has begun, and its last report is here first
-                self.thermal.rewind([run.plan])
+            if run.plan.is_cut_short and not self.running:  # a pause has begun, and its last report is here first
+                self.thermal.rewind([run.plan], self.waiting)
             self.stream.keep_unfinished(run.plan)
 
     def end_epoch(self, reason: str, clock_shift_s: float = 0.0) -> None:

@@ -75,12 +75,12 @@ class QueuePause:
         plans = self._plans
         with plans.lock:
             self.begin(off_s)
-            streams = [run.plan for run in plans.running if run.plan.record.streamed]
+            ended: list[ActivePlan] = []
             while plans.running:
                 run = plans.running.popleft()
                 plans.accounts.count_progress(run)
                 if self._session.lost is not None and self._counts_on(run, self._session.lost.stage):
-                    self._interrupt_by_loss(run, self._session.lost, off_s)
+                    ended += self._interrupt_by_loss(run, self._session.lost, off_s)
                     continue
                 plan, record = run.plan, run.plan.record
                 left = record.pulse_count - record.executed_count
@@ -89,28 +89,26 @@ class QueuePause:
                     is_left = left or plan.growth is not None
                     error = "the light was paused, and a stream shows the present" if is_left else None
                     plans.conclude(run, PlanStatus.SUPERSEDED if is_left else PlanStatus.DONE, error)
+                    ended.append(plan)
                     continue
                 plans.accounts.collect_executed(run)
                 delay_s = record.delay_s
                 plan.interrupt(off_s)
                 plans.delay_all(delay_s)
                 plans.waiting.appendleft(plan)
-            if streams:
-                plans.thermal.rewind(streams)
-                if plans.waiting:  # they go on from the heat before the first of them, see build_restart
-                    first, estimate = plans.waiting[0], plans.thermal.estimate
-                    first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
-                    plans.thermal.append(plans.waiting[-1])
+            if ended:
+                plans.thermal.rewind(ended, plans.waiting)
 
     @staticmethod
     def _counts_on(run: PlanRun, stage: int) -> bool:
         """Return whether a running plan has points for a stage."""
         return len(run.plan.points.stages[stage]) > 0
 
-    def _interrupt_by_loss(self, run: PlanRun, lost: LostStage, off_s: float) -> None:
+    def _interrupt_by_loss(self, run: PlanRun, lost: LostStage, off_s: float) -> list[ActivePlan]:
         """Let the plan that ran last when a stage was lost wait for its rest, unless a newer streamed one waits.
 
         Its pulses that the lost board may have emitted count as executed. Time in the dark without a pulse is over.
+        Return the plan if it has ended with that.
         """
         plans = self._plans
         plans.accounts.collect_executed(run)
@@ -123,14 +121,12 @@ class QueuePause:
         left = plan.rest_count
         if left and not plans.running and not any(each.record.streamed for each in plans.waiting):
             plans.waiting.appendleft(plan)
-            return
+            return []
         record.dropped = left
-        if plans.waiting and not plans.running:
-            first, estimate = plans.waiting[0], plans.thermal.estimate_before(plan)
-            first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
         plans.end_waiting(
             plan, PlanStatus.SUPERSEDED if left else PlanStatus.DONE, "replaced by a newer plan" if left else None
         )
+        return [plan]
 
     def end_if_idle(self) -> None:
         """Let the queue go on after a pause if nothing waits."""

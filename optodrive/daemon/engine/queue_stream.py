@@ -204,6 +204,7 @@ class QueueStream:
                     return False
             self._plans.accounts.totals["planned"] += len(grown.planned.plan) - plan.record.pulse_count
             plan.replace_rows(grown.planned, grown.points, grown.crc, grown.summary_json)
+            plan.predict_heat()  # the rest was planned from the heat for which the first part was made
             self._plans.thermal.append(plan)
             return True
 

@@ -1,6 +1,7 @@
 """Thermal estimate after all plans of the queue, and its changes at early ends, delays and restarts."""
 
 from collections.abc import Callable, Sequence
+from math import inf
 
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.thermal_estimate import (
@@ -12,6 +13,7 @@ from optodrive.daemon.engine.thermal_estimate import (
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.limiter import commit_until
 
 HOLD_MAX_S = 1.0
 """Longest time for which the board waits for points before it ends a plan."""
@@ -58,22 +60,40 @@ class QueueThermal:
         """Take back the heat of a plan that will never be executed. behind: the plans that wait behind it."""
         end_s = self.end_s
         self.go_back(plan)
-        for each in behind:
-            heat, _ = self.estimate.shift_to_plan(each.record.start_s)
-            each.begin_later(heat, each.budget_before)
-            estimate = ThermalEstimate.from_plan(each.planned.heat, each.planned.budget, each.record.start_s)
-            self.set(estimate, end_s)
+        self._continue_with(behind, end_s)
 
-    def rewind(self, ended: Sequence[ActivePlan], clock_shift_s: float = 0.0, notice_s: float = 0.0) -> None:
+    def rewind(
+        self,
+        ended: Sequence[ActivePlan],
+        behind: Sequence[ActivePlan] = (),
+        clock_shift_s: float = 0.0,
+        notice_s: float = 0.0,
+    ) -> None:
         """Count only the pulses that the plans that end early may have executed.
 
+        behind: the plans that wait behind them
         clock_shift_s: by which the board's clock has jumped since they were queued
         notice_s: time until the link process renews the lease no more
         """
+        end_s = self.end_s
         now_s = self._session.board_s() - clock_shift_s
         gate_off_s = max(now_s + notice_s + self._lease_s, self._session.dark_s)
-        estimate = rewind_estimate(EndedPlans.from_plans(ended), gate_off_s, self._budget, self._on_progress, now_s)
+        dark_s = now_s + self._session.round_trip_s  # the command that turns the gate off is on its way
+        estimate = rewind_estimate(EndedPlans.from_plans(ended), gate_off_s, self._budget, self._on_progress, dark_s)
         self.set(estimate, max(gate_off_s, estimate.budget.at_s))
+        self._continue_with(behind, end_s)
+
+    def _continue_with(self, behind: Sequence[ActivePlan], end_s: float) -> None:
+        """Let the plans that wait begin from the present estimate, each from that after the one before it.
+
+        end_s: end of the last one
+        """
+        for plan in behind:
+            start_s = plan.record.start_s
+            heat, budget = self.estimate.shift_to_plan(start_s)
+            plan.begin_from(heat, budget)
+            after = commit_until(plan.planned.plan, inf, budget, self._budget, self._on_progress)
+            self.set(ThermalEstimate.from_plan(plan.planned.heat, after, start_s), end_s)
 
     def delay(self, delay_s: float) -> None:
         """Shift all pulses, because a plan was late."""

@@ -60,11 +60,8 @@ class QueuedPlans:
                 self.waiting.remove(plan)
                 if not plan.is_interrupted:
                     self.thermal.forget(plan, behind)
-                elif self.waiting:
-                    first, estimate = self.waiting[0], self.thermal.estimate_before(plan)
-                    first.heat_before, first.budget_before = estimate.shift_to_plan(first.record.start_s)
                 else:
-                    self.thermal.rewind([plan])
+                    self.thermal.rewind([plan], behind)
             self.end_waiting(plan, PlanStatus.CANCELLED, reason or "removed from the queue")
         elif any(run.plan.record is record for run in self.running):
             self._session.flush()
@@ -78,8 +75,8 @@ class QueuedPlans:
             for run in ended:
                 self.conclude(run, status, error)
             self.delay_all(max((run.plan.record.delay_s for run in ended), default=0.0))
-            if ended and not self.waiting:
-                self.thermal.rewind([run.plan for run in ended], clock_shift_s)
+            if ended:
+                self.thermal.rewind([run.plan for run in ended], self.waiting, clock_shift_s)
 
     def end_all(self, status: PlanStatus, reason: str, clock_shift_s: float = 0.0) -> None:
         """End all running and waiting plans.
@@ -92,7 +89,7 @@ class QueuedPlans:
             if self.running:
                 self.end_running(status, reason, clock_shift_s)
             elif waiting:
-                self.thermal.rewind(waiting[:1], clock_shift_s)
+                self.thermal.rewind(waiting[:1], clock_shift_s=clock_shift_s)
         for plan in waiting:
             self.end_waiting(plan, status, reason)
 

@@ -7,6 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses, PulsePlan
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.physics.thermal_state import ThermalState
@@ -44,17 +45,10 @@ class ThermalEstimate:
         return ThermalEstimate(self.heat.copy_shifted(delay_s), shift_state(self.budget, delay_s))
 
 
-def apply_executed(before: ThermalState, executed: ExecutedPulses) -> ThermalState:
-    """Return the thermal state after executed pulses. Both arguments are on the plan's time line."""
-    heat = before.copy()
-    heat.apply_pulses(executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-    return heat
-
-
 class EndedPlan(NamedTuple):
     """Plan that ended early, with its executed pulses.
 
-    start_s: board time of the plan's zero; executed: None without a report
+    start_s: board time of the plan's zero; executed, executed_rows: as in `ActivePlan`, None without a report
     dropped: number of pulses at the plan's end that the board will never get
     """
 
@@ -62,6 +56,7 @@ class EndedPlan(NamedTuple):
     plan: PulsePlan
     dropped: int
     executed: ExecutedPulses | None
+    executed_rows: IntArray | None
 
     @classmethod
     def from_plan(cls, plan: ActivePlan) -> Self:
@@ -71,6 +66,7 @@ class EndedPlan(NamedTuple):
             PulsePlan(**{item.name: getattr(plan.planned.plan, item.name) for item in fields(PulsePlan)}),
             plan.rest_count if plan.is_interrupted else plan.record.dropped,
             plan.executed,
+            plan.executed_rows,
         )
 
 
@@ -109,24 +105,29 @@ def rewind_estimate(
             until_s = min(gate_off_s - record.start_s, float(np.nextafter(plan.start_s[kept_pulses - 1], inf)))
             kept = PulsePlan(**{item.name: getattr(plan, item.name)[:kept_pulses] for item in fields(PulsePlan)})
             state = commit_until(kept, until_s, state, budget, on_progress)
-        if record.executed is not None:
-            heat = apply_executed(heat, record.executed)
-        heat = _apply_unreported(heat, record, dark_s)
+        heat = _apply_emitted(heat, record, dark_s)
     return ThermalEstimate.from_plan(heat, state, zero_s)
 
 
-def _apply_unreported(before: ThermalState, record: EndedPlan, dark_s: float) -> ThermalState:
-    """Return the heat after the pulses of a plan for one board that have no report, but began before dark_s."""
-    plan, kept, first, late_s = record.plan, len(record.plan) - record.dropped, 0, 0.0
-    if record.executed is not None and len(record.executed):
-        first = len(record.executed)
-        late_s = max(0.0, float(record.executed.start_s[-1] - plan.start_s[first - 1]))
-    start_s = plan.start_s + late_s
-    row = first + np.flatnonzero(start_s[first:kept] < dark_s - record.start_s)
-    if plan.stage.any() or not len(row):
-        return before
-    heat, width_s = before.copy(), np.minimum(plan.width_s[row], dark_s - record.start_s - start_s[row])
-    heat.apply_pulses(plan.pixel[row], start_s[row], width_s, plan.power_w[row])
+def _apply_emitted(before: ThermalState, record: EndedPlan, dark_s: float) -> ThermalState:
+    """Return the heat after the executed pulses of a plan, and those that have no report but began before dark_s."""
+    plan, late_s = record.plan, 0.0
+    is_due = np.arange(len(plan)) < len(plan) - record.dropped
+    if record.executed is not None and record.executed_rows is not None and len(record.executed):
+        is_due[record.executed_rows] = False
+        if not plan.stage.any():  # several boards emit nothing late
+            late_s = max(0.0, float(record.executed.start_s[-1] - plan.start_s[record.executed_rows[-1]]))
+    start_s, until_s = plan.start_s + late_s, dark_s - record.start_s
+    row = np.flatnonzero(is_due & (start_s < until_s))
+    width_s = np.minimum(plan.width_s, until_s - start_s)
+    columns = [plan.pixel[row], start_s[row], width_s[row], plan.power_w[row]]
+    if record.executed is not None:
+        reported = [getattr(record.executed, name) for name in ("pixel", "start_s", "width_s", "power_w")]
+        columns = [np.concatenate(pair) for pair in zip(reported, columns, strict=True)]
+    order = np.argsort(columns[1], kind="stable")
+    pixel, begin_s, on_time_s, power_w = (column[order] for column in columns)
+    heat = before.copy()
+    heat.apply_pulses(pixel, begin_s, on_time_s, power_w)
     return heat
 
 
@@ -134,5 +135,5 @@ def estimate_before_rest(plan: ActivePlan, budget: Budget, on_progress: Callable
     """Build the estimate before a plan that waits, or before the rest of one that was interrupted."""
     if plan.first_row:
         ended = EndedPlan.from_plan(plan)._replace(dropped=plan.rest_count)
-        return rewind_estimate(EndedPlans.from_plans([plan])._replace(plans=(ended,)), inf, budget, on_progress)
+        return rewind_estimate(EndedPlans.from_plans([plan])._replace(plans=(ended,)), inf, budget, on_progress, inf)
     return ThermalEstimate.from_plan(plan.heat_before, plan.budget_before, plan.record.start_s)

@@ -109,6 +109,12 @@ class LinkStatus:
             return None
         return ClockReading(sample[1] + (now_s - sample[0]), now_s, time.time())
 
+    @property
+    def round_trip_s(self) -> float:
+        """Shortest recent round trip from the link process to the board, s, 0 before the first."""
+        round_trip_ms: float | None = self.stats.get("round_trip_ms")
+        return 0.0 if round_trip_ms is None else 1e-3 * round_trip_ms
+
     def board_s(self) -> float:
         """Return the present board time, s, or 0 before the first status with a synchronised clock."""
         sample = self._clock_sample
