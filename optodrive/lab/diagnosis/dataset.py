@@ -1,6 +1,8 @@
 """Recording as one vector of finite samples, in blocks of one signal of one run each, and its hypotheses."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,8 @@ COMMAND_DIGITS = 6
 """Digits of mirror commands, s and rad, within which they are equal."""
 EDGE_EXCLUSION_S = 6e-5
 """Temperature samples closer to a gate edge are excluded: timing jitter acts nonlinearly on the kink there."""
+NEVER_S: FloatArray = np.zeros(0)
+"""Times of a signal that was not measured."""
 CLOCKS = ("temperature", "displacement", "force", "mirrors", "mirrors")
 """Clock of each kind of signal, in the order of `dataset.SIGNALS`."""
 
@@ -35,6 +39,16 @@ class Block:
     pixel: int
     part: slice
     t_s: FloatArray
+
+
+class Samples(NamedTuple):
+    """Samples of one signal of one run before they are joined: kind is an index into SIGNALS."""
+
+    run: int
+    kind: int
+    pixel: int
+    t_s: FloatArray
+    value: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,33 +126,15 @@ class Dataset:
 
     def select(self, runs: list[int], kinds: tuple[int, ...] = (*PIXEL_KINDS, *MIRROR_KINDS)) -> "Dataset":
         """Return the data of these runs and signal kinds. Doses and session times stay unchanged."""
-        new_numbers = {old: number for number, old in enumerate(runs)}
-        blocks: list[Block] = []
-        values: list[FloatArray] = []
-        new_blocks: dict[int, int] = {}
-        offset = 0
-        for number, block in enumerate(self.blocks):
-            if block.run not in new_numbers or block.kind not in kinds:
-                continue
-            count = block.part.stop - block.part.start
-            new_blocks[number] = len(blocks)
-            blocks.append(
-                Block(new_numbers[block.run], block.kind, block.pixel, slice(offset, offset + count), block.t_s)
-            )
-            values.append(self.value[block.part])
-            offset += count
-        experiments = []
-        for experiment, numbers in self.experiments:
-            if any(number in new_blocks for number in numbers):
-                first, second, third = (new_blocks.get(number, -1) for number in numbers)
-                experiments.append((experiment, (first, second, third)))
-        return Dataset(
-            tuple(self.runs[old] for old in runs),
-            tuple(blocks),
-            tuple(experiments),
-            _group_by_drive(experiments),
-            np.concatenate(values) if values else np.zeros(0),
-        )
+        numbers = {old: number for number, old in enumerate(runs)}
+        samples = [
+            Samples(numbers[block.run], block.kind, block.pixel, block.t_s, self.value[block.part])
+            for block in self.blocks
+            if block.run in numbers and block.kind in kinds
+        ]
+        experiments = [(self.blocks[max(blocks)].run, experiment) for experiment, blocks in self.experiments]
+        kept = [(numbers[run], experiment) for run, experiment in experiments if run in numbers]
+        return assemble_dataset(tuple(self.runs[old] for old in runs), samples, kept)
 
 
 def build_dataset(measurement: Measurement) -> Dataset:
@@ -152,49 +148,60 @@ def build_dataset(measurement: Measurement) -> Dataset:
     full_power_w = max([FULL_POWER_W, *(float(run.pulses[:, 2].max()) for run in runs if len(run.pulses))])
     total_doses_j, doses_before_j = _compute_doses_j(runs, order)
     max_total_j = max([1e-12, *total_doses_j.values()])  # dose per joule is equal for all pixels
-    blocks: list[Block] = []
-    experiments: list[tuple[PixelExperiment, tuple[int, int, int]]] = []
-    values: list[FloatArray] = []
-    offset = 0
+    samples: list[Samples] = []
+    experiments: list[tuple[int, PixelExperiment]] = []
     for number, run in enumerate(runs):
-        by_pixel: dict[int, dict[int, int]] = {}
-        for name, signal in run.signals.items():
-            kind = SIGNALS.index(name)
-            is_used = np.isfinite(signal.value)
-            if kind == 0:
-                is_used &= _is_off_edges(signal.t_s, run.pulses)
-            value = signal.value[is_used] - (run.ambient_k if kind == 0 else 0.0)
-            if not len(value):
-                continue
-            if kind in PIXEL_KINDS:
-                by_pixel.setdefault(signal.pixel, {})[kind] = len(blocks)
-            blocks.append(Block(number, kind, signal.pixel, slice(offset, offset + len(value)), signal.t_s[is_used]))
-            values.append(value)
-            offset += len(value)
-        for pixel, by_kind in by_pixel.items():
-            block_numbers = (by_kind.get(0, -1), by_kind.get(1, -1), by_kind.get(2, -1))
-            times = tuple(blocks[number].t_s if number >= 0 else np.zeros(0) for number in block_numbers)
+        measured = [item for name in run.signals if len((item := _select_samples(number, run, name)).value)]
+        samples += measured
+        for pixel in dict.fromkeys(item.pixel for item in measured if item.kind in PIXEL_KINDS):
+            t_s = {item.kind: item.t_s for item in measured if item.pixel == pixel}
             experiment = PixelExperiment(
                 pulses=run.pulses[np.argsort(run.pulses[:, 0], kind="stable")],
                 pixel=pixel,
                 ambient_k=run.ambient_k,
-                t_s=(times[0], times[1], times[2]),
+                t_s=(t_s.get(0, NEVER_S), t_s.get(1, NEVER_S), t_s.get(2, NEVER_S)),
                 dose_before=doses_before_j[number].get(pixel, 0.0) / max_total_j,
                 dose_per_j=1.0 / max_total_j,
                 session_time=float(2.0 * (start_times_s[number] - start_times_s.min()) / session_span_s - 1.0),
                 session_time_per_s=2.0 / session_span_s if is_stated else 0.0,
                 full_w=full_power_w,
             )
-            experiments.append((experiment, block_numbers))
-    if not blocks:
+            experiments.append((number, experiment))
+    if not samples:
         raise InputError("recording", "no finite sample", "signals to compare with the model")
-    return Dataset(
-        _build_run_infos(runs),
-        tuple(blocks),
-        tuple(experiments),
-        _group_by_drive(experiments),
-        np.concatenate(values),
-    )
+    return assemble_dataset(_build_run_infos(runs), samples, experiments)
+
+
+def _select_samples(number: int, run: Run, name: str) -> Samples:
+    """Return the finite samples of a signal: of a temperature, the rise above ambient, and none at a gate's edge."""
+    signal, kind = run.signals[name], SIGNALS.index(name)
+    is_used = np.isfinite(signal.value)
+    if kind == 0:
+        is_used &= _is_off_edges(signal.t_s, run.pulses)
+    value = signal.value[is_used] - (run.ambient_k if kind == 0 else 0.0)
+    return Samples(number, kind, signal.pixel, signal.t_s[is_used], value)
+
+
+def assemble_dataset(
+    runs: tuple[RunInfo, ...], samples: Iterable[Samples], experiments: Iterable[tuple[int, PixelExperiment]]
+) -> Dataset:
+    """Join samples to one vector. Omit experiments that no sample belongs to.
+
+    experiments: one per run and pixel, with the number of its run
+    """
+    blocks: list[Block] = []
+    values, offset = [np.zeros(0)], 0
+    for item in samples:
+        blocks.append(Block(item.run, item.kind, item.pixel, slice(offset, offset + len(item.value)), item.t_s))
+        values.append(item.value)
+        offset += len(item.value)
+    number_of = {(block.run, block.pixel, block.kind): number for number, block in enumerate(blocks)}
+    numbered = []
+    for run, experiment in experiments:
+        first, second, third = (number_of.get((run, experiment.pixel, kind), -1) for kind in PIXEL_KINDS)
+        if max(first, second, third) >= 0:
+            numbered.append((experiment, (first, second, third)))
+    return Dataset(runs, tuple(blocks), tuple(numbered), _group_by_drive(numbered), np.concatenate(values))
 
 
 def _group_by_drive(experiments: list[tuple[PixelExperiment, tuple[int, int, int]]]) -> tuple[DriveGroup, ...]:

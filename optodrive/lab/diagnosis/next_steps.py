@@ -16,7 +16,7 @@ import numpy as np
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import Discrepancy, NextExperiment
-from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Block, Dataset, DriveGroup, RunInfo
+from optodrive.lab.diagnosis.dataset import NEVER_S, PIXEL_KINDS, SIGNALS, Dataset, RunInfo, Samples, assemble_dataset
 from optodrive.lab.diagnosis.fitting import (
     FitProblem,
     ModelFit,
@@ -160,20 +160,10 @@ def _list_pulsed_pixels(data: Dataset) -> list[int]:
 
 def _build_synthetic_dataset(pulses: FloatArray, pixel: int, span_s: float, kinds: tuple[int, ...]) -> Dataset:
     t_s = np.linspace(span_s / SAMPLES, span_s, SAMPLES)
-    blocks = tuple(
-        Block(0, kind, pixel, slice(row * SAMPLES, (row + 1) * SAMPLES), t_s) for row, kind in enumerate(kinds)
-    )
-    empty = np.zeros(0)
-    times = tuple(t_s if kind in kinds else empty for kind in PIXEL_KINDS)
-    experiment = PixelExperiment(
-        pulses, pixel, 293.15, (times[0], times[1], times[2]), dose_before=1.0, session_time=1.0
-    )
-    numbers_by_kind = {kind: row for row, kind in enumerate(kinds)}
-    rows = np.arange(SAMPLES)
-    drive_group = DriveGroup(experiment, tuple((kind, numbers_by_kind[kind], rows) for kind in kinds))
-    numbers = (numbers_by_kind.get(0, -1), numbers_by_kind.get(1, -1), numbers_by_kind.get(2, -1))
-    info = RunInfo("next", "next", 293.15, pulses, None)
-    return Dataset((info,), blocks, ((experiment, numbers),), (drive_group,), np.zeros(SAMPLES * len(kinds)))
+    first, second, third = (t_s if kind in kinds else NEVER_S for kind in PIXEL_KINDS)
+    experiment = PixelExperiment(pulses, pixel, 293.15, (first, second, third), dose_before=1.0, session_time=1.0)
+    samples = [Samples(0, kind, pixel, t_s, np.zeros(SAMPLES)) for kind in kinds]
+    return assemble_dataset((RunInfo("next", "next", 293.15, pulses, None),), samples, [(0, experiment)])
 
 
 def _compute_separation(problem: FitProblem, first: ModelFit, second: ModelFit, data: Dataset, repeats: int) -> float:

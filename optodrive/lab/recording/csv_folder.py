@@ -47,9 +47,13 @@ class CsvTree(RecordingTree):
     def __exit__(self, *details: object) -> None:
         """Do nothing. No file stays open."""
 
-    def read_root_attributes(self) -> Attributes:
-        """Return the attributes of the recording."""
-        return normalize_attributes(self._toml)
+    def read_attributes(self, *names: str) -> Attributes:
+        """Return the attributes of the recording, of a run, or of a signal."""
+        if not names:
+            return normalize_attributes(self._toml)
+        table = self._get_run_table(names[0])
+        described = table.get(names[1], {}) if len(names) > 1 else table
+        return normalize_attributes(described) if isinstance(described, dict) else {}
 
     def list_runs(self) -> list[str]:
         """Return the run names: tables of `recording.toml`, and folders with pulses that lack a table."""
@@ -58,19 +62,10 @@ class CsvTree(RecordingTree):
             folder_names = sorted(name for name in folders if not name.startswith("."))
         return list(dict.fromkeys([*self._get_run_tables(), *folder_names]))
 
-    def read_run_attributes(self, run: str) -> Attributes:
-        """Return the attributes of a run."""
-        return normalize_attributes(self._get_run_table(run))
-
     def list_members(self, run: str) -> list[str]:
         """Return the names of a run's tables and signals, from `recording.toml` and from the files."""
         tables = [name for name, value in self._get_run_table(run).items() if isinstance(value, dict)]
         return list(dict.fromkeys([*tables, *self._list_files(run)]))
-
-    def read_signal_attributes(self, run: str, signal: str) -> Attributes:
-        """Return the attributes of a signal."""
-        described = self._get_run_table(run).get(signal, {})
-        return normalize_attributes(described) if isinstance(described, dict) else {}
 
     def read_table(self, run: str, name: str) -> FloatArray:
         """Return a table of a run, [n, columns]."""

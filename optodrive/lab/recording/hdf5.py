@@ -74,35 +74,29 @@ class Hdf5Tree(RecordingTree):
         with suppress(Exception):  # a damaged file may fail again when it is closed
             self._file.close()
 
-    def read_root_attributes(self) -> Attributes:
-        """Return the attributes of the recording."""
-        return self._read_attributes(str(self.path), self._file)
+    def read_attributes(self, *names: str) -> Attributes:
+        """Return the attributes of the recording, of a run, or of a signal."""
+        group = self._open_run(*names) if names else self._file
+        return self._read_attributes(self.format_place(*names) if names else str(self.path), group)
 
     def list_runs(self) -> list[str]:
         """Return the run names."""
         place = self.format_place()
         return self._list_groups(place, self._open_group(place, self._file, "runs"))
 
-    def read_run_attributes(self, run: str) -> Attributes:
-        """Return the attributes of a run."""
-        return self._read_attributes(self.format_place(run), self._open_run(run))
-
     def list_members(self, run: str) -> list[str]:
         """Return the names of a run's tables and signals."""
-        return self._list_names(self.format_place(run), self._open_run(run))
-
-    def read_signal_attributes(self, run: str, signal: str) -> Attributes:
-        """Return the attributes of a signal."""
-        return self._read_attributes(self.format_place(run, signal), self._open_signal(run, signal))
+        group = self._open_run(run)
+        with convert_errors(self.format_place(run), "a readable group"):
+            return list(group)
 
     def list_plans(self) -> list[str]:
         """Return the IDs of a session's plans. Return none for another recording."""
         if "plans" not in self._file:
             return []
         place = f"{self.path}: /plans"
-        return [
-            name for name in self._list_groups(place, self._open_group(place, self._file, "plans")) if name != "config"
-        ]
+        names = self._list_groups(place, self._open_group(place, self._file, "plans"))
+        return [name for name in names if name != "config"]
 
     def read_plan(self, plan: str) -> tuple[Attributes, dict[str, str], dict[str, FloatArray]]:
         """Return a plan's attributes, texts (`PLAN_TEXTS`) and tables (`PLAN_TABLES`), those that it has."""
@@ -143,23 +137,16 @@ class Hdf5Tree(RecordingTree):
         """Return the number of samples of a signal."""
         return int(self._open_series(run, signal)[0].shape[0])
 
-    def _open_run(self, run: str) -> Any:
-        if (
-            self._cached_run is None or self._cached_run[0] != run
-        ):  # consecutive calls concern one run; traversal is slow
-            self._cached_run = (
-                run,
-                self._open_group(
-                    self.format_place(run), self._open_group(self.format_place(), self._file, "runs"), run
-                ),
-            )
-        return self._cached_run[1]
-
-    def _open_signal(self, run: str, signal: str) -> Any:
-        return self._open_group(self.format_place(run, signal), self._open_run(run), signal)
+    def _open_run(self, run: str, *signal: str) -> Any:
+        """Return the group of a run, or of one of its signals."""
+        if self._cached_run is None or self._cached_run[0] != run:  # consecutive calls concern one run
+            runs = self._open_group(self.format_place(), self._file, "runs")
+            self._cached_run = run, self._open_group(self.format_place(run), runs, run)
+        group = self._cached_run[1]
+        return self._open_group(self.format_place(run, *signal), group, signal[0]) if signal else group
 
     def _open_series(self, run: str, signal: str) -> tuple[Any, Any]:
-        group = self._open_signal(run, signal)
+        group = self._open_run(run, signal)
         t_s, value = (self._open_dataset(self.format_place(run, signal, name), group, name) for name in SAMPLE_COLUMNS)
         if len(t_s.shape) != 1:
             raise InputError(
@@ -197,10 +184,6 @@ class Hdf5Tree(RecordingTree):
             if dataset.shape != () or self._h5.check_string_dtype(dataset.dtype) is None:
                 raise InputError(place, Unquoted(f"entries of type {dataset.dtype}"), "one text")
             return str(normalize_attribute(dataset[()]))
-
-    def _list_names(self, place: str, group: Any) -> list[str]:
-        with convert_errors(place, "a readable group"):
-            return list(group)
 
     def _read_attributes(self, place: str, group: Any) -> Attributes:
         values: dict[str, Any] = {}
@@ -326,7 +309,7 @@ def _read_all(path: Path, run_limit_s: int) -> None:
     plans: list[str] = []
     _extend_cpu_limit(run_limit_s)
     with suppress(InputError), Hdf5Tree(path) as tree:
-        tree.read_root_attributes()
+        tree.read_attributes()
         runs = tree.list_runs()
         plans = tree.list_plans()
     for plan in plans:
@@ -336,7 +319,7 @@ def _read_all(path: Path, run_limit_s: int) -> None:
     for run in runs:
         _extend_cpu_limit(run_limit_s)
         with suppress(InputError), Hdf5Tree(path) as tree:
-            tree.read_run_attributes(run)
+            tree.read_attributes(run)
             _read_members(tree, run, tree.list_members(run))
 
 
@@ -346,7 +329,7 @@ def _read_members(tree: Hdf5Tree, run: str, members: list[str]) -> None:
             if name in TABLE_COLUMNS:
                 tree.read_table(run, name)
             elif name in SIGNALS:
-                tree.read_signal_attributes(run, name)
+                tree.read_attributes(run, name)
                 tree.read_samples(run, name)
 
 

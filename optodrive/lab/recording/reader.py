@@ -82,7 +82,7 @@ def open_tree(path: Path, trusted: bool = False) -> RecordingTree:
 
 def read_header(tree: RecordingTree) -> tuple[list[str], str]:
     """Check format and version. Return the run names in natural order and the notes on the instruments."""
-    head = tree.read_root_attributes()
+    head = tree.read_attributes()
     checks.check_format(tree.format_place(), head)
     names = tree.list_runs()
     if not names:
@@ -99,28 +99,32 @@ def read_pulses(tree: RecordingTree, run: str) -> FloatArray:
     return pulses
 
 
-def _read_run(tree: RecordingTree, name: str) -> Run:
+def _read_drive(tree: RecordingTree, name: str, measured: bool = True) -> tuple[Run, list[str], bool]:
+    """Return a run with attributes and pulses alone, the names of its signals, and whether it has commands.
+
+    measured: False for a run of a session, which has no signals
+    """
     place = tree.format_place(name)
-    attributes = tree.read_run_attributes(name)
+    attributes = tree.read_attributes(name)
     ambient_k = checks.pop_ambient_k(place, attributes)
-    members = tree.list_members(name)
-    signal_names = checks.select_signals(place, members)
-    pulses = read_pulses(tree, name)
-    commands = _read_commands(tree, name) if COMMANDS in members else None
-    signals = {signal: _read_signal(tree, name, signal) for signal in signal_names}
-    return Run(name, ambient_k, pulses, signals, attributes, commands)
+    members = tree.list_members(name) if measured else []
+    signals = checks.select_signals(place, members) if measured else []
+    return Run(name, ambient_k, read_pulses(tree, name), {}, attributes), signals, COMMANDS in members
 
 
-def _read_commands(tree: RecordingTree, run: str) -> FloatArray:
-    commands = tree.read_table(run, COMMANDS)
-    checks.check_commands(tree.format_place(run, COMMANDS), commands)
-    return commands
+def _read_run(tree: RecordingTree, name: str) -> Run:
+    run, names, has_commands = _read_drive(tree, name)
+    commands = None
+    if has_commands:
+        commands = tree.read_table(name, COMMANDS)
+        checks.check_commands(tree.format_place(name, COMMANDS), commands)
+    return replace(run, signals={signal: _read_signal(tree, name, signal) for signal in names}, commands=commands)
 
 
 def read_signal_attributes(tree: RecordingTree, run: str, signal: str) -> tuple[int, float | None]:
     """Return the checked pixel and stated noise of a signal."""
     place = tree.format_place(run, signal)
-    attributes = tree.read_signal_attributes(run, signal)
+    attributes = tree.read_attributes(run, signal)
     checks.check_names(place, attributes, checks.SIGNAL_ATTRIBUTES)
     checks.check_unit(place, signal, attributes)
     return checks.parse_pixel(place, signal, attributes), checks.parse_sigma(place, attributes)
@@ -197,19 +201,13 @@ class RecordingIndex:
 
 
 def _build_run_index(tree: RecordingTree, name: str) -> RunIndex:
-    place = tree.format_place(name)
-    attributes = tree.read_run_attributes(name)
-    ambient_k = checks.pop_ambient_k(place, attributes)
-    members = tree.list_members(name)
-    signals = {signal: _build_signal_index(tree, name, signal) for signal in checks.select_signals(place, members)}
-    pulses = read_pulses(tree, name)
-    pulsed_pixels = tuple(int(pixel) for pixel in np.unique(pulses[:, 3]))
-    return RunIndex(name, ambient_k, attributes, pulsed_pixels, len(pulses), COMMANDS in members, signals)
-
-
-def _build_signal_index(tree: RecordingTree, run: str, signal: str) -> SignalIndex:
-    pixel, sigma = read_signal_attributes(tree, run, signal)
-    return SignalIndex(pixel, tree.count_samples(run, signal), sigma)
+    run, names, has_commands = _read_drive(tree, name)
+    signals = {}
+    for signal in names:
+        pixel, sigma = read_signal_attributes(tree, name, signal)
+        signals[signal] = SignalIndex(pixel, tree.count_samples(name, signal), sigma)
+    pulsed = tuple(np.unique(run.pulses[:, 3]).astype(int).tolist())
+    return RunIndex(name, run.ambient_k, run.attributes, pulsed, len(run.pulses), has_commands, signals)
 
 
 @dataclass(frozen=True)
@@ -320,13 +318,7 @@ def read_recording_or_session(path: Path) -> tuple[Measurement, bool]:
 def _read_session_runs(session: Path) -> dict[str, Run]:
     """Read the runs of a session, which have no signals."""
     with open_tree(session) as tree, convert_errors(str(session), "a session's recording"):
-        names, _ = read_header(tree)
-        runs = {}
-        for name in names:
-            attributes = tree.read_run_attributes(name)
-            ambient_k = checks.pop_ambient_k(tree.format_place(name), attributes)
-            runs[name] = Run(name, ambient_k, read_pulses(tree, name), {}, attributes)
-        return runs
+        return {name: _read_drive(tree, name, measured=False)[0] for name in read_header(tree)[0]}
 
 
 def _merge_run(run: Run, session_runs: dict[str, Run], session: Path, measured: Path, shift_s: float) -> Run:

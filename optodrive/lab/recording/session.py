@@ -36,7 +36,6 @@ ACKNOWLEDGEMENT = b"."
 Arrays = Mapping[str, np.ndarray[Any, Any]]
 SessionEntry = tuple[dict[str, Any], Arrays]
 """Metadata of a plan and its arrays."""
-SESSION_VERSION = 2
 COLD_AFTER_S = 10.0
 """Pause without pulses after which a new run begins: absorbers are cold again, although walls need minutes."""
 RESERVED_BYTES = 1 << 18
@@ -161,7 +160,6 @@ class SessionRecordingFile:
         with import_h5py().File(path, "w") as file:
             file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
             file.attrs["instrument_notes"] = INSTRUMENT_NOTES
-            file.attrs["session_version"] = SESSION_VERSION
             file.attrs["display"], file.attrs["optodrive"] = metadata["display"], metadata["optodrive"]
             file.create_group("runs")
             file.create_group("plans").create_dataset("config", data=metadata["config"])

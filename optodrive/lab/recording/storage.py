@@ -66,20 +66,14 @@ class RecordingTree(Protocol):
         """Return the place of a run, signal or field for messages, preceded by the recording's path."""
         return f"{self.path}: /{'/'.join(('runs', *names))}"
 
-    def read_root_attributes(self) -> Attributes:
-        """Return the attributes of the recording."""
+    def read_attributes(self, *names: str) -> Attributes:
+        """Return the attributes of the recording, of a run, or of a signal, by the names of run and signal."""
 
     def list_runs(self) -> list[str]:
         """Return the run names in any order."""
 
-    def read_run_attributes(self, run: str) -> Attributes:
-        """Return the attributes of a run."""
-
     def list_members(self, run: str) -> list[str]:
         """Return the names of a run's tables and signals, known or not."""
-
-    def read_signal_attributes(self, run: str, signal: str) -> Attributes:
-        """Return the attributes of a signal."""
 
     def read_table(self, run: str, name: str) -> FloatArray:
         """Return a table of a run, [n, columns]."""

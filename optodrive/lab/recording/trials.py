@@ -81,10 +81,6 @@ def _read_trial(tree: Hdf5Tree, path: Path, plan: str) -> Trial:
     place = f"{path}: /plans/{plan}"
     attributes, texts, tables = tree.read_plan(plan)
     executed = tables.get("executed")
-    # A session of an earlier version states no onsets, but the first pulse.
-    first: dict[str, float | None] = {}
-    if executed is not None and len(executed):
-        first = {"board_s": float(executed[0, 0]), "unix_s": _read_time_s(place, attributes, "first_pulse_unix_s")}
     name, run, status, error = (str(attributes.get(key, "")) for key in ("name", "run", "status", "error"))
     return Trial(
         plan,
@@ -95,14 +91,14 @@ def _read_trial(tree: Hdf5Tree, path: Path, plan: str) -> Trial:
         _read_object(f"{place}/labels", texts.get("labels", "{}")),
         _read_object(f"{place}/parameters", texts.get("parameters", "{}")),
         {clock: _read_time_s(place, attributes, f"requested_{clock}") for clock in CLOCKS},
-        {clock: _read_time_s(place, attributes, f"executed_{clock}", first.get(clock)) for clock in CLOCKS},
+        {clock: _read_time_s(place, attributes, f"executed_{clock}") for clock in CLOCKS},
         _count(tables.get("planned")),
         _count(executed),
     )
 
 
-def _read_time_s(place: str, attributes: Attributes, name: str, otherwise: float | None = None) -> float | None:
-    value = attributes.get(name, otherwise)
+def _read_time_s(place: str, attributes: Attributes, name: str) -> float | None:
+    value = attributes.get(name)
     if value is None:
         return None
     if isinstance(value, str) or not abs(value) <= TIME_MAX_S:
