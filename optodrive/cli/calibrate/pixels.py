@@ -41,7 +41,10 @@ def pixels(
 
 def fit_pixel_map(recordings: list[Path], out: Path | None, config: str | None, model: Path | None, json: bool) -> None:
     """Fit the gain and offset of every pixel, write pixels.toml where requested, and print the statistics."""
+    from optodrive.core.extras import import_extra
     from optodrive.core.files import check_output
+
+    import_extra("scipy")
     from optodrive.device.field_file import strip_toml_specials
     from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
     from optodrive.lab.calibration.pixel_map_fit import PixelMapFitter, compute_stats

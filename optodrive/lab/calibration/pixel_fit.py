@@ -43,7 +43,8 @@ REDUCED_CHI2_MAX = 2.0
 """Reduced chi-square above which the sigmas are enlarged."""
 GRID_OFFSETS = 41
 """Offsets per axis of the initial grid search."""
-GAUSS_NEWTON_STEPS = 12
+DERIVATIVE_STEPS = (1e-6, 1e-9, 1e-9)
+"""Steps of the derivatives by gain and by offsets, m."""
 
 
 class PixelResponse(NamedTuple):
@@ -147,12 +148,6 @@ class Optics:
         overlap_m = self.absorber_half_m[axis] + focus_half_m - np.abs(offset_m)
         return np.asarray(np.clip(overlap_m / (2.0 * focus_half_m), 0.0, 1.0), dtype=np.float64)
 
-    def slope_per_m(self, axis: int, offset_m: FloatArray) -> FloatArray:
-        """Return the derivative of the absorbed fraction by the offset, 1/m."""
-        fraction = self.absorbed_fraction(axis, offset_m)
-        is_on_edge = (fraction > 0.0) & (fraction < 1.0)
-        return np.where(is_on_edge, -np.sign(offset_m) / (2.0 * self.focus_half_m[axis]), 0.0)
-
     def search_range_m(self, axis: int) -> float:
         """Return the largest searched offset, m. Beyond it hardly any of the focus is on the absorber."""
         return min(self.offset_max_m[axis], self.absorber_half_m[axis] + 0.6 * self.focus_half_m[axis])
@@ -187,8 +182,8 @@ def fit_pixel(responses: list[PixelResponse], optics: Optics) -> PixelEstimate:
             table = table.select(optics.absorbed_fraction(axis, table.aim_m[axis]) == 1.0)
     if not len(table.ratio):
         return NO_ESTIMATE
-    gain, offset_m = _refine(table, optics, is_offset_free, *_search_offsets(table, optics, is_offset_free))
-    sigma = _standard_errors(table, optics, is_offset_free, gain, offset_m)
+    gain, offset_m = _search_offsets(table, optics, is_offset_free)
+    gain, offset_m, sigma = _fit_from(table, optics, is_offset_free, gain, offset_m)
     if not (sigma[0] <= GAIN_SIGMA_MAX and GAIN_MIN <= gain <= GAIN_MAX):
         return NO_ESTIMATE
     is_offset_known = [
@@ -251,57 +246,20 @@ def _search_offsets(table: _ResponseTable, optics: Optics, is_offset_free: list[
     return float(gain[x_at, y_at]), np.array([offsets_m[0][x_at], offsets_m[1][y_at]])
 
 
-def _model_response(
-    table: _ResponseTable, optics: Optics, gain: float, offset_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the responses [k], and their derivatives by gain and both offsets [k, 3]."""
-    x_off_m, y_off_m = table.aim_m - offset_m[:, None]
-    x_fraction, y_fraction = optics.absorbed_fraction(0, x_off_m), optics.absorbed_fraction(1, y_off_m)
-    by_x = -gain * optics.slope_per_m(0, x_off_m) * y_fraction
-    by_y = -gain * optics.slope_per_m(1, y_off_m) * x_fraction
-    return gain * x_fraction * y_fraction, np.column_stack([x_fraction * y_fraction, by_x, by_y])
-
-
-def _compute_chi2(table: _ResponseTable, optics: Optics, gain: float, offset_m: FloatArray) -> float:
-    return float((((table.ratio - _model_response(table, optics, gain, offset_m)[0]) / table.sigma) ** 2).sum())
-
-
-def _refine(
+def _fit_from(
     table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
-) -> tuple[float, FloatArray]:
-    """Refine by Gauss-Newton from the grid's best offset. A step that increases chi-square is halved."""
-    columns = np.array([True, *is_offset_free])
-    best_chi2 = _compute_chi2(table, optics, gain, offset_m)
-    for _ in range(GAUSS_NEWTON_STEPS):
-        expected, derivative = _model_response(table, optics, gain, offset_m)
-        step = np.zeros(3)
-        scaled = derivative[:, columns] / table.sigma[:, None]
-        step[columns] = np.linalg.lstsq(scaled, (table.ratio - expected) / table.sigma, rcond=None)[0]
-        for _ in range(GAUSS_NEWTON_STEPS):
-            tried = gain + step[0], offset_m + step[1:]
-            chi2 = _compute_chi2(table, optics, *tried)
-            if chi2 < best_chi2:
-                break
-            step *= 0.5
-        else:
-            break
-        (gain, offset_m), best_chi2 = (float(tried[0]), tried[1]), chi2
-    return gain, offset_m
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return gain, offset and their standard errors [3], enlarged if the residuals exceed the stated sigmas."""
+    from optodrive.lab.inference.fit import fit_residuals  # a sweep needs no scipy
 
+    def compute_residual(x: FloatArray) -> FloatArray:
+        fractions = [optics.absorbed_fraction(axis, table.aim_m[axis] - x[1 + axis]) for axis in range(2)]
+        return np.asarray((table.ratio - x[0] * fractions[0] * fractions[1]) / table.sigma)
 
-def _standard_errors(
-    table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
-) -> FloatArray:
-    """Return the standard errors of gain and offsets, [3], enlarged if the residuals exceed the stated sigmas."""
-    columns = np.array([True, *is_offset_free])
-    scaled = _model_response(table, optics, gain, offset_m)[1][:, columns] / table.sigma[:, None]
-    sigma = np.full(3, np.inf)
-    information = scaled.T @ scaled
-    if np.linalg.cond(information / np.sqrt(np.outer(information.diagonal(), information.diagonal()))) > 1e8:
-        return sigma
-    degrees_of_freedom = len(table.ratio) - int(columns.sum())
-    reduced_chi2 = _compute_chi2(table, optics, gain, offset_m) / degrees_of_freedom if degrees_of_freedom > 0 else 1.0
-    sigma[columns] = np.sqrt(
-        np.linalg.inv(information).diagonal() * (reduced_chi2 if reduced_chi2 > REDUCED_CHI2_MAX else 1.0)
-    )
-    return sigma
+    ends = np.array([np.inf, optics.search_range_m(0), optics.search_range_m(1)])
+    free, start = np.array([True, *is_offset_free]), np.array([gain, *offset_m])
+    fit = fit_residuals(compute_residual, start, (-ends, ends), np.array(DERIVATIVE_STEPS), free=free)
+    sigma = np.where(free & (fit.sigma > 0.0), fit.sigma, np.inf)  # 0: no response depends on it
+    degrees_of_freedom = len(table.ratio) - int(free.sum())
+    reduced_chi2 = fit.chi2 / degrees_of_freedom if degrees_of_freedom > 0 else 1.0
+    return float(fit.x[0]), fit.x[1:], sigma * np.sqrt(reduced_chi2 if reduced_chi2 > REDUCED_CHI2_MAX else 1.0)

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from optodrive.core.document import to_json
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import m_to_um
+from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import DEAD, GAIN_MAX, GAIN_MIN, MEASURED, NOT_MEASURED, PixelMap
@@ -120,6 +122,9 @@ def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
     """Return counts, extremes and each pixel's values, for --json."""
     measured = np.flatnonzero(pixel_map.state == MEASURED)
     gain = pixel_map.gain[measured]
+    columns: dict[str, FloatArray] = {"gain": pixel_map.gain, "gain_sigma": pixel_map.gain_sigma}
+    for name in ("offset_x", "offset_x_sigma", "offset_y", "offset_y_sigma"):
+        columns[f"{name}_um"] = m_to_um(getattr(pixel_map, f"{name}_m"))
     return {
         "pixels": len(pixel_map),
         "runs": runs,
@@ -138,16 +143,8 @@ def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
         },
         "offset_um": {axis: _compute_offset_stats(pixel_map, axis) for axis in "xy"},
         "per_pixel": [
-            {
-                "pixel": pixel,
-                "state": str(pixel_map.state[pixel]),
-                "gain": float(pixel_map.gain[pixel]),
-                "gain_sigma": _finite_or_none(pixel_map.gain_sigma[pixel]),
-                "offset_x_um": m_to_um(float(pixel_map.offset_x_m[pixel])),
-                "offset_x_sigma_um": _finite_or_none(m_to_um(pixel_map.offset_x_sigma_m[pixel])),
-                "offset_y_um": m_to_um(float(pixel_map.offset_y_m[pixel])),
-                "offset_y_sigma_um": _finite_or_none(m_to_um(pixel_map.offset_y_sigma_m[pixel])),
-            }
+            {"pixel": pixel, "state": str(pixel_map.state[pixel])}
+            | {name: to_json(float(values[pixel])) for name, values in columns.items()}
             for pixel in range(len(pixel_map))
         ],
     }
@@ -167,7 +164,3 @@ def _compute_offset_stats(pixel_map: PixelMap, axis: str) -> dict[str, Any] | No
         "farthest_pixel": int(measured[farthest]),
         "sigma_median": m_to_um(float(np.median(sigma_m[measured]))),
     }
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optodrive.core.document import to_json
 from optodrive.core.files import atomic_write, check_output
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
@@ -38,10 +39,10 @@ def _summarize_run(run: Run) -> dict[str, Any]:
         "run": run.name,
         "group": None if group is None else str(group),
         "ambient_K": run.ambient_k,
-        "attributes": {key: _finite_or_none(value) for key, value in run.attributes.items()},
+        "attributes": {key: to_json(value) for key, value in run.attributes.items()},
         "pulses": len(run.pulses),
         "pulsed_pixels": [int(pixel) for pixel in np.unique(run.pulses[:, 3])],
-        "energy_J": _finite_or_none(_compute_energy_j(run.pulses)),
+        "energy_J": to_json(_compute_energy_j(run.pulses)),
         "commands": None if run.commands is None else len(run.commands),
         "signals": {name: _summarize_signal(signal) for name, signal in run.signals.items()},
     }
@@ -64,11 +65,6 @@ def _summarize_signal(signal: Signal) -> dict[str, Any]:
         "max": float(measured.max()),
         "sigma": signal.sigma,
     }
-
-
-def _finite_or_none(value: str | float) -> str | float | None:
-    # JSON cannot represent NaN and infinity.
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def write_plot(path: Path, measurement: Measurement) -> int:
