@@ -22,8 +22,7 @@ UsageError: Any = typer.BadParameter.__bases__[0]
 
 MODULES = {
     "serve": ("serve",),
-    "home": ("home",),
-    "first_light": ("first-light",),
+    "commissioning": ("home", "first-light"),
     "calibrate.group": ("calibrate",),
     "field": ("field",),
     "service": ("service",),

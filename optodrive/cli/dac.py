@@ -4,6 +4,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
@@ -25,6 +26,8 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.push_options import PushOptions
 
 if TYPE_CHECKING:
+    from optodrive.link.dac.discovery import FoundDac
+if TYPE_CHECKING:
     from optodrive.core.clock import Clock
     from optodrive.core.types.plans import BudgetState
     from optodrive.link.dac.laser_dac import LaserDac
@@ -33,6 +36,13 @@ if TYPE_CHECKING:
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.heat_record import HeatRecord
     from optodrive.planning.planned_sequence import PlannedSequence
+
+
+def summarize_dacs(found: "list[FoundDac]") -> tuple[dict[str, Any], list[str]]:
+    """Return the document and the lines on found DACs."""
+    lines = [f"{dac.transport:<12} {dac.port:<16} {dac.name}: {dac.description}" for dac in found]
+    return {"dacs": [asdict(dac) for dac in found]}, lines or ["no laser DAC found"]
+
 
 TERMINATING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -50,7 +60,7 @@ GROUP = typer.Typer(help="Play on a laser DAC; see docs/how-to/use-a-laser-dac.m
 @GROUP.command("list")
 def list_dacs(json: JsonOption = False) -> None:
     """Show the laser DACs on USB and in the network within two seconds. None is played because it was found."""
-    from optodrive.cli.dac_list import summarize_dacs
+    from optodrive.cli.dac import summarize_dacs
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.dac.discovery import find_dacs
 

@@ -1,15 +1,19 @@
 """`optodrive doctor`: check the computer, the port and the board before a display is driven."""
 
+import re
 import sys
 import time
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from optodrive.cli.doctor_finding import Finding
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.cli.output import print_json
+from optodrive.core.clock import Clock
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,6 +21,30 @@ if TYPE_CHECKING:
     from optodrive.cli.doctor_finding import Finding
     from optodrive.core.clock import Clock
     from optodrive.device.config import Config
+
+
+INTERVAL_S = 2.0
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
+
+
+def watch(examine: Callable[[], list[Finding]], clock: Clock) -> Iterator[list[Finding]]:
+    """Yield all findings, and then, every INTERVAL_S, those that changed, without end.
+
+    Numbers that vary, such as a round trip, are no change.
+    """
+    before: set[tuple[str, str, str]] = set()
+    while True:
+        findings = examine()
+        changed = [finding for finding in findings if _build_key(finding) not in before]
+        if changed:
+            yield changed
+        before = {_build_key(finding) for finding in findings}
+        clock.sleep(INTERVAL_S)
+
+
+def _build_key(finding: Finding) -> tuple[str, str, str]:
+    return finding.check, finding.status, NUMBER.sub("#", finding.observation)
+
 
 BAUD = 1_000_000
 MARKS = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
@@ -65,7 +93,7 @@ def _report_changes(examination: "Callable[[], list[Finding]]", json: bool) -> N
     """Print all findings and then, with the time of day, those that change. With `json`, print one line per change."""
     from json import dumps
 
-    from optodrive.cli.doctor_watch import watch
+    from optodrive.cli.doctor import watch
     from optodrive.core.clock import MonotonicClock
 
     for number, changed in enumerate(watch(examination, MonotonicClock())):
@@ -133,7 +161,7 @@ def examine_port(port: str, baud: int = BAUD, root: Path = Path("/")) -> list["F
 def _examine_board(config: "Config", clock: "Clock", root: Path, is_part: bool) -> list["Finding"]:
     """Return the findings on mirrors, port and board of one stage. is_part: whether there are others."""
     from optodrive.cli.doctor_board import check_board
-    from optodrive.cli.doctor_mirrors import check_mirrors
+    from optodrive.cli.doctor_host import check_mirrors
     from optodrive.cli.doctor_port import check_port
 
     mirrors = check_mirrors(config)

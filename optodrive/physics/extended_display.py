@@ -1,23 +1,29 @@
 """Thermal state of a display whose pixels have terms: `NominalThermalState` with a compiled integrator.
 
-Terms act as a recording leaves them: ageing at its full dose, a drifting room at its stated temperature.
+Terms act as a recording leaves them: ageing at its full dose, a drifting room at its stated temperature. A snapshot is
+the state at successive times, continued from the previous one.
 """
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.core.kernels import array_kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.device.panel import Neighbours
 from optodrive.physics.extended_pulse_for_height import find_shortest_pulse
 from optodrive.physics.extended_pulses import (
+    DISPLACEMENT_SIGNAL,
     EventStates,
     add_peaks_after_off,
     advance_shared,
+    advance_states,
     advance_to,
     apply_pulses,
     copy_rows,
+    copy_states,
     set_light,
     simulate_displacement,
 )
@@ -27,16 +33,79 @@ from optodrive.physics.nominal_display import (
     PulsePeaks,
     build_kernel_columns,
     ignore_progress,
+    pixel_at,
 )
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, output_signal, simulate_signals
 from optodrive.physics.pulse_for_height import DriveRange
-from optodrive.physics.snapshot import SnapshotCache, compute_snapshot
 from optodrive.physics.stability import check_time_constants
-from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, ELSEWHERE, FULL_W, SESSION_TIME, BySignal, TermValues
+from optodrive.physics.term import (
+    ABSORBER,
+    AMBIENT_K,
+    CONTEXT_SIZE,
+    DOSE,
+    ELSEWHERE,
+    FULL_W,
+    PANEL_HELD,
+    POWER_W,
+    SESSION_TIME,
+    BySignal,
+    TermValues,
+)
 from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import all_terms
+
+
+class SnapshotCache(NamedTuple):
+    """States [p + 1, STATE_COUNT] of pixels and of laser and panel at at_s, computed from their events at event_s."""
+
+    at_s: FloatArray
+    event_s: FloatArray
+    states: FloatArray
+
+    @classmethod
+    def from_events(cls, events: EventStates) -> "SnapshotCache":
+        """Return an empty cache for the pixels of some events."""
+        count = len(events.states)
+        return cls(np.full(count, np.nan), np.full(count, np.nan), np.zeros((count, events.states.shape[1])))
+
+
+@array_kernel
+def compute_snapshot(
+    events: EventStates,
+    active: ActiveTerms,
+    context: FloatArray,
+    cache: SnapshotCache,
+    now_s: float,
+    displacement_m: FloatArray,
+    absorber_k: FloatArray,
+) -> None:
+    """Fill in displacement and absorber rise of every pixel [p] at now_s, with the gate off since its last event.
+
+    The cache is updated.
+    """
+    work, c, at_s = np.zeros((8, events.states.shape[1])), context.copy(), events.at_s
+    c[POWER_W] = 0.0
+    last = len(events.columns)
+    for i in range(last, -1, -1):  # laser and panel come first: every pixel needs the panel
+        # After a new event, or for an earlier time, the cached states are no start: begin at the event.
+        if cache.event_s[i] != at_s[i] or now_s < cache.at_s[i]:
+            cache.event_s[i] = cache.at_s[i] = at_s[i]
+            copy_states(events.states[i], cache.states[i])
+        one, wait_s = pixel_at(events.columns, i if i < last else 0), max(0.0, now_s - cache.at_s[i])
+        set_light(c, i, events.illuminated[0])
+        copy_states(cache.states[i], work[0])
+        if i < last:
+            copy_rows(active.panel_rows, cache.states[last], work[0])
+        c[PANEL_HELD] = 1.0 if i < last else 0.0
+        advance_states(one, active, c, work, 0.0, events.off_s[i] + cache.at_s[i] - at_s[i], wait_s)
+        copy_states(work[0], cache.states[i])
+        cache.at_s[i] += wait_s
+        if i < last:
+            displacement_m[i] = output_signal(one, active, work[0], c, DISPLACEMENT_SIGNAL)
+            absorber_k[i] = work[0, ABSORBER]
+
 
 BATCH = 128
 """Pulses or pixels between two calls of on_progress: a tenth of a second on a slow machine."""

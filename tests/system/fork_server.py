@@ -23,7 +23,7 @@ RLIMITS = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE, resource.RLIMIT_AS, re
 def load():
     """Import the modules that a daemon, a command or a board imports, and load the compiled kernels."""
     import optodrive.cli.main
-    import optodrive.daemon.engine.planner_process
+    import optodrive.daemon.engine.planner_server
     import optodrive.daemon.preview.process
     import optodrive.daemon.server.web_process
     import optodrive.daemon.supervisor.daemon

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from finger_judge import measure_light, read_pulses, read_zero_s
-from optodrive.daemon.engine.touch_report import WINDOW_S
+from optodrive.daemon.engine.telemetry_events import WINDOW_S
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from rig import running, wait_for

@@ -12,7 +12,7 @@ import pytest
 
 from forked_process import run_process
 from optodrive.cli.main import run
-from optodrive.cli.redaction import REMOVED, Redaction
+from optodrive.cli.support_archive import REMOVED, Redaction
 from rig import OPTODRIVE, TOKEN
 
 HEAD = 'format = "optodrive-tokens"\nversion = 1\n'

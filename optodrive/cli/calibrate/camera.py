@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.calibrate.field_report import (
+from optodrive.cli.calibrate.field import (
     FieldCalibration,
     FieldOutOption,
     ReportOption,

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from optodrive.cli.calibrate.pixel_sweep import write_sweep
+from optodrive.cli.calibrate.sweep import write_sweep
 from optodrive.cli.options import ConfigOption, JsonOption, ModelOption, load_run_config
 from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.core.errors import MISSING, InputError

@@ -31,13 +31,12 @@ from math import inf
 
 from optodrive.core.errors import StoppedError
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.engine.plan_store import PlanStore
+from optodrive.daemon.engine.plan_store import PlanStore, RevokedCallers
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.progress import ClockShift, PlanRun
 from optodrive.daemon.engine.queue_pause import START_LEAD_S, QueuePause
 from optodrive.daemon.engine.queue_stream import STREAM_RESTART_S, STREAM_START_LEAD_S, QueueStream
 from optodrive.daemon.engine.queued_plans import QueuedPlans
-from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES

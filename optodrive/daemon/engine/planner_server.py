@@ -1,29 +1,42 @@
-"""Server of planner.sock: requests of the web process, pushed state, ended streamed plans and telemetry."""
+"""The planner process, and its server of planner.sock: requests of the web process, pushed state, telemetry.
 
+It sends ended streamed plans, too.
+"""
+
+import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from math import inf
 from pathlib import Path
 
-from optodrive.core.clock import Clock
+from optodrive.core.child_process import BeatWriter, SupervisorGoneError
+from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.json_model import iterate_json
-from optodrive.core.processes import use_usual_priority
+from optodrive.core.processes import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.daemon.engine.dry_run import build_dry_run_start
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.request_body import BuiltRequest, build_request
+from optodrive.daemon.engine.session_recording import start_session_recorder
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
+from optodrive.daemon.engine.thermal_memory import ThermalMemory
+from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.message_loop import MessageServer
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.messages import RefreshReport
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import build_error_problem, build_problem
+from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.link.board_setup import build_scales
+from optodrive.link.service.remote_session import RemoteSession
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.stimuli.sequence_codec import decode_sequence
 
 STATE_PERIOD_S = 0.5
@@ -273,3 +286,41 @@ def _encode(
     except Exception as error:
         problem = build_error_problem(OptodriveError(f"{type(error).__name__}: {error}"))
     return problem.status, problem.to_json(), {}
+
+
+def run_planner(
+    display: DisplayModel,
+    folder: RuntimeFolder,
+    beat: BeatWriter,
+    session_path: Path | None,
+    memory: ThermalMemory,
+) -> None:
+    """Plan and hand over until SIGTERM or the end of the supervisor.
+
+    display: warm, see `warm_up`; session_path: new HDF5 file for a recording of every plan, instead of the configured
+    one; memory: shared with earlier and later planner processes. Raise InputError if the recording cannot be started.
+    """
+    ending: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: ending.append(number))
+    clock = MonotonicClock()
+    with ExitStack() as exit_stack:
+        log = open_daemon_log()
+        exit_stack.callback(log.close)
+        session = RemoteSession(build_scales(display.config), folder.link_socket, clock)
+        engine = Engine(display, session, clock, memory)
+        engine.on_warning = log.warn
+        recorder = start_session_recorder(engine, session_path, log)
+        if recorder is not None:
+            exit_stack.callback(recorder.close)
+        exit_stack.callback(engine.close)
+        server = PlannerServer(engine, folder.planner_socket, clock)
+        exit_stack.callback(server.close)
+
+        engine.on_loop, engine.on_beat = server.publish_state, beat.beat
+        engine.message_loop.watch(beat, beat.receive)
+        beat.report_ready()
+        set_realtime_priority(PLANNING)
+        try:
+            engine.run(lambda: bool(ending))
+        except SupervisorGoneError:
+            return

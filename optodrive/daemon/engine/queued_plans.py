@@ -8,8 +8,7 @@ from concurrent.futures import Executor
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.plan_simulation import simulate_plan
-from optodrive.daemon.engine.progress import PlanRun
-from optodrive.daemon.engine.pulse_accounts import PulseAccounts
+from optodrive.daemon.engine.progress import PlanRun, PulseAccounts
 from optodrive.daemon.engine.queue_thermal import HOLD_MAX_S, QueueThermal
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.plan import PlanStatus

@@ -18,12 +18,12 @@ from optodrive.daemon.engine.display_snapshot import EmittedPulses, ExecutedBatc
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.progress import ClockShift, merge_events
 from optodrive.daemon.engine.telemetry_events import (
+    TouchReport,
     build_display_event,
     build_page_event,
     build_pulse_batch,
     describe_caps,
 )
-from optodrive.daemon.engine.touch_report import TouchReport
 from optodrive.daemon.responses.telemetry import BudgetEvent, FingersEvent
 from optodrive.physics.nominal_display import DisplayState
 

@@ -11,8 +11,7 @@ from optodrive.core.child_process import BeatWriter, SupervisorGoneError
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.daemon.message_loop import MessageLoop, MessageServer
-from optodrive.daemon.preview.job_queue import WAITING_MAX, Job, JobQueue, build_busy_error
-from optodrive.daemon.preview.jobs import build_refusal, run_job
+from optodrive.daemon.preview.jobs import WAITING_MAX, Job, JobQueue, build_busy_error, build_refusal, run_job
 from optodrive.daemon.preview.worker import JobRunner, Worker, build_timeout_error
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.board_setup import build_scales

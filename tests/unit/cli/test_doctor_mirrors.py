@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from optodrive.cli.doctor_mirrors import MEASURED, check_mirrors
+from optodrive.cli.doctor_host import MEASURED, check_mirrors
 from optodrive.device.config_file import load_config
 from optodrive.lab.servo_identification.common_servo import HALF_WIDTH_MIN
 from optodrive.planning.display_model import DisplayModel

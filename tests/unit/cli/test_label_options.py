@@ -2,7 +2,7 @@
 
 import pytest
 
-from optodrive.cli.label_options import parse_label_options
+from optodrive.cli.play import parse_label_options
 from optodrive.core.errors import InputError
 
 

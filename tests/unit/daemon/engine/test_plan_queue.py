@@ -10,8 +10,8 @@ from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import planner
 from optodrive.daemon.engine.plan_queue import PlanQueue
+from optodrive.daemon.engine.plan_store import RevokedCallers
 from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
-from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.planning.listed_pulses import ListedPulses
 from planner_rig import PlannerRig, build_frame, build_train
 from standing_rig import StandingRig, build_display, build_page

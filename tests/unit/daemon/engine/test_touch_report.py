@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.finger_tracks import PredictedFinger
-from optodrive.daemon.engine.touch_report import WINDOW_S, TouchReport
+from optodrive.daemon.engine.telemetry_events import WINDOW_S, TouchReport
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 

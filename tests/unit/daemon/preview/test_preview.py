@@ -20,7 +20,7 @@ from optodrive.core.ipc import Message, MessageSocket
 from optodrive.daemon.engine import request_body
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.preview import jobs, worker
-from optodrive.daemon.preview.job_queue import CALLER_WAITING_MAX, WAITING_MAX, Job, JobQueue
+from optodrive.daemon.preview.jobs import CALLER_WAITING_MAX, WAITING_MAX, Job, JobQueue
 from optodrive.daemon.preview.process import run_preview
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport

@@ -3,7 +3,7 @@
 import pytest
 
 from displays import DISPLAYS
-from optodrive.cli.label_options import add_labels, parse_label_options
+from optodrive.cli.play import add_labels, parse_label_options
 from optodrive.core.errors import InputError
 from optodrive.planning.stimuli.json_values import parse_labels
 from optodrive.planning.stimuli.sequence_file import parse_sequence
