@@ -57,6 +57,10 @@ class HomingResult:
     details: dict[str, object] = field(default_factory=dict)
 
 
+Outcome = tuple[str, dict[str, object]]
+"""Message and details of a step that succeeded."""
+
+
 class Homing:
     """One run of the steps on one board.
 
@@ -68,106 +72,113 @@ class Homing:
     ) -> None:
         self._board, self._spot_reader, self._power_w, self._acknowledge = board, spot_reader, power_w, acknowledge
         self._code_rad = board.config.scanner.rad_per_code
+        self._step = ""
         self._zero: HomingPosition | None = None
         self._ends: dict[int, tuple[HomingPosition, HomingPosition]] = {}
 
     def run(self, on_step: Callable[[HomingResult], None], steps: "tuple[Step, ...] | None" = None) -> None:
         """Run each step in order, by default all, and report its result. Raise OptodriveError if a step fails."""
         for name, step in STEPS if steps is None else steps:
-            on_step(step(self, name))
+            self._step = name
+            on_step(HomingResult(name, *step(self)))
+
+    def _require(self, is_met: bool, what: str, found: str, expected: str) -> None:
+        if not is_met:
+            raise RefusedError(f"home: {self._step}: {what}: got {found}, expected {expected}")
 
     # --- the steps ----------------------------------------------------------------------------------------------
 
-    def check_link(self, name: str) -> HomingResult:
+    def check_link(self) -> Outcome:
         """Check that board and sensor answer."""
         self._board.connect()
+        sensor = "no sensor"
         if self._spot_reader is not None:
             self._spot_reader.open()
-        session, sensor = (
-            self._board.session,
-            "no sensor" if self._spot_reader is None else f"sensor at {self._spot_reader.port}",
-        )
-        uid = session.board.uid
-        return HomingResult(name, f"board {uid} at {session.port}, {sensor}", {"board": session.port, "uid": uid})
+            sensor = f"sensor at {self._spot_reader.port}"
+        port, uid = self._board.session.port, self._board.session.board.uid
+        return f"board {uid} at {port}, {sensor}", {"board": port, "uid": uid}
 
-    def check_status(self, name: str) -> HomingResult:
+    def check_status(self) -> Outcome:
         """Check that the board is DISARMED without a fault."""
         board = self._board.session.board
         if board.state == BoardState.FAULT and self._acknowledge:
             self._board.disarm()
-        if board.state != BoardState.DISARMED:
-            fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
-            raise _build_refusal(
-                name, "board", f"{board.state}{fault}", "DISARMED; --acknowledge once the cause is gone"
-            )
-        return HomingResult(name, f"DISARMED, {board.temperature_c:g} °C", {"temperature_c": board.temperature_c})
+        fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
+        expected = "DISARMED; --acknowledge once the cause is gone"
+        self._require(board.state == BoardState.DISARMED, "board", f"{board.state}{fault}", expected)
+        return f"DISARMED, {board.temperature_c:g} °C", {"temperature_c": board.temperature_c}
 
-    def check_inputs(self, name: str) -> HomingResult:
+    def check_inputs(self) -> Outcome:
         """Check that interlock, key and emergency stop are safe."""
         bits = self._board.session.board.inputs
         labels = {each: INPUT_LABELS[each][bits >> k & 1] for k, each in enumerate(INPUTS)}
         for each, label in labels.items():
-            if label != SAFE_LABELS[each]:
-                raise _build_refusal(name, each, label, SAFE_LABELS[each])
-        return HomingResult(name, ", ".join(f"{each} {word}" for each, word in labels.items()), dict(labels))
+            self._require(label == SAFE_LABELS[each], each, label, SAFE_LABELS[each])
+        return ", ".join(f"{each} {word}" for each, word in labels.items()), dict(labels)
 
-    def check_indicator(self, name: str) -> HomingResult:
+    def check_indicator(self) -> Outcome:
         """Arm the board and check that its indicator is on for two seconds before ARMED."""
         indicator_s = self._board.arm()
-        if indicator_s < INDICATOR_S * (1.0 - CLOCK_TOLERANCE):
-            raise _build_refusal(
-                name, "time from the request to ARMED", f"{indicator_s:.2f} s", f"at least {INDICATOR_S:g} s"
-            )
-        return HomingResult(
-            name, f"indicator on for {indicator_s:.2f} s, ARMED", {"indicator_s": round(indicator_s, 3)}
-        )
+        is_met, expected = indicator_s >= INDICATOR_S * (1.0 - CLOCK_TOLERANCE), f"at least {INDICATOR_S:g} s"
+        self._require(is_met, "time from the request to ARMED", f"{indicator_s:.2f} s", expected)
+        return f"indicator on for {indicator_s:.2f} s, ARMED", {"indicator_s": round(indicator_s, 3)}
 
-    def move_to_zero(self, name: str) -> HomingResult:
+    def move_to_zero(self) -> Outcome:
         """Move the mirrors to the centre and check the position outputs there."""
         self._zero = position = self._measure_at(CENTRE_CODE, CENTRE_CODE)
-        if position.output_rad is not None:
-            for axis in range(2):
-                output_rad = position.output_rad[axis]
-                if abs(output_rad) > ZERO_TOLERANCE_RAD:
-                    expected = f"0 ± {format_quantity(ZERO_TOLERANCE_RAD, 'rad')} at the centre"
-                    raise _build_refusal(
-                        name, f"position output of mirror {AXES[axis]}", format_quantity(output_rad, "rad"), expected
-                    )
-        return HomingResult(name, _describe_position(position), _position_details(position))
+        expected = f"0 ± {format_quantity(ZERO_TOLERANCE_RAD, 'rad')} at the centre"
+        for axis, output_rad in zip(AXES, position.output_rad or (), strict=False):
+            what, found = f"position output of mirror {axis}", format_quantity(output_rad, "rad")
+            self._require(abs(output_rad) <= ZERO_TOLERANCE_RAD, what, found, expected)
+        return _describe_position(position), _position_details(position)
 
-    def check_travel_x(self, name: str) -> HomingResult:
-        """Move mirror x to both ends of the display and check its travel."""
-        return self._check_travel(name, 0)
+    def check_travel(self, axis: int) -> Outcome:
+        """Move mirror x (0) or y (1) to both ends of the display and check its travel."""
+        high, low = (self._measure_at(*self._end_codes(axis, sign)) for sign in (1, -1))
+        self._ends[axis] = high, low
+        commanded_rad = high.commanded_rad[axis] - low.commanded_rad[axis]
+        if high.output_rad is not None:
+            self._require_motion(axis, _difference(high.output_rad, low.output_rad, axis), commanded_rad, "rad")
+        if high.spot_m is not None:
+            commanded_m = 2.0 * self._board.config.scanner.focal_length_m * commanded_rad
+            own_m, other_m = (_difference(high.spot_m, low.spot_m, each) for each in (axis, 1 - axis))
+            self._require_motion(axis, own_m, commanded_m, "m")
+            tolerance_m = SPOT_TOLERANCE * commanded_m
+            self._require(
+                abs(own_m - commanded_m) <= tolerance_m and abs(other_m) <= tolerance_m,
+                f"spot over the travel of mirror {AXES[axis]}",
+                f"{own_m:.4f} m along {AXES[axis]}, {other_m:.4f} m along {AXES[1 - axis]}",
+                f"{commanded_m:.4f} ± {tolerance_m:.4f} m along {AXES[axis]}: scanner.swap_axes, invert_x or invert_y, "
+                "or another lens?",
+            )
+        details: dict[str, object] = {"plus": _position_details(high), "minus": _position_details(low)}
+        return f"±{commanded_rad / 2:.4f} rad, {_describe_evidence(high)}", details
 
-    def check_travel_y(self, name: str) -> HomingResult:
-        """Move mirror y to both ends of the display and check its travel."""
-        return self._check_travel(name, 1)
-
-    def check_readback(self, name: str) -> HomingResult:
+    def check_readback(self) -> Outcome:
         """Check that the position outputs follow the commands: axis, direction and scale."""
         if self._zero is None or self._zero.output_rad is None:
-            return HomingResult(name, "no position outputs: not checked", {"checked": False})
+            return "no position outputs: not checked", {"checked": False}
         for axis, (high, low) in self._ends.items():
             commanded_rad = high.commanded_rad[axis] - low.commanded_rad[axis]
             own_rad, other_rad = (_difference(high.output_rad, low.output_rad, each) for each in (axis, 1 - axis))
-            expected = f"{commanded_rad:.5f} ± {OUTPUT_TOLERANCE * commanded_rad:.5f} rad"
-            what = f"position output of mirror {AXES[axis]}"
-            if abs(own_rad + commanded_rad) <= OUTPUT_TOLERANCE * commanded_rad:
-                raise _build_refusal(name, f"{what} over its travel", f"{own_rad:.5f} rad, inverted", expected)
-            if abs(own_rad - commanded_rad) > OUTPUT_TOLERANCE * commanded_rad:
-                raise _build_refusal(name, f"{what} over its travel", f"{own_rad:.5f} rad", expected)
-            if abs(other_rad) > OUTPUT_TOLERANCE * commanded_rad:
-                other = f"position output of mirror {AXES[1 - axis]} while {AXES[axis]} moves"
-                raise _build_refusal(
-                    name, other, f"{other_rad:.5f} rad", f"0 ± {OUTPUT_TOLERANCE * commanded_rad:.5f} rad"
-                )
-        return HomingResult(name, f"both mirrors follow within {OUTPUT_TOLERANCE:.0%}", {"checked": True})
+            tolerance_rad, what = OUTPUT_TOLERANCE * commanded_rad, f"position output of mirror {AXES[axis]}"
+            inverted = ", inverted" if abs(own_rad + commanded_rad) <= tolerance_rad else ""
+            self._require(
+                abs(own_rad - commanded_rad) <= tolerance_rad,
+                f"{what} over its travel",
+                f"{own_rad:.5f} rad{inverted}",
+                f"{commanded_rad:.5f} ± {tolerance_rad:.5f} rad",
+            )
+            what = f"position output of mirror {AXES[1 - axis]} while {AXES[axis]} moves"
+            expected = f"0 ± {tolerance_rad:.5f} rad"
+            self._require(abs(other_rad) <= tolerance_rad, what, f"{other_rad:.5f} rad", expected)
+        return f"both mirrors follow within {OUTPUT_TOLERANCE:.0%}", {"checked": True}
 
-    def return_to_zero(self, name: str) -> HomingResult:
+    def return_to_zero(self) -> Outcome:
         """Return the mirrors to the centre with the gate off, and disarm."""
         self._board.move_to(CENTRE_CODE, CENTRE_CODE)
         self._board.disarm()
-        return HomingResult(name, "mirrors at the centre, DISARMED", {"board": BoardState.DISARMED})
+        return "mirrors at the centre, DISARMED", {"board": BoardState.DISARMED}
 
     # --- measurements -------------------------------------------------------------------------------------------
 
@@ -178,56 +189,27 @@ class Homing:
             if self._power_w:
                 self._board.fire_spot(x_code, y_code, self._power_w)
             return HomingPosition(commanded_rad, None, None)
-        output_rad = self._spot_reader.read_mirrors_rad()
-        reading = (
-            self._spot_reader.read_spot(x_code, y_code, self._power_w, READINGS_PER_SPOT) if self._power_w else None
-        )
-        spot_m = None if reading is None else (reading.x_m, reading.y_m)
-        if self._power_w and spot_m is None:
-            context = f"with the mirrors at {commanded_rad[0]:.4f}, {commanded_rad[1]:.4f} rad"
-            raise _build_refusal(
-                "spot", f"sensor at {self._spot_reader.port} {context}", "no spot", "a spot: is it covered, or too dim?"
-            )
-        return HomingPosition(commanded_rad, output_rad, spot_m)
-
-    def _check_travel(self, name: str, axis: int) -> HomingResult:
-        high, low = (self._measure_at(*self._end_codes(axis, sign)) for sign in (1, -1))
-        self._ends[axis] = high, low
-        commanded_rad = high.commanded_rad[axis] - low.commanded_rad[axis]
-        if high.output_rad is not None:
-            self._check_moved(name, axis, _difference(high.output_rad, low.output_rad, axis), commanded_rad, "rad")
-        if high.spot_m is not None:
-            commanded_m = 2.0 * self._board.config.scanner.focal_length_m * commanded_rad
-            own_m, other_m = (_difference(high.spot_m, low.spot_m, each) for each in (axis, 1 - axis))
-            self._check_moved(name, axis, own_m, commanded_m, "m")
-            expected, what = (
-                f"{commanded_m:.4f} ± {SPOT_TOLERANCE * commanded_m:.4f} m",
-                f"spot over the travel of mirror {AXES[axis]}",
-            )
-            if abs(own_m - commanded_m) > SPOT_TOLERANCE * commanded_m or abs(other_m) > SPOT_TOLERANCE * commanded_m:
-                measured = f"{own_m:.4f} m along {AXES[axis]}, {other_m:.4f} m along {AXES[1 - axis]}"
-                raise _build_refusal(
-                    name,
-                    what,
-                    measured,
-                    f"{expected} along {AXES[axis]}: scanner.swap_axes, invert_x or invert_y, or another lens?",
+        output_rad, spot_m = self._spot_reader.read_mirrors_rad(), None
+        if self._power_w:
+            reading = self._spot_reader.read_spot(x_code, y_code, self._power_w, READINGS_PER_SPOT)
+            if reading is None:
+                place = f"with the mirrors at {commanded_rad[0]:.4f}, {commanded_rad[1]:.4f} rad"
+                expected = "a spot: is it covered, or too dim?"
+                raise RefusedError(
+                    f"home: spot: sensor at {self._spot_reader.port} {place}: got no spot, expected {expected}"
                 )
-        message = f"±{commanded_rad / 2:.4f} rad, {_describe_evidence(high)}"
-        return HomingResult(name, message, {"plus": _position_details(high), "minus": _position_details(low)})
+            spot_m = reading.x_m, reading.y_m
+        return HomingPosition(commanded_rad, output_rad, spot_m)
 
     def _end_codes(self, axis: int, sign: int) -> tuple[int, int]:
         codes = [CENTRE_CODE, CENTRE_CODE]
         codes[axis] += sign * self._board.half_travel_codes[axis]
         return codes[0], codes[1]
 
-    def _check_moved(self, name: str, axis: int, moved: float, commanded: float, unit: str) -> None:
-        if abs(moved) < STUCK_SHARE * commanded:
-            what = f"mirror {AXES[axis]}, commanded {commanded:.4f} {unit} from end to end,"
-            raise _build_refusal(name, what, f"does not move: {moved:.4f} {unit}", f"{commanded:.4f} {unit}")
-
-
-def _build_refusal(step: str, what: str, value: str, expected: str) -> RefusedError:
-    return RefusedError(f"home: {step}: {what}: got {value}, expected {expected}")
+    def _require_motion(self, axis: int, moved: float, commanded: float, unit: str) -> None:
+        what = f"mirror {AXES[axis]}, commanded {commanded:.4f} {unit} from end to end,"
+        found, expected = f"does not move: {moved:.4f} {unit}", f"{commanded:.4f} {unit}"
+        self._require(abs(moved) >= STUCK_SHARE * commanded, what, found, expected)
 
 
 def _difference(high: tuple[float, float] | None, low: tuple[float, float] | None, axis: int) -> float:
@@ -256,7 +238,8 @@ def _position_details(position: HomingPosition) -> dict[str, object]:
     return {"commanded_rad": position.commanded_rad, "output_rad": position.output_rad, "spot_m": position.spot_m}
 
 
-Step = tuple[str, Callable[[Homing, str], HomingResult]]
+Step = tuple[str, Callable[[Homing], Outcome]]
+"""Name of a step and its function."""
 
 DARK_STEPS: tuple[Step, ...] = (
     ("link", Homing.check_link),
@@ -269,8 +252,8 @@ DARK_STEPS: tuple[Step, ...] = (
 STEPS: tuple[Step, ...] = (
     *DARK_STEPS,
     ("zero", Homing.move_to_zero),
-    ("travel x", Homing.check_travel_x),
-    ("travel y", Homing.check_travel_y),
+    ("travel x", lambda homing: homing.check_travel(0)),
+    ("travel y", lambda homing: homing.check_travel(1)),
     ("readback", Homing.check_readback),
     ("zero again", Homing.return_to_zero),
 )

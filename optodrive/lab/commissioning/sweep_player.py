@@ -59,7 +59,7 @@ def play_aims(
             board.wait(rest_s)
         recorder = _JournalRecorder(item, board, journal, on_progress)
         for first in range(0, len(item.plan), PULSES_PER_JOB):
-            recorder.begin(first)
+            recorder.first = recorder.count = first
             board.play(_cut_plan(item.plan, first), recorder.record)
         journal.raise_if_failed()
         if recorder.count != len(item.plan):
@@ -76,35 +76,31 @@ def _cut_plan(plan: LimitedPlan, first: int) -> PulsePlan:
     return PulsePlan(**columns)
 
 
+@dataclass
 class _JournalRecorder:
-    """Copies the reported pulses of one aim to the journal. count: number of pulses copied."""
+    """Copies the reported pulses of one aim to the journal.
 
-    def __init__(
-        self,
-        item: AimPlan,
-        board: ExclusiveBoard,
-        journal: SweepJournal,
-        on_progress: Callable[[AimPlan, int], None],
-    ) -> None:
-        self._item, self._board, self._journal = item, board, journal
-        self._on_progress = on_progress
-        self._first = self.count = 0
+    first: row of the plan with which the present job begins; count: number of pulses copied
+    """
 
-    def begin(self, first: int) -> None:
-        """Begin with the job whose first pulse is row `first` of the plan."""
-        self._first = self.count = first
+    item: AimPlan
+    board: ExclusiveBoard
+    journal: SweepJournal
+    on_progress: Callable[[AimPlan, int], None]
+    first: int = 0
+    count: int = 0
 
     def record(self, job: PlanJob) -> None:
         """Append the pulses reported since the last call."""
-        scale, plan = self._board.session.scale, self._item.plan
+        scale, plan = self.board.session.scale, self.item.plan
         done = job.executed_count
-        reported = job.read_reported(self.count - self._first, done)
-        unix_minus_board_s = time.time() - self._board.session.board_s()
-        self._journal.append(
+        reported = job.read_reported(self.count - self.first, done)
+        unix_minus_board_s = time.time() - self.board.session.board_s()
+        self.journal.append(
             [
                 SweepPulse(
-                    self._item.aim.name,
-                    int(plan.pixel[self._first + row]),
+                    self.item.aim.name,
+                    int(plan.pixel[self.first + row]),
                     round(unix_minus_board_s + on_tick * scale.tick_s, 6),
                     round(on_tick * scale.tick_s, 6),
                     round(on_ticks * scale.tick_s, 6),
@@ -113,5 +109,5 @@ class _JournalRecorder:
                 for row, on_tick, on_ticks, duty, _ in zip(*(column.tolist() for column in reported), strict=True)
             ]
         )
-        self.count = self._first + done
-        self._on_progress(self._item, self.count)
+        self.count = self.first + done
+        self.on_progress(self.item, self.count)
