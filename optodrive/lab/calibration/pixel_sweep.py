@@ -52,22 +52,14 @@ class Aim(NamedTuple):
 
 def list_aims(config: Config) -> list[Aim]:
     """Return the middle, and two aims across each edge."""
-    optics = Optics.from_config(config)
-    edge_offsets_m = [
-        [
-            optics.absorber_half_m[axis] + (1.0 - 2.0 * fraction) * optics.focus_half_m[axis]
-            for fraction in EDGE_FRACTIONS
-        ]
-        for axis in range(2)
-    ]
-    aims = [Aim("middle", 0.0, 0.0)]
+    optics, aims = Optics.from_config(config), [Aim("middle", 0.0, 0.0)]
     for sign, suffix in ((-1.0, "minus"), (1.0, "plus")):
-        aims += [
-            Aim(f"x-{suffix}-{k}", round(sign * offset_m, 9), 0.0) for k, offset_m in enumerate(edge_offsets_m[0], 1)
-        ]
-        aims += [
-            Aim(f"y-{suffix}-{k}", 0.0, round(sign * offset_m, 9)) for k, offset_m in enumerate(edge_offsets_m[1], 1)
-        ]
+        for axis, name in enumerate("xy"):
+            for k, fraction in enumerate(EDGE_FRACTIONS, 1):
+                offset_m = optics.absorber_half_m[axis] + (1.0 - 2.0 * fraction) * optics.focus_half_m[axis]
+                place_m = [0.0, 0.0]
+                place_m[axis] = round(sign * offset_m, 9)
+                aims.append(Aim(f"{name}-{suffix}-{k}", *place_m))
     return aims
 
 

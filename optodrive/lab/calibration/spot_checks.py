@@ -133,10 +133,13 @@ def _lag_error(where: str, lag: int) -> InputError:
     return InputError(f"{where}: x_m, y_m", Unquoted(found), "each position in the row of its codes")
 
 
+def _measure_spread(places_m: FloatArray) -> FloatArray:
+    """Return the median distance of places [n, 2] from their median along both axes, [2]."""
+    return np.asarray(np.median(np.abs(places_m - np.median(places_m, axis=0)), axis=0))
+
+
 def _check_beam_moves(where: str, commanded_m: FloatArray, measured_m: FloatArray) -> None:
-    commanded, measured = (
-        np.median(np.abs(places - np.median(places, axis=0)), axis=0) for places in (commanded_m, measured_m)
-    )
+    commanded, measured = _measure_spread(commanded_m), _measure_spread(measured_m)
     is_stationary = measured < MOTION_RATIO_MIN * commanded
     (x_mm, y_mm), (x_commanded_mm, y_commanded_mm) = measured * 1e3, commanded * 1e3
     motion = f"by {x_mm:.3g}, {y_mm:.3g} mm, commanded {x_commanded_mm:.3g}, {y_commanded_mm:.3g}"
@@ -171,9 +174,7 @@ def _fit_affine(commanded_m: FloatArray, measured_m: FloatArray) -> tuple[FloatA
 
 def _check_single_columns(where: str, commanded_m: FloatArray, measured_m: FloatArray) -> None:
     """Raise InputError for one column in another unit, beside another one in metres or not."""
-    commanded, measured = (
-        np.median(np.abs(places - np.median(places, axis=0)), axis=0) for places in (commanded_m, measured_m)
-    )
+    commanded, measured = _measure_spread(commanded_m), _measure_spread(measured_m)
     scales = np.divide(measured, commanded, out=np.ones(2), where=commanded > 0.0)
     row = int(scales.argmax())
     if scales[row] < COLUMNS_RATIO_MIN * scales[1 - row]:

@@ -36,22 +36,16 @@ def build_model_toml(
         f'claims = "{claim}. For other bridge widths: R by 1 / width."',
         "",
     ]
-    for name, unit in VALUE_UNITS.items():
-        lines += [f"[{name}]", f"value = {base[name]!r}", f'unit = "{unit}"', source, ""]
-    lines += ["[R_width_product]", f"value = {base['R'] * width_m!r}", 'unit = "m K/W"', source, ""]
-    lines += ["[C_mean]", f"value = {base['C']!r}", 'unit = "J/K"', source, ""]
+    rows = [(name, base[name], unit) for name, unit in VALUE_UNITS.items()]
+    rows += [("R_width_product", base["R"] * width_m, "m K/W"), ("C_mean", base["C"], "J/K")]
+    lines += [line for row in rows for line in (*_format_quantity(*row), source, "")]
     lines += ["[[bridge]]", f"width_m = {width_m!r}"]
     for name, unit in (("R", "K/W"), ("C", "J/K")):
-        lines += [f"[bridge.{name}]", f"value = {base[name]!r}", f'unit = "{unit}"', source]
+        lines += [*_format_quantity(f"bridge.{name}", base[name], unit), source]
     for key, values in terms.items():
         for item in discover_terms()[key].parameters:
-            lines += [
-                "",
-                f"[terms.{key}.{item.name}]",
-                f"value = {float(values[item.name])!r}",
-                f'unit = "{item.unit}"',
-                source,
-            ]
+            quantity = _format_quantity(f"terms.{key}.{item.name}", float(values[item.name]), item.unit)
+            lines += ["", *quantity, source]
     for term in discovered:
         lines += ["", "[[discovered]]", source]
         lines += [f'{name} = "{getattr(term, name)}"' for name in ("where", "depends_on", "unit", "formula")]
@@ -60,6 +54,10 @@ def build_model_toml(
             lines.append(f"memory_time_s = {term.memory_time_s!r}")
         lines.append(f"values = [{', '.join(f'{value:.9g}' for value in term.values)}]")
     return "\n".join(lines) + "\n"
+
+
+def _format_quantity(table: str, value: float, unit: str) -> list[str]:
+    return [f"[{table}]", f"value = {value!r}", f'unit = "{unit}"']
 
 
 def _sanitize(text: str) -> str:

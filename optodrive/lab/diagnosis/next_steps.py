@@ -200,35 +200,49 @@ def list_next_steps(
 
     recordings, out, config: what was diagnosed, the answer's folder and the configuration, as the command named them
     """
+    verdict, causes = discrepancy.verdict, discrepancy.causes
     display = () if config is None else ("--config", config)
-    model = str(Path(out) / "model.toml")
-    steps = [_inspect_term(label) for label in discrepancy.failures]
-    if discrepancy.verdict == "unexplained":
-        show = ("recording", "show", recordings[0], "--out", "signals.png")
-        steps.append(_step("Look at the signals in which the residuals are largest.", *show))
-    if discrepancy.verdict in ("ambiguous", "undecided") or discrepancy.doubts:
-        again = (
-            "Record the proposed experiment" if discrepancy.next_experiment else "Record each experiment three times"
-        )
-        more = ("diagnose", *recordings, "more.h5", "--out", f"{out.rstrip('/')}-2", *display)
-        steps.append(_step(f"{again}, and diagnose it together with these runs.", *more))
-    if "mirror_lag" in discrepancy.causes:
-        steps.append(
-            _step("Identify the mirrors' servos from steps.", "calibrate", "steps", "--out", "steps", *display)
-        )
-        servo = ("calibrate", "servo", "steps", "--out", "mirrors.toml", *display)
-        steps.append(_step("Complete the steps by the measured angles; plan with the result (--mirrors).", *servo))
-    if "clock_offset" in discrepancy.causes:
-        steps.append(_correct_clock(discrepancy, recordings, out, display))
-    changes_plans = any(_changes_plans(key) for key in discrepancy.causes)
-    is_nominal = discrepancy.verdict in ("none", "instrument")
-    if discrepancy.base and discrepancy.verdict != "unexplained" and (changes_plans or is_nominal):
-        steps.append(_step("Plan heights with this model.", "plan", FRAMES, "--model", model, *display))
-        if changes_plans:
-            simulate = ("simulate", FRAMES, "--truth", model, *display)
-            steps.append(_step("See what the effect does to heights planned without it.", *simulate))
-        steps.append(_step("Serve the display with it.", "serve", "--model", model, *display))
-    return steps
+    model, again = str(Path(out) / "model.toml"), ("--out", f"{out.rstrip('/')}-2", *display)
+    more = "the proposed experiment" if discrepancy.next_experiment else "each experiment three times"
+    has_model = bool(discrepancy.base) and verdict != "unexplained"
+    changes_plans = has_model and any(_changes_plans(key) for key in causes)
+    plans = changes_plans or (has_model and verdict in ("none", "instrument"))
+    table: list[tuple[bool, str, Sequence[str]]] = [
+        (
+            verdict == "unexplained",
+            "Look at the signals in which the residuals are largest.",
+            ("recording", "show", recordings[0], "--out", "signals.png"),
+        ),
+        (
+            verdict in ("ambiguous", "undecided") or bool(discrepancy.doubts),
+            f"Record {more}, and diagnose it together with these runs.",
+            ("diagnose", *recordings, "more.h5", *again),
+        ),
+        (
+            "mirror_lag" in causes,
+            "Identify the mirrors' servos from steps.",
+            ("calibrate", "steps", "--out", "steps", *display),
+        ),
+        (
+            "mirror_lag" in causes,
+            "Complete the steps by the measured angles; plan with the result (--mirrors).",
+            ("calibrate", "servo", "steps", "--out", "mirrors.toml", *display),
+        ),
+        ("clock_offset" in causes, *_correct_clock(discrepancy, recordings, again)),
+        (plans, "Plan heights with this model.", ("plan", FRAMES, "--model", model, *display)),
+        (
+            changes_plans,
+            "See what the effect does to heights planned without it.",
+            ("simulate", FRAMES, "--truth", model, *display),
+        ),
+        (plans, "Serve the display with it.", ("serve", "--model", model, *display)),
+    ]
+    failed = [label.partition(" ")[0].rstrip(":") for label in discrepancy.failures]
+    steps: list[tuple[str, Sequence[str]]] = [
+        (f"Correct the term, which could not be computed: {key}.", ("terms", key)) for key in failed
+    ]
+    steps += [(reason, arguments) for is_due, reason, arguments in table if is_due]
+    return [NextStep(reason, join(["optodrive", *arguments])) for reason, arguments in steps]
 
 
 def _changes_plans(key: str) -> bool:
@@ -237,24 +251,15 @@ def _changes_plans(key: str) -> bool:
     return any(hook is not None for hook in kernels)
 
 
-def _correct_clock(discrepancy: Discrepancy, recordings: Sequence[str], out: str, display: Sequence[str]) -> NextStep:
+def _correct_clock(
+    discrepancy: Discrepancy, recordings: Sequence[str], again: Sequence[str]
+) -> tuple[str, Sequence[str]]:
     """Return the step that corrects the times of all signals when they are merged, or of one before it is."""
     offsets = {name: item.value for name, item in discrepancy.parameters.items() if name.startswith("clock_offset.")}
+    name, offset_s = next(iter(offsets.items()), ("", 0.0))
     if len(offsets) > 1:
-        offset_s = next(iter(offsets.values()))
         files = ("session.h5", "measured", f"--time-offset={-offset_s:.3g}", "--out", "recording.h5")
-        return _step(
-            "Correct the instrument's times when session and measurement are merged.", "recording", "merge", *files
-        )
-    name, offset_s = next(iter(offsets.items()))
+        reason = "Correct the instrument's times when session and measurement are merged."
+        return reason, ("recording", "merge", *files)
     reason = f"Correct the times of {name.partition('.')[2]} by {format_quantity(-offset_s, 's')}, and diagnose again."
-    return _step(reason, "diagnose", *recordings, "--out", f"{out.rstrip('/')}-2", *display)
-
-
-def _inspect_term(label: str) -> NextStep:
-    key = label.partition(" ")[0].rstrip(":")
-    return _step(f"Correct the term, which could not be computed: {key}.", "terms", key)
-
-
-def _step(reason: str, *arguments: str) -> NextStep:
-    return NextStep(reason, join(["optodrive", *arguments]))
+    return reason, ("diagnose", *recordings, *again)

@@ -8,7 +8,6 @@ from optodrive.device.config import Config
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON
 from optodrive.physics.parameters import load_parameters
-from optodrive.physics.pixel import Pixel
 
 DEFAULT_PARAMETER_SET = "calibrated"
 R_SIGMA, C_SIGMA, GAS_SIGMA = 0.25, 0.16, 0.4
@@ -20,30 +19,17 @@ def build_prior(measurement: Measurement, config: Config | None) -> tuple[BasePa
 
     The prior is centred on the configured pixel, else on the stated bridge width, else it covers the whole of Table S3.
     """
+    stated_m = None
     for run in measurement.runs:
         width = run.attributes.get("bridge_width_m")
-        if isinstance(width, (int, float)):
+        if isinstance(width, int | float):
             check_plausible(f"recording: {run.name}: bridge_width_m", float(width), RECORDING["bridge_width_m"])
-    widths_m = [run.attributes.get("bridge_width_m") for run in measurement.runs]
-    stated_m = next((float(width) for width in widths_m if isinstance(width, (int, float))), None)
-    if config is not None:
-        width_m = stated_m or config.display.bridge_width_m
-        return (
-            _build_prior_around(load_parameters(config.pixel_model.parameters).build_pixel(width_m)),
-            DEFAULT_EPSILON,
-            width_m,
-        )
-    if stated_m is not None:
-        return (
-            _build_prior_around(load_parameters(DEFAULT_PARAMETER_SET).build_pixel(stated_m)),
-            DEFAULT_EPSILON,
-            stated_m,
-        )
-    return BROAD_PRIOR, DEFAULT_EPSILON, None
-
-
-def _build_prior_around(pixel: Pixel) -> BaseParameterPrior:
+            stated_m = float(width) if stated_m is None else stated_m
+    width_m = stated_m if config is None else stated_m or config.display.bridge_width_m
+    if width_m is None:
+        return BROAD_PRIOR, DEFAULT_EPSILON, None
+    parameter_set = DEFAULT_PARAMETER_SET if config is None else config.pixel_model.parameters
+    pixel = load_parameters(parameter_set).build_pixel(width_m)
     values = (pixel.r_k_per_w, pixel.c_j_per_k, pixel.tau_g_s, pixel.kappa_m_per_k, pixel.phi_n_per_k)
-    return BaseParameterPrior(
-        tuple(log(value) for value in values), (R_SIGMA, C_SIGMA, GAS_SIGMA, GAS_SIGMA, GAS_SIGMA)
-    )
+    sigma = (R_SIGMA, C_SIGMA, GAS_SIGMA, GAS_SIGMA, GAS_SIGMA)
+    return BaseParameterPrior(tuple(map(log, values)), sigma), DEFAULT_EPSILON, width_m

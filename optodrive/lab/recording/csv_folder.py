@@ -14,7 +14,7 @@ from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.numeric_tables import CsvTable, open_table
 from optodrive.core.toml_model import read_toml
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.types.measurements import Run, Signal
+from optodrive.core.types.measurements import Run
 from optodrive.lab.recording.storage import (
     COMMANDS,
     FORMAT,
@@ -160,16 +160,11 @@ def write_folder(folder: Path, runs: tuple[Run, ...], instrument_notes: str) -> 
 def _format_run(run: Run) -> list[str]:
     table = f"runs.{_format_key(run.name)}"
     attributes = {**run.attributes, "ambient_K": run.ambient_k}
-    lines = ["", f"[{table}]"] + [f"{_format_key(key)} = {_format_value(value)}" for key, value in attributes.items()]
-    for name in SIGNALS:
-        if name in run.signals:
-            lines += _format_signal(f"{table}.{name}", run.signals[name])
+    lines = ["", f"[{table}]", *(f"{_format_key(key)} = {_format_value(value)}" for key, value in attributes.items())]
+    for name, signal in ((name, run.signals[name]) for name in SIGNALS if name in run.signals):
+        lines += ["", f"[{table}.{name}]", f"pixel = {signal.pixel}"]
+        lines += [] if signal.sigma is None else [f"sigma = {_format_value(signal.sigma)}"]
     return lines
-
-
-def _format_signal(table: str, signal: Signal) -> list[str]:
-    lines = ["", f"[{table}]", f"pixel = {signal.pixel}"]
-    return lines if signal.sigma is None else [*lines, f"sigma = {_format_value(signal.sigma)}"]
 
 
 def _format_key(key: str) -> str:

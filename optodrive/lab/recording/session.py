@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from queue import Full, Queue
 from typing import Any, BinaryIO
@@ -127,12 +128,9 @@ class SessionRecorder:
         return message.decode("utf-8", "replace").strip().rpartition("\n")[2] or f"status {self._writer.returncode}"
 
     def _close_writer(self) -> None:
-        for pipe in (self._writer.stdin, self._writer.stdout, self._writer.stderr):
-            if pipe is not None:
-                try:
-                    pipe.close()
-                except OSError:
-                    continue  # the failure has been reported already
+        for pipe in filter(None, (self._writer.stdin, self._writer.stdout, self._writer.stderr)):
+            with suppress(OSError):  # the failure has been reported already
+                pipe.close()
         try:
             self._writer.wait(timeout=CLOSE_TIMEOUT_S)
         except subprocess.TimeoutExpired:
