@@ -14,7 +14,7 @@ from optodrive.core.plausibility import RECORDING
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.measurements import DataFinding, Measurement, Run, Signal
-from optodrive.lab.inspection.response_faults import RESPONSE_STEPS
+from optodrive.lab.inspection.response_faults import RESPONSE_STEPS, find_saturation
 from optodrive.lab.inspection.signal_faults import (
     find_ceiling,
     find_hold,
@@ -194,17 +194,22 @@ def _find_clipped(work: Work, name: str) -> Found:
         found = [
             top for _, _, t_s, value in signals if (top := find_ceiling(t_s, sign * value, may_be_smooth)) is not None
         ]
+        ceiling, reach, where = min(found, default=0.0), 0.0, f"where the signal is clipped, its {side} value"
         if not found:
-            continue
-        ceiling = min(found)
+            level = find_saturation(work, name)
+            if level is None or level[0] != sign:
+                continue
+            ceiling, reach = sign * level[1], level[2]
+            where = f"where the signal saturates, its {side} value but for noise"
         own = []
         for number, signal, _, value in signals:
-            if len(value) and float((sign * value).max()) >= ceiling:
-                own.append(remove_samples(number, name, signal, select_near_ceiling(sign * value, ceiling)))
+            is_near = select_near_ceiling(sign * value, ceiling, reach)
+            if is_near.any():
+                own.append(remove_samples(number, name, signal, is_near))
         work.apply(own)
         samples, total = sum(item.samples for item in own), sum(len(value) for _, _, _, value in signals)
         text = f"{name}: {count(samples, 'sample')} ({samples / total:.1%}) of {count(len(own), 'run')} are at or near "
-        text += f"{format_quantity(sign * ceiling, find_unit(name))}, where the signal is clipped, its {side} value"
+        text += f"{format_quantity(sign * ceiling, find_unit(name))}, {where}"
         findings.append(describe(work, "clipped", name, own, text))
         edits += own
     return edits, findings

@@ -166,11 +166,13 @@ def _is_reached_fast(t_s: FloatArray, value: FloatArray, is_tie: BoolArray, quan
     return slow_s <= SLOWING * usual_s + 2.5 * dt_s and length * dt_s >= 5.0 * slow_s
 
 
-def select_near_ceiling(value: FloatArray, ceiling: float) -> BoolArray:
-    """Return the samples at and near a ceiling. Gaps count too, so that noise does not select."""
+def select_near_ceiling(value: FloatArray, ceiling: float, reach: float) -> BoolArray:
+    """Return the samples at a ceiling and, if any is there, near it. Gaps count too, so that noise does not select."""
     noise = measure_noise(value)
-    margin = max(CEILING_SIGMAS * noise.sigma, 2.0 * noise.quantum)
+    margin = max(CEILING_SIGMAS * noise.sigma, 2.0 * noise.quantum) + reach
     is_near = value >= ceiling - margin
+    if not len(value) or value.max() < ceiling - reach:
+        return np.zeros(len(value), dtype=bool)
     rows = np.flatnonzero(is_near)
     for first, last in itertools.pairwise(rows):
         if last - first <= 4:

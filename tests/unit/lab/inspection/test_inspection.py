@@ -138,6 +138,32 @@ def test_a_ceiling_is_left_out_with_what_is_near(share, quantum, noise):
         assert (kept & far).sum() > 0.9 * (far & np.isfinite(old.signals[HEIGHT].value)).sum()
 
 
+@pytest.mark.parametrize("width", [0.0, 0.05])
+@pytest.mark.parametrize(("share", "side"), [(0.6, 1.0), (0.85, 1.0), (0.3, -1.0)])
+@pytest.mark.parametrize("name", [HEIGHT, HEAT])
+def test_a_sensor_that_saturates_before_the_noise_is_left_out_there(name, share, side, width):
+    clean, rng = build_clean(5, 1000.0, 0.0), np.random.default_rng(8)
+    values = np.concatenate([run.signals[name].value for run in clean.runs])
+    range_, sigma = float(np.nanmax(values) - np.nanmin(values)), {HEIGHT: 2e-6, HEAT: 0.3}[name]
+    level = float(np.nanmin(values)) + share * range_
+
+    def saturate(_, value):
+        over = side * (value - level)
+        over = -width * range_ * np.logaddexp(0.0, -over / (width * range_)) if width else np.minimum(over, 0.0)
+        return level + side * over + sigma * rng.standard_normal(len(value))
+
+    kinds, inspection = find(change(clean, name, saturate))
+    assert kinds == {"clipped"}
+    kept_far, far = 0, 0
+    for old, new in zip(clean.runs, inspection.measurement.runs, strict=True):
+        kept = np.isfinite(new.signals[name].value)
+        true = side * (old.signals[name].value - level)
+        assert np.all(true[kept] < 0.02 * range_)
+        is_far = true < -0.25 * range_
+        kept_far, far = kept_far + int((kept & is_far).sum()), far + int(is_far.sum())
+    assert kept_far > 0.9 * far > 0
+
+
 def test_what_settles_is_no_ceiling():
     """Long pulses end in equal samples, exact or in steps of a converter; a settled membrane is none either."""
     runs = []
@@ -148,6 +174,7 @@ def test_what_settles_is_no_ceiling():
                 0,
                 t_s,
                 scale
+                * run.pulses[0, 2]
                 * np.where(
                     t_s < 0.02,
                     0.0,
