@@ -40,7 +40,7 @@ def tables(draw, stages=ONE):
     slew_rad_per_s = draw(log_uniform(5.0, 500.0))
     table = {
         "format": "optodrive-config",
-        "version": 4,
+        "version": 1,
         "name": "own",
         "ambient_c": ambient_c,
         "display": {

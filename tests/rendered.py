@@ -136,7 +136,7 @@ def taken(light, random, noise=2.0, blur_px=0.8, full=np.uint8):
 def describe(folder: Path, grid=GRID, views=("grid.png",), dark="dark.png", spots='table = "pictures.csv"', **other):
     """Write pictures.toml."""
     marks = other.get("marks", marks_px(grid))
-    lines = ['format = "optodrive-pictures"', "version = 2"]
+    lines = ['format = "optodrive-pictures"', "version = 1"]
     lines += [f'dark = "{dark}"'] if dark else []
     lines += ["[grid]", *(f"{key} = {value!r}" for key, value in grid.items()), f"pictures = {list(views)!r}"]
     lines += ["[origin]", f"marks_px = {np.round(marks).tolist()!r}", f"first_corner_m = {list(FIRST_M)!r}"]

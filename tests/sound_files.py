@@ -213,7 +213,7 @@ class FieldFile(Format):
         scanner = FIELD_CONFIG.scanner
         return {
             "format": "optodrive-field",
-            "version": 2,
+            "version": 1,
             "scanner": {"rad_per_code": scanner.rad_per_code, "focal_length_m": scanner.focal_length_m},
             "extent": {"x_code": 32768.0, "y_code": 32768.0, "x_half": 9000.0, "y_half": 9000.0},
             "geometry": {key: float(value) for key, value in geometry._asdict().items()},
@@ -274,7 +274,7 @@ class Pictures(Format):
         turn = float(rng.choice([0.0, 0.5, -0.5, 1.0])) * np.pi + float(rng.normal(0.0, 0.02)) * (rng.random() < 0.3)
         return {
             "format": "optodrive-pictures",
-            "version": 2,
+            "version": 1,
             "grid": {
                 "kind": "chessboard",
                 "rows": 7,

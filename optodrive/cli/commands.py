@@ -34,7 +34,7 @@ MODULES = {
     "plan": ("plan",),
     "simulate": ("simulate",),
     "study": ("study",),
-    "dac": ("dac", "helios"),
+    "dac": ("dac",),
     "recording": ("recording",),
     "diagnose": ("diagnose",),
     "discover": ("discover",),
@@ -126,8 +126,7 @@ def build_app(command: str | None = None) -> typer.Typer:
     for name in [name for name, commands in MODULES.items() if command in commands] or MODULES:
         module, commands = import_module(f"optodrive.cli.{name}"), MODULES[name]
         if hasattr(module, "GROUP"):
-            for each in commands:  # the names after the first are former ones
-                app.add_typer(module.GROUP, name=each, hidden=each != commands[0])
+            app.add_typer(module.GROUP, name=commands[0])
             continue
         for each in commands:
             app.command(each)(getattr(module, each.replace("-", "_")))

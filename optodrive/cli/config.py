@@ -1,4 +1,4 @@
-"""`optodrive config new | show | check | migrate`: write, show, check or migrate a configuration."""
+"""`optodrive config new | show | check`: write, show or check a configuration."""
 
 import os
 import sys
@@ -20,7 +20,7 @@ COUNT_MAX = 200
 PITCH, POWER = "display.pitch_m", "laser.max_power_w"
 
 
-GROUP = typer.Typer(help="Write, show, check or migrate a configuration.", no_args_is_help=True)
+GROUP = typer.Typer(help="Write, show or check a configuration.", no_args_is_help=True)
 
 
 @GROUP.command()
@@ -149,33 +149,3 @@ def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     warnings = [] if exchangeable is None else [f"{exchangeable}; {EXCHANGE_REMEDY}"]
     lines = [f"{name}: {pixels} pixels, configuration valid", *(f"warning: {each}" for each in warnings)]
     print_answer({"name": name, "pixels": pixels, "ok": True, "warnings": warnings}, lines, json)
-
-
-@GROUP.command()
-def migrate(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Configuration of an older version.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="NEW.toml", help="Write a new file; by default to stdout.")
-    ] = None,
-    json: JsonOption = False,
-) -> None:
-    """Rename the keys of an older configuration, or list the lines that only you can change. FILE stays as it is."""
-    from optodrive.core.files import check_output, write_text
-    from optodrive.device.config_migration import migrate_config
-
-    check_output("--out", out, ".toml")
-    migration = migrate_config(file)
-    if json:
-        print_json(migration._asdict() | {"out": None if migration.by_hand or out is None else str(out)})
-    elif migration.by_hand:
-        print("\n".join(migration.by_hand))
-    if migration.by_hand:
-        expected = f"{len(migration.by_hand)} lines changed by hand, as listed"
-        raise InputError(f"{file}: version", migration.version, expected)
-    if out is not None:
-        write_text(out, migration.text)
-    elif not json:
-        print(migration.text, end="")
-    if not json:
-        done = ", ".join(f"renamed {each}" for each in migration.renamed) or "no key renamed"
-        print(f"optodrive: version {migration.version}: {done}", file=sys.stderr)

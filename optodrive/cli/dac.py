@@ -1,4 +1,4 @@
-"""`optodrive dac list | info | play`: play frames on a laser DAC instead of the board. Its former name is `helios`."""
+"""`optodrive dac list | info | play`: play frames on a laser DAC instead of the board."""
 
 import signal
 import sys

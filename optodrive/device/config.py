@@ -33,7 +33,7 @@ from optodrive.device.config_sections import (
 )
 
 FORMAT = "optodrive-config"
-VERSION = 4
+VERSION = 1
 DAMPING_MAX = 0.995
 """Largest damping ratio of a servo with two poles that ring."""
 
@@ -43,7 +43,7 @@ class Config(Section):
 
     format: Literal["optodrive-config"]
     """Name of the format."""
-    version: Literal[4]
+    version: Literal[1]
     """Version of the format."""
     name: Name
     """Name of the display."""

@@ -14,9 +14,6 @@ from optodrive.core.toml_model import Section, check_format, parse_table, read_t
 from optodrive.device.config import FORMAT, VERSION, Config
 from optodrive.device.config_sections import ServoSection
 
-RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
-"""Keys that version 4 renamed, with their new names."""
-OLD_VERSIONS = (1, 2, 3)
 MIRRORS_FORMAT = "optodrive-mirrors"
 MIRRORS_VERSION = 1
 DEFAULT_CONFIG = "display-437"
@@ -52,10 +49,6 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
 
 def build_config(path: Path, table: dict[str, Any]) -> Config:
     """Build the configuration of a file's table, with the servo that it states. Raise InputError with one line."""
-    if table.get("format") == FORMAT and type(version := table.get("version")) is int and version in OLD_VERSIONS:
-        renamed = ", ".join(f"{old} is now {new}" for old, new in RENAMED_KEYS.items())
-        expected = f"{VERSION}: {renamed}; `optodrive config migrate` renames them, or lists the lines to change"
-        raise InputError(f"{path}: version", version, expected)
     check_format(path, table, FORMAT, VERSION)
     check_table(str(path), table, collect_ranges(Config))
     for section, key in list_named_files(table):

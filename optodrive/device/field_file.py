@@ -14,7 +14,7 @@ from optodrive.device.config_sections import FocalLength, Wiring
 from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
 
 FORMAT = "optodrive-field"
-VERSION = 2
+VERSION = 1
 
 
 Code = Annotated[float, Item(ge=-1e5, le=1e5)]
@@ -66,7 +66,7 @@ def strip_toml_specials(text: str) -> str:
 
 
 def format_field(field: CalibratedField, about: dict[str, str | float | int]) -> str:
-    """Return a field as TOML of format optodrive-field, version 2."""
+    """Return a field as TOML of format optodrive-field, version 1."""
     extent = field.extent
     if field.display:
         about = {"display": strip_toml_specials(field.display), **about}

@@ -1,4 +1,4 @@
-"""`optodrive helios` on the emulated DAC, through the real pyusb, in virtual time."""
+"""`optodrive dac` on the emulated DAC, through the real pyusb, in virtual time."""
 
 import json
 import resource
@@ -56,7 +56,7 @@ def desk(tmp_path, monkeypatch):
 
 
 def test_info_reports_identity_and_permission_to_emit(desk, capsys):
-    assert run(["helios", "info", *desk.config(), "--json"]) == 0
+    assert run(["dac", "info", *desk.config(), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {
         "device": "Helios",
         "name": "Helios 1163021877",
@@ -65,7 +65,7 @@ def test_info_reports_identity_and_permission_to_emit(desk, capsys):
         "may_emit": True,
         "heat": "recorded",
     }
-    assert run(["helios", "info", *desk.config("false")]) == 0
+    assert run(["dac", "info", *desk.config("false")]) == 0
     assert "may emit         no" in capsys.readouterr().out
 
 
@@ -119,7 +119,7 @@ def test_a_play_accounts_for_the_heat_of_the_previous_one(desk, capsys, after):
 
 
 def test_without_an_external_interlock_one_line_and_no_emission(desk, capsys):
-    assert run(["helios", "play", str(desk.frames), *desk.config("false")]) == 2
+    assert run(["dac", "play", str(desk.frames), *desk.config("false")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("optodrive: board.interlock_watched: got False, expected true")
     assert error.count("\n") == 1
@@ -133,7 +133,7 @@ def test_a_board_is_no_dac(desk, capsys, command):
 
 
 def test_another_converter_width_is_rejected(desk, capsys):
-    assert run(["helios", "play", str(desk.frames), *desk.config(steps=32767)]) == 2
+    assert run(["dac", "play", str(desk.frames), *desk.config(steps=32767)]) == 2
     assert "scanner.half_range_codes: got 32767, expected 2047" in capsys.readouterr().err
 
 

@@ -39,7 +39,6 @@ ELSEWHERE = {
     "optodrive home": "a synopsis; tests/system/test_home.py",
     "optodrive doctor --config display.toml": "tests/system/test_stages.py",
     "optodrive doctor --board": "tests/unit/cli/test_doctor_bare_board.py",
-    "optodrive config migrate": "tests/unit/device/test_config_migration.py",
     "optodrive first-light --stage": "tests/unit/device/test_stage_config.py",
     "optodrive calibrate board": "a synopsis; tests/system/test_calibrate_loop.py",
     "optodrive diagnose --live": "a synopsis; tests/system/test_diagnose_live.py",

@@ -208,7 +208,7 @@ CONFIGS = {
         "at most limits.display_mean_power_max_w 2.45",
     ),
     "wrong type": ("pwm_hz = 5000.0", 'pwm_hz = "fast"', "laser.pwm_hz"),
-    "other version": ("version = 4", "version = 2", "version: got 2, expected 4"),
+    "other version": ("version = 1", "version = 2", "version: got 2, expected 1"),
     "other format": ('format = "optodrive-config"', 'format = "svg"', "format"),
     "no TOML": ("[display]", "[display", "valid TOML"),
     "unreachable pixel": ("pitch_m = 3.6e-3", "pitch_m = 9e-3", "a reach of"),

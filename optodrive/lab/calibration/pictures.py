@@ -19,7 +19,7 @@ from optodrive.core.toml_model import Section, check_format, parse_table, read_t
 from optodrive.device.field_geometry import CODE_MAX
 
 PICTURES_FORMAT = "optodrive-pictures"
-PICTURES_VERSION = 2
+PICTURES_VERSION = 1
 DESCRIPTION_FILE = "pictures.toml"
 COLUMNS = ("file", "x_code", "y_code")
 CODES_IN_NAME = re.compile(r"(\d+)[_,-](\d+)\.[A-Za-z]+$")

@@ -69,7 +69,7 @@ def test_there_and_back_through_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("version = 2", "version = 1", "version"),
+        ("version = 1", "version = 2", "version"),
         ("optodrive-field", "optodrive-config", "format"),
         ("gain_x = ", "gian_x = ", "gian_x"),
         ("order = 6", "order = 5", "surface.order"),

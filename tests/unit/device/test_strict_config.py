@@ -67,9 +67,9 @@ def test_no_whole_number_has_a_decimal_point(tmp_path):
             load_with(tmp_path, place, 4.0)
 
 
-@pytest.mark.parametrize("value", [True, 4.0, 3.0, "4"])
+@pytest.mark.parametrize("value", [True, 1.0, 4.0, "1"])
 def test_a_version_is_a_whole_number(tmp_path, value):
-    with pytest.raises(InputError, match=f"version: got {value!r}, expected 4, the one this release reads"):
+    with pytest.raises(InputError, match=f"version: got {value!r}, expected 1, the one this release reads"):
         load_with(tmp_path, ("version",), value)
 
 
