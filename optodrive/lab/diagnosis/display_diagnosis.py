@@ -58,9 +58,10 @@ class PixelSpread:
     unit: str
 
     @classmethod
-    def from_values(cls, values: list[float], unit: str) -> "PixelSpread":
-        """Return median and range of values."""
-        return cls(float(np.median(values)), min(values), max(values), unit)
+    def from_values(cls, values: Iterable[float], unit: str = "1") -> "PixelSpread | None":
+        """Return median and range of values, None without any."""
+        found = list(values)
+        return cls(float(np.median(found)), min(found), max(found), unit) if found else None
 
 
 NOMINAL = ("none", "instrument", "undecided")
@@ -69,28 +70,43 @@ NOMINAL = ("none", "instrument", "undecided")
 
 @dataclass(frozen=True, eq=False)
 class PixelGroup:
-    """Pixels with the same verdict and causes.
-
-    parameters: of the named causes; gain: reduction on held-out runs; height_error: rms of planned heights, on held-out
-    pushes where there are any
-    """
+    """Pixels with the same verdict and causes, each with its diagnosis."""
 
     verdict: str
     causes: tuple[str, ...]
-    answers: tuple[PixelAnswer, ...]
-    parameters: dict[str, PixelSpread]
-    gain: PixelSpread | None
-    height_error: PixelSpread | None
+    members: tuple[tuple[PixelAnswer, Discrepancy], ...]
+
+    @property
+    def parameters(self) -> dict[str, PixelSpread]:
+        """Parameters of the named causes."""
+        values: dict[tuple[str, str], list[float]] = {}
+        for _, found in self.members if self.verdict == "cause" else ():
+            for name, item in found.parameters.items():
+                if "." in name:
+                    values.setdefault((name, item.unit), []).append(item.value)
+        spreads = {name: PixelSpread.from_values(numbers, unit) for (name, unit), numbers in values.items()}
+        return {name: spread for name, spread in spreads.items() if spread is not None}
+
+    @property
+    def gain(self) -> PixelSpread | None:
+        """Reduction of the error on held-out runs."""
+        return PixelSpread.from_values(found.gain.reduction for _, found in self.members if found.gain is not None)
+
+    @property
+    def height_error(self) -> PixelSpread | None:
+        """Rms error of planned heights, on held-out pushes where there are any."""
+        errors = (found.height_error_held_out or found.height_error_fitted for _, found in self.members)
+        return PixelSpread.from_values(error.extended_rms for error in errors if error is not None)
 
     @property
     def doubtful(self) -> list[int]:
         """Indices of the pixels at which the size of a named cause is not established, sorted."""
-        return sorted(item.pixel for item in self.answers if item.discrepancy is not None and item.discrepancy.doubts)
+        return sorted(item.pixel for item, found in self.members if found.doubts)
 
     @property
     def pixels(self) -> list[int]:
         """Pixel indices, sorted."""
-        return sorted(item.pixel for item in self.answers)
+        return sorted(item.pixel for item, _ in self.members)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +129,12 @@ class DisplayAnswer:
 
     def build_groups(self) -> list[PixelGroup]:
         """Return the pixels grouped by verdict and causes, largest group first."""
-        by_causes: dict[tuple[str, tuple[str, ...]], list[PixelAnswer]] = {}
+        by_causes: dict[tuple[str, tuple[str, ...]], list[tuple[PixelAnswer, Discrepancy]]] = {}
         for item in self.pixels:
             if (found := item.discrepancy) is not None:
-                by_causes.setdefault((found.verdict, tuple(sorted(found.causes))), []).append(item)
-        groups = [_build_group(*key, tuple(members)) for key, members in by_causes.items()]
-        return sorted(groups, key=lambda item: (-len(item.answers), item.verdict, item.causes))
+                by_causes.setdefault((found.verdict, tuple(sorted(found.causes))), []).append((item, found))
+        groups = [PixelGroup(*key, tuple(members)) for key, members in by_causes.items()]
+        return sorted(groups, key=lambda item: (-len(item.members), item.verdict, item.causes))
 
     def build_model(self) -> tuple[Discrepancy | None, float | None, str]:
         """Return one pixel model of the display, its bridge width and its description, or None, None and the reason.
@@ -127,17 +143,16 @@ class DisplayAnswer:
         a cause or none; all pixels of which no error was found are one group.
         """
         groups = self.build_groups()
-        nominal = [item for group in groups if group.verdict in NOMINAL for item in group.answers]
-        answers = max([nominal, *(list(group.answers) for group in groups)], key=len)
-        if 2 * len(answers) <= len(self.pixels):
+        nominal = [item for group in groups if group.verdict in NOMINAL for item in group.members]
+        members = max([nominal, *(list(group.members) for group in groups)], key=len)
+        if 2 * len(members) <= len(self.pixels):
             return None, None, "no set of causes holds for most pixels"
-        verdict = answers[0].discrepancy.verdict if answers[0].discrepancy is not None else ""
-        if verdict not in (*NOMINAL, "cause"):
+        if (verdict := members[0][1].verdict) not in (*NOMINAL, "cause"):
             return None, None, f"most pixels are {verdict}"
-        widths_m = {item.width_m for item in answers}
+        widths_m = {item.width_m for item, _ in members}
         if len(widths_m) > 1:
             return None, None, "the bridge widths of the pixels differ"
-        discrepancies = [item.discrepancy for item in answers if item.discrepancy is not None and item.discrepancy.base]
+        discrepancies = [found for _, found in members if found.base]
         first = discrepancies[0]
         base = {name: _compute_median(item.base[name] for item in discrepancies) for name in first.base}
         terms = {
@@ -168,23 +183,6 @@ def compile_kernels() -> None:
     experiment = PixelExperiment(np.array([[0.0, 0.01, 1.0, 0.0]]), 0, 293.15, (t_s, t_s, t_s))
     simulate_signals(experiment, load_parameters(DEFAULT_PARAMETER_SET).build_pixel(4e-4), ActiveTerms.from_values({}))
     whiten(t_s, np.ones((2, 1)), ColouredNoise(1.0, (1.0, 1.0), (0.01, 1.0)))
-
-
-def _build_group(verdict: str, causes: tuple[str, ...], answers: tuple[PixelAnswer, ...]) -> PixelGroup:
-    discrepancies = [item.discrepancy for item in answers if item.discrepancy is not None]
-    values: dict[str, list[float]] = {}
-    units: dict[str, str] = {}
-    for discrepancy in discrepancies if verdict == "cause" else ():
-        for name, item in discrepancy.parameters.items():
-            if "." in name:
-                values.setdefault(name, []).append(item.value)
-                units[name] = item.unit
-    gains = [discrepancy.gain.reduction for discrepancy in discrepancies if discrepancy.gain is not None]
-    parameters = {name: PixelSpread.from_values(pixel_values, units[name]) for name, pixel_values in values.items()}
-    errors = (discrepancy.height_error_held_out or discrepancy.height_error_fitted for discrepancy in discrepancies)
-    rms = [error.extended_rms for error in errors if error is not None]
-    gain, height_error = (PixelSpread.from_values(items, "1") if items else None for items in (gains, rms))
-    return PixelGroup(verdict, causes, answers, parameters, gain, height_error)
 
 
 def _compute_median(values: Iterable[float]) -> float:

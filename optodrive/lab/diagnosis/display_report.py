@@ -43,7 +43,7 @@ def build_display_narrative(answer: DisplayAnswer) -> list[str]:
     """Return the lines of the narrative: headline, groups with parameters and gain, errors, mirrors and model."""
     lines = [build_headline(answer), ""]
     for group in answer.build_groups():
-        lines.append(f"- {_count_pixels(len(group.answers))}: {_describe_group(group)}: {format_ranges(group.pixels)}.")
+        lines.append(f"- {_count_pixels(len(group.members))}: {_describe_group(group)}: {format_ranges(group.pixels)}.")
         for name, item in group.parameters.items():
             median, low, high = (format_quantity(value, item.unit) for value in (item.median, item.low, item.high))
             lines.append(f"  {name}: median {median}, from {low} to {high}")
