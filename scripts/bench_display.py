@@ -8,8 +8,8 @@ from pathlib import Path
 import measuring  # noqa: F401 - the folder of the tests
 
 from display_lab import display_lab  # of the tests
-from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
 from optodrive.lab.diagnosis.display_diagnosis import PixelTask, compile_kernels, diagnose_pixel
+from optodrive.lab.diagnosis.pixel_workers import run_tasks
 from optodrive.lab.recording import DisplayRuns, write_recording
 
 PIXELS, WORKERS = 100, 2
@@ -34,11 +34,9 @@ def measure():
         runs = DisplayRuns.open([path])
         opened_s = time.monotonic()
         tasks = [PixelTask(item.pixel, item.read) for item in runs.pixels]
-        with open_client(workers=WORKERS) as client:
-            ready_s = time.monotonic()
-            answers = {task.pixel: answer for task, answer, _ in run_tasks(client, diagnose_pixel, tasks)}
-            end_s = time.monotonic()
-            largest_mib = max(client.run(read_peak_mib).values())
+        answers = {task.pixel: answer for task, answer, _ in run_tasks(diagnose_pixel, tasks, WORKERS)}
+        end_s = time.monotonic()
+        largest_mib = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**10
     named = [answers[pixel].discrepancy.causes == tuple(terms) for pixel, terms in hidden.items()]
     busy_s = sum(answer.discrepancy.elapsed_s for answer in answers.values())
     yield "pixels, 15 runs per pixel", len(answers), "1"
@@ -46,13 +44,7 @@ def measure():
     yield "correct answers", sum(named), "1"
     yield "whole diagnosis", end_s - begin_s, "s"
     yield "part: opening the recording", opened_s - begin_s, "s"
-    yield "part: starting two workers", ready_s - opened_s, "s"
     yield "per pixel, whole diagnosis", (end_s - begin_s) / len(answers), "s"
     yield "per pixel, on its worker", busy_s / len(answers), "s"
-    yield "fraction of the workers' time in the diagnosis", busy_s / WORKERS / (end_s - ready_s), "1"
+    yield "fraction of the workers' time in the diagnosis", busy_s / WORKERS / (end_s - opened_s), "1"
     yield "maximum memory of a worker", largest_mib, "MiB"
-
-
-def read_peak_mib():
-    """Return the peak memory of this process, MiB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10

@@ -30,7 +30,6 @@ def diagnose_display(
     Raises InputError where the diagnosis fails for every pixel.
     """
     from optodrive.core.types.measurements import MIRRORS
-    from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
     from optodrive.lab.diagnosis.display_diagnosis import (
         DisplayAnswer,
         PixelAnswer,
@@ -38,6 +37,7 @@ def diagnose_display(
         compile_kernels,
         diagnose_pixel,
     )
+    from optodrive.lab.diagnosis.pixel_workers import run_tasks
 
     start_s = perf_counter()
     tasks = [PixelTask(item.pixel, item.read, seed, config, use) for item in runs.pixels]
@@ -47,11 +47,8 @@ def diagnose_display(
         compile_kernels()
     pixels: list[PixelAnswer] = []
     mirrors: PixelAnswer | None = None
-    with (
-        _report_progress(len(runs.pixels)) as report_count,
-        open_client(dask, workers, max_workers=len(tasks)) as client,
-    ):
-        for task, result, error in run_tasks(client, diagnose_pixel, tasks):
+    with _report_progress(len(runs.pixels)) as report_count:
+        for task, result, error in run_tasks(diagnose_pixel, tasks, workers, dask):
             answer = result or PixelAnswer(task.pixel, None, error)
             if task.pixel == MIRRORS:
                 mirrors = answer

@@ -65,8 +65,8 @@ def measure_live(request: LiveRequest, quiet: bool) -> "CampaignResult":
 
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.files import create_folder
+    from optodrive.core.worker_process import WorkerProcess
     from optodrive.lab.commissioning.sensor import PixelReader
-    from optodrive.lab.commissioning.worker_process import WorkerProcess
     from optodrive.lab.live_diagnosis import BoardBench, CampaignRecording, find_pixels, run_campaign
 
     confirm_emission(request.yes, "this arms the board and pulses one pixel and its neighbour at up to full power")

@@ -28,10 +28,10 @@ from optodrive.core.types.discrepancy import Discrepancy, NextExperiment, Probab
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
+from optodrive.core.worker_process import WorkerProcess
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.lab.commissioning.exclusive_board import LOOP_STEP_S, ExclusiveBoard
 from optodrive.lab.commissioning.sensor import PixelReader
-from optodrive.lab.commissioning.worker_process import WorkerProcess
 from optodrive.lab.diagnosis.next_steps import CERTAIN
 from optodrive.lab.recording import read_recording, write_recording
 from optodrive.link.session.plan_job import PlanJob

@@ -9,7 +9,7 @@ import pytest
 
 from display_lab import display_lab
 from optodrive.core.types.measurements import Measurement
-from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
+from optodrive.lab.diagnosis.pixel_workers import run_tasks
 from optodrive.lab.recording import write_recording
 from rig import OPTODRIVE, is_alive, read_proc, wait_for
 from signalled_processes import SIGNALS, assert_one_line, signalling, wait_for_end
@@ -56,15 +56,9 @@ def list_children(pid):
     return [int(child) for thread in threads for child in read_proc(pid, f"task/{thread}/children").split()]
 
 
-def find_clusters(pid):
-    """Return the process id of the local cluster of a diagnosis, once it runs."""
-    return [child for child in list_children(pid) if "dask_workers" in read_proc(child, "cmdline")]
-
-
 def find_workers(pid):
-    """Return the process ids of the workers that a process or its local cluster has started."""
-    children = [child for each in (pid, *find_clusters(pid)) for child in list_children(each)]
-    return [child for child in children if "spawn_main" in read_proc(child, "cmdline")]
+    """Return the process ids of the workers that a process has started."""
+    return [child for child in list_children(pid) if "spawn_main" in read_proc(child, "cmdline")]
 
 
 def has_reached(stage, process):
@@ -100,16 +94,6 @@ def test_the_others_do_the_work_of_a_worker_that_is_lost_at_the_start(start, tmp
     assert (tmp_path / "out" / "report.html").exists()
 
 
-@pytest.mark.slow
-def test_a_cluster_that_is_lost_at_the_start_ends_the_diagnosis(start, tmp_path):
-    process = start("--workers", "2")
-    wait_for(lambda: find_clusters(process.pid), "the cluster")
-    os.kill(find_clusters(process.pid)[0], signal.SIGKILL)
-    assert "did not start" in assert_one_line(wait_for_end(process))
-    assert process.returncode == 1
-    assert not (tmp_path / "out").exists()
-
-
 def suspend_once(path):
     """Suspend the process of the first task that finds no file, for good."""
     if not path.exists():
@@ -122,8 +106,7 @@ def suspend_once(path):
 def test_the_task_of_a_suspended_worker_runs_again(tmp_path):
     paths = [tmp_path / name for name in ("one", "two")]
     paths[1].touch()
-    with open_client(workers=2) as client:
-        results = {task: (pid, error) for task, pid, error in run_tasks(client, suspend_once, paths)}
+    results = {task: (pid, error) for task, pid, error in run_tasks(suspend_once, paths, workers=2)}
     assert all(pid and not error for pid, error in results.values())
 
 

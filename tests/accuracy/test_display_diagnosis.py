@@ -4,6 +4,7 @@ import json
 import os
 import signal
 from functools import partial
+from multiprocessing import active_children
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config_file import load_config
-from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelTask, compile_kernels, diagnose_pixel
 from optodrive.lab.diagnosis.display_report import (
     build_display_answer,
@@ -21,6 +21,7 @@ from optodrive.lab.diagnosis.display_report import (
     build_display_report,
     format_ranges,
 )
+from optodrive.lab.diagnosis.pixel_workers import run_tasks
 from optodrive.lab.recording import DisplayRuns, read_recording, write_recording
 
 DROOP = {"laser_droop": {"share": 0.15, "time": 0.05, "spread": 1.0}}
@@ -71,10 +72,10 @@ def answers_by_pixel(recording):
     return {task.pixel: diagnose_pixel(task) for task in tasks_of(DisplayRuns.open([recording]))}
 
 
-def run_with_killer(client, tasks):
+def run_with_killer(tasks, workers):
     """Yield the pixel, answer and error of each task, and of one that kills its worker each time."""
     killer = PixelTask(KILLER, partial(signal.raise_signal, signal.SIGKILL))
-    for task, answer, error in run_tasks(client, diagnose_pixel, [*tasks, killer]):
+    for task, answer, error in run_tasks(diagnose_pixel, [*tasks, killer], workers):
         yield task.pixel, answer, error
 
 
@@ -94,14 +95,10 @@ def test_every_pixel_has_an_answer_although_workers_were_killed(answers_by_pixel
     """Two processes, one of which is killed, beside the task that kills its worker."""
     compile_kernels()
     answers = {}
-    with open_client(workers=2) as client:
-        client.wait_for_workers(2)
-        before = client.run(os.getpid)
-        assert len(set(before.values())) == 2
-        for pixel, answer, error in run_with_killer(client, tasks_of(DisplayRuns.open([recording]))):
-            if not answers:
-                os.kill(next(iter(before.values())), signal.SIGKILL)
-            answers[pixel] = (answer, error)
+    for pixel, answer, error in run_with_killer(tasks_of(DisplayRuns.open([recording])), workers=2):
+        if not answers:
+            os.kill(min(child.pid for child in active_children()), signal.SIGKILL)
+        answers[pixel] = (answer, error)
     assert sorted(answers) == [*HIDDEN, BAD, KILLER]
     check_is_reported(*answers[KILLER])
     for pixel, terms in HIDDEN.items():
@@ -113,8 +110,8 @@ def test_every_pixel_has_an_answer_although_workers_were_killed(answers_by_pixel
 
 def test_a_pixel_that_kills_its_workers_is_reported_and_affects_no_other(answers_by_pixel, recording):
     compile_kernels()
-    with open_client(workers=1) as client:
-        answers = {pixel: own for pixel, *own in run_with_killer(client, tasks_of(DisplayRuns.open([recording]))[:2])}
+    tasks = tasks_of(DisplayRuns.open([recording]))[:2]
+    answers = {pixel: own for pixel, *own in run_with_killer(tasks, workers=1)}
     assert sorted(answers) == [*list(HIDDEN)[:2], KILLER]
     check_is_reported(*answers.pop(KILLER))
     for pixel, (answer, error) in answers.items():

@@ -153,11 +153,11 @@ def measure_on_board(
     """
     from optodrive.cli.board_access import open_board
     from optodrive.core.clock import MonotonicClock
+    from optodrive.core.worker_process import WorkerProcess
     from optodrive.lab.calibration.spots import FieldPrior
     from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.measurement_loop import CalibrationSession, MeasurementLoop, fit_and_warm_up
     from optodrive.lab.commissioning.spot_locator import ManualLocator, SensorLocator
-    from optodrive.lab.commissioning.worker_process import WorkerProcess
 
     power_w, target_rms_m = request.spot_power_mw * 1e-3, um_to_m(request.target_rms_um)
     # The board closes first on exit: it receives ABORT before the worker process is joined.

@@ -18,12 +18,12 @@ from optodrive.core.errors import InputError, NotReadyError, RefusedError
 from optodrive.core.files import atomic_write
 from optodrive.core.quantity import m_to_um
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.core.worker_process import WorkerProcess
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit, fit_field, select_next_spot
 from optodrive.lab.calibration.spot_checks import check_fit, check_spots
 from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-from optodrive.lab.commissioning.worker_process import WorkerProcess
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 
 GRID_SIDE = 15

@@ -9,12 +9,12 @@ import pytest
 from displays import DISPLAYS
 from exclusive_rig import ExclusiveRig
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
+from optodrive.core.worker_process import WorkerProcess
 from optodrive.device.config import Config
 from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.lab.commissioning.measurement_loop import CalibrationSession, SpotRow, save_text, session_path_for
 from optodrive.lab.commissioning.sensor import SpotReader, SpotReading, SpotSensorClient, robust_mean
 from optodrive.lab.commissioning.spot_locator import SensorLocator
-from optodrive.lab.commissioning.worker_process import WorkerProcess
 from optodrive.link.transport.serial_port import SerialPort
 from optodrive.planning.display_model import DisplayModel
 

@@ -1,4 +1,4 @@
-"""A worker process for computations and disk access while the parent process renews the lease of an armed board.
+"""A worker process for computations and disk access, beside a parent that renews the lease of an armed board.
 
 A thread would share the interpreter's lock, which would delay the lease on a busy machine.
 """
@@ -21,6 +21,10 @@ SUSPENDED_MAX_S = 2.0
 """A worker that a signal has stopped for this time is given up."""
 
 
+class WorkerLostError(OptodriveError):
+    """The worker process has ended, or is suspended."""
+
+
 class WorkerProcess:
     """Runs one function at a time. It ends with its parent process, however that ends."""
 
@@ -40,6 +44,10 @@ class WorkerProcess:
         self._process.kill()  # SIGTERM would wait in a worker that is suspended
         self._process.join()
 
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable with a result, or at the worker's end."""
+        return self._pipe.fileno()
+
     def submit(self, function: Callable[..., Any], *arguments: object) -> None:
         """Start a function of a module with its arguments."""
         try:
@@ -48,7 +56,7 @@ class WorkerProcess:
             raise self._build_exit_error() from None
 
     def is_ready(self) -> bool:
-        """Return whether the result is available. Raise OptodriveError if the worker is suspended."""
+        """Return whether the result is available. Raise WorkerLostError if the worker is suspended."""
         if self._pipe.poll():
             return True
         self._check_runs()
@@ -57,8 +65,8 @@ class WorkerProcess:
     def result(self) -> Any:
         """Wait for the result and return it.
 
-        Raise RefusedError if the function raised InputError, OptodriveError for any other error, and if the worker has
-        ended or is suspended.
+        Raise RefusedError if the function raised InputError, OptodriveError for any other error, WorkerLostError if the
+        worker has ended or is suspended.
         """
         try:
             while not self._pipe.poll(LOOK_PERIOD_S):
@@ -71,7 +79,7 @@ class WorkerProcess:
         return outcome
 
     def _check_runs(self) -> None:
-        """Raise OptodriveError if a signal has stopped the worker, which then would not end its computation."""
+        """Raise WorkerLostError if a signal has stopped the worker, which then would not end its computation."""
         now_s = time.monotonic()
         if now_s < self._look_at_s:
             return
@@ -81,10 +89,10 @@ class WorkerProcess:
         if not is_suspended(self._process.pid):
             self._ran_s = now_s
         elif now_s - self._ran_s > SUSPENDED_MAX_S:
-            raise OptodriveError(f"the worker process {self._process.pid} is suspended: stopped by a signal")
+            raise WorkerLostError(f"the worker process {self._process.pid} is suspended: stopped by a signal")
 
-    def _build_exit_error(self) -> OptodriveError:
-        return OptodriveError("the worker process has ended: out of memory, or killed?")
+    def _build_exit_error(self) -> WorkerLostError:
+        return WorkerLostError("the worker process has ended: out of memory, or killed?")
 
 
 def _serve(pipe: Connection) -> None:
