@@ -187,11 +187,11 @@ def _build_report(
     true_display: "ThermalState",
 ) -> dict[str, Any]:
     from optodrive.core.quantity import m_to_um
-    from optodrive.planning.listed_pulses import ListedPulses
     from optodrive.planning.plan_summary import summarize_plan
+    from optodrive.planning.pulse_table import PulseTable
 
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-    pulses = ListedPulses.from_planned(planned_sequence)
+    pulses = PulseTable.from_planned(planned_sequence)
     simulated_m = true_display.copy().apply_pulses(*columns).displacement_m
     return {
         "summary": summarize_plan(planned_sequence, feasibility),

@@ -154,13 +154,13 @@ class Observer:
         return min(places, key=lambda answer: (right - places[answer][1] + 1) ** 2 + (up + places[answer][0] - 1) ** 2)
 
     def _rate(self, shown: Presentation, rng: np.random.Generator) -> float:
-        intensity = self.feel(shown)[0].intensity
+        intensity = self.respond(shown)[0].intensity
         noisy = intensity * np.exp(WEBER_FRACTION * rng.standard_normal())
-        brightest = self.feel_at_full_power(shown).intensity
+        brightest = self.respond_at_full_power(shown).intensity
         return float(np.clip(noisy / (FULL_SCALE * brightest), *MAGNITUDE_BOUNDS))
 
     def _find_odd(self, shown: Presentation, rng: np.random.Generator) -> str:
-        felt = np.log1p([list(signals) for signals in self.feel(shown)])
+        felt = np.log1p([list(signals) for signals in self.respond(shown)])
         noisy = felt + WEBER_FRACTION * rng.standard_normal(felt.shape)
         distances = [np.linalg.norm(noisy - one, axis=1).sum() for one in noisy]
         return str(1 + int(np.argmax(distances)))
@@ -184,23 +184,23 @@ class Observer:
 
     def _compare(self, shown: Presentation, rng: np.random.Generator) -> str:
         """Name the stronger of two stimuli, the first or the second of the answers."""
-        felt = np.log1p([signals.intensity for signals in self.feel(shown)])
+        felt = np.log1p([signals.intensity for signals in self.respond(shown)])
         noisy = felt + WEBER_FRACTION * rng.standard_normal(len(felt))
         return self._study.response.answers[int(noisy.argmax())]
 
-    def feel(self, shown: Presentation) -> list[ChannelSignals]:
+    def respond(self, shown: Presentation) -> list[ChannelSignals]:
         """Return the channels' signals of each stimulus on one pixel. Stimuli are separated by pauses."""
         firsts = np.flatnonzero(np.diff(shown.start_s, prepend=-np.inf) > STIMULUS_PAUSE_S)
         groups = np.split(np.arange(len(shown.pixel)), firsts[1:])
-        return [self._feel_pulses(shown, rows, shown.power_w) for rows in groups]
+        return [self._respond_to_pulses(shown, rows, shown.power_w) for rows in groups]
 
-    def feel_at_full_power(self, shown: Presentation) -> ChannelSignals:
+    def respond_at_full_power(self, shown: Presentation) -> ChannelSignals:
         """Return the signals of the first stimulus as if at the laser's highest power."""
         firsts = np.flatnonzero(np.diff(shown.start_s, prepend=-np.inf) > STIMULUS_PAUSE_S)
         rows = np.split(np.arange(len(shown.pixel)), firsts[1:])[0]
-        return self._feel_pulses(shown, rows, np.full(len(shown.pixel), self._display.config.laser.max_power_w))
+        return self._respond_to_pulses(shown, rows, np.full(len(shown.pixel), self._display.config.laser.max_power_w))
 
-    def _feel_pulses(self, shown: Presentation, rows: IntArray, power_w: FloatArray) -> ChannelSignals:
+    def _respond_to_pulses(self, shown: Presentation, rows: IntArray, power_w: FloatArray) -> ChannelSignals:
         return compute_signals(self._excite(shown, rows, power_w))
 
     def _excite(self, shown: Presentation, rows: IntArray, power_w: FloatArray) -> tuple[float, float]:

@@ -12,9 +12,9 @@ from optodrive.daemon.engine.plan_record import Execution, LargestTarget, PlanRe
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.physics.thermal_state import ThermalState
-from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.planned_sequence import PlannedSequence
+from optodrive.planning.pulse_table import PulseTable
 
 CUT_MIN_S = 1e-5
 """A pulse that is shorter than planned by more than this was cut short."""
@@ -135,7 +135,7 @@ class ActivePlan:
         record = self.record
         self.planned, self.points, self.crc, self.growth = planned, points, crc, None
         record.pulse_count, record.duration_s = len(planned.plan), planned.duration_s
-        record.pulses, record.largest_target = ListedPulses.from_planned(planned), LargestTarget.from_planned(planned)
+        record.pulses, record.largest_target = PulseTable.from_planned(planned), LargestTarget.from_planned(planned)
         record.summary_json = summary_json
 
     def add_executed(self, executed: ExecutedPulses, rows: IntArray) -> None:
@@ -177,7 +177,7 @@ class ActivePlan:
         columns = {item.name: getattr(plan, item.name)[order] for item in fields(plan) if item.name != "headroom_k"}
         reordered = replace(plan, **columns)
         planned = replace(self.planned, plan=reordered, predicted_m=self.planned.predicted_m[order])
-        record.pulses, record.largest_target = ListedPulses.from_planned(planned), LargestTarget.from_planned(planned)
+        record.pulses, record.largest_target = PulseTable.from_planned(planned), LargestTarget.from_planned(planned)
         rows = None if self.executed_rows is None else np.flatnonzero(np.isin(order, self.executed_rows))
         return replace(self, planned=planned, executed_rows=rows)
 

@@ -22,11 +22,11 @@ from optodrive.planning.stimuli.standing_page import SLOT_S, Refresh, build_refr
 
 TRACKER_LOST_S = 0.1
 """Without the places of fingers for this time, the page is drawn as if there were none."""
-PAGE_GONE_S = 0.5
+PAGE_TIMEOUT_S = 0.5
 """A page that was not refreshed for this time no longer stands."""
 CAP_GONE_S = 1.0
 """A cap limits a page for this time after it took light from a refresh."""
-AHEAD_SLOTS = 2
+LOOKAHEAD_SLOTS = 2
 """A dot is drawn for a finger that will touch it within this number of slots."""
 MOVE_S = 4e-4
 """Typical time of a move between two pixels under the same finger."""
@@ -79,7 +79,7 @@ class PageRefresh:
     @property
     def page_m(self) -> FloatArray:
         """Heights of the page that stands, [p], m, 0 without one."""
-        stands = self._clock.now_s() - self._selected_s <= PAGE_GONE_S
+        stands = self._clock.now_s() - self._selected_s <= PAGE_TIMEOUT_S
         return self._page_m if stands else np.zeros(len(self._layout))
 
     def note_limits(self, caps: Iterable[str]) -> None:
@@ -90,7 +90,7 @@ class PageRefresh:
     def limited_by(self) -> tuple[str, ...]:
         """Caps that took light from the page that stands in the last second, in the order of their names."""
         now_s = self._clock.now_s()
-        stands = now_s - self._selected_s <= PAGE_GONE_S
+        stands = now_s - self._selected_s <= PAGE_TIMEOUT_S
         return tuple(sorted(cap for cap, at_s in self._limited_s.items() if stands and now_s - at_s <= CAP_GONE_S))
 
     def select(self, display: DisplayModel, page: FrameSequence, snapshot: PlanningSnapshot) -> Refresh:
@@ -104,8 +104,8 @@ class PageRefresh:
         begin_s = now_s + snapshot.start_s - self._board_s()
         margin_s = min(MARGIN_MAX_S, max(MARGIN_MIN_S, MARGIN_INTERVALS * max(self._intervals_s)))
         slots = ceil((self._lead_s() + margin_s) / SLOT_S)
-        touched = self._find_touched((begin_s + SLOT_S * np.arange(slots + AHEAD_SLOTS)).tolist())
-        is_touched = np.logical_or.reduce([touched[step : slots + step] for step in range(AHEAD_SLOTS + 1)])
+        touched = self._find_touched((begin_s + SLOT_S * np.arange(slots + LOOKAHEAD_SLOTS)).tolist())
+        is_touched = np.logical_or.reduce([touched[step : slots + step] for step in range(LOOKAHEAD_SLOTS + 1)])
         drawn_s = self._find_drawn_s(snapshot)
         bursts = select_bursts(frame.target_m, is_touched, drawn_s, snapshot.start_s, pixel_time_s)
         return build_refresh(frame, bursts, self._layout, pixel_time_s)

@@ -26,7 +26,7 @@ from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.streamed_frame import FRAME_DURATION_S, can_split
 
 
-class GrownPlan(NamedTuple):
+class ExtendedPlan(NamedTuple):
     """A plan with its rest.
 
     points: of the whole plan; added: those behind the first part; crc, added_crc: CRC-32 of the bytes of both
@@ -52,7 +52,7 @@ def may_grow(push: Push, sequence: FrameSequence, stages: int) -> bool:
 
 def grow_plan(
     plan: ActivePlan, growth: SequencePlanner, scales: Sequence[WireScale], on_progress: Callable[[float], None]
-) -> GrownPlan:
+) -> ExtendedPlan:
     """Plan, limit and quantise the rest of a plan, and verify its decoded bytes against the budget.
 
     Raise LocalProtocolError if a pulse exceeds a cap, or if points of the first part would change.
@@ -69,7 +69,7 @@ def grow_plan(
     pulses = DecodedPulses(**{name: column[is_added] for name, column in vars(decoded).items()})
     verify(rest, row[is_added] - first, pulses, budget, display.budget, lambda: on_progress(1.0))
     pulsed_s = None if plan.cycle is None else plan.cycle.pulsed_s - plan.record.start_s
-    return GrownPlan(
+    return ExtendedPlan(
         planned=planned,
         points=points,
         added=added,

@@ -19,9 +19,9 @@ from optodrive.link.protocol.stage_points import StagePoints, decode_stages
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.limiter.limiter import verify
-from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
+from optodrive.planning.pulse_table import PulseTable
 from optodrive.planning.stimuli.standing_page import Refresh
 from optodrive.planning.stimuli.streamed_frame import can_split, delay_frames, stale_pixels_first
 
@@ -86,7 +86,7 @@ def make_plan(
         pulse_count=len(planned.plan),
         duration_s=planned.duration_s,
         summary_json=summarize_plan(planned, feasibility, pulsed_s).model_dump_json().encode(),
-        pulses=ListedPulses.from_planned(planned),
+        pulses=PulseTable.from_planned(planned),
         largest_target=LargestTarget.from_planned(planned),
         start_s=snapshot.start_s,
         arrived_s=request.arrived_s,

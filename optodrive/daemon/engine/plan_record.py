@@ -11,8 +11,8 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanOnset, PlanReport, PlanStatus
 from optodrive.link.session.clock_sync import ClockReading, TimingError
-from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses, UInt8Array
 from optodrive.planning.planned_sequence import PlannedSequence
+from optodrive.planning.pulse_table import PULSES_LISTED_MAX, Int32Array, PulseTable, UInt8Array
 from optodrive.planning.summary_schema import PlanSummary
 
 
@@ -125,7 +125,7 @@ class PlanRecord:
     pulse_count: int
     duration_s: float
     summary_json: bytes
-    pulses: ListedPulses | None
+    pulses: PulseTable | None
     largest_target: LargestTarget | None
     start_s: float
     arrived_s: float

@@ -17,7 +17,7 @@ If that is too late, because the computer stalled, the rest becomes a frame of i
 from math import inf
 
 from optodrive.daemon.engine.active_plan import ActivePlan, RefreshCycle
-from optodrive.daemon.engine.plan_growth import GrownPlan
+from optodrive.daemon.engine.plan_growth import ExtendedPlan
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot, continue_cycle
 from optodrive.daemon.engine.progress import PlanRun
 from optodrive.daemon.engine.queued_plans import QueuedPlans
@@ -192,7 +192,7 @@ class QueueStream:
         """Give up the plan that has ended without its rest."""
         self._unfinished = None
 
-    def extend(self, plan: ActivePlan, grown: GrownPlan) -> bool:
+    def extend(self, plan: ActivePlan, grown: ExtendedPlan) -> bool:
         """Append the rest of a plan to it. Return False, unchanged, if it is too late or a newer plan came."""
         self._session.connection.receive()
         with self._plans.lock:

@@ -21,9 +21,9 @@ from optodrive.daemon.api.reload_requests import apply_reload
 from optodrive.daemon.api.tokens import Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.server.acceptor_client import BEAT, NUMBER, send_connection
+from optodrive.daemon.server.connection_queue import ConnectionQueue, Waiting
 from optodrive.daemon.server.listeners import raise_descriptor_limit
 from optodrive.daemon.server.request_head import Rank, parse_head, peek_head, rank_request
-from optodrive.daemon.server.waiting_room import Waiting, WaitingRoom
 from optodrive.device.config_sections import DaemonSection
 from optodrive.link.service.link_connection import LinkConnection
 
@@ -73,14 +73,14 @@ class Acceptor:
         self._daemon = daemon
         self._beat = beat
         self._link = LinkConnection(link_path, "acceptor", MonotonicClock())
-        self._room = WaitingRoom(listeners, self._rank, time.monotonic)
-        self._room.on_unserved = self._report_unserved
+        self._queue = ConnectionQueue(listeners, self._rank, time.monotonic)
+        self._queue.on_unserved = self._report_unserved
         self._listener = open_unix_listener(path, 0o600, 1, "socket of the acceptor process", socket.SOCK_SEQPACKET)
         self._listener.setblocking(False)
         self._web: socket.socket | None = None
         self._unopened: dict[int, Waiting] = {}  # handed over; another web process gets them if this one ends before
         self._handed_over = 0
-        self._beat_at_s = self._room_at_s = 0.0
+        self._beat_at_s = self._queue_at_s = 0.0
         self._is_ending = False
 
     def end(self) -> None:
@@ -100,7 +100,7 @@ class Acceptor:
     def close(self) -> None:
         """Close everything but the listening sockets."""
         self._lose_web()
-        self._room.close()
+        self._queue.close()
         self._listener.close()
         self._link.close()
 
@@ -108,8 +108,8 @@ class Acceptor:
         now_s = time.monotonic()
         ready = self._wait(now_s)
         now_s = time.monotonic()
-        if self._room.fileno() in ready and self._room.receive():
-            self._room_at_s = now_s + BUSY_PAUSE_S
+        if self._queue.fileno() in ready and self._queue.receive():
+            self._queue_at_s = now_s + BUSY_PAUSE_S
         if self._link.fileno() in ready:
             self._link.receive()
         if self._listener.fileno() in ready:
@@ -120,7 +120,7 @@ class Acceptor:
         if now_s >= self._beat_at_s:
             self._beat_at_s = now_s + TURN_MAX_S
             self._link.connect_if_due()
-            self._room.close_expired()
+            self._queue.close_expired()
             self._send_beats()
         if self._beat.fileno() in ready:
             for fields in self._beat.receive():
@@ -128,18 +128,18 @@ class Acceptor:
                     self._daemon, _ = apply_reload(self._policy, self._daemon, fields)
 
     def _wait(self, now_s: float) -> set[int]:
-        is_room_due = now_s >= self._room_at_s
+        is_queue_due = now_s >= self._queue_at_s
         poll = select.poll()
         for descriptor in (
             self._beat.fileno(),
             self._listener.fileno(),
             self._link.fileno(),
-            self._room.fileno() if is_room_due else -1,
+            self._queue.fileno() if is_queue_due else -1,
             -1 if self._web is None else self._web.fileno(),
         ):
             if descriptor >= 0:
                 poll.register(descriptor, select.POLLIN)
-        due_s = self._beat_at_s if is_room_due else min(self._beat_at_s, self._room_at_s)
+        due_s = self._beat_at_s if is_queue_due else min(self._beat_at_s, self._queue_at_s)
         return {descriptor for descriptor, _ in poll.poll(max(0.0, due_s - now_s) * 1e3)}
 
     def _rank(self, head: bytes) -> Rank:
@@ -183,7 +183,7 @@ class Acceptor:
 
     def _lose_web(self) -> None:
         while self._unopened:
-            self._room.put_back(self._unopened.popitem()[1])
+            self._queue.put_back(self._unopened.popitem()[1])
         if self._web is not None:
             self._web.close()
             self._web = None
@@ -206,8 +206,8 @@ class Acceptor:
         """Hand over as many connections as the web process may have unopened, the highest rank first."""
         for rank, unopened_max in UNOPENED_MAX.items():
             unopened = sum(waiting.rank is rank for waiting in self._unopened.values())
-            for _ in range(min(unopened_max - unopened, self._room.count(rank))):
-                if self._web is None or not self._send(self._web, self._room.take(rank)):
+            for _ in range(min(unopened_max - unopened, self._queue.count(rank))):
+                if self._web is None or not self._send(self._web, self._queue.take(rank)):
                     return
 
     def _send(self, web: socket.socket, waiting: Waiting) -> bool:
@@ -216,7 +216,7 @@ class Acceptor:
         try:
             send_connection(web, waiting)
         except OSError as error:
-            self._room.put_back(waiting)
+            self._queue.put_back(waiting)
             if not isinstance(error, BlockingIOError):
                 self._lose_web()
             return False

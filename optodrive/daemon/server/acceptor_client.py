@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from optodrive.daemon.server.connection_queue import Waiting
 from optodrive.daemon.server.listeners import TimedSocket
 from optodrive.daemon.server.request_head import Rank
-from optodrive.daemon.server.waiting_room import Waiting
 
 BEAT = b"beat"
 _CONNECTION_RECORD = struct.Struct("<QBd")

@@ -12,7 +12,7 @@ from optodrive.daemon.engine import planner
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import RevokedCallers
 from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
-from optodrive.planning.listed_pulses import ListedPulses
+from optodrive.planning.pulse_table import PulseTable
 from planner_rig import PlannerRig, build_frame, build_train
 from standing_rig import StandingRig, build_display, build_page
 
@@ -42,14 +42,14 @@ def test_plans_are_executed_in_order_with_the_points_that_were_proven(rig):
 
 def test_no_report_states_an_end_without_the_execution(rig, monkeypatch):
     """The plan ends in another thread while its report is built."""
-    record, to_columns = submit(rig, build_frame(60.0)), ListedPulses.to_columns
+    record, to_columns = submit(rig, build_frame(60.0)), PulseTable.to_columns
     rig.until(lambda: record.executed_count >= 1)
 
     def end_now(pulses):
         finish(rig, record)
         return to_columns(pulses)
 
-    monkeypatch.setattr(ListedPulses, "to_columns", end_now)
+    monkeypatch.setattr(PulseTable, "to_columns", end_now)
     report = record.build_report(0.0)
     assert record.has_ended
     assert report.status == "running"

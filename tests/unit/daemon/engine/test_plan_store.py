@@ -12,7 +12,7 @@ from optodrive.core.types.plans import BudgetState, LimitedPlan
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.daemon.engine import plan_store
 from optodrive.link.protocol.quantisation import WirePoints
-from optodrive.planning import listed_pulses
+from optodrive.planning import pulse_table
 from optodrive.planning.planned_sequence import PlannedSequence
 from planner_rig import DISPLAY, build_frame, build_train
 
@@ -97,7 +97,7 @@ def test_old_plans_make_room_for_newer_ones(rig, monkeypatch):
 
 
 def test_a_plan_of_many_pulses_keeps_its_summary_only(rig, monkeypatch):
-    monkeypatch.setattr(listed_pulses, "PULSES_LISTED_MAX", 10)
+    monkeypatch.setattr(pulse_table, "PULSES_LISTED_MAX", 10)
     monkeypatch.setattr("optodrive.daemon.engine.plan_record.PULSES_LISTED_MAX", 10)
     record = submit(rig, build_frame())
     rig.until(lambda: record.has_ended)

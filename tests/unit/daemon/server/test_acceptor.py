@@ -13,7 +13,7 @@ from optodrive.core.child_process import BeatWriter
 from optodrive.core.ipc import MessageSocket
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.tokens import Token, Tokens
-from optodrive.daemon.server import acceptor_client, waiting_room
+from optodrive.daemon.server import acceptor_client, connection_queue
 from optodrive.daemon.server.acceptor import UNOPENED_MAX, Acceptor
 from optodrive.daemon.server.acceptor_client import AcceptorClient
 from optodrive.daemon.server.listeners import open_tcp_listener
@@ -124,7 +124,7 @@ def test_a_revoked_token_does_not_stop(rig):
 
 
 def test_a_stop_that_nobody_answers_is_audited(rig, monkeypatch):
-    monkeypatch.setattr(waiting_room, "WAIT_MAX_S", 0.2)
+    monkeypatch.setattr(connection_queue, "WAIT_MAX_S", 0.2)
     link = rig.send(build_head(*HEADERS[Rank.STOP]))
     fields = rig.await_report("audit")["fields"]
     assert (fields["name"], fields["call"], fields["event"]) == ("viewer", "POST /v1/stop", "unanswered")

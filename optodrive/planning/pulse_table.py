@@ -18,7 +18,7 @@ Int32Array = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
 
 
 @dataclass(frozen=True, eq=False)
-class ListedPulses:
+class PulseTable:
     """Columns of a plan's pulses, [n], with names and units as in `LimitedPlan` and `PlannedSequence`.
 
     reason: index into reasons

@@ -37,7 +37,7 @@ class Waiting(NamedTuple):
     number: int = 0
 
 
-class WaitingRoom:
+class ConnectionQueue:
     """The accepted connections of listening sockets.
 
     rank_head: ranks the head of a request; now_s: monotonic clock

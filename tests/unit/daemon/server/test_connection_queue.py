@@ -5,10 +5,10 @@ from contextlib import ExitStack
 
 import pytest
 
-from optodrive.daemon.server import waiting_room
+from optodrive.daemon.server import connection_queue
+from optodrive.daemon.server.connection_queue import PHASE_MAX_S, WAIT_MAX_S, WAITING_MAX, ConnectionQueue
 from optodrive.daemon.server.listeners import open_tcp_listener
 from optodrive.daemon.server.request_head import Rank
-from optodrive.daemon.server.waiting_room import PHASE_MAX_S, WAIT_MAX_S, WAITING_MAX, WaitingRoom
 
 RANKS = {b"S": Rank.STOP, b"T": Rank.TOKEN, b"O": Rank.OTHER}
 END = b"\r\n\r\n"
@@ -35,7 +35,7 @@ def stack():
 @pytest.fixture
 def room(clock, stack):
     listener = stack.enter_context(open_tcp_listener("127.0.0.1", 0))
-    room = WaitingRoom([listener], lambda head: RANKS[head[:1]], clock)
+    room = ConnectionQueue([listener], lambda head: RANKS[head[:1]], clock)
     room.port = listener.getsockname()[1]
     stack.callback(room.close)
     return room
@@ -131,7 +131,7 @@ def test_who_waits_too_long_is_closed(room, connect, clock):
 
 @pytest.mark.parametrize("flood", [b"", b"O" + END])
 def test_those_of_whom_there_are_most_give_way_first(room, connect, flood, monkeypatch):
-    monkeypatch.setattr(waiting_room, "WAITING_MAX", 20)
+    monkeypatch.setattr(connection_queue, "WAITING_MAX", 20)
     kept = [connect(text) for text in (b"S" + END, b"T" + END, b"O" + END if not flood else b"")]
     receive_all(room)
     others = [connect(flood) for _ in range(40)]
@@ -141,7 +141,7 @@ def test_those_of_whom_there_are_most_give_way_first(room, connect, flood, monke
 
 
 def test_a_token_gives_way_only_to_tokens(room, connect, monkeypatch):
-    monkeypatch.setattr(waiting_room, "WAITING_MAX", 10)
+    monkeypatch.setattr(connection_queue, "WAITING_MAX", 10)
     other, *trusted = [connect(text + END) for text in (b"O", *[b"T"] * 12)]
     receive_all(room)
     assert is_closed(other)
