@@ -160,3 +160,198 @@ def tanks_record(seed, noise=0.02, count=1024, dt_s=4.0, overflow_at=10.0):
 
     solution = solve_ivp(rate, (0.0, t[-1]), [6.0, 5.0], t_eval=t, rtol=1e-7, atol=1e-9, max_step=dt_s)
     return Record(t, pump, solution.y[1] + noise * rng.standard_normal(count))
+
+
+def solve(rate, t, state, inputs=None):
+    """Return the states [m, n] at times t, of rate(time, state, u) with inputs [m] that are linear between samples."""
+
+    def total(time, y):
+        return rate(time, y, 0.0 if inputs is None else np.interp(time, t, inputs))
+
+    return solve_ivp(total, (t[0], t[-1]), state, "LSODA", t, rtol=1e-8, atol=1e-10, max_step=2.0 * (t[1] - t[0])).y.T
+
+
+def measure(seed, t, values, noise, inputs=None):
+    """Return a record of one output with noise."""
+    noisy = values + noise * np.random.default_rng(seed).standard_normal(len(t))
+    return Record(t, np.zeros((len(t), 0)) if inputs is None else inputs, noisy)
+
+
+def oscillator_model(has_input=True):
+    """Return a linear oscillator, driven by a force or not, that starts at rest."""
+    gain = {"gain": Parameter(1.0, 0.1, 10.0)} if has_input else {}
+    return OdeModel(
+        states=("x", "v"),
+        inputs=("force",) if has_input else (),
+        outputs=("position",),
+        parameters={"stiffness": Parameter(20.0, 1.0, 400.0), "damping": Parameter(0.3, 0.01, 20.0), **gain},
+        rhs=(lambda t, s, u, p: [s[1], p["gain"] * u[0] - p["stiffness"] * s[0] - p["damping"] * s[1]])
+        if has_input
+        else (lambda t, s, u, p: [s[1], -p["stiffness"] * s[0] - p["damping"] * s[1]]),
+        output=lambda s, u, p: [s[0]],
+        initial=lambda first, p: [first[0, 0], 0.0],
+    )
+
+
+def first_order_model(state, signal, gain, loss, rest):
+    """Return a store that an input fills and that empties in proportion to its level above rest."""
+    return OdeModel(
+        states=(state,),
+        inputs=(signal,),
+        outputs=("measured",),
+        parameters={"gain": Parameter(*gain), "loss": Parameter(*loss)},
+        rhs=lambda t, s, u, p: [p["gain"] * u[0] - p["loss"] * (s[0] - rest)],
+        output=lambda s, u, p: [s[0]],
+        initial=lambda first, p: [first[0, 0]],
+    )
+
+
+def decay(seed, start, drag=0.0, friction=0.0):
+    """Return the free decay of an oscillator with quadratic drag or dry friction."""
+    t = 0.02 * np.arange(900)
+    states = solve(
+        lambda _, y, u: [y[1], -25.0 * y[0] - 0.15 * y[1] - drag * y[1] * abs(y[1]) - friction * np.tanh(y[1] / 2e-3)],
+        t,
+        [start, 0.0],
+    )
+    return measure(seed, t, states[:, 0], 1e-3)
+
+
+def heated_plate(seed, power):
+    """Return a plate, K above its surroundings, that radiates; power [m] in steps of 2 s."""
+    t = 2.0 * np.arange(len(power))
+
+    def rate(_, y, u):
+        return [0.02 * u - 0.004 * y[0] - 2.5e-13 * ((y[0] + 293.0) ** 4 - 293.0**4)]
+
+    return measure(seed, t, solve(rate, t, [0.0], power)[:, 0], 0.05, power)
+
+
+def draining_tank(seed, flow):
+    """Return a tank that drains through an orifice; flow [m] in steps of 1 s."""
+    t = 1.0 * np.arange(len(flow))
+    levels = solve(lambda _, y, u: [0.05 * u - 0.09 * np.sqrt(max(y[0], 0.0))], t, [1.0], flow)
+    return measure(seed, t, levels[:, 0], 2e-3, flow)
+
+
+def driven(seed, force, cubic=0.0, friction=0.0):
+    """Return an oscillator with a cubic spring or dry friction under a force [m] in steps of 0.02 s."""
+    t = 0.02 * np.arange(len(force))
+
+    def rate(_, y, u):
+        spring = 25.0 * y[0] + cubic * y[0] ** 3
+        return [y[1], 2.0 * u - spring - 0.8 * y[1] - friction * np.tanh(y[1] / 2e-3)]
+
+    return measure(seed, t, solve(rate, t, [0.0, 0.0], force)[:, 0], 1e-3, force)
+
+
+def servo(seed, reference):
+    """Return a motor with a dead zone of its drive under proportional control of its angle; its voltage is measured."""
+    t, rng = 0.01 * np.arange(len(reference)), np.random.default_rng(seed)
+    angle, voltages, state = np.zeros(len(t)), np.zeros(len(t)), np.zeros(2)
+    for k in range(len(t)):
+        angle[k] = state[0]
+        voltages[k] = 2.0 * (reference[k] - state[0]) + 0.02 * rng.standard_normal()
+        if k + 1 < len(t):
+            drive = np.sign(voltages[k]) * max(abs(voltages[k]) - 0.5, 0.0)
+            step = solve_ivp(lambda _, y, d=drive: [y[1], 40.0 * d - 6.0 * y[1]], (0.0, 0.01), state, rtol=1e-8)
+            state = step.y[:, -1]
+    return Record(t, voltages, angle + 1e-3 * rng.standard_normal(len(t)))
+
+
+def coupled_tanks_model():
+    """Return two tanks in cascade with orifices, without an overflow: level of the lower one from the pump."""
+    return OdeModel(
+        states=("upper", "lower"),
+        inputs=("pump",),
+        outputs=("level",),
+        parameters={
+            "k1": Parameter(0.06, 1e-3, 1.0),
+            "k2": Parameter(0.06, 1e-3, 1.0),
+            "k3": Parameter(0.05, 1e-3, 1.0),
+        },
+        rhs=lambda t, x, u, p: [
+            p["k3"] * u[0] - p["k1"] * np.sqrt(max(x[0], 0.0)),
+            p["k1"] * np.sqrt(max(x[0], 0.0)) - p["k2"] * np.sqrt(max(x[1], 0.0)),
+        ],
+        output=lambda x, u, p: [x[1]],
+        initial=lambda first, p: [6.0, first[0, 0]],
+    )
+
+
+def coupled_tanks(seed, pump):
+    """Return the lower level of two tanks of which the upper one overflows at 10; pump [m] in steps of 4 s."""
+    t = 4.0 * np.arange(len(pump))
+
+    def rate(_, y, u):
+        upper, lower = max(y[0], 0.0), max(y[1], 0.0)
+        out1 = 0.085 * np.sqrt(upper)
+        return [0.065 * u - out1 - 0.3 * max(upper - 10.0, 0.0), out1 - 0.08 * np.sqrt(lower)]
+
+    return measure(seed, t, solve(rate, t, [6.0, 5.0], pump)[:, 1], 0.02, pump)
+
+
+def _steps(seed, count, length, low, high):
+    return np.repeat(np.random.default_rng(seed).uniform(low, high, count), length)
+
+
+def _noise(seed, count, rms, bandwidth_hz=1.2, dt_s=0.02):
+    return smooth_input(np.random.default_rng(seed), dt_s * np.arange(count), bandwidth_hz, rms)[1]
+
+
+def poor_excitation():
+    """Return systems of poor excitation that lack one term: model, records, and records for judging alone.
+
+    By name, with what is missing: kind of term, its place and its variable.
+    """
+    sine = np.sin(3.0 * 0.02 * np.arange(1000))
+    plate = first_order_model("rise", "power", (0.02, 1e-3, 1.0), (0.01, 1e-4, 1.0), 0.0)
+    tank = first_order_model("height", "flow", (0.05, 1e-3, 1.0), (0.05, 1e-3, 1.0), 0.0)
+    ramp, servo_steps = np.linspace(0.5, 3.0, 700), _steps(6, 12, 80, -1.5, 1.5)
+    pumps = np.concatenate([np.full(150, 3.0), np.linspace(3.0, 5.2, 400), np.full(150, 4.6)])
+    free, forced = oscillator_model(False), oscillator_model()
+    return {
+        "decay, quadratic drag": (free, [decay(1, 1.0, drag=0.8)], [decay(2, 2.0, drag=0.8), decay(3, 0.4, drag=0.8)]),
+        "decay, dry friction": (free, [decay(1, 1.0, friction=0.6)], [decay(2, 2.0, friction=0.6)]),
+        "two decays, dry friction": (
+            free,
+            [decay(1, 1.0, friction=0.6), decay(4, 0.5, friction=0.6)],
+            [decay(2, 2.0, friction=0.6)],
+        ),
+        "one step, radiation": (
+            plate,
+            [heated_plate(1, np.concatenate([np.zeros(10), np.full(290, 120.0)]))],
+            [heated_plate(2, _steps(1, 10, 60, 0.0, 200.0))],
+        ),
+        "slow ramp, orifice": (tank, [draining_tank(1, ramp)], [draining_tank(2, _steps(2, 14, 50, 0.3, 4.0))]),
+        "one amplitude, cubic spring": (
+            forced,
+            [driven(1, 4.0 * sine, cubic=40.0)],
+            [driven(2, _noise(3, 1500, 6.0), cubic=40.0)],
+        ),
+        "one amplitude, dry friction": (
+            forced,
+            [driven(1, 4.0 * sine, friction=1.5)],
+            [driven(2, _noise(4, 1500, 4.0), friction=1.5)],
+        ),
+        "closed loop, dead zone": (motor_model(), [servo(1, servo_steps)], [servo(2, _noise(5, 900, 1.5, dt_s=0.01))]),
+        "slow pump, overflow": (
+            coupled_tanks_model(),
+            [coupled_tanks(1, pumps)],
+            [coupled_tanks(2, _steps(7, 14, 50, 2.0, 5.5))],
+        ),
+    }
+
+
+def compute_error(model, parameters, record):
+    """Return the rms error of a model in free run, by an integrator that shares no code with the package."""
+    inputs = record.inputs.T
+
+    def rate(time, state):
+        return model.rhs(time, state, [np.interp(time, record.t_s, each) for each in inputs], parameters)
+
+    start, span = model.initial(record.outputs[:1], parameters), (record.t_s[0], record.t_s[-1])
+    longest = 2.0 * float(np.diff(record.t_s).max())
+    states = solve_ivp(rate, span, start, "LSODA", record.t_s, rtol=1e-7, atol=1e-9, max_step=longest).y
+    predicted = [model.output(state, u, parameters)[0] for state, u in zip(states.T, record.inputs, strict=True)]
+    return float(np.sqrt(np.nanmean((np.array(predicted) - record.outputs[:, 0]) ** 2)))

@@ -34,21 +34,25 @@ def discover(model: ModelArgument, records: RecordsArgument, json: JsonOption = 
 
 def build_document(answer: "Discovery") -> dict[str, object]:
     """Return the answer as JSON."""
+    from optodrive.lab.inference.sentences import build_term_document
+
     return {
+        "verdict": answer.claim.verdict,
         "findings": [
             {
-                "where": each.where,
-                "depends_on": list(each.depends_on),
-                "formula": each.formula,
-                "kind": each.kind,
-                "gain": each.gain,
-                "probability": each.probability,
+                "where": each.term.chosen.where,
+                "depends_on": list(each.term.chosen.depends_on),
+                "formula": each.term.chosen.formula,
+                "kind": each.term.chosen.kind,
+                **build_term_document(each.term),
                 "curve": {name: getattr(each.curve, name).tolist() for name in ("x", "y", "low", "high")},
             }
             for each in answer.findings
         ],
+        "judged_by": answer.judged_by,
         "base_rmse": answer.base_rmse,
         "extended_rmse": answer.extended_rmse,
+        "noise": answer.noise,
         "parameters": answer.parameters,
         "base_parameters": answer.base_parameters,
     }
@@ -56,15 +60,16 @@ def build_document(answer: "Discovery") -> dict[str, object]:
 
 def build_lines(answer: "Discovery") -> list[str]:
     """Return the answer as text."""
+    from optodrive.lab.inference.sentences import describe_no_term, describe_term
+
     if not answer.findings:
-        return [f"no missing term found; held-out error of the fitted simulation {answer.base_rmse:.4g}"]
+        return describe_no_term(answer.claim, answer.base_rmse, answer.noise, answer.judged_by)
     lines = []
     for each in answer.findings:
-        lines.append(f"{each.where} lacks {each.formula}")
-        lines.append(
-            f"  {each.kind} in {' and '.join(each.depends_on)}; removes {100 * each.gain:.0f} % of the avoidable "
-            f"held-out error; probability {each.probability:.4f}"
-        )
-    lines.append(f"held-out error {answer.base_rmse:.4g} before, {answer.extended_rmse:.4g} after")
+        variable, x = each.term.chosen.depends_on[0], each.curve.x
+        lines += [*describe_term(each.term), f"  not tested outside of {variable} from {x[0]:.4g} to {x[-1]:.4g}"]
+    lines.append(
+        f"held-out error {answer.base_rmse:.4g} before, {answer.extended_rmse:.4g} after, in {answer.judged_by}"
+    )
     lines.append("parameters " + ", ".join(f"{name} {value:.6g}" for name, value in answer.parameters.items()))
     return lines

@@ -25,9 +25,11 @@ def rmse(answer, record, first=0):
 def test_dry_friction_of_a_motor():
     answer = discover(motor_model(), [motor_record(1, 12.0)])
     (finding,) = answer.findings
-    assert (finding.where, finding.depends_on, finding.kind) == ("dspeed/dt", ("speed",), "dry friction")
-    assert finding.probability > 0.99
-    assert finding.gain > 0.95
+    term, form = finding.term, finding.term.chosen
+    assert (form.where, form.depends_on, form.kind) == ("dspeed/dt", ("speed",), "dry friction")
+    assert (term.is_sure, answer.claim.verdict) == (True, "cause")
+    assert min(term.missing, term.place_probability, form.probability) > 0.97
+    assert form.gain > 0.95
     assert rmse(answer, motor_record(2, 12.0)) < 0.05 * answer.base_rmse
     fast = np.abs(finding.curve.x) > 2.0
     assert np.abs(finding.curve.y[fast] + 12.0 * np.sign(finding.curve.x[fast])).max() < 2.5
@@ -36,9 +38,10 @@ def test_dry_friction_of_a_motor():
 @pytest.mark.slow
 def test_end_stop_of_a_pendulum():
     answer = discover(pendulum_model(), [pendulum_record(1, 0.35)])
-    spring, damper = answer.findings
+    spring, damper = (each.term.chosen for each in answer.findings)
     assert (spring.where, spring.depends_on, spring.kind) == ("dspeed/dt", ("angle",), "end stop")
     assert (damper.where, damper.depends_on) == ("dspeed/dt", ("angle", "speed"))
+    assert answer.findings[0].term.is_sure
     assert answer.parameters == pytest.approx({"gravity": 30.0, "damping": 0.8, "gain": 12.0}, rel=0.01)
     assert rmse(answer, pendulum_record(2, 0.35)) < 0.1 * answer.base_rmse
 
@@ -49,8 +52,10 @@ def test_nothing_is_found_where_nothing_is_missing():
     record.outputs[3::7] = np.nan
     answer = discover(motor_model(), [record])
     assert answer.findings == ()
+    assert answer.claim.verdict in ("none", "undecided")
     noise = np.hypot(1e-3, record.outputs[0, 0])  # the run starts from the first sample, where the angle is zero
-    assert answer.extended_rmse == answer.base_rmse == pytest.approx(noise, rel=0.15)
+    assert rmse(answer, record) == pytest.approx(noise, rel=0.15)
+    assert answer.extended_rmse == answer.base_rmse < 5.0 * noise  # parameters of two thirds, in the last one
     assert answer.parameters == pytest.approx({"gain": 50.0, "damping": 2.0}, rel=2e-3)
 
 
@@ -88,7 +93,7 @@ def test_cubic_spring_of_the_silverbox():
         initial=lambda first, p: [first[0, 0], (first[1, 0] - first[0, 0]) * SAMPLE_RATE_HZ],
     )
     answer = discover(model, [part(40_650, middle)])
-    assert "cubic" in answer.findings[0].kind
+    assert answer.findings[0].term.chosen.kind == "cubic"
     assert rmse(answer, part(middle, 127_400), 50) < 1.1 * 0.91e-3
     assert rmse(answer, part(99, 40_574), 50) < 1.1 * 0.96e-3
 

@@ -39,10 +39,10 @@ EXPECTED = {
     "membrane_play": Expectation(("membrane",), ("dry friction", "saturation")),
     "thermometer_ceiling": Expectation(("sensor",), ("end stop",)),
     "second_node": Expectation(("absorber", "wall"), ("memory",)),
-    "hum": Expectation(("sensor",), ("sine",)),
-    "late_light": Expectation(("light",), ("step", "decay", "end stop", "bump")),
+    "hum": Expectation(("sensor",), ("curve",)),
+    "late_light": Expectation(("light",), ("threshold", "decay", "end stop", "curve")),
     "missed_pulses": Expectation(("light",), ("random",)),
-    "melting": Expectation(("absorber",), ("bump",)),
+    "melting": Expectation(("absorber",), ("curve",)),
     "one_way_gas": Expectation(("gas",), ("end stop", "absolute value")),
     "slack_membrane": Expectation(("membrane",), ("dead zone", "end stop", "saturation")),
 }
@@ -50,12 +50,13 @@ EXPECTED = {
 
 @dataclass(frozen=True)
 class Answer:
-    """What was found in one recording: of the strongest finding the node and the class, and the gain of all."""
+    """What was found in one recording: node, class and verdict of the strongest finding, and the gain of all."""
 
     seed: int
     hidden: str
     node: str
     kind: str
+    verdict: str
     gain: float
     error_before: float
     error_after: float
@@ -77,14 +78,15 @@ def measure(case: Case) -> Answer:
     measurement = read_recording(case.path)
     prior, epsilon, _ = build_prior(measurement, None)
     found = discover_in_pixel(measurement, prior, epsilon)
-    strongest = max(found.findings, key=lambda finding: finding.gain, default=None)
-    node, kind, gain = "", "", 0.0
+    strongest = max(found.findings, key=lambda finding: finding.term.chosen.gain, default=None)
+    node, kind, gain, verdict = "", "", 0.0, found.claim.verdict
     if strongest is not None:
-        node, kind, gain = strongest.node, strongest.kind, sum(finding.gain for finding in found.findings)
+        gain = sum(finding.term.chosen.gain for finding in found.findings)
+        node, kind, verdict = strongest.node, strongest.kind, strongest.term.claim.verdict
     elif any(item.form == "line" for item in found.disturbances):
-        node, kind, gain = "sensor", "sine", math.nan
+        node, kind, gain, verdict = "sensor", "curve", math.nan, "instrument"
     hidden = case.causes[-1] if case.causes else ""
-    return Answer(case.seed, hidden, node, kind, gain, found.error_before, found.error_after, found.elapsed_s)
+    return Answer(case.seed, hidden, node, kind, verdict, gain, found.error_before, found.error_after, found.elapsed_s)
 
 
 def format_table(answers: Iterable[Answer]) -> str:
@@ -105,10 +107,12 @@ def format_table(answers: Iterable[Answer]) -> str:
         lines.append(f"| held-out gain, median | {gains[len(gains) // 2]:.2f} of {len(gains)} | ≥ 0.8 |")
     seconds = sorted(each.elapsed_s for each in every)
     lines += [f"| time, median and largest | {seconds[len(seconds) // 2]:.0f} s, {seconds[-1]:.0f} s | ≤ 5 min |", ""]
-    lines += ["| hidden | found: node, class, held-out gain |", "|---|---|"]
+    lines += ["| hidden | found: node, class, verdict, held-out gain |", "|---|---|"]
     for name in EXPECTED:
         own = [each for each in hidden if each.hidden == name]
-        found = "; ".join(f"{each.node} {each.kind} {each.gain:.2f}" if each.node else "nothing" for each in own)
+        found = "; ".join(
+            f"{each.node} {each.kind} {each.verdict} {each.gain:.2f}" if each.node else "nothing" for each in own
+        )
         if own:
             lines.append(f"| {name} | {found} |")
     return "\n".join(lines) + "\n"

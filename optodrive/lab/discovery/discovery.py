@@ -2,21 +2,21 @@
 
 Theory of operation. 1. The parameters are fitted, first with filters that keep the states near the data, then in free
 run. 2. Filters of several tightness give the states; `screening` compares all places, variables and factors on what no
-parameter can do, by cross-validation over blocks of samples. 3. The best formulas of the best places are fitted,
-together with all parameters, by their prediction errors and then in free run; the simplest of those that do as well as
-the best is proposed. 4. It is a finding if it predicts held-out blocks, which no choice has used, better than the model
-without it, by more than the noise can explain. 5. Steps 2 to 4 are repeated with the finding in the model.
+parameter can do. 3. The best formulas of the best places are fitted, together with all parameters, by their prediction
+errors. 4. The best of these are fitted in free run, once without each part that is held out (`held_out`), and compared
+there (`judgement`), where nothing interpolates. 5. The model is extended by a term that gains in every such part, and
+steps 2 to 4 are repeated. What is claimed of it is decided in `lab.inference`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.discovery.blocks import Data, split, thin
-from optodrive.lab.discovery.evidence import compute_probability, find_p_value
 from optodrive.lab.discovery.fitting import (
     Point,
     Simulation,
@@ -24,19 +24,14 @@ from optodrive.lab.discovery.fitting import (
     choose_step,
     estimate_noise,
     fit,
-    free_run_rmse,
     output_sizes,
 )
-from optodrive.lab.discovery.formula_text import build_terms
-from optodrive.lab.discovery.model import Discovery, OdeModel, Record
-from optodrive.lab.discovery.proposals import Proposal, Step, choose_simplest, describe_steps
-from optodrive.lab.discovery.screening import (
-    Filtered,
-    Screened,
-    list_places,
-    rank_formulas,
-    screen,
-)
+from optodrive.lab.discovery.forms import CURVE, Form
+from optodrive.lab.discovery.held_out import choose_splits, prepare_search
+from optodrive.lab.discovery.judgement import Judge, Measured, Proposal, name_form
+from optodrive.lab.discovery.model import Curve, Discovery, Finding, OdeModel, Record
+from optodrive.lab.discovery.screening import Filtered, Place, Screened, list_places, rank_formulas, screen
+from optodrive.lab.inference.claim import MAX_NO_EFFECT, NOTHING_SHOWN, Claim, TermClaim, combine_claims
 
 TIGHTNESS = (0.3, 0.03, 0.003)
 """Model errors that the filters assume, relative to the rms of each state's rate."""
@@ -50,20 +45,20 @@ START_UNCERTAINTY = 0.3
 RATE_MEMORY = 10.0
 """Samples over which a model error persists that the filters assume."""
 MAX_TERMS = 4
-PLACES, PLACES_FROM_REST, FORMULAS = 3, 7, 5
-"""Places whose formulas are fitted, with a filter and without one, and how many of each.
+PLACES, PLACES_FROM_REST, PLAIN_PLACES, FORMULAS = 3, 7, 2, 5
+"""Places whose formulas are fitted, with a filter and without one, further ones without a factor, and how many of each.
 
 A large effect leads free runs away from where it acts, and the first-order comparison of places with them.
 """
-ATTEMPTS = 3
-"""Places whose best formula is judged by held-out free runs, one after another, until one predicts them."""
+JUDGED, JUDGED_PER_PLACE = 8, 4
+"""Formulas that are judged on what is held out."""
 REFINEMENTS = 2
 """How often formulas are ranked again along the free runs with the best one."""
 MIN_ERROR = 1e-3
 """Error of a model, relative to the output, that the integration and the inputs' interpolation may cause."""
 MIN_REDUCTION, MIN_FURTHER_REDUCTION = 0.005, 0.03
 """Reduction of the held-out RMSE of the first term, and of further ones, below which none is reported."""
-MIN_FURTHER_GAIN, MIN_FURTHER_GAIN_WHITE = 0.01, 0.1
+MIN_FURTHER_GAIN, MIN_FURTHER_GAIN_WHITE = 0.05, 0.1
 """Share of the first model's avoidable error that a further term removes at least, where noise is estimated and known.
 
 Where it is known a little more than the first formula's form is seen, which is no term of its own.
@@ -71,77 +66,83 @@ Where it is known a little more than the first formula's form is seen, which is 
 MIN_GAIN_WHITE = 0.5
 """Share of the avoidable error that the first term removes at least, where noise is known: one that leaves more than it
 removes is not what is missing."""
-MAX_P = 1e-3
 MIN_SQUARES = 12.0
 """Squares in units of noise that a curve removes in cross-validation, below which no formula is fitted."""
+UNCOMPUTABLE = (np.linalg.LinAlgError, ArithmeticError, ValueError)
+"""Errors of one candidate, which it alone is lost by."""
+MIN_MISSING = 1.0 - MAX_NO_EFFECT
 Progress = Callable[[str, float], None]
 
 
-def discover(
-    model: OdeModel,
-    train: Sequence[Record],
-    seed: int = 0,
-    progress: Progress = lambda stage, fraction: None,
-    held_out: Sequence[int] = (),
-) -> Discovery:
+def discover(model: OdeModel, train: Sequence[Record], progress: Progress = lambda stage, fraction: None) -> Discovery:
     """Return the terms that a simulation lacks, and the model extended by them.
 
-    held_out: numbers of records that are held out as a whole, parts of all records by default; progress: receives the
-    name of each stage and the share of the work that is done. seed: kept for methods that draw; this one does not.
-    Raises InputError for records that do not fit the model.
+    progress: receives the name of each stage and the share of the work that is done. Raises InputError for records that
+    do not fit the model.
     """
-    del seed
     if not train:
         raise InputError("train", "no record", "at least one record")
     for record in train:
         record.check(model)
-    return _Search(model, split(train, held_out), progress).run()
+    return _Search(model, train, progress).run()
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A term by which the model is extended, the claim on it, all forms that were judged, and where they were found."""
+
+    proposal: Proposal
+    term: TermClaim
+    judged: Sequence[Proposal]
+    filtered: Sequence[Filtered]
 
 
 class _Search:
     """One discovery."""
 
-    def __init__(self, model: OdeModel, data: Data, progress: Progress) -> None:
-        self.model, self.data, self.few, self.progress = model, data, thin(data), progress
+    def __init__(self, model: OdeModel, records: Sequence[Record], progress: Progress) -> None:
+        self.model, self.records, self.progress = model, records, progress
+        self.splits = choose_splits(records)
+        self.few = prepare_search(records, self.splits[0])
         progress("compiling", 0.0)
         self.simulation = Simulation(model, hold=0 if model.from_rest else 1)
-        self.is_white = all(record.whiten is not None for record in data.records)
-        self.sizes = np.ones(len(model.outputs)) if self.is_white else output_sizes(data.records)
-        self.noise = np.maximum(estimate_noise(data.records), 1e-4 * self.sizes * (not self.is_white))
-        self.min_further_gain = MIN_FURTHER_GAIN_WHITE if self.is_white else MIN_FURTHER_GAIN
+        noise = estimate_noise(records)
+        self.is_white = all(record.whiten is not None for record in records)
+        self.noise = noise if self.is_white else np.maximum(noise, 1e-4 * output_sizes(records))
+        self.judge = Judge(self.simulation, records, self.splits, self.noise)
         self.state_sizes = np.ones(len(model.states))
         self.rate_sizes = np.ones(len(model.states))
 
     def run(self) -> Discovery:
         """Return the answer."""
-        base = self._fit_base()
-        base_rmse = rmse = self._held_out_rmse(base)
-        point, found = base, list[Step]()
+        first = self._fit_base()
+        base = current = self.judge.measure([[first]] * len(self.splits))
+        found, claims = list[Found](), list[Claim]()
         for number in range(MAX_TERMS):
             self.progress(f"term {number + 1}", 0.2 + 0.16 * number)
-            if float(np.max(rmse / self.sizes)) < MIN_ERROR:
+            if current.rmse[0, 1] < MIN_ERROR and not self.is_white:
                 break
-            if found and self._share_left(base_rmse, rmse) < self.min_further_gain:
+            if (
+                found
+                and self.is_white
+                and (current.rmse[0, 1] - 1.0) < MIN_FURTHER_GAIN_WHITE * (base.rmse[0, 1] - 1.0)
+            ):
                 break
-            min_reduction = MIN_FURTHER_REDUCTION if found else MIN_REDUCTION
-            if self.is_white and not found:
-                min_reduction = max(min_reduction, MIN_GAIN_WHITE * (1.0 - 1.0 / max(float(rmse[0]), 1.0)))
-            proposal, probability = self._extend(point, min_reduction)
-            if proposal is None:
+            further = self._extend(base, current)
+            if further is None:
                 break
-            shorter_rmse = self._held_out_rmse(proposal.point)
-            floor = np.minimum(1.0 if self.is_white else self.noise, shorter_rmse)
-            gain = float(np.max((rmse - shorter_rmse) / np.maximum(base_rmse - floor, 1e-300)))
-            if found and gain < self.min_further_gain:
+            if not self._is_enough(base, current, further.proposal, bool(found)) or further.term.missing < MIN_MISSING:
+                claims += [] if found else [further.term.claim]
                 break
-            point, rmse = proposal.point, shorter_rmse
-            found.append(Step(proposal, gain, probability))
+            current = further.proposal.measured or current
+            found.append(further)
+        if len(found) > 1:
+            current, found = self._reconsider(base, current, found)
         self.progress("final fit", 0.85)
-        everything = [*self.data.fitted, *self.data.held_out]
-        final_base = self._fit_free(base, everything)
-        final = self._fit_free(point, everything) if found else final_base
-        filtered = self._filter(final, 0.0 if self.model.from_rest else TIGHTNESS[1])
-        findings = describe_steps(self.model, final, found, filtered, self.few.fitted)
+        everything = [np.full(len(record.t_s), True) for record in self.records]
+        final_base = self.judge.fit([base.points[0]], everything, 15)
+        final = self.judge.fit([current.points[0]], everything, 15) if found else final_base
+        findings = self._describe(final, found)
         self.progress("done", 1.0)
         simulation = self.simulation
 
@@ -149,10 +150,14 @@ class _Search:
             record.check(self.model)
             return simulation.run(record, final)[0]
 
+        scale = 1.0 if self.is_white else float(np.sqrt(np.mean(self.judge.sizes**2)))
         return Discovery(
             findings,
-            float(np.sqrt(np.mean(base_rmse**2))),
-            float(np.sqrt(np.mean(rmse**2))),
+            combine_claims([each.term.claim for each in findings] or claims or [NOTHING_SHOWN], {}, False),
+            self.splits[0].name,
+            scale * float(base.rmse[0, 1]),
+            scale * float(current.rmse[0, 1]),
+            scale * self.judge.floor,
             dict(zip(simulation.names, final.parameters.tolist(), strict=True)),
             dict(zip(simulation.names, final_base.parameters.tolist(), strict=True)),
             simulate,
@@ -163,13 +168,13 @@ class _Search:
     def _fit_base(self) -> Point:
         """Return the fitted parameters, and settle the inputs' interpolation and the integration step."""
         simulation = self.simulation
-        dt_s = float(np.median(np.concatenate([np.diff(r.t_s) for r in self.data.records])))
+        dt_s = float(np.median(np.concatenate([np.diff(r.t_s) for r in self.records])))
         simulation.h_max = dt_s
         start = Point(simulation.start, Terms.none())
-        simulation.h_max = choose_step(simulation, self.few.records, start)
+        simulation.h_max = choose_step(simulation, self.records, start)
         self._measure_sizes(start)
         if self.model.from_rest:
-            return self._fit_free(start, self.data.fitted)
+            return self.judge.fit([start], self.splits[0].fitted, 15)
         best: tuple[float, int, Point] | None = None
         for hold in (0, 1, 2) if self.model.inputs else (0,):
             simulation.hold, point, loss = hold, start, np.inf
@@ -182,11 +187,8 @@ class _Search:
             self.progress("parameters", 0.02 + 0.04 * hold)
         assert best is not None  # noqa: S101
         simulation.hold, point = best[1], best[2]
-        simulation.h_max = choose_step(simulation, self.few.records, point)
-        trials = [start, point, self._fit_free(point, self.data.fitted)]
-        masks = self.data.masks(self.data.fitted)
-        losses = [np.sum((free_run_rmse(simulation, self.data.records, p, masks) / self.sizes) ** 2) for p in trials]
-        return trials[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
+        simulation.h_max = choose_step(simulation, self.records, point)
+        return self.judge.fit([point, start], self.splits[0].fitted, 15)
 
     def _measure_sizes(self, point: Point) -> None:
         """Note rms of states and of their rates along the filtered records."""
@@ -203,7 +205,7 @@ class _Search:
     def _filter(self, point: Point, tightness: float) -> list[Filtered]:
         """Return the search records, filtered under model errors of this relative size, and linearised."""
         simulation, filtered = self.simulation, []
-        for record, block in zip(self.few.records, self.few.block, strict=True):
+        for record, fold in self.few:
             dt_s = float(np.median(np.diff(record.t_s)))
             noise_rate = (tightness * self.rate_sizes) ** 2 * RATE_MEMORY * dt_s
             start_sigma = (0.0 if self.model.from_rest else START_UNCERTAINTY) * self.state_sizes
@@ -216,111 +218,191 @@ class _Search:
                 weights = np.where(measured, 1.0 / np.sqrt(np.where(measured, line.variance, 1.0)), 0.0)
             columns = line.propagate(line.forcing, line.direct, start)
             variables = simulation.list_variables(record, point, line.states)
-            filtered.append(Filtered(record, line, columns, block, weights, *variables))
+            filtered.append(Filtered(record, line, columns, fold, weights, *variables))
         return filtered
 
     def _fit_filtered(self, point: Point, filtered: Sequence[Filtered], evaluations: int = 15) -> tuple[Point, float]:
-        """Return the point that minimises the prediction errors in fitted blocks, with the filters' gains kept."""
-        masks = self.few.masks(self.few.fitted)
-        weights = [each.weights * mask[:, None] for each, mask in zip(filtered, masks, strict=True)]
+        """Return the point that minimises the prediction errors where fitted, with the filters' gains kept."""
+        weights = [each.weights * (each.fold >= 0)[:, None] for each in filtered]
         gains, records = [each.line.gains for each in filtered], [each.record for each in filtered]
         return fit(self.simulation, records, point, weights, gains, evaluations)
 
-    def _fit_free(self, point: Point, blocks: Sequence[int], evaluations: int = 15) -> Point:
-        """Return the point that minimises the error of free runs in these blocks."""
-        masks = self.data.masks(blocks)
-        weights = [np.outer(mask, 1.0 / self.sizes) for mask in masks]
-        return fit(self.simulation, self.data.records, point, weights, evaluations=evaluations)[0]
-
-    def _held_out_rmse(self, point: Point) -> FloatArray:
-        """Return the RMSE of free runs in held-out blocks, of each output [o], or of all in units of noise [1]."""
-        rmse = free_run_rmse(self.simulation, self.data.records, point, self.data.masks(self.data.held_out))
-        return np.sqrt(np.mean(rmse**2, keepdims=True)) if self.is_white else rmse
-
-    def _share_left(self, base_rmse: FloatArray, rmse: FloatArray) -> float:
-        """Return the share of the first model's avoidable error that is left, or 1 where noise is estimated."""
-        return float((rmse[0] - 1.0) / max(base_rmse[0] - 1.0, 1e-9)) if self.is_white else 1.0
-
     # One further term
 
-    def _extend(self, point: Point, min_reduction: float) -> tuple[Proposal | None, float]:
-        """Return the best further term, None if there is no evidence for one, and its probability."""
-        base, filtered, ranked = self._screen(point)
+    def _extend(self, base: Measured, current: Measured) -> Found | None:
+        """Return the best further term, None if there is no form of one."""
+        point = current.points[0]
+        start, filtered, ranked = self._screen(point)
         if not ranked or ranked[0].loss >= 1.0:
-            return None, 0.0
-        if self.is_white and (1.0 - ranked[0].loss) * ranked[0].total < MIN_SQUARES:
-            return None, 0.0
-        base, base_loss = self._fit_filtered(base, filtered, 5)
-        proposals = []
+            return None
+        time = len(self.model.states) + len(self.model.inputs)
+        changes = [each for each in ranked if time in (each.at.variable, each.at.factor)]
+        # The curve of a term shows what its formula lacks at its own place.
+        found = {tuple(row[[0, 2, 3]]) for row in point.terms.table}
+        ranked = [
+            each
+            for each in ranked
+            if each not in changes and (each.at.place, each.at.variable, each.at.factor) not in found
+        ]
         places, evaluations = (PLACES_FROM_REST, 3) if self.model.from_rest else (PLACES, 5)
-        for screened in ranked[:places]:
-            for candidate in rank_formulas(screened, FORMULAS):
-                terms = point.terms.extend(build_terms(candidate, screened.nodes))
-                longer, loss = self._fit_filtered(base.with_terms(terms), filtered, evaluations)
-                proposals.append(Proposal(screened, candidate, longer, loss))
-        for _ in range(ATTEMPTS if self.model.from_rest else 1):
-            if not proposals:
-                break
-            if self.model.from_rest:
-                for _ in range(REFINEMENTS):
+        plain = [each for each in ranked[places:] if each.at.factor < 0]
+        shown = ranked[:places] + plain[:PLAIN_PLACES] + changes[:1]
+        if self.is_white:
+            shown = [each for each in shown if (1.0 - each.loss) * each.total >= MIN_SQUARES]
+        start, _ = self._fit_filtered(start, filtered, 5)
+        proposals = list[Proposal]()
+        for screened in shown:
+            proposals += self._propose(screened, start, point.terms, filtered, evaluations)
+        if self.model.from_rest:
+            for _ in range(REFINEMENTS if proposals else 0):
+                with suppress(*UNCOMPUTABLE):
                     proposals += self._refine(point, min(proposals, key=lambda p: p.loss))
-            chosen = choose_simplest(proposals, base_loss)
-            chosen, p_value = self._judge(point, base, filtered, chosen, min_reduction)
-            if p_value <= MAX_P:
-                return chosen, compute_probability(p_value)
-            proposals = [each for each in proposals if each.candidate.at != chosen.candidate.at]
-        return None, 0.0
+        judged = self._measure(current, self._choose_judged(proposals, {id(screened) for screened in changes}))
+        if not judged:
+            return None
+        chosen, term = self.judge.judge(base, current, judged, filtered, start)
+        return Found(chosen, term, judged, filtered)
 
-    def _judge(
-        self, point: Point, base: Point, filtered: Sequence[Filtered], chosen: Proposal, min_reduction: float
-    ) -> tuple[Proposal, float]:
-        """Return the proposal as fitted in free run, and its p value, 1 if held-out free runs gain too little."""
-        p_value = find_p_value(self.simulation, self.few, filtered, base, chosen.point)
-        if p_value > MAX_P:
-            return chosen, 1.0
-        # Numbers that fit one step ahead need not fit free runs best; those of a chaotic system fit only the former.
-        masks, records = self.data.masks(self.data.fitted), self.data.records
-        trials = [chosen.point, self._fit_free(chosen.point, self.data.fitted, 8)]
-        losses = [np.sum((free_run_rmse(self.simulation, records, p, masks) / self.sizes) ** 2) for p in trials]
-        fitted = replace(chosen, point=trials[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))])
-        before, after = self._held_out_rmse(point) / self.sizes, self._held_out_rmse(fitted.point) / self.sizes
-        is_better = np.sum(after**2) < np.sum(before**2) * (1.0 - min_reduction) ** 2
-        return fitted, p_value if is_better else 1.0
+    def _propose(
+        self, screened: Screened, start: Point, terms: Terms, filtered: Sequence[Filtered], evaluations: int
+    ) -> list[Proposal]:
+        """Return the best formulas of a place, fitted by their prediction errors."""
+        proposals = list[Proposal]()
+        with suppress(*UNCOMPUTABLE):
+            for candidate in rank_formulas(screened, FORMULAS):
+                with suppress(*UNCOMPUTABLE):
+                    longer = start.with_terms(terms.extend(candidate.build_terms()))
+                    proposals.append(Proposal(candidate, *self._fit_filtered(longer, filtered, evaluations)))
+        return proposals
 
     def _refine(self, point: Point, best: Proposal) -> list[Proposal]:
         """Return formulas at the place of the best one, ranked along its own free runs, nearer to the data."""
         frozen = best.point.terms.freeze()
         filtered = self._filter(best.point.with_terms(frozen), 0.0)
-        rest = screen(filtered, best.candidate.at, self.few.fitted, len(self.model.states))
+        rest = screen(filtered, best.candidate.screened.at, len(self.model.states))
         if rest is None:
             return []
-        proposals = []
-        for candidate in rank_formulas(rest.add_curve(best.evaluate(rest.nodes)), FORMULAS):
-            terms = point.terms.extend(build_terms(candidate, rest.nodes))
-            longer, loss = self._fit_filtered(best.point.with_terms(terms), filtered, 20)
-            proposals.append(Proposal(best.screened, candidate, longer, loss))
-        return proposals
+        return self._propose(rest.add_curve(best.evaluate(rest.nodes)), best.point, point.terms, filtered, 20)
+
+    @staticmethod
+    def _choose_judged(proposals: Sequence[Proposal], changes: set[int]) -> list[Proposal]:
+        """Return the best formulas, few of each place, and two that change with time."""
+        chosen, counts = list[Proposal](), dict[Place, int]()
+        for each in sorted(proposals, key=lambda p: p.loss):
+            at = each.candidate.screened.at
+            is_change = id(each.candidate.screened) in changes
+            room = 2 if is_change else JUDGED_PER_PLACE
+            if counts.get(at, 0) < room and (is_change or len(chosen) < JUDGED):
+                chosen.append(each)
+                counts[at] = counts.get(at, 0) + 1
+        return chosen
+
+    def _measure(self, current: Measured, proposals: Sequence[Proposal]) -> list[Proposal]:
+        """Return the proposals as measured in free runs, fitted in every split from the model without their term."""
+        measured = list[Proposal]()
+        for each in proposals:
+            with suppress(*UNCOMPUTABLE):
+                term = each.point.terms[-1:]
+                starts = [[point.with_terms(point.terms.extend(term))] for point in current.points]
+                starts[0].insert(0, each.point)
+                measured.append(replace(each, measured=self.judge.measure(starts)))
+        return measured
+
+    def _reconsider(self, base: Measured, current: Measured, found: Sequence[Found]) -> tuple[Measured, list[Found]]:
+        """Return the model and its terms, each judged again beside all others, which may have stood in for it."""
+        kept = list(found)
+        for number in range(len(found)):
+            self.progress(f"term {number + 1} beside the others", 0.8)
+            each = kept.pop(0)  # the first row of the table, and then the last
+            turned = [[point.with_terms(point.terms[1:].extend(point.terms[:1]))] for point in current.points]
+            others = self.judge.measure([[point.with_terms(point.terms[1:])] for point in current.points])
+            first, alone = (
+                turned[0][0],
+                [trial for trial in each.judged if trial.candidate is not each.proposal.candidate],
+            )
+            trials = [
+                replace(trial, point=first.with_terms(first.terms[:-1].extend(trial.point.terms[-1:])))
+                for trial in alone
+            ]
+            own = replace(each.proposal, point=first, measured=self.judge.measure(turned))
+            judged = [own, *self._measure(others, trials)]
+            chosen, term = self.judge.judge(base, others, judged, each.filtered, None)
+            if self._is_enough(base, others, chosen, True):
+                current = chosen.measured or current
+                kept.append(replace(each, proposal=chosen, term=term))
+            else:
+                current = others
+        return current, kept
+
+    def _is_enough(self, base: Measured, current: Measured, proposal: Proposal, is_further: bool) -> bool:
+        """Return whether a term removes enough of the error and helps in every split."""
+        if proposal.measured is None:
+            return False
+        before, after = current.rmse[0, 1], proposal.measured.rmse[0, 1]
+        gains = self.judge.measure_gains(base, current, proposal.measured)
+        shares = [each.held_out for each in gains if is_further or each.split == self.splits[0].name]
+        if is_further and proposal.candidate.form.kind == CURVE:
+            return False  # beside a term it follows what that one leaves
+        minimum = MIN_FURTHER_REDUCTION if is_further else MIN_REDUCTION
+        minimum_gain = MIN_FURTHER_GAIN if is_further else 0.0
+        if self.is_white:
+            minimum_gain = MIN_FURTHER_GAIN_WHITE if is_further else MIN_GAIN_WHITE
+        return (
+            after < before * (1.0 - minimum)
+            and min(shares, default=0.0) >= minimum_gain
+            and all(each.held_out > 0.0 for each in gains)
+        )
 
     def _screen(self, point: Point) -> tuple[Point, list[Filtered], list[Screened]]:
         """Return the places in order of evidence, with the filter that shows it most clearly, and its parameters."""
-        best: tuple[Point, list[Filtered], list[Screened]] = (point, [], [])
+        best: tuple[Point, list[Filtered], list[Screened]] | None = None
         for tightness in (0.0,) if self.model.from_rest else (*TIGHTNESS, 0.0):
-            refitted, _ = self._fit_filtered(point, self._filter(point, tightness), 5)
-            filtered, found = self._screen_filtered(refitted, tightness)
-            if found and (not best[2] or 1.0 - found[0].loss > LOOSER * (1.0 - best[2][0].loss)):
-                best = (refitted, filtered, found)
-        return best
+            with suppress(*UNCOMPUTABLE):
+                refitted, _ = self._fit_filtered(point, self._filter(point, tightness), 5)
+                filtered, found = self._screen_filtered(refitted, tightness)
+                gain = -1.0 if not found else 1.0 - found[0].loss
+                if best is None or gain > (LOOSER * (1.0 - best[2][0].loss) if best[2] else -1.0):
+                    best = (refitted, filtered, found)
+        return best or (point, [], [])
 
     def _screen_filtered(self, point: Point, tightness: float) -> tuple[list[Filtered], list[Screened]]:
         """Return the filtered records, and the places in order of evidence, none where the model diverges."""
-        filtered = self._filter(point, tightness)
+        filtered, found = self._filter(point, tightness), list[Screened]()
         if not all(np.isfinite(each.line.predicted).all() for each in filtered):
             return filtered, []
-        found = [
-            screened
-            for place in list_places(self.simulation, filtered, point)
+        for place in list_places(self.simulation, filtered, point):
             # A term in an output also changes how strongly a filter follows the data: only free runs judge it.
-            if (place.place < len(self.model.states) or tightness == 0.0)
-            and (screened := screen(filtered, place, self.few.fitted, len(self.model.states))) is not None
-        ]
+            if place.place < len(self.model.states) or tightness == 0.0:
+                with suppress(*UNCOMPUTABLE):
+                    screened = screen(filtered, place, len(self.model.states))
+                    found += [] if screened is None or not np.isfinite(screened.loss) else [screened]
         return filtered, sorted(found, key=lambda each: each.loss)
+
+    # The answer
+
+    def _describe(self, final: Point, found: Sequence[Found]) -> tuple[Finding, ...]:
+        """Return the findings with the numbers of the final fit.
+
+        The curve is the formula plus what the data still ask for there; its band is that of a curve without a formula.
+        """
+        if not found:
+            return ()
+        filtered, findings = self._filter(final, 0.0 if self.model.from_rest else TIGHTNESS[1]), list[Finding]()
+        for row, each in enumerate(found):
+            candidate, term, values = each.proposal.candidate, each.term, final.terms.values[row]
+            screened = candidate.screened
+            with suppress(*UNCOMPUTABLE):
+                screened = screen(filtered, screened.at, len(self.model.states)) or screened
+            evaluate = partial(_evaluate, candidate.form, values)
+            rest, own = screened.curve, evaluate(screened.nodes)
+            curve = Curve(rest.x, own + rest.y, own + rest.low, own + rest.high, evaluate)
+            named = name_form(self.simulation, candidate, values)
+            chosen = replace(named, kind=term.chosen.kind, probability=term.chosen.probability, gain=term.chosen.gain)
+            forms = tuple(chosen if form is term.chosen else form for form in term.forms)
+            findings.append(Finding(replace(term, chosen=chosen, forms=forms), curve))
+        return tuple(findings)
+
+
+def _evaluate(form: Form, values: FloatArray, z: FloatArray) -> FloatArray:
+    """Return a formula with its numbers [3] at z [n]."""
+    return np.asarray(values[0] * form.evaluate(z, values[1], values[2]))

@@ -12,6 +12,8 @@ from optodrive.lab.discovery.integration import STEP, Kernels, allocate_work, bu
 from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.model import OdeModel, Record
 
+Gains = Sequence[FloatArray] | None
+"""Gains [m, n, o] by which a filter corrects the states, per record; None for free runs."""
 DIVERGED = 1e3
 """Residual in standard deviations of an output that stands for a diverged one."""
 CONVERGED = 1e-3
@@ -43,6 +45,9 @@ class Terms:
     def freeze(self) -> "Terms":
         """Return the same terms, none of whose numbers is fitted."""
         return replace(self, free=np.zeros_like(self.free))
+
+    def __getitem__(self, rows: slice) -> "Terms":
+        return Terms(*(getattr(self, f)[rows] for f in Terms.__dataclass_fields__))
 
     def __len__(self) -> int:
         return len(self.table)
@@ -226,7 +231,7 @@ def fit(
     records: Sequence[Record],
     point: Point,
     weights: Sequence[FloatArray],
-    gains: Sequence[FloatArray] | None = None,
+    gains: Gains = None,
     evaluations: int = 30,
     on_progress: Callable[[], None] = lambda: None,
 ) -> tuple[Point, float]:
@@ -316,19 +321,20 @@ def output_sizes(records: Sequence[Record]) -> FloatArray:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
-def free_run_rmse(
-    simulation: Simulation, records: Sequence[Record], point: Point, masks: Sequence[BoolArray]
-) -> FloatArray:
-    """Return the RMSE of each output [o] in free run over the samples [m] of the masks, infinite after divergence."""
-    total, count = np.zeros(len(simulation.model.outputs)), np.zeros(len(simulation.model.outputs))
-    for record, mask in zip(records, masks, strict=True):
-        predicted, _ = simulation.run(record, point)
-        use = np.isfinite(record.outputs) & mask[:, None]
-        error = np.where(use, weigh(record, record.outputs - predicted, np.ones_like(predicted)), 0.0)
-        total += np.sum(np.where(np.isnan(error), np.inf, error) ** 2, axis=0)
-        count += use.sum(axis=0)
-    result: FloatArray = np.sqrt(total / np.maximum(count, 1.0))
-    return result
+def run_errors(
+    simulation: Simulation, records: Sequence[Record], point: Point, sizes: FloatArray, gains: Gains = None
+) -> list[FloatArray]:
+    """Return the errors [m, o] of each record, whitened or in units of sizes [o], 0 where nothing was measured.
+
+    gains: as of `Simulation.run`, None for free runs
+    """
+    errors = []
+    for k, record in enumerate(records):
+        predicted, _ = simulation.run(record, point, None if gains is None else gains[k])
+        error = weigh(record, record.outputs - predicted, np.broadcast_to(1.0 / sizes, predicted.shape))
+        error = np.clip(np.nan_to_num(error, nan=DIVERGED), -DIVERGED, DIVERGED)
+        errors.append(np.where(np.isfinite(record.outputs), error, 0.0))
+    return errors
 
 
 def choose_step(simulation: Simulation, records: Sequence[Record], point: Point) -> float:

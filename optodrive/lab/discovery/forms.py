@@ -1,6 +1,6 @@
 """Library of formulas: functions of one variable with at most two numbers inside, by which a term may be written."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, exp, pi, sin, sqrt, tanh
 
 import numpy as np
@@ -25,11 +25,18 @@ from optodrive.core.types.arrays import FloatArray
     DECAY,
 ) = range(14)
 MAX_EXPONENT = 50.0
+CURVE, CHANGE = "curve", "change with time"
+"""Kinds that are no names: what follows the data without a formula of physics, and what no state explains."""
+NAMELESS = {CURVE: "a curve without a formula", CHANGE: "changes with time: not explained"}
+MAX_SHARE_OF_FRICTION = 0.1
+"""Scale of a tanh, relative to the variable's largest value, below which it is dry friction."""
+SMOOTHING = {SATURATION: 2e-3, EXPONENTIAL: 1e-2, BUMP: 1e-2, DECAY: 1e-4}
+"""Smallest inner number that is a scale, relative to the variable's largest value."""
 
 
 @kernel
 def evaluate_form(form: int, z: float, first: float, second: float) -> float:
-    """Return the value of a form at z. first, second: its inner numbers, see `FORMS`."""
+    """Return the value of a form at z. first, second: its inner numbers, see `list_forms`."""
     if form == POWER:
         value = 1.0
         for _ in range(int(first)):
@@ -81,8 +88,33 @@ class Form:
         """Return the values [n] at z [n]."""
         return np.array([evaluate_form(self.code, float(each), first, second) for each in z])
 
+    def limit(self, nodes: FloatArray, first: float) -> tuple[float, float]:
+        """Return limits of the first inner number from the variable's nodes."""
+        size, span = float(np.abs(nodes).max()), float(nodes[-1] - nodes[0])
+        edge = SMOOTHING.get(self.code, 0.0) * size
+        if self.code == SATURATION:
+            return edge, 5.0 * size
+        if self.code == EXPONENTIAL:
+            return (edge, np.inf) if first > 0.0 else (-np.inf, -edge)
+        if self.code in (SINE, COSINE):
+            return 0.3 * first, 3.0 * first
+        if self.code == DECAY:
+            return edge, 10.0 * size
+        return float(nodes[0]) - 0.5 * span, float(nodes[-1]) + 0.5 * span
 
-KIND_OF_POWER = {0: "constant", 1: "linear", 2: "quadratic", 3: "cubic", 4: "quartic", 5: "quintic"}
+    def settle(self, first: float, size: float) -> "Form":
+        """Return the form with the name that its fitted inner number gives it. size: the variable's largest value."""
+        if self.code != SATURATION:
+            return self
+        if first < MAX_SHARE_OF_FRICTION * size:
+            return replace(self, kind="dry friction", text="sign({z})")
+        return replace(self, kind="saturation", text="tanh({z} / {a})")
+
+    def describe(self, values: FloatArray, variable: str, factor: str = "") -> str:
+        """Return one term as a formula, such as -7.41e+05 x^3. values: [3] amplitude and inner numbers."""
+        amplitude, first, second = (f"{value:.4g}" for value in values)
+        text = self.text.format(z=variable, a=first, b=second)
+        return " ".join(part for part in (amplitude, factor, text) if part)
 
 
 def list_forms(z: FloatArray) -> list[Form]:
@@ -92,16 +124,17 @@ def list_forms(z: FloatArray) -> list[Form]:
     def starts(first: FloatArray, second: float = 0.0) -> FloatArray:
         return np.column_stack([first, np.full(len(first), second)])
 
+    powers = {"constant": "", "linear": "{z}", "quadratic": "{z}^2", "cubic": "{z}^3", "fourth power": "{z}^4"}
     forms = [
-        Form(POWER, starts(np.array([float(power)])), 0, KIND_OF_POWER[power], "" if power == 0 else f"{{z}}^{power}")
-        for power in range(6)
+        Form(POWER, starts(np.array([float(power)])), 0, kind, text)
+        for power, (kind, text) in enumerate(powers.items())
     ]
     inner = z[1:-1]
     widths = span * np.geomspace(0.05, 4.0, 14)
     if z[0] < 0.0 < z[-1]:
         forms += [
             Form(ABSOLUTE, starts(np.zeros(1)), 0, "absolute value", "|{z}|"),
-            Form(SIGNED_POWER, starts(np.array([2.0])), 0, "quadratic friction", "{z} |{z}|"),
+            Form(SIGNED_POWER, starts(np.array([2.0])), 0, "quadratic drag", "{z} |{z}|"),
             Form(SIGNED_POWER, starts(np.array([0.5])), 0, "square root", "sign({z}) sqrt|{z}|"),
             Form(SATURATION, starts(size * np.array([0.01])), 1, "dry friction", "sign({z})"),
             Form(SATURATION, starts(size * np.geomspace(0.1, 1.0, 6)), 1, "saturation", "tanh({z} / {a})"),
@@ -114,19 +147,15 @@ def list_forms(z: FloatArray) -> list[Form]:
             Form(CLIP, starts(inner), 1, "saturation", "min({z}, {a})"),
             Form(DECAY, starts(np.concatenate([inner[inner < 0.5 * span], widths])), 1, "decay", "exp(-{z} / {a})"),
         ]
-    forms += [
+    bumps = np.array([(centre, width * span) for centre in inner for width in (0.03, 0.08, 0.2)])
+    waves = starts(np.array([1.0, *(np.arange(1, 9) * pi / span)]))
+    return [
+        *forms,
         Form(EXPONENTIAL, starts(np.concatenate([widths, -widths])), 1, "exponential", "(exp({z} / {a}) - 1)"),
         Form(ABOVE, starts(inner), 1, "end stop", "max({z} - {a}, 0)"),
         Form(BELOW, starts(inner), 1, "end stop", "max({a} - {z}, 0)"),
-        Form(STEP, starts(inner, 0.01 * span), 1, "step", "step({z} - {a})"),
-        Form(SINE, starts(np.array([1.0, *(np.arange(1, 9) * pi / span)])), 1, "sine", "sin({a} {z})"),
-        Form(COSINE, starts(np.array([1.0, *(np.arange(1, 9) * pi / span)])), 1, "sine", "(cos({a} {z}) - 1)"),
-        Form(
-            BUMP,
-            np.array([(centre, width * span) for centre in inner for width in (0.03, 0.08, 0.2)]),
-            2,
-            "bump",
-            "exp(-(({z} - {a}) / {b})^2)",
-        ),
+        Form(STEP, starts(inner, 0.01 * span), 1, "threshold", "step({z} - {a})"),
+        Form(SINE, waves, 1, CURVE, "sin({a} {z})"),
+        Form(COSINE, waves, 1, CURVE, "(cos({a} {z}) - 1)"),
+        Form(BUMP, bumps, 2, CURVE, "exp(-(({z} - {a}) / {b})^2)"),
     ]
-    return forms

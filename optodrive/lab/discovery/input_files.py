@@ -35,6 +35,6 @@ def read_record(path: Path, model: OdeModel) -> Record:
     with open_table(path, (TIME, *model.inputs, *model.outputs)) as columns:
         table = columns.read_numbers(missing=model.outputs)
     try:
-        return Record(table[:, 0], table[:, 1 : 1 + inputs], table[:, 1 + inputs :])
+        return Record(table[:, 0], table[:, 1 : 1 + inputs], table[:, 1 + inputs :], name=path.stem)
     except InputError as error:
         raise InputError(f"{path}: {error.where}", error.value, error.expected) from None

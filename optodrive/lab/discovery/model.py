@@ -9,6 +9,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
+from optodrive.lab.inference.claim import Claim, TermClaim
 
 FIRST_ROWS = 100
 """Rows of measured outputs that `OdeModel.initial` receives at most."""
@@ -88,13 +89,14 @@ class Record:
 
     whiten: linear map of errors [m, o, k], zero where nothing was measured, to errors of independent noise of one, in
     the same shape; what differs from record to record, such as a zero, is marginalised by it. Without it, noise is
-    estimated and taken as white.
+    estimated and taken as white. name: by which the answer refers to the record
     """
 
     t_s: FloatArray
     inputs: FloatArray
     outputs: FloatArray
     whiten: Callable[[FloatArray], FloatArray] | None = None
+    name: str = ""
 
     def __post_init__(self) -> None:
         times = np.array(self.t_s, dtype=np.float64).reshape(-1)
@@ -166,33 +168,29 @@ class Curve:
 class Finding:
     """Term that the simulation lacks.
 
-    where: equation or output that it is added to; depends_on: names of the quantities; curve: the term against the
-    first of them, per unit of the second, if any; formula: text with numbers in the units of the model; kind: name of
-    the formula's class; gain: share of the avoidable held-out error that this term removes; probability: that the
-    term, in any form, is real
+    term: the claim on it; curve: against the first of its variables, per unit of the second variable, if any
     """
 
-    where: str
-    depends_on: tuple[str, ...]
+    term: TermClaim
     curve: Curve
-    formula: str
-    kind: str
-    gain: float
-    probability: float
 
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
     """Answer of `discover`.
 
-    base_rmse, extended_rmse: root mean square error over all outputs in free run, in the held-out parts, to which
-    neither model was fitted, in units of noise for records that state it; parameters: of the extended model, fitted to
-    everything; base_parameters: likewise without terms
+    findings: terms by which the simulation is extended; claim: of all, also where there is none; judged_by: what the
+    search did not see; base_rmse, extended_rmse: root mean square error over all outputs in free run there, in units of
+    noise for records that state it; noise: its expected size; parameters: of the extended model, fitted to everything;
+    base_parameters: likewise without terms
     """
 
     findings: tuple[Finding, ...]
+    claim: Claim
+    judged_by: str
     base_rmse: float
     extended_rmse: float
+    noise: float
     parameters: dict[str, float]
     base_parameters: dict[str, float]
     _simulate: Callable[[Record], FloatArray]

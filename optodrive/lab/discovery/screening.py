@@ -3,19 +3,19 @@
 Theory of operation. Along the states of the filter, a term g(z) at one place changes the predictions, to first order,
 by a linear functional of g. With g as a sum of hat functions of z, one linear recursion per hat gives a regression of
 the prediction errors on the hats' weights. The columns of all fitted parameters stand beside them, so a term only
-counts for what no parameter can do (orthogonality). The normal equations of each block of samples suffice: curves with
-a roughness penalty that is chosen by cross-validation over blocks, their band, and any formula, whose column is the
+counts for what no parameter can do (orthogonality). The normal equations of each fold of samples suffice: curves with
+a roughness penalty that is chosen by cross-validation over folds, their band, and any formula, whose column is the
 hats' columns times its values at the nodes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.lab.discovery.fitting import Point, Simulation, weigh
+from optodrive.lab.discovery.fitting import Point, Simulation, Terms, weigh
 from optodrive.lab.discovery.forms import Form, list_forms
 from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.model import Curve, Record
@@ -23,7 +23,6 @@ from optodrive.lab.discovery.model import Curve, Record
 EVEN_NODES = 21
 SHARES = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.3, 0.4])
 """Nodes at equal distances, and at these shares of the samples from either end: end stops act on few samples."""
-FOLDS = 4
 PENALTIES = np.geomspace(1e-7, 1e3, 11)
 RIDGE = 1e-9
 PARAMETER_SHARE = 1e-4
@@ -31,20 +30,23 @@ PARAMETER_SHARE = 1e-4
 OWN_SHARE = 1e-3
 """The same share, below which the curve is not drawn as the term's."""
 BAND = 1.96
+TWIN_SHARE = 0.02
+"""Share of a term's squares that is no function of another variable, below which the data cannot tell them apart."""
+SLOW_NODES = 6
+Evaluate = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """Linearisation of one record with the derivatives [m, o, q] by all fitted numbers and a label of each sample [m].
+    """Linearisation of one record with the derivatives [m, o, q] by all fitted numbers and the fold of each sample [m].
 
-    block: number of the block, which is used for fits if it is in the list of fitted blocks; variables, arriving: as
-    of `Simulation.list_variables`
+    fold: −1 where a sample is held out; variables, arriving: as of `Simulation.list_variables`
     """
 
     record: Record
     line: Linearisation
     columns: FloatArray
-    block: IntArray
+    fold: IntArray
     weights: FloatArray
     variables: FloatArray
     arriving: FloatArray
@@ -63,7 +65,7 @@ class Place:
 class Screened:
     """A place with its normal equations in the hats' weights, less the part that parameters explain.
 
-    nodes: [c]; matrix: [c, c]; full: [c, c] before that projection; vector: [c], over all fitted blocks; loss:
+    nodes: [c]; matrix: [c, c]; full: [c, c] before that projection; vector: [c], over all fitted samples; loss:
     cross-validated, relative to that without a term; weights: [c] of the smooth curve; sigma: [c] their standard errors
     """
 
@@ -97,7 +99,7 @@ class Screened:
 class Candidate:
     """A form at a place, with its inner numbers and its amplitude."""
 
-    at: Place
+    screened: Screened
     form: Form
     first: float
     second: float
@@ -105,8 +107,20 @@ class Candidate:
 
     @property
     def numbers(self) -> int:
-        """How many numbers the formula has."""
-        return 1 + self.form.free
+        """How many numbers the formula has, and one for a factor."""
+        return 1 + self.form.free + (self.screened.at.factor >= 0)
+
+    def build_terms(self) -> Terms:
+        """Return the candidate as a row of a table of terms, with limits of its numbers."""
+        at, form, nodes = self.screened.at, self.form, self.screened.nodes
+        span, (low, high) = float(nodes[-1] - nodes[0]), form.limit(nodes, self.first)
+        return Terms(
+            np.array([[at.place, form.code, at.variable, at.factor]]),
+            np.array([[self.amplitude, self.first, self.second]]),
+            np.array([[True, form.free > 0, form.free > 1]]),
+            np.array([[-np.inf, low, 0.01 * span]]),
+            np.array([[np.inf, high, 10.0 * span]]),
+        )
 
 
 def list_places(simulation: Simulation, filtered: Sequence[Filtered], point: Point) -> list[Place]:
@@ -157,24 +171,23 @@ def hat_functions(z: FloatArray, nodes: FloatArray) -> FloatArray:
     return hats
 
 
-def screen(filtered: Sequence[Filtered], at: Place, blocks: Sequence[int], n: int) -> Screened | None:
-    """Return the regression of a place on the fitted blocks, None if the variable does not vary."""
+def screen(filtered: Sequence[Filtered], at: Place, n: int) -> Screened | None:
+    """Return the regression of a place on the fitted samples, None if the variable does not vary."""
     values = np.concatenate([each.variables[:, at.variable] for each in filtered])
     if not np.isfinite(values).all() or np.ptp(values) <= 1e-9 * np.abs(values).max():
         return None
     nodes = choose_nodes(values)
-    grams = _build_grams(filtered, at, nodes, blocks, n)
+    grams = _build_grams(filtered, at, nodes, n)
     if not np.isfinite(grams).all():
         return None
     q = filtered[0].columns.shape[2]
     total = grams.sum(axis=0)
-    folds = [grams[k::FOLDS].sum(axis=0) for k in range(FOLDS)]
-    without = float(np.sum([_held_loss(total - fold, fold, q, 0, None) for fold in folds]))
+    without = float(np.sum([_held_loss(total - fold, fold, q, 0, None) for fold in grams]))
     roughness = _roughness(nodes)
     trace = np.trace(total[q:-1, q:-1]) / np.trace(roughness)
     c = len(nodes)
     losses = [
-        float(np.sum([_held_loss(total - fold, fold, q, c, penalty * trace * roughness) for fold in folds]))
+        float(np.sum([_held_loss(total - fold, fold, q, c, penalty * trace * roughness) for fold in grams]))
         for penalty in PENALTIES
     ]
     best = int(np.argmin(losses))
@@ -191,19 +204,16 @@ def screen(filtered: Sequence[Filtered], at: Place, blocks: Sequence[int], n: in
     )
 
 
-def _build_grams(
-    filtered: Sequence[Filtered], at: Place, nodes: FloatArray, blocks: Sequence[int], n: int
-) -> FloatArray:
-    """Return the products of all columns, parameters, hats and prediction errors, of each block [b, k, k]."""
+def _build_grams(filtered: Sequence[Filtered], at: Place, nodes: FloatArray, n: int) -> FloatArray:
+    """Return the products of all columns, parameters, hats and prediction errors, of each fold [f, k, k]."""
     o = filtered[0].line.predicted.shape[1]
     direct = np.zeros(o)
     if at.place >= n:
         direct[at.place - n] = 1.0
     size = filtered[0].columns.shape[2] + len(nodes) + 1
-    grams = np.zeros((len(blocks), size, size))
+    grams = np.zeros((1 + max(int(each.fold.max()) for each in filtered), size, size))
     for each in filtered:
-        own = [row for row, block in enumerate(blocks) if (each.block == block).any()]
-        if not own:
+        if each.fold.max() < 0:
             continue
         hats, arriving = (
             hat_functions(values[:, at.variable], nodes) * (values[:, at.factor, None] if at.factor >= 0 else 1.0)
@@ -216,9 +226,9 @@ def _build_grams(
         change = line.propagate(forcing, direct[:, None] * hats[:, None, :], np.zeros((n, len(nodes))))
         error = np.nan_to_num(each.record.outputs - line.predicted)[:, :, None]
         joined = weigh(each.record, np.concatenate([each.columns, change, error], axis=2), each.weights)
-        for row in own:
-            part = joined[each.block == blocks[row]].reshape(-1, size)
-            grams[row] += part.T @ part
+        for fold in np.unique(each.fold[each.fold >= 0]):
+            part = joined[each.fold == fold].reshape(-1, size)
+            grams[fold] += part.T @ part
     return grams
 
 
@@ -242,7 +252,7 @@ def _solve(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def _held_loss(fitted: FloatArray, held: FloatArray, q: int, c: int, penalty: FloatArray | None) -> float:
-    """Return the squared error in held blocks of the regression on the fitted ones, on q parameters and c hats."""
+    """Return the squared error in a held fold of the regression on the others, on q parameters and c hats."""
     keep = np.arange(q + c)
     matrix = fitted[np.ix_(keep, keep)].copy()
     if penalty is not None:
@@ -258,6 +268,26 @@ def _project(total: FloatArray, q: int) -> tuple[FloatArray, FloatArray, float]:
     rest = total[q:, q:] - cross.T @ inner
     rest = 0.5 * (rest + rest.T)
     return rest[:-1, :-1], rest[:-1, -1], float(rest[-1, -1])
+
+
+def find_twin(filtered: Sequence[Filtered], at: Place, evaluate: Evaluate, names: Sequence[str], time: int) -> str:
+    """Return a variable of which the term is a function too along these records, "" if there is none.
+
+    names: of the variables; time: number of that which is time, of which only slow changes count
+    """
+    table = np.concatenate([each.variables[each.fold >= 0] for each in filtered])
+    values = evaluate(table[:, at.variable]) * (table[:, at.factor] if at.factor >= 0 else 1.0)
+    spread = float(np.sum((values - values.mean()) ** 2))
+    for number, name in enumerate(names):
+        variable = table[:, number]
+        if (number == at.variable and at.factor < 0) or np.ptp(variable) <= 1e-9 * np.abs(variable).max():
+            continue
+        nodes = np.linspace(variable.min(), variable.max(), SLOW_NODES) if number == time else choose_nodes(variable)
+        hats = hat_functions(variable, nodes)
+        rest = values - hats @ np.linalg.lstsq(hats, values, rcond=None)[0]
+        if float(rest @ rest) < TWIN_SHARE * spread:
+            return f"a function of {name}"
+    return ""
 
 
 def rank_formulas(found: Screened, count: int) -> list[Candidate]:
@@ -279,7 +309,7 @@ def rank_formulas(found: Screened, count: int) -> list[Candidate]:
     for k in np.argsort(-share):
         best.setdefault((owners[k][0].kind, owners[k][0].text), int(k))
     return [
-        Candidate(found.at, *owners[k][:3], float(vector[k] / squares[k] / owners[k][3]))
+        Candidate(found, *owners[k][:3], float(vector[k] / squares[k] / owners[k][3]))
         for k in list(best.values())[:count]
         if usable[k]
     ]

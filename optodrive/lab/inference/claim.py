@@ -15,12 +15,21 @@ of the claim. Without repeats the noise is a guess, and nothing is certain.
 Nothing found. `none` needs a large probability of no effect. Between that and an effect that is certain, the recording
 cannot tell, and the claim says so: `undecided`.
 
+Missing terms. A discovery compares forms of a term where a diagnosis compares causes, by the same conditions and one
+more: a name must gain where the fit does not interpolate, in every split at least half of what it gains in training.
+What has no formula of physics, a curve or a change with time, is no name. Three probabilities stay apart: that
+something is missing, where, and in which form, the latter two among what was tried.
+
 Everything here is a function of `Evidence`. No caller makes a verdict of its own.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import exp, log, log1p
 
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import Probabilities
 
 Causes = tuple[str, ...]
@@ -42,6 +51,12 @@ MIN_EXPLAINED, MIN_EXPLAINED_WITH_FORMS = 0.5, 0.9
 """Smallest share of the excess that a cause explains alone, and with other forms of its effect."""
 MAX_WORSE_SIGMA = 3.0
 """Largest increase of a held-out signal's error, in σ, that counts as noise."""
+MIN_TRAINED = 0.02
+"""Share of the avoidable error that a term removes in training, below which a split cannot test it."""
+MIN_KEPT = 0.5
+"""Smallest gain in held-out data, relative to that in training, with which a term extrapolates."""
+MAX_LAG = 16
+"""Parts over which products of errors may be correlated."""
 WORST_FIRST = ("unexplained", "ambiguous", "cause", "incomplete", "undecided", "instrument", "none")
 """Verdicts, in the order in which that of one part of a recording decides that of the whole."""
 NOTHING_FOUND = ("none", "instrument", "incomplete", "undecided")
@@ -64,18 +79,32 @@ class HeldOutChange:
 
 
 @dataclass(frozen=True)
+class SplitGain:
+    """Shares of the avoidable error that a term removes in fitted and in held-out data.
+
+    split: what was held out, in words
+    """
+
+    split: str
+    trained: float
+    held_out: float
+
+
+@dataclass(frozen=True)
 class Alternative:
-    """A fitted set of causes.
+    """A fitted set of causes, or a form of a missing term.
 
     explained: shares of the excess that it explains alone and with other forms of its effect, None if not known;
     held_out: its changes, empty if nothing was held out; doubts: clauses on sizes whose intervals
-    contain no effect, by cause
+    contain no effect, by cause; gains: of a term; nameless: why it is no name, "" if it is one
     """
 
     causes: Causes
     explained: tuple[float, float] | None = None
     held_out: tuple[HeldOutChange, ...] = ()
     doubts: Mapping[str, str] = field(default_factory=dict)
+    gains: tuple[SplitGain, ...] = ()
+    nameless: str = ""
 
     @property
     def name(self) -> str:
@@ -110,6 +139,99 @@ class Claim:
     def causes(self) -> Causes:
         """All causes named, each once."""
         return tuple(dict.fromkeys(key for keys in self.sets for key in keys))
+
+
+NOTHING_SHOWN, NOTHING_SOUGHT = Claim("none"), Claim("incomplete")
+"""Claims of a discovery in which no candidate improves anything, and of one with too little data to begin with."""
+
+
+@dataclass(frozen=True)
+class TermForm:
+    """Form of a term that a simulation may lack.
+
+    where: equation or output that it is added to; depends_on: its variable, and what multiplies it, if anything;
+    probability: among the forms tried, given that something is missing; gain: the smallest in held-out data
+    """
+
+    where: str
+    depends_on: tuple[str, ...]
+    kind: str
+    formula: str
+    probability: float
+    gain: float
+
+    @property
+    def place(self) -> str:
+        """Place and variables in words."""
+        return f"{self.where} on {' times '.join(self.depends_on)}"
+
+    @property
+    def name(self) -> str:
+        """Form and place in words."""
+        return f"{self.kind} in {self.place}"
+
+
+@dataclass(frozen=True)
+class TermClaim:
+    """Verdict on one missing term.
+
+    missing: probability that something is missing; forms: most probable first; chosen: that by which the simulation
+    is extended; gains: its own; next_record: which record would decide, "" if nothing is open
+    """
+
+    claim: Claim
+    missing: float
+    forms: tuple[TermForm, ...]
+    chosen: TermForm
+    gains: tuple[SplitGain, ...]
+    next_record: str = ""
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the form is a name, and no other one is left."""
+        return self.claim.verdict == "cause"
+
+    @property
+    def place_probability(self) -> float:
+        """Probability of the chosen place and variables among those tried."""
+        return min(1.0, sum(form.probability for form in self.forms if form.place == self.chosen.place))
+
+    @property
+    def rivals(self) -> tuple[TermForm, ...]:
+        """Further forms that the data leaves."""
+        return tuple(each for each in self.forms if each is not self.chosen and each.probability >= MIN_LISTED)
+
+
+def sum_in_sigma(values: FloatArray, noise: FloatArray) -> tuple[float, float]:
+    """Return the sum of values [parts] in its standard deviations, and to how many independent parts these amount.
+
+    noise: [parts] values without the effect; neighbouring ones may be correlated (Newey & West 1987)
+    """
+    squares = float(noise @ noise)
+    lags = range(1, min(MAX_LAG, len(noise) - 1) + 1)
+    correlated = sum(2.0 * (1.0 - lag / (MAX_LAG + 1.0)) * float(noise[lag:] @ noise[:-lag]) for lag in lags)
+    variance = max(squares + correlated, 0.1 * squares, 1e-300)
+    return float(np.sum(values)) / variance**0.5, max(1.0, len(noise) * min(1.0, squares / variance))
+
+
+def compute_no_effect(sigma: float, parts: float, tries: int = 1) -> float:
+    """Return the probability of no effect.
+
+    sigma: by how many σ the best of some tries is better; parts: independent ones that it was summed over
+
+    The Bayes factor is that of a unit-information prior (Kass & Wasserman 1995), at even odds of any effect.
+    """
+    evidence = 0.5 * max(sigma, 0.0) ** 2 * parts / (1.0 + parts) - 0.5 * log1p(parts) - log(tries)
+    return 1.0 / (1.0 + exp(min(evidence, 700.0)))
+
+
+def weigh_forms(behind: Sequence[float], prior: Sequence[float]) -> list[float]:
+    """Return the probabilities of forms among each other.
+
+    behind: by how many σ each predicts held-out data worse than the best one; prior: relative weights
+    """
+    weights = [p * exp(-0.5 * max(sigma, 0.0) ** 2) for sigma, p in zip(behind, prior, strict=True)]
+    return [weight / sum(weights) for weight in weights]
 
 
 def claim(evidence: Evidence) -> Claim:
@@ -199,12 +321,27 @@ def _list_refusals(item: Alternative) -> tuple[str, ...]:
     total = HeldOutChange("", "", sum(each.chi2 for each in item.held_out), noise)
     if total.sigma > MAX_WORSE_SIGMA:
         out.append(f"With {item.name}, the held-out runs are predicted worse, by {total.sigma:.1f} σ.")
+    if item.nameless:
+        out.append(f"{item.name} is no name: {item.nameless}.")
+    out += [
+        f"With {item.name}, {each.split} is predicted worse, by {_format_share(-each.held_out)} of the avoidable error."
+        for each in item.gains
+        if each.held_out < 0.0
+    ]
     return tuple(out)
 
 
 def _list_doubts(item: Alternative) -> tuple[str, ...]:
     """Return why a probable set of causes that is not refused is not certain."""
     out = []
+    for each in item.gains:
+        if each.trained < MIN_TRAINED:
+            out.append(f"Without {each.split}, no data shows {item.name}.")
+        elif each.held_out < MIN_KEPT * each.trained:
+            trained, held_out = _format_share(each.trained), _format_share(each.held_out)
+            out.append(
+                f"{item.name} removes {trained} of the avoidable error where it was fitted, {held_out} in {each.split}."
+            )
     if item.explained is not None and item.explained[1] < MIN_EXPLAINED_WITH_FORMS:
         share = _format_share(item.explained[1])
         out.append(f"{item.name} explains {share} of the excess in all its forms, less than nine tenths.")

@@ -1,10 +1,12 @@
 """Sentences that state a claim and its numbers."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
 
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.discrepancy import Discrepancy, HeldOutGain, InstrumentDisturbance, Probabilities
-from optodrive.lab.inference.claim import NOTHING_FOUND, format_probability
+from optodrive.lab.inference.claim import NOTHING_FOUND, Claim, TermClaim, format_probability
 from optodrive.physics.term import Term
 
 MIN_SHOWN = 0.01
@@ -99,6 +101,63 @@ def describe_gain(gain: HeldOutGain | None, verdict: str, runs: int) -> list[str
             f"noise {format_quantity(floor, unit)}"
         )
     return lines
+
+
+def describe_term(term: TermClaim) -> list[str]:
+    """Return the lines on a missing term: its form, three probabilities, gains, rivals and doubts."""
+    form = term.chosen
+    if term.is_sure:
+        head = f"{form.where} lacks {form.formula}: {form.kind} in {' times '.join(form.depends_on)}"
+    elif term.claim.verdict == "ambiguous":
+        head = f"{form.where} lacks a term, perhaps {form.formula}: {form.kind} in {' times '.join(form.depends_on)}"
+    else:
+        head = f"{form.where} lacks a function of {' times '.join(form.depends_on)}: {form.formula}"
+    lines = [
+        head,
+        f"  something is missing: {format_probability(term.missing)}; of what was tried, in {form.place}: "
+        f"{format_probability(term.place_probability)}; as {form.kind} there: {format_probability(form.probability)}",
+    ]
+    if term.gains:
+        shares = ", ".join(
+            f"{_format_share(each.held_out)} in {each.split} ({_format_share(each.trained)} where fitted)"
+            for each in term.gains
+        )
+        lines.append(f"  removes of the avoidable error, where it was held out: {shares}")
+    lines += [
+        f"  or {rival.name}, {rival.formula}: {format_probability(rival.probability)}, "
+        f"removes {_format_share(rival.gain)} or more"
+        for rival in term.rivals
+    ]
+    lines += [f"  {reason}" for reason in term.claim.reasons]
+    return [*lines, *([f"  next record: {term.next_record}"] if term.next_record else [])]
+
+
+def describe_no_term(found: Claim, error: float, noise: float, judged_by: str) -> list[str]:
+    """Return the lines where no term is added. error: of free runs of held-out data."""
+    size = f"held-out error of the fitted simulation {error:.4g} in {judged_by}, noise at least {noise:.2g}"
+    openings = {
+        "none": "no missing term found",
+        "undecided": "undecided: these records show neither a missing term nor that there is none",
+    }
+    head = openings.get(
+        found.verdict, "something is missing, and no term that was tried predicts all that was held out"
+    )
+    return [f"{head}; {size}", *(f"  {reason}" for reason in found.reasons)]
+
+
+def build_term_document(term: TermClaim) -> dict[str, Any]:
+    """Return the claim on a missing term as JSON values."""
+    return {
+        "verdict": term.claim.verdict,
+        "reasons": list(term.claim.reasons),
+        "probability_missing": term.missing,
+        "probability_place": term.place_probability,
+        "probability_form": term.chosen.probability,
+        "gain": term.chosen.gain,
+        "gains": [asdict(each) for each in term.gains],
+        "rivals": [asdict(each) for each in term.rivals],
+        "next_record": term.next_record,
+    }
 
 
 def _format_share(share: float) -> str:

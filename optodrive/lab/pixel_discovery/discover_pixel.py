@@ -12,13 +12,13 @@ from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, r
 from optodrive.lab.diagnosis.model_selection import has_replicate_excess
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal
 from optodrive.lab.diagnosis.search_log import ProgressCallback, ignore_progress
-from optodrive.lab.discovery import Finding, discover
-from optodrive.lab.pixel_discovery.experiment_records import build_records, choose_held_out
+from optodrive.lab.discovery import discover
+from optodrive.lab.inference.claim import NOTHING_SOUGHT, TermForm
+from optodrive.lab.pixel_discovery.experiment_records import build_records
 from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.pixel_model import AFTER, LIGHT, OUTPUTS, TEMPERATURE, build_model
 from optodrive.lab.pixel_discovery.random_light import find_random_light
 
-UNITS = {"dabsorber/dt": "K/s", "dgas/dt": "K/s", "temperature": "K", "displacement": "m", "force": "N"}
 OTHER_SIGNALS = "displacement and force, by powers fitted to the temperature alone"
 MIN_EXPERIMENTS = 4
 """Experiments below which none can be held out and the others still tell places apart."""
@@ -38,30 +38,30 @@ def discover_in_pixel(
     on_progress("discovery: noise and nominal model")
     parts = [part for part in build_dataset(measurement).split_subsystems() if set(part.kinds) <= set(PIXEL_KINDS)]
     if not parts:
-        return PixelDiscovery((), (), "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
+        return PixelDiscovery((), (), NOTHING_SOUGHT, "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
     problem, base = fit_nominal(parts[0], prior, epsilon)
     if has_replicate_excess(problem):
         # Before disturbances are subtracted: missed pulses would pass for hops of an instrument.
         found, errors = find_random_light(problem, base)
         if found:
-            return PixelDiscovery(found, (), OTHER_SIGNALS, *errors, {}, epsilon, perf_counter() - began_s)
+            claimed = found[0].term.claim
+            return PixelDiscovery(found, (), claimed, OTHER_SIGNALS, *errors, {}, epsilon, perf_counter() - began_s)
     # A large effect shifts the sensitivities to jitters, and repeats then differ too; held-out experiments judge it.
     problem, base, disturbances = _subtract_disturbances(problem, base)
-    experiments = build_records(problem, base)
-    held_out = choose_held_out(experiments)
-    if len(experiments) < MIN_EXPERIMENTS or not held_out:
-        return PixelDiscovery((), disturbances, "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
+    records = build_records(problem, base)
+    if len(records) < MIN_EXPERIMENTS:
+        return PixelDiscovery((), disturbances, NOTHING_SOUGHT, "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
     measured = [name for name, kind in zip(OUTPUTS, PIXEL_KINDS, strict=True) if kind in problem.data.kinds]
     answer = discover(
         build_model(np.exp(np.array(base.point.base)).tolist(), measured),
-        [each.record for each in experiments],
+        records,
         progress=lambda stage, fraction: on_progress(f"discovery: {stage}"),
-        held_out=held_out,
     )
     return PixelDiscovery(
-        tuple(_describe(each) for each in answer.findings),
+        tuple(PixelFinding(_find_node(each.term.chosen), each.term, each.curve) for each in answer.findings),
         disturbances,
-        "held-out experiments: " + ", ".join(experiments[number].name for number in held_out),
+        answer.claim,
+        f"held-out experiments: {answer.judged_by}",
         answer.base_rmse,
         answer.extended_rmse,
         answer.parameters,
@@ -82,29 +82,13 @@ def _subtract_disturbances(
     return problem, base, disturbances
 
 
-def _describe(finding: Finding) -> PixelFinding:
-    """Return a finding with the node of the pixel in which it lies."""
-    kind = "memory" if finding.depends_on[0] == "memory" else finding.kind
-    return PixelFinding(
-        _find_node(finding),
-        finding.where,
-        UNITS[finding.where],
-        finding.depends_on,
-        kind,
-        finding.formula,
-        finding.curve,
-        finding.gain,
-        finding.probability,
-    )
-
-
-def _find_node(finding: Finding) -> str:
+def _find_node(form: TermForm) -> str:
     """Return the node in which a term acts. One of light that acts on a signal is an instrument's."""
-    if finding.where == "dgas/dt":
+    if form.where == "dgas/dt":
         return "gas"
-    if finding.where == "dabsorber/dt":
-        if finding.depends_on[0] == "memory":
+    if form.where == "dabsorber/dt":
+        if form.depends_on[0] == "memory":
             return "wall"
-        return "light" if LIGHT in finding.depends_on or AFTER in finding.depends_on else "absorber"
-    is_instrument = finding.where == TEMPERATURE or finding.depends_on[0] in (LIGHT, "t")
+        return "light" if LIGHT in form.depends_on or AFTER in form.depends_on else "absorber"
+    is_instrument = form.where == TEMPERATURE or form.depends_on[0] in (LIGHT, "t")
     return "sensor" if is_instrument else "membrane"

@@ -7,7 +7,7 @@ own, without outputs, because light is held from one sample to the next.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,20 +25,9 @@ MAX_SAMPLES, FIRST_PULSES = 500, 10
 """Samples of a record above which bins are kept only of its first pulses and of one in two, four, eight… later ones."""
 NEAR = 0.1
 """Share of a bin within which mean times of two signals count as one."""
-HELD_OUT_EVERY = 3
-"""Every third experiment in order of energy is held out, from the second strongest on."""
 
 Repeats = list[tuple[PixelExperiment, tuple[int, int, int]]]
 """Runs of one experiment with the numbers of their blocks by kind of signal, −1 where it was not measured."""
-
-
-@dataclass(frozen=True, eq=False)
-class ExperimentRecord:
-    """Record of one experiment with its name and its pulses [n, 4]."""
-
-    name: str
-    pulses: FloatArray
-    record: Record
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +51,7 @@ class _Grid:
         return np.asarray(np.where(is_inside, self.rows[found, kind], -1))
 
 
-def build_records(problem: FitProblem, base: ModelFit) -> list[ExperimentRecord]:
+def build_records(problem: FitProblem, base: ModelFit) -> list[Record]:
     """Return the records of all experiments that light the measured pixel and no other."""
     data = problem.data
     experiments: dict[tuple[str, int], Repeats] = {}
@@ -73,22 +62,8 @@ def build_records(problem: FitProblem, base: ModelFit) -> list[ExperimentRecord]
     sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
     columns = np.column_stack([data.value - base.prediction, sensitivity.power, sensitivity.timing])
     return [
-        ExperimentRecord(name, repeats[0][0].pulses, _build_record(repeats, problem, base, columns))
-        for (name, _), repeats in experiments.items()
+        replace(_build_record(repeats, problem, base, columns), name=name) for (name, _), repeats in experiments.items()
     ]
-
-
-def choose_held_out(experiments: Sequence[ExperimentRecord]) -> list[int]:
-    """Return the numbers of the experiments to hold out, of trains and of single pulses separately.
-
-    The strongest is fitted: where it alone shows an effect, there would be nothing else to find it in.
-    """
-    held_out: list[int] = []
-    for is_train in (False, True):
-        own = [k for k, each in enumerate(experiments) if (len(each.pulses) > 2) == is_train]
-        own.sort(key=lambda k: -float((experiments[k].pulses[:, 1] * experiments[k].pulses[:, 2]).sum()))
-        held_out += own[1::HELD_OUT_EVERY]
-    return sorted(held_out)
 
 
 def _build_record(repeats: Repeats, problem: FitProblem, base: ModelFit, columns: FloatArray) -> Record:

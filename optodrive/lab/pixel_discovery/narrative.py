@@ -7,8 +7,9 @@ from typing import Any
 from optodrive.core.quantity import format_quantity
 from optodrive.core.svg_plot import Axis, Series, draw_plot
 from optodrive.lab.discovery import Curve
-from optodrive.lab.inference.claim import format_probability
-from optodrive.lab.pixel_discovery.findings import NODES, PixelDiscovery, PixelFinding
+from optodrive.lab.discovery.forms import NAMELESS
+from optodrive.lab.inference.sentences import build_term_document, describe_no_term, describe_term
+from optodrive.lab.pixel_discovery.findings import NODES, UNITS, PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.planned_terms import PlannedTerms
 
 PLOT_HEIGHT = 200
@@ -40,10 +41,8 @@ def build_lines(discovery: PixelDiscovery) -> list[str]:
         return ["No missing term was sought: too few experiments light a measured pixel alone."]
     judged = f"on {discovery.judged_by}"
     if not discovery.findings:
-        return [
-            "No missing term was found: nothing predicts better than the nominal pixel, which is off by "
-            f"{discovery.error_before:.2f} times the noise {judged}."
-        ]
+        lines = describe_no_term(discovery.claim, discovery.error_before, 1.0, discovery.judged_by)
+        return [f"A term that nobody wrote down: {lines[0]} (1: the noise).", *lines[1:]]
     lines = [line for finding in discovery.findings for line in _describe(finding)]
     before, after = discovery.error_before, discovery.error_after
     return [
@@ -66,18 +65,16 @@ def build_planning_lines(planned: PlannedTerms, model: str) -> list[str]:
 
 
 def _describe(finding: PixelFinding) -> list[str]:
-    gain = f"  removes {finding.gain:.0%} of the avoidable error; probability {format_probability(finding.probability)}"
+    form, node = finding.term.chosen, NODES[finding.node]
     if finding.curve is None:
-        return [
-            f"A term that nobody wrote down: {NODES[finding.node]} changes at random, other in every repeat.",
-            f"  {finding.formula}",
-            gain,
-        ]
-    on = " times ".join(VARIABLES[name][0] for name in finding.depends_on)
+        head = f"A term that nobody wrote down: {node} changes at random, other in every repeat."
+        return [head, f"  {form.formula}", *describe_term(finding.term)[1:]]
+    on = " times ".join(VARIABLES[name][0] for name in form.depends_on)
+    kind = finding.kind if finding.term.is_sure or form.kind in NAMELESS else f"perhaps {finding.kind}"
     return [
-        f"A term that nobody wrote down: {NODES[finding.node]} lacks one that depends on {on} ({finding.kind}).",
-        f"  {PLACES[finding.where]}, {finding.unit}: {finding.formula}",
-        gain,
+        f"A term that nobody wrote down: {node} lacks one that depends on {on} ({kind}).",
+        f"  {PLACES[form.where]}, {UNITS[form.where]}: {form.formula}",
+        *describe_term(finding.term)[1:],
     ]
 
 
@@ -87,19 +84,19 @@ def build_document(discovery: PixelDiscovery) -> dict[str, Any]:
         "findings": [
             {
                 "node": each.node,
-                "where": each.where,
-                "unit": each.unit,
-                "depends_on": [{"name": name, "unit": VARIABLES[name][1]} for name in each.depends_on],
+                "where": each.term.chosen.where,
+                "unit": UNITS[each.term.chosen.where],
+                "depends_on": [{"name": name, "unit": VARIABLES[name][1]} for name in each.term.chosen.depends_on],
                 "kind": each.kind,
-                "formula": each.formula,
+                "formula": each.term.chosen.formula,
+                **build_term_document(each.term),
                 "curve": None
                 if each.curve is None
                 else {name: getattr(each.curve, name).tolist() for name in ("x", "y", "low", "high")},
-                "gain": each.gain,
-                "probability": each.probability,
             }
             for each in discovery.findings
         ],
+        "verdict": discovery.claim.verdict,
         "error_before": discovery.error_before,
         "error_after": discovery.error_after,
         "judged_by": discovery.judged_by,
@@ -116,11 +113,12 @@ def build_sections(discovery: PixelDiscovery, lines: Sequence[str]) -> list[str]
 
 
 def _draw_curve(finding: PixelFinding, curve: Curve) -> str:
-    quantity, unit = VARIABLES[finding.depends_on[0]]
-    factor = VARIABLES[finding.depends_on[1]] if len(finding.depends_on) > 1 else None
-    y_axis = Axis(finding.where if factor is None else f"{finding.where} per {factor[1]}", finding.unit)
+    form = finding.term.chosen
+    quantity, unit = VARIABLES[form.depends_on[0]]
+    factor = VARIABLES[form.depends_on[1]] if len(form.depends_on) > 1 else None
+    y_axis = Axis(form.where if factor is None else f"{form.where} per {factor[1]}", UNITS[form.where])
     series = [Series(curve.y, "extended"), Series(curve.low, "nominal"), Series(curve.high, "nominal")]
-    plot = draw_plot(f"{finding.where} against {quantity}", curve.x, Axis(quantity, unit), y_axis, series, PLOT_HEIGHT)
+    plot = draw_plot(f"{form.where} against {quantity}", curve.x, Axis(quantity, unit), y_axis, series, PLOT_HEIGHT)
     span = f"{format_quantity(float(curve.x[0]), unit)} to {format_quantity(float(curve.x[-1]), unit)}"
-    caption = f"{finding.formula}; over the data, {span}. Dashed: 95 % band."
+    caption = f"{form.formula}; over the data, {span}, and not tested outside. Dashed: 95 % band."
     return f"<figure>{plot}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -42,15 +42,15 @@ def build_planned_terms(discovery: PixelDiscovery) -> PlannedTerms:
             continue
         if finding.curve is None:
             refused.append("the light changes at random, otherwise in every run")
-        elif AFTER in finding.depends_on:
+        elif AFTER in finding.term.chosen.depends_on:
             refused.append("light after the gate has closed has no bound in the limiter")
         elif _acts_when_cold(finding, finding.curve):
-            refused.append(f"{finding.formula} acts on a pixel without light")
+            refused.append(f"{finding.term.chosen.formula} acts on a pixel without light")
         else:
             try:
                 terms.append(_build_term(finding, finding.curve, discovery.parameters, discovery.epsilon))
             except ValidationError as error:
-                refused.append(str(build_input_error(error, finding.formula)))
+                refused.append(str(build_input_error(error, finding.term.chosen.formula)))
     return PlannedTerms(base, tuple(terms), tuple(refused))
 
 
@@ -58,7 +58,9 @@ def _acts_when_cold(finding: PixelFinding, curve: Curve) -> bool:
     """Return whether a term without a factor differs from 0 on a cold pixel in the dark."""
     z = _choose_knots(float(curve.x[0]), float(curve.x[-1]))
     at_zero = float(curve.evaluate(np.clip(np.zeros(1), z[0], z[-1]))[0])
-    return len(finding.depends_on) == 1 and abs(at_zero) > NEGLIGIBLE * float(np.abs(curve.evaluate(z)).max())
+    return len(finding.term.chosen.depends_on) == 1 and abs(at_zero) > NEGLIGIBLE * float(
+        np.abs(curve.evaluate(z)).max()
+    )
 
 
 def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float], epsilon: float) -> DiscoveredTerm:
@@ -66,17 +68,18 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
 
     Rates of the absorber become heat flows by its capacity, absorbed light becomes incident light.
     """
-    variable, *factor = finding.depends_on
-    where, depends_on, low = finding.where, variable, float(curve.x[0])
+    form = finding.term.chosen
+    variable, *factor = form.depends_on
+    where, depends_on, low = form.where, variable, float(curve.x[0])
     if where == RATE_OF_ABSORBER and depends_on in ("memory", "gas"):
         low = max(0.0, low)  # its cold would heat, and there is hardly a record of it
     z = _choose_knots(low, float(curve.x[-1]))
     low, high, values = float(z[0]), float(z[-1]), curve.evaluate(z)
     if not factor:  # by less than is negligible, see `_acts_when_cold`
         values = values - float(np.interp(0.0, z, values))
-    if finding.where == RATE_OF_GAS:
+    if form.where == RATE_OF_GAS:
         where = "gas"
-    elif finding.where == RATE_OF_ABSORBER:
+    elif form.where == RATE_OF_ABSORBER:
         where, capacity = "absorber", parameters["C"]
         if factor == ["heating"]:
             where, capacity = "heat_capacity", 1.0
@@ -92,7 +95,7 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
             "where": where,
             "depends_on": depends_on,
             "unit": "W" if depends_on == "power" else UNITS[where],
-            "formula": f"{finding.where}: {finding.formula}",
+            "formula": f"{form.where}: {form.formula}",
             "low": low,
             "high": high,
             "values": values.tolist(),

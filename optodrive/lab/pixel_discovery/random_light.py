@@ -6,15 +6,25 @@ factor each: light moves all signals together, an instrument only its own.
 """
 
 from dataclasses import dataclass, replace
-from math import erfc, sqrt
+from math import sqrt
 
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
 from optodrive.lab.diagnosis.power_fluctuation import slice_pulses
-from optodrive.lab.discovery.evidence import compute_probability
+from optodrive.lab.inference.claim import (
+    MAX_NO_EFFECT,
+    Alternative,
+    Evidence,
+    SplitGain,
+    TermClaim,
+    TermForm,
+    claim,
+    compute_no_effect,
+)
 from optodrive.lab.pixel_discovery.findings import PixelFinding
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
@@ -23,7 +33,6 @@ POWER_SIGMA = 0.5
 """Prior σ of a slice's relative power: a missed pulse has none."""
 MIN_GAIN = 0.5
 """Share of the displacement's and force's error that the powers remove, below which the light is not the cause."""
-MAX_P = 1e-3
 DARK = 0.3
 """Relative power below which a slice counts as dark."""
 
@@ -55,14 +64,15 @@ def find_random_light(problem: FitProblem, base: ModelFit) -> tuple[tuple[PixelF
     gain = (rms[0] - rms[1]) / max(rms[0] - min(1.0, rms[1]), 1e-9)
     score = sum(float(((each[:, 0] - each[:, 1]) * each[:, 0]).sum()) for each in errors)
     squares = sum(float(((each[:, 0] - each[:, 1]) * each[:, 1]).sum()) ** 2 for each in errors)
-    p_value = 0.5 * erfc(score / sqrt(2.0 * max(squares, 1e-300)))
-    if gain < MIN_GAIN or p_value > MAX_P:
+    no_effect = compute_no_effect(score / sqrt(max(squares, 1e-300)), len(runs))
+    if gain < MIN_GAIN or no_effect > MAX_NO_EFFECT:
         return (), rms
     powers = np.concatenate([run.powers for run in runs])
-    finding = PixelFinding(
-        "light", "light", "1", (), "random", _describe(powers), None, gain, compute_probability(p_value)
-    )
-    return (finding,), rms
+    form = TermForm("light", (), "random", _describe(powers), 1.0, gain)
+    gains = (SplitGain("displacement and force", gain, gain),)
+    probabilities = Probabilities(no_effect, 0.0, {(form.kind,): 1.0 - no_effect})
+    claimed = claim(Evidence(probabilities, (Alternative((form.kind,), gains=gains),)))
+    return (PixelFinding("light", TermClaim(claimed, 1.0 - no_effect, (form,), form, gains), None),), rms
 
 
 def _fit_powers(

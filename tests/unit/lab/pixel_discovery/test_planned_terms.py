@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.lab.discovery import Curve
+from optodrive.lab.inference.claim import Claim, TermClaim, TermForm
 from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.planned_terms import build_planned_terms
 
@@ -13,8 +14,9 @@ PARAMETERS = {"R": 184.0, "C": 126e-6, "tau_g": 3e-3, "kappa": 4e-6, "phi": 2.3e
 def plan_with(where, depends_on, function, low, high):
     x = np.linspace(low, high, 20)
     curve = Curve(x, function(x), function(x), function(x), function)
-    finding = PixelFinding("absorber", where, "K/s", depends_on, "", "f", curve, 1.0, 1.0)
-    return build_planned_terms(PixelDiscovery((finding,), (), "", 2.0, 1.0, PARAMETERS, 0.66, 0.0))
+    form = TermForm(where, depends_on, "", "f", 1.0, 1.0)
+    finding = PixelFinding("absorber", TermClaim(Claim("cause"), 1.0, (form,), form, ()), curve)
+    return build_planned_terms(PixelDiscovery((finding,), (), Claim("cause"), "", 2.0, 1.0, PARAMETERS, 0.66, 0.0))
 
 
 @pytest.mark.parametrize("quantity", ["memory", "gas"])

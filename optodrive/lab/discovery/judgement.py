@@ -1,0 +1,313 @@
+"""Judgement of the forms of a term: each is fitted anew without every split's held-out data, and compared on that.
+
+Theory of operation. Errors are those of free runs, in units of each output's size, or whitened. In parts of what is
+held out, the logarithm of an error's square does not depend on the part's own size, so that one passage does not decide
+between two forms; how far one is behind another is the sum of its differences in units of their own scatter. Which
+claim follows is decided in `lab.inference`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optodrive.core.types.arrays import BoolArray, FloatArray
+from optodrive.core.types.discrepancy import Probabilities
+from optodrive.lab.discovery.fitting import Point, Simulation, fit, output_sizes, run_errors, weigh
+from optodrive.lab.discovery.forms import CHANGE, CURVE, NAMELESS, Form
+from optodrive.lab.discovery.held_out import Split, sum_parts
+from optodrive.lab.discovery.model import Record
+from optodrive.lab.discovery.screening import Candidate, Filtered, find_twin
+from optodrive.lab.inference.claim import (
+    MIN_KEPT,
+    Alternative,
+    Evidence,
+    SplitGain,
+    TermClaim,
+    TermForm,
+    claim,
+    compute_no_effect,
+    sum_in_sigma,
+    weigh_forms,
+)
+
+PARTS, EVIDENCE_PARTS = 64, 256
+"""Parts of a split's held-out samples in which forms are compared, and in which the evidence for a term is summed."""
+WITHIN_NOISE = 1.1
+"""Error in units of noise below which nothing is left to gain."""
+START_NOISE = 5.0
+"""Error of free runs in units of noise, below which it may be that of the first sample, from which the run starts."""
+SAME = 0.01
+"""Squared difference of two functions, relative to the smaller one, below which they are one."""
+ALIKE_SIGMA = 2.0
+PER_NUMBER, PER_CHANGE = 0.5, 0.1
+"""Weight of a form beforehand, for each number that it has more than another, and for a change with time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A model fitted in each split.
+
+    points: [splits]; rmse: [splits, 2] in free run where fitted and held out; logs: [parts] of squared errors held out
+    in all splits; errors: [m, o] of each record, with the first split's numbers
+    """
+
+    points: tuple[Point, ...]
+    rmse: FloatArray
+    logs: FloatArray
+    errors: list[FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A candidate with all numbers fitted by prediction errors, their squared sum, and the model in free run.
+
+    point: its last term is the proposed one
+    """
+
+    candidate: Candidate
+    point: Point
+    loss: float
+    measured: Measured | None = None
+
+    def evaluate(self, z: FloatArray) -> FloatArray:
+        """Return the values [n] of the proposed term at z [n]."""
+        point = self.point if self.measured is None else self.measured.points[0]
+        amplitude, first, second = point.terms.values[-1].tolist()
+        return np.asarray(self.candidate.form.evaluate(z, first, second) * amplitude)
+
+
+class Judge:
+    """Comparison of models on held-out data. noise: [o] of the outputs."""
+
+    def __init__(
+        self, simulation: Simulation, records: Sequence[Record], splits: Sequence[Split], noise: FloatArray
+    ) -> None:
+        self.simulation, self.records, self.splits, self.noise = simulation, records, splits, noise
+        self.is_white = all(record.whiten is not None for record in records)
+        self.sizes = np.ones(len(noise)) if self.is_white else output_sizes(records)
+        self.floor = 1.0 if self.is_white else float(np.sqrt(np.mean((noise / self.sizes) ** 2)))
+
+    def fit(self, starts: Sequence[Point], masks: Sequence[BoolArray], evaluations: int = 12) -> Point:
+        """Return the best of some points, and of the fit of free runs from the first of them, in masked samples."""
+        weights = [np.outer(mask, 1.0 / self.sizes) for mask in masks]
+        fitted, _ = fit(self.simulation, self.records, starts[0], weights, evaluations=evaluations)
+        # Numbers that fit one step ahead need not fit free runs best; those of a chaotic system fit only the former.
+        return min((*starts, fitted), key=lambda each: _compute_rms(self.run(each), masks))
+
+    def run(self, point: Point) -> list[FloatArray]:
+        """Return the errors [m, o] of free runs of all records."""
+        return run_errors(self.simulation, self.records, point, self.sizes)
+
+    def measure(self, starts: Sequence[Sequence[Point]], evaluations: int = 12) -> Measured:
+        """Return a model fitted in each split from some points of it, of which the first split's answer is one more."""
+        points, rmse, logs, first = list[Point](), list[list[float]](), list[FloatArray](), list[FloatArray]()
+        for split, own in zip(self.splits, starts, strict=True):
+            points.append(self.fit([*own, *points[:1]], split.fitted, evaluations))
+            errors = self.run(points[-1])
+            first = first or errors
+            rmse.append([_compute_rms(errors, split.fitted), _compute_rms(errors, split.held_out)])
+            sums = sum_parts([each**2 for each in errors], split.held_out, PARTS)
+            counts = sum_parts([np.ones(each.shape) for each in errors], split.held_out, PARTS)
+            logs.append(np.log(sums / counts + self.floor**2))
+        return Measured(tuple(points), np.array(rmse), np.concatenate(logs), first)
+
+    def measure_gains(self, base: Measured, before: Measured, after: Measured) -> tuple[SplitGain, ...]:
+        """Return the shares of the first model's avoidable error that a term removes, where there is any."""
+        shares = (before.rmse - after.rmse) / np.maximum(base.rmse - np.minimum(self.floor, after.rmse), 1e-12)
+        is_quiet = np.maximum(before.rmse, after.rmse)[:, 1] <= WITHIN_NOISE * self.floor
+        return tuple(
+            SplitGain(split.name, *np.clip(share, -9.0, 1.0).tolist())
+            for split, share, quiet in zip(self.splits, shares, is_quiet, strict=True)
+            if not quiet
+        )
+
+    def compute_evidence(
+        self, before: Sequence[FloatArray], after: Sequence[FloatArray], masks: Sequence[BoolArray]
+    ) -> float:
+        """Return the probability of no effect from errors [m, o] without and with a term in masked samples.
+
+        The change of the predictions does not depend on the noise of held-out samples, so without an effect the sum of
+        its products with the errors has mean zero. Their noise is that with the errors that the term leaves.
+        """
+        change = [a - b for a, b in zip(before, after, strict=True)]
+        products = [
+            sum_parts([d * e for d, e in zip(change, errors, strict=True)], masks, EVIDENCE_PARTS)
+            for errors in (before, after)
+        ]
+        improves = sum(float(np.sum(each)) for each in products) > 0.0  # the sum of squares falls
+        sigma, parts = sum_in_sigma(*products)
+        return compute_no_effect(sigma if improves else 0.0, parts, tries=2)
+
+    def judge(
+        self,
+        base: Measured,
+        before: Measured,
+        proposals: Sequence[Proposal],
+        filtered: Sequence[Filtered],
+        start: Point | None,
+    ) -> tuple[Proposal, TermClaim]:
+        """Return the proposal to extend the model by, and the claim on its term.
+
+        filtered: the search's records; start: the model without the term there, None where it is known to be missing
+        """
+        fitted = [(each, each.measured) for each in proposals if each.measured is not None]
+        kept = list[tuple[Proposal, Measured]]()
+        named = dict[str, tuple[Proposal, Measured]]()
+        for each, measured in sorted(fitted, key=lambda item: -float(item[1].logs.mean())):
+            named[self.name(each).name] = each, measured  # of one name the best, which is the last
+        # Curves come last: one is as good as a formula of physics nearly everywhere.
+        for each, measured in sorted(
+            named.values(), key=lambda item: (item[0].candidate.form.kind == CURVE, item[0].candidate.numbers)
+        ):
+            alike = [other for one, other in kept if _is_same(one, each) and _is_behind(other, measured) < ALIKE_SIGMA]
+            if not alike:
+                kept.append((each, measured))
+        forms = [self.name(each) for each, _ in kept]
+        gains = [self.measure_gains(base, before, measured) for _, measured in kept]
+        minimum = [min((each.held_out for each in own), default=0.0) for own in gains]
+        # What gains less than half of another one where it was not fitted is no rival of it.
+        prior = [
+            PER_NUMBER**each.candidate.numbers
+            * (PER_CHANGE if form.kind == CHANGE else 1.0)
+            * (max(minimum) <= 0.0 or gain >= MIN_KEPT * max(minimum))
+            for (each, _), form, gain in zip(kept, forms, minimum, strict=True)
+        ]
+        rivals = [measured for (_, measured), weight in zip(kept, prior, strict=True) if weight > 0.0]
+        best = min(rivals, key=lambda each: float(each.logs.mean()))
+        weights = weigh_forms([_is_behind(measured, best) for _, measured in kept], prior)
+        forms = [
+            replace(form, probability=weight, gain=gain)
+            for form, weight, gain in zip(forms, weights, minimum, strict=True)
+        ]
+        # A term has no other forms of its own, and is a name only beside terms that explain half of all together.
+        explained = [
+            (min((each.held_out for each in self.measure_gains(base, base, measured)), default=1.0), 1.0)
+            for _, measured in kept
+        ]
+        is_usable = [form.gain > 0.0 and len(own) > 0 for form, own in zip(forms, gains, strict=True)]
+        # Time explains any slow misfit: it is what is left where no state and no input extrapolates.
+        order = sorted(range(len(kept)), key=lambda k: (not is_usable[k], forms[k].kind == CHANGE, -weights[k]))
+        chosen = order[0]
+        no_effect = 0.0
+        if start is not None:
+            no_effect = self._compute_step_evidence(filtered, start, kept[chosen][0].point)
+        if before.rmse[0, 1] > START_NOISE * self.floor:
+            run_evidence = self.compute_evidence(before.errors, kept[chosen][1].errors, self.splits[0].held_out)
+            no_effect = min(no_effect, run_evidence)
+        names = {k: (f"{forms[k].name} ({forms[k].formula})",) for k in order}
+        probabilities = Probabilities(no_effect, 0.0, {names[k]: (1.0 - no_effect) * weights[k] for k in order})
+        ranked = sorted(order, key=lambda k: -weights[k])
+        alternatives = [
+            Alternative(names[k], explained[k], gains=gains[k], nameless=NAMELESS.get(forms[k].kind, ""))
+            for k in ranked
+        ]
+        twins = {names[k][0]: twin for k in ranked if (twin := self._find_twin(filtered, kept[k][0]))}
+        found = TermClaim(
+            claim(Evidence(probabilities, tuple(alternatives), twins)),
+            1.0 - no_effect,
+            tuple(forms[k] for k in ranked),
+            forms[chosen],
+            gains[chosen],
+        )
+        if found.claim.verdict not in ("cause", "none", "undecided"):
+            rival = next((k for k in ranked if k != chosen and weights[k] >= 0.01), None)
+            found = replace(found, next_record=self._propose_record(kept, forms, chosen, rival, gains[chosen]))
+        return kept[chosen][0], found
+
+    def _compute_step_evidence(self, filtered: Sequence[Filtered], start: Point, longer: Point) -> float:
+        """Return the probability of no effect from predictions that follow the data, where held out."""
+        records, gains = [each.record for each in filtered], [each.line.gains for each in filtered]
+        before, after = (
+            [
+                error * each.weights
+                for error, each in zip(
+                    run_errors(self.simulation, records, point, np.ones(len(self.noise)), gains), filtered, strict=True
+                )
+            ]
+            for point in (start, longer)
+        )
+        return self.compute_evidence(before, after, [each.fold < 0 for each in filtered])
+
+    def _find_twin(self, filtered: Sequence[Filtered], proposal: Proposal) -> str:
+        """Return another variable of which the term is a function too, "" if there is none."""
+        model, at = self.simulation.model, proposal.candidate.screened.at
+        if model.from_rest:
+            return ""
+        return find_twin(filtered, at, proposal.evaluate, model.variable_names, len(model.states) + len(model.inputs))
+
+    def name(self, proposal: Proposal) -> TermForm:
+        """Return the form of a proposal with the numbers of the first split."""
+        measured = proposal.measured
+        point = proposal.point if measured is None else measured.points[0]
+        return name_form(self.simulation, proposal.candidate, point.terms.values[-1])
+
+    def _propose_record(
+        self,
+        kept: Sequence[tuple[Proposal, Measured]],
+        forms: Sequence[TermForm],
+        chosen: int,
+        rival: int | None,
+        gains: Sequence[SplitGain],
+    ) -> str:
+        """Return which record would tell the two most probable forms apart, or why one fails."""
+        if rival is None:
+            worst = min(gains, key=lambda each: each.held_out - each.trained, default=None)
+            return "" if worst is None else f"another one like {worst.split}"
+        points = [kept[k][1].points[0] for k in (chosen, rival)]
+        best, text = 0.0, ""
+        for number, record in enumerate(self.records):
+            name = record.name or f"record {number + 1}"
+            later_s = float(record.t_s[-1] - record.t_s[0])
+            trials = {f"{name} once more": record}
+            if not self.simulation.model.from_rest:
+                trials[f"{name} with start and inputs twice as large"] = _scale(record, 2.0)
+                trials[f"{name} with start and inputs half as large"] = _scale(record, 0.5)
+                trials[f"{name} once more, begun {later_s:.3g} s later"] = replace(record, t_s=record.t_s + later_s)
+            for words, trial in trials.items():
+                first, second = (self.simulation.run(trial, point)[0] for point in points)
+                apart = weigh(trial, first - second, np.ones_like(first)) / self.sizes
+                size = float(np.sqrt(np.mean(apart**2))) / self.floor
+                if np.isfinite(size) and size > best:
+                    best, text = size, f"{words}, where {forms[chosen].kind} and {forms[rival].kind} differ by"
+        return f"{text} {best:.2g} times the noise" if text else ""
+
+
+def name_form(simulation: Simulation, candidate: Candidate, values: FloatArray) -> TermForm:
+    """Return the form of a candidate with fitted numbers [3]."""
+    at, nodes, model = candidate.screened.at, candidate.screened.nodes, simulation.model
+    names = model.variable_names
+    involved = (names[at.variable], *((names[at.factor],) if at.factor >= 0 else ()))
+    form: Form = candidate.form.settle(float(values[1]), float(np.abs(nodes).max()))
+    kind = CHANGE if "t" in involved else form.kind
+    formula = NAMELESS[CHANGE] if kind == CHANGE else form.describe(values, *involved)
+    return TermForm(model.place_names[at.place], involved, kind, NAMELESS.get(kind, formula), 0.0, 0.0)
+
+
+def _scale(record: Record, factor: float) -> Record:
+    return replace(record, inputs=record.inputs * factor, outputs=record.outputs * factor)
+
+
+def _compute_rms(errors: Sequence[FloatArray], masks: Sequence[BoolArray]) -> float:
+    """Return the root mean square of errors [m, o] of each record over masked samples [m]."""
+    squares = sum(float(np.sum(each[mask] ** 2)) for each, mask in zip(errors, masks, strict=True))
+    count = sum(int(np.count_nonzero(each[mask])) for each, mask in zip(errors, masks, strict=True))
+    return float(np.sqrt(squares / max(count, 1)))
+
+
+def _is_same(one: Proposal, other: Proposal) -> bool:
+    """Return whether two terms are one function along the data. A curve may be any."""
+    screened = one.candidate.screened
+    if screened.at != other.candidate.screened.at:
+        return False
+    if other.candidate.form.kind == CURVE:
+        return True
+    a, b = one.evaluate(screened.nodes), other.evaluate(screened.nodes)
+    apart = float((a - b) @ screened.full @ (a - b))
+    return apart <= SAME * min(float(a @ screened.full @ a), float(b @ screened.full @ b))
+
+
+def _is_behind(one: Measured, best: Measured) -> float:
+    """Return by how many σ one model predicts worse than another."""
+    apart = one.logs - best.logs
+    return sum_in_sigma(apart, apart - apart.mean())[0] if np.abs(apart).max() > 1e-9 else 0.0
