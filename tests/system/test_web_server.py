@@ -180,7 +180,7 @@ def acceptor(tmp_path, policy, clock):
     with supervisor, open_tcp_listener("127.0.0.1", 0) as listener:
         acceptor = Acceptor([listener], policy, DaemonSection(), tmp_path / "acceptor", tmp_path / "link", beat)
         acceptor.port = listener.getsockname()[1]
-        clock.drive(acceptor._room)
+        clock.drive(acceptor._queue)
         thread = threading.Thread(target=acceptor.run)
         thread.start()
         yield acceptor
@@ -258,7 +258,7 @@ def test_a_connection_that_stays_in_a_phase_is_closed(open_client, acceptor, ser
         if phase in ("idle", "drain"):
             assert client.receive_answer()
         if phase == "headers":  # it waits in front of the server
-            wait_for(lambda: len(acceptor._room) == 1, "the connection")
+            wait_for(lambda: len(acceptor._queue) == 1, "the connection")
         else:
             await_phases(server, phase)
         clock.sleep(0.9 * LONG_S)

@@ -65,7 +65,7 @@ class AcceptorRig:
 
     def collect_kinds(self, rank):
         """Return the kinds of all messages to the link process once a connection waits with a rank."""
-        while not self.acceptor._room.count(rank):
+        while not self.acceptor._queue.count(rank):
             time.sleep(0.005)
         return [message.kind for message in self._link.receive()]
 
