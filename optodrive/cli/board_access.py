@@ -13,7 +13,7 @@ from optodrive.core.errors import MISSING, InputError, LinkError
 
 if TYPE_CHECKING:
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-    from optodrive.lab.commissioning.sensor import SpotReader
+    from optodrive.lab.commissioning.sensor import SensorReader
 
 SENSOR_BAUD = 115_200
 
@@ -34,7 +34,7 @@ class BoardAccess(NamedTuple):
     """A board that is not yet connected, and the reader of its spot sensor, None without a sensor."""
 
     board: "ExclusiveBoard"
-    spot_reader: "SpotReader | None"
+    spot_reader: "SensorReader | None"
 
 
 def _report_heat(text: str) -> None:
@@ -54,7 +54,7 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
     from optodrive.core.clock import MonotonicClock
     from optodrive.device.config_file import DEFAULT_CONFIG, load_config
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
-    from optodrive.lab.commissioning.sensor import SpotReader, SpotSensorClient
+    from optodrive.lab.commissioning.sensor import SensorReader, SpotSensorClient
     from optodrive.link.board_setup import build_port_settings
     from optodrive.link.transport.registry import build_bench_transport
     from optodrive.link.transport.serial_port import SerialPort
@@ -77,7 +77,7 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
         spot_reader = None
         if loaded.sensor is not None or sensor_port:
             port, baud = (loaded.sensor.port, loaded.sensor.baud) if loaded.sensor else (sensor_port, SENSOR_BAUD)
-            spot_reader = SpotReader(exclusive_board, SpotSensorClient(SerialPort(port, baud, "sensor.port")), clock)
+            spot_reader = SensorReader(exclusive_board, SpotSensorClient(SerialPort(port, baud, "sensor.port")), clock)
         try:
             yield BoardAccess(exclusive_board, spot_reader)
         except LinkError as error:

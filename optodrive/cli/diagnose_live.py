@@ -66,7 +66,6 @@ def measure_live(request: LiveRequest, quiet: bool) -> "CampaignResult":
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.files import create_folder
     from optodrive.core.worker_process import WorkerProcess
-    from optodrive.lab.commissioning.sensor import PixelReader
     from optodrive.lab.live_diagnosis import BoardBench, CampaignRecording, find_pixels, run_campaign
 
     confirm_emission(request.yes, "this arms the board and pulses one pixel and its neighbour at up to full power")
@@ -79,12 +78,11 @@ def measure_live(request: LiveRequest, quiet: bool) -> "CampaignResult":
             raise InputError("sensor.port", MISSING, "a sensor that records signals of a pixel", "no_port")
         if recording.runs:
             print(f"optodrive: going on with {len(recording.runs)} runs of {recording.path}", file=sys.stderr)
-        reader = PixelReader(board, spot_reader, clock)
         board.connect()
-        reader.open()
+        spot_reader.open(records_pixels=True)
         with show_campaign(quiet) as (on_step, on_run):
             return run_campaign(
-                BoardBench(board, reader, worker, clock),
+                BoardBench(board, spot_reader, worker, clock),
                 board.display,
                 find_pixels(board.config),
                 recording,

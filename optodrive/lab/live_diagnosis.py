@@ -31,7 +31,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.core.worker_process import WorkerProcess
 from optodrive.device.config import Config, build_pixel_layout
 from optodrive.lab.commissioning.exclusive_board import LOOP_STEP_S, ExclusiveBoard
-from optodrive.lab.commissioning.sensor import PixelReader
+from optodrive.lab.commissioning.sensor import SensorReader
 from optodrive.lab.diagnosis.next_steps import CERTAIN
 from optodrive.lab.recording import read_recording, write_recording
 from optodrive.link.session.plan_job import PlanJob
@@ -303,7 +303,7 @@ def name_probabilities(probabilities: Probabilities) -> dict[str, float]:
 class BoardBench:
     """Plays experiments on a connected board, which is armed from the first run to `disarm`."""
 
-    def __init__(self, board: ExclusiveBoard, reader: PixelReader, worker: WorkerProcess, clock: Clock) -> None:
+    def __init__(self, board: ExclusiveBoard, reader: SensorReader, worker: WorkerProcess, clock: Clock) -> None:
         self._board, self._reader, self._worker, self._clock = board, reader, worker, clock
         self._is_armed = False
         self._rested_s = 0.0
@@ -325,11 +325,11 @@ class BoardBench:
         step_us = max(STEP_MIN_US, ceil(experiment.span_s * 1e6 / SAMPLES_MAX))
         count = int(experiment.span_s * 1e6 / step_us)
         jobs: list[PlanJob] = []
-        self._reader.begin(experiment.pixel, count, step_us)
+        self._reader.begin_recording(experiment.pixel, count, step_us)
         started = datetime.now(UTC).isoformat()
         board.play(experiment.plan, jobs.append)
         board.wait(experiment.span_s - float(experiment.pulses[-1, 0]))
-        values = self._reader.read(count)
+        values = self._reader.read_recording(count)
         self._rested_s = self.now_s() + REST_S
         scale = board.session.scale
         executed = jobs[-1].build_executed(experiment.plan, scale.full_power_w, scale.tick_s)

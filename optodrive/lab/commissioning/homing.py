@@ -13,7 +13,7 @@ from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config import Config
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard, max_spot_power_w
-from optodrive.lab.commissioning.sensor import SpotReader
+from optodrive.lab.commissioning.sensor import SensorReader
 from optodrive.link.protocol.messages import INPUTS
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 from optodrive.link.protocol.states import BoardState
@@ -68,7 +68,7 @@ class Homing:
     """
 
     def __init__(
-        self, board: ExclusiveBoard, spot_reader: SpotReader | None, power_w: float, acknowledge: bool = False
+        self, board: ExclusiveBoard, spot_reader: SensorReader | None, power_w: float, acknowledge: bool = False
     ) -> None:
         self._board, self._spot_reader, self._power_w, self._acknowledge = board, spot_reader, power_w, acknowledge
         self._code_rad = board.config.scanner.rad_per_code

@@ -143,11 +143,12 @@ class SpotSensorClient:
         )
 
 
-class SpotReader:
+class SensorReader:
     """Reads the sensor and keeps the board's lease while it waits."""
 
     def __init__(self, board: ExclusiveBoard, sensor: SpotSensorClient, clock: Clock) -> None:
         self._board, self.sensor, self._clock = board, sensor, clock
+        self.signals: tuple[str, ...] = ()
 
     @property
     def port(self) -> str:
@@ -183,10 +184,19 @@ class SpotReader:
         """Return the position outputs of the mirrors, rad. Return None without position outputs."""
         return self.sensor.parse_mirrors_rad(self.query("mirrors"))
 
-    def open(self) -> None:
-        """Open the sensor's port. Raise InputError if it does not exist, LinkError if no sensor answers."""
+    def open(self, records_pixels: bool = False) -> None:
+        """Open the sensor's port, and ask for its signals where it is to record pixels.
+
+        Raise InputError if the port does not exist or the sensor records no signal of a pixel, LinkError if no sensor
+        answers.
+        """
         self.sensor.open()
         self._query_spot()
+        if records_pixels:
+            self.signals = self.sensor.parse_signals(self.query("signals"))
+            if not self.signals:
+                expected = "a sensor that records signals of a pixel; this one measures only spots and mirrors"
+                raise InputError("sensor.port", self.port, expected)
 
     def close(self) -> None:
         """Close the sensor's port."""
@@ -208,6 +218,29 @@ class SpotReader:
     def _query_spot(self) -> SpotReading | None:
         return self.sensor.parse_spot(self.query("spot"))
 
+    def begin_recording(self, pixel: int, count: int, step_us: int) -> None:
+        """Ask for a recording of `count` samples per signal from the next light on."""
+        self.sensor.parse_granted(self.query(f"record {pixel} {count} {step_us}"), count)
+
+    def read_recording(self, count: int) -> dict[str, FloatArray]:
+        """Return the recorded signals, [count] each. Raise RefusedError if the sensor has seen no light."""
+        return {name: self._read_signal(number, count) for number, name in enumerate(self.signals)}
+
+    def _read_signal(self, number: int, count: int) -> FloatArray:
+        until_s = self._clock.now_s() + LATE_MAX_S
+        values: list[float] = []
+        while len(values) < count:
+            samples = self.sensor.parse_samples(self.query(f"samples {number} {len(values)}"))
+            if samples is not None:
+                values += samples
+            elif self._clock.now_s() > until_s:
+                raise RefusedError(f"sensor at {self.port}: recorded no light: does the beam reach the display?")
+            else:
+                self._board.wait(POLL_S)
+        if len(values) > count:
+            raise LinkError(f"sensor at {self.port}: {len(values)} samples, expected {count}")
+        return np.array(values)
+
 
 def robust_mean(readings: list[SpotReading]) -> SpotReading:
     """Return the mean of the readings near their median. Return the first reading if none is near."""
@@ -222,44 +255,3 @@ def robust_mean(readings: list[SpotReading]) -> SpotReading:
         fmean(each.y_m for each in inliers),
         inliers[0].sigma_m / sqrt(len(inliers)),
     )
-
-
-class PixelReader:
-    """Reads recordings that begin before the first light after a request. The board keeps its lease meanwhile."""
-
-    def __init__(self, board: ExclusiveBoard, reader: SpotReader, clock: Clock) -> None:
-        self._board, self._reader, self._sensor, self._clock = board, reader, reader.sensor, clock
-        self.signals: tuple[str, ...] = ()
-
-    def open(self) -> None:
-        """Open the sensor's port and ask for its signals. Raise InputError if it records none of a pixel."""
-        self._reader.open()
-        self.signals = self._sensor.parse_signals(self._reader.query("signals"))
-        if not self.signals:
-            expected = "a sensor that records signals of a pixel; this one measures only spots and mirrors"
-            raise InputError("sensor.port", self._sensor.port, expected)
-
-    def begin(self, pixel: int, count: int, step_us: int) -> None:
-        """Ask for a recording of `count` samples per signal from the next light on."""
-        self._sensor.parse_granted(self._reader.query(f"record {pixel} {count} {step_us}"), count)
-
-    def read(self, count: int) -> dict[str, FloatArray]:
-        """Return the recorded signals, [count] each. Raise RefusedError if the sensor has seen no light."""
-        return {name: self._read_signal(number, count) for number, name in enumerate(self.signals)}
-
-    def _read_signal(self, number: int, count: int) -> FloatArray:
-        until_s = self._clock.now_s() + LATE_MAX_S
-        values: list[float] = []
-        while len(values) < count:
-            samples = self._sensor.parse_samples(self._reader.query(f"samples {number} {len(values)}"))
-            if samples is not None:
-                values += samples
-            elif self._clock.now_s() > until_s:
-                raise RefusedError(
-                    f"sensor at {self._sensor.port}: recorded no light: does the beam reach the display?"
-                )
-            else:
-                self._board.wait(POLL_S)
-        if len(values) > count:
-            raise LinkError(f"sensor at {self._sensor.port}: {len(values)} samples, expected {count}")
-        return np.array(values)

@@ -13,7 +13,7 @@ from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.commissioning.measurement_loop import SpotRow, build_code_grid
-from optodrive.lab.commissioning.sensor import SpotReader
+from optodrive.lab.commissioning.sensor import SensorReader
 
 GRID_SIDE = 11
 """Candidate positions per side for a sensor."""
@@ -27,7 +27,7 @@ HELP = "'dx dy' in µm moves the spot, an empty line confirms that it is on the 
 class SensorLocator:
     """Locates spots with a sensor, several readings per position."""
 
-    def __init__(self, board: ExclusiveBoard, spot_reader: SpotReader, power_w: float, readings: int) -> None:
+    def __init__(self, board: ExclusiveBoard, spot_reader: SensorReader, power_w: float, readings: int) -> None:
         self._spot_reader, self._power_w, self._readings = spot_reader, power_w, readings
         # The whole grid shrinks to the board's range: places that are clipped one by one may get the same codes, and
         # one that cannot be told from another would never count as measured.

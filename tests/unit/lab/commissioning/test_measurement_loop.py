@@ -13,7 +13,7 @@ from optodrive.core.worker_process import WorkerProcess
 from optodrive.device.config import Config
 from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.lab.commissioning.measurement_loop import CalibrationSession, SpotRow, save_text, session_path_for
-from optodrive.lab.commissioning.sensor import SpotReader, SpotReading, SpotSensorClient, robust_mean
+from optodrive.lab.commissioning.sensor import SensorReader, SpotReading, SpotSensorClient, robust_mean
 from optodrive.lab.commissioning.spot_locator import SensorLocator
 from optodrive.link.transport.serial_port import SerialPort
 from optodrive.planning.display_model import DisplayModel
@@ -84,7 +84,7 @@ def test_every_place_of_a_sensor_s_grid_is_told_from_the_others(empty_columns):
     table = DISPLAYS["display-16"].config.model_dump()
     table["display"] |= {"missing": [[row, column] for row in range(4) for column in range(empty_columns)]}
     rig = ExclusiveRig(DisplayModel.from_config(Config.model_validate(table)), lambda x_code, y_code, at_us: None)
-    sensor = SpotReader(rig.held, SpotSensorClient(SerialPort("/dev/null", 115_200)), rig.clock)
+    sensor = SensorReader(rig.held, SpotSensorClient(SerialPort("/dev/null", 115_200)), rig.clock)
     locator = SensorLocator(rig.held, sensor, 5e-3, 3)
     codes = locator.candidate_codes(None)
     spots = MeasuredSpots.from_table(np.column_stack([codes, np.zeros_like(codes)]))
