@@ -9,11 +9,9 @@ The file is a recording (docs/reference/recordings.md) whose runs have pulses as
 group /plans/ID per plan. A run begins after a pause of COLD_AFTER_S; a plan's attribute `run` names its run.
 """
 
-import io
-import json
 import os
+import pickle
 import signal
-import struct
 import subprocess
 import sys
 import threading
@@ -32,7 +30,6 @@ from optodrive.lab.recording.storage import FORMAT, PULSES, TABLE_COLUMNS, VERSI
 QUEUE_MAX = 200
 """Maximum number of plans that wait to be written."""
 CLOSE_TIMEOUT_S = 10.0
-LENGTH_PREFIX = struct.Struct("<Q")
 ACKNOWLEDGEMENT = b"."
 Arrays = Mapping[str, np.ndarray[Any, Any]]
 SessionEntry = tuple[dict[str, Any], Arrays]
@@ -42,14 +39,6 @@ COLD_AFTER_S = 10.0
 RESERVED_BYTES = 1 << 18
 """More than HDF5 needs per plan beside its arrays."""
 INSTRUMENT_NOTES = "executed pulses of a session of the driver; signals are merged in afterwards"
-
-
-def encode_entry(metadata: Mapping[str, Any], arrays: Arrays) -> bytes:
-    """Encode an entry for the writer process."""
-    body = io.BytesIO()
-    text = np.frombuffer(json.dumps(metadata).encode(), dtype=np.uint8)
-    np.savez(body, about_=text, **arrays)  # type: ignore[arg-type]
-    return LENGTH_PREFIX.pack(body.tell()) + body.getvalue()
 
 
 class SessionRecorder:
@@ -76,7 +65,7 @@ class SessionRecorder:
             start_new_session=True,  # Ctrl-C ends the daemon only: the writer ends with its pipe
         )
         try:
-            self._send(encode_entry(metadata, {}))
+            self._send((dict(metadata), {}))
         except OSError:
             raise InputError("--record-session", str(path), f"a writable file ({self._read_failure()})") from None
         self._thread = threading.Thread(target=self._run_feeder, name="session recorder", daemon=True)
@@ -102,7 +91,7 @@ class SessionRecorder:
     def _run_feeder(self) -> None:
         try:
             while (make := self._queue.get()) is not None:
-                self._send(encode_entry(*make()))
+                self._send(make())
         except OSError:
             self._stop(self._read_failure())
         except Exception as error:  # a failing build_entry must not end the recording silently
@@ -110,10 +99,10 @@ class SessionRecorder:
         finally:
             self._close_writer()
 
-    def _send(self, packed: bytes) -> None:
+    def _send(self, entry: SessionEntry) -> None:
         assert self._writer.stdin is not None  # noqa: S101 - as it was started
         assert self._writer.stdout is not None  # noqa: S101
-        self._writer.stdin.write(packed)
+        pickle.dump(entry, self._writer.stdin)
         self._writer.stdin.flush()
         if self._writer.stdout.read(1) != ACKNOWLEDGEMENT:
             raise BrokenPipeError
@@ -217,33 +206,27 @@ def reserve_disk_space(path: Path, size: int) -> None:
             raise
 
 
-def read_entry(stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]] | None:
+def _read_entry(stream: BinaryIO) -> SessionEntry | None:
     """Read the next entry. Return None at the end of the stream, also in the middle of an entry."""
-    head = stream.read(LENGTH_PREFIX.size)
-    if len(head) < LENGTH_PREFIX.size:
+    try:
+        entry: SessionEntry = pickle.load(stream)  # noqa: S301 - from the daemon
+    except (EOFError, pickle.UnpicklingError):
         return None
-    (length,) = LENGTH_PREFIX.unpack(head)
-    body = stream.read(length)
-    if len(body) < length:
-        return None
-    with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
-        entry_arrays = {name: arrays[name] for name in arrays.files}
-    metadata: dict[str, Any] = json.loads(entry_arrays.pop("about_").tobytes())
-    return metadata, entry_arrays
+    return entry
 
 
 def main() -> int:
     """Write entries until the stream ends."""
     for number in (signal.SIGXFSZ, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with its pipe, after the daemon's last entry
-    first = read_entry(sys.stdin.buffer)
+    first = _read_entry(sys.stdin.buffer)
     if first is None:
         return 0
     try:
         file = SessionRecordingFile(Path(sys.argv[1]), first[0])
         sys.stdout.buffer.write(ACKNOWLEDGEMENT)
         sys.stdout.buffer.flush()
-        while (note := read_entry(sys.stdin.buffer)) is not None:
+        while (note := _read_entry(sys.stdin.buffer)) is not None:
             file.add_plan(*note)
             sys.stdout.buffer.write(ACKNOWLEDGEMENT)
             sys.stdout.buffer.flush()
