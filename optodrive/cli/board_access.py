@@ -34,7 +34,7 @@ class BoardAccess(NamedTuple):
     """A board that is not yet connected, and the reader of its spot sensor, None without a sensor."""
 
     board: "ExclusiveBoard"
-    spot_reader: "SensorReader | None"
+    sensor_reader: "SensorReader | None"
 
 
 def _report_heat(text: str) -> None:
@@ -74,17 +74,19 @@ def open_board(config: str | None, calibrated_field: bool = False, stage: str | 
         defer_interruption() as defer,
         ExclusiveBoard(display, transport, clock, is_part, _report_heat) as exclusive_board,
     ):
-        spot_reader = None
+        sensor_reader = None
         if loaded.sensor is not None or sensor_port:
             port, baud = (loaded.sensor.port, loaded.sensor.baud) if loaded.sensor else (sensor_port, SENSOR_BAUD)
-            spot_reader = SensorReader(exclusive_board, SpotSensorClient(SerialPort(port, baud, "sensor.port")), clock)
+            sensor_reader = SensorReader(
+                exclusive_board, SpotSensorClient(SerialPort(port, baud, "sensor.port")), clock
+            )
         try:
-            yield BoardAccess(exclusive_board, spot_reader)
+            yield BoardAccess(exclusive_board, sensor_reader)
         except LinkError as error:
             if "cannot be opened" in str(error):
                 raise LinkError(f"{error} A running `optodrive serve` holds the port: stop it first") from None
             raise
         finally:
             defer()  # no signal may interrupt the ABORT
-            if spot_reader is not None:
-                spot_reader.close()
+            if sensor_reader is not None:
+                sensor_reader.close()

@@ -63,10 +63,10 @@ def home(
     from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.homing import Homing
 
-    with report_steps("home", json) as report_step, open_board(config, stage=stage) as (board, spot_reader):
+    with report_steps("home", json) as report_step, open_board(config, stage=stage) as (board, sensor_reader):
         if spot_power_mw:
             check_spot_power(board.config, spot_power_mw * 1e-3)
-        Homing(board, spot_reader, spot_power_mw * 1e-3, acknowledge).run(report_step)
+        Homing(board, sensor_reader, spot_power_mw * 1e-3, acknowledge).run(report_step)
 
 
 def first_light(

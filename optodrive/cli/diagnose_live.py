@@ -72,17 +72,17 @@ def measure_live(request: LiveRequest, quiet: bool) -> "CampaignResult":
     create_folder(request.out)
     clock = MonotonicClock()
     # The board closes first on exit: it receives ABORT before the worker process is joined.
-    with WorkerProcess() as worker, open_board(request.config, calibrated_field=True) as (board, spot_reader):
+    with WorkerProcess() as worker, open_board(request.config, calibrated_field=True) as (board, sensor_reader):
         recording = CampaignRecording(request.out / RECORDING, board.config.name)
-        if spot_reader is None:
+        if sensor_reader is None:
             raise InputError("sensor.port", MISSING, "a sensor that records signals of a pixel", "no_port")
         if recording.runs:
             print(f"optodrive: going on with {len(recording.runs)} runs of {recording.path}", file=sys.stderr)
         board.connect()
-        spot_reader.open(records_pixels=True)
+        sensor_reader.open(records_pixels=True)
         with show_campaign(quiet) as (on_step, on_run):
             return run_campaign(
-                BoardBench(board, spot_reader, worker, clock),
+                BoardBench(board, sensor_reader, worker, clock),
                 board.display,
                 find_pixels(board.config),
                 recording,

@@ -161,10 +161,10 @@ def measure_on_board(
 
     power_w, target_rms_m = request.spot_power_mw * 1e-3, um_to_m(request.target_rms_um)
     # The board closes first on exit: it receives ABORT before the worker process is joined.
-    with WorkerProcess() as worker, open_board(config, stage=stage) as (exclusive_board, spot_reader):
+    with WorkerProcess() as worker, open_board(config, stage=stage) as (exclusive_board, sensor_reader):
         check_spot_power(exclusive_board.config, power_w)
         session = CalibrationSession.load_or_create(out, exclusive_board.config)
-        if not request.manual and spot_reader is None:
+        if not request.manual and sensor_reader is None:
             raise InputError(
                 "sensor.port", MISSING, "a spot sensor in the configuration; without one, --manual", "no_port"
             )
@@ -175,13 +175,13 @@ def measure_on_board(
         worker.submit(fit_and_warm_up, session.spots, FieldPrior.from_config(exclusive_board.config))
         worker.result()  # compiles and loads the fit before the lease is running
         exclusive_board.connect()
-        if request.manual or spot_reader is None:
+        if request.manual or sensor_reader is None:
             locator: ManualLocator | SensorLocator = ManualLocator(
                 exclusive_board, power_w, _read_stdin_lines(), print_status
             )
         else:
-            spot_reader.open()
-            locator = SensorLocator(exclusive_board, spot_reader, power_w, request.readings)
+            sensor_reader.open()
+            locator = SensorLocator(exclusive_board, sensor_reader, power_w, request.readings)
         print_status("optodrive: arming, the board's indicator is on for two seconds first")
         exclusive_board.arm()
         with show_measurement_progress(request.spots_max, request.target_rms_um, request.manual) as on_progress:

@@ -64,13 +64,13 @@ Outcome = tuple[str, dict[str, object]]
 class Homing:
     """One run of the steps on one board.
 
-    spot_reader: None without a sensor; power_w: of spots, 0 to keep the gate off; acknowledge: a fault of the board
+    sensor_reader: None without a sensor; power_w: of spots, 0 to keep the gate off; acknowledge: a fault of the board
     """
 
     def __init__(
-        self, board: ExclusiveBoard, spot_reader: SensorReader | None, power_w: float, acknowledge: bool = False
+        self, board: ExclusiveBoard, sensor_reader: SensorReader | None, power_w: float, acknowledge: bool = False
     ) -> None:
-        self._board, self._spot_reader, self._power_w, self._acknowledge = board, spot_reader, power_w, acknowledge
+        self._board, self._sensor_reader, self._power_w, self._acknowledge = board, sensor_reader, power_w, acknowledge
         self._code_rad = board.config.scanner.rad_per_code
         self._step = ""
         self._zero: HomingPosition | None = None
@@ -92,9 +92,9 @@ class Homing:
         """Check that board and sensor answer."""
         self._board.connect()
         sensor = "no sensor"
-        if self._spot_reader is not None:
-            self._spot_reader.open()
-            sensor = f"sensor at {self._spot_reader.port}"
+        if self._sensor_reader is not None:
+            self._sensor_reader.open()
+            sensor = f"sensor at {self._sensor_reader.port}"
         port, uid = self._board.session.port, self._board.session.board.uid
         return f"board {uid} at {port}, {sensor}", {"board": port, "uid": uid}
 
@@ -185,18 +185,18 @@ class Homing:
     def _measure_at(self, x_code: int, y_code: int) -> HomingPosition:
         self._board.move_to(x_code, y_code)
         commanded_rad = (x_code - CENTRE_CODE) * self._code_rad, (y_code - CENTRE_CODE) * self._code_rad
-        if self._spot_reader is None:
+        if self._sensor_reader is None:
             if self._power_w:
                 self._board.fire_spot(x_code, y_code, self._power_w)
             return HomingPosition(commanded_rad, None, None)
-        output_rad, spot_m = self._spot_reader.read_mirrors_rad(), None
+        output_rad, spot_m = self._sensor_reader.read_mirrors_rad(), None
         if self._power_w:
-            reading = self._spot_reader.read_spot(x_code, y_code, self._power_w, READINGS_PER_SPOT)
+            reading = self._sensor_reader.read_spot(x_code, y_code, self._power_w, READINGS_PER_SPOT)
             if reading is None:
                 place = f"with the mirrors at {commanded_rad[0]:.4f}, {commanded_rad[1]:.4f} rad"
                 expected = "a spot: is it covered, or too dim?"
                 raise RefusedError(
-                    f"home: spot: sensor at {self._spot_reader.port} {place}: got no spot, expected {expected}"
+                    f"home: spot: sensor at {self._sensor_reader.port} {place}: got no spot, expected {expected}"
                 )
             spot_m = reading.x_m, reading.y_m
         return HomingPosition(commanded_rad, output_rad, spot_m)

@@ -27,8 +27,8 @@ HELP = "'dx dy' in µm moves the spot, an empty line confirms that it is on the 
 class SensorLocator:
     """Locates spots with a sensor, several readings per position."""
 
-    def __init__(self, board: ExclusiveBoard, spot_reader: SensorReader, power_w: float, readings: int) -> None:
-        self._spot_reader, self._power_w, self._readings = spot_reader, power_w, readings
+    def __init__(self, board: ExclusiveBoard, sensor_reader: SensorReader, power_w: float, readings: int) -> None:
+        self._sensor_reader, self._power_w, self._readings = sensor_reader, power_w, readings
         # The whole grid shrinks to the board's range: places that are clipped one by one may get the same codes, and
         # one that cannot be told from another would never count as measured.
         grid = build_code_grid(board.config, GRID_MARGIN_M, GRID_SIDE)
@@ -36,7 +36,7 @@ class SensorLocator:
         self._codes: FloatArray = np.rint(
             board.clip_codes(low) + (grid - low) / (high - low) * (board.clip_codes(high) - board.clip_codes(low))
         )
-        self.name = f"sensor at {spot_reader.port}"
+        self.name = f"sensor at {sensor_reader.port}"
         self.not_found_message = (
             f"{self.name} sees no spot, expected one: is it covered, or is {format_quantity(power_w, 'W')} too dim?"
         )
@@ -56,7 +56,7 @@ class SensorLocator:
 
     def measure(self, place: int, x_code: int, y_code: int) -> SpotRow | None:
         """Measure a position as the robust mean of several readings."""
-        reading = self._spot_reader.read_spot(x_code, y_code, self._power_w, self._readings)
+        reading = self._sensor_reader.read_spot(x_code, y_code, self._power_w, self._readings)
         return None if reading is None else SpotRow(x_code, y_code, reading.x_m, reading.y_m)
 
 

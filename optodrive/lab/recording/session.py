@@ -190,7 +190,7 @@ class SessionRecordingFile:
             if key in ("summary", "trains", "labels", "parameters"):  # too long for an HDF5 attribute
                 group.create_dataset(key, data=value)
             elif value is not None:
-                group.attrs[key] = value
+                group.attrs[key] = str(value) if isinstance(value, str) else value  # h5py stores no NumPy text
         for name, array in arrays.items():
             group.create_dataset(name, data=array, compression="gzip" if array.size > 1000 else None)
 
