@@ -28,7 +28,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.config import Config
 from optodrive.device.servo import Servo, ServoRange
-from optodrive.lab.servo_identification.common_servo import find_half_widths
+from optodrive.lab.servo_identification.gate import find_half_widths
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.planning.budget_setup import build_galvo_model
 from optodrive.planning.limiter.galvo_load import move_energy

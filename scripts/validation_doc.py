@@ -53,9 +53,11 @@ pulses much longer than τ, and the mean follows τ/t_g for pulses much shorter;
 DIAGNOSIS_SECTION = """\
 ## Results of `optodrive validate --diagnose`
 
-The command treats the twelve measured outcomes as a recording and the literal set as the model, selects among the
+The command treats the twelve measured outcomes as a recording and the literal set as the model, weighs sets of the
 causes of `optodrive/lab/validation/candidate_causes.py`, and repeats selection and fit without each group of facts to
-predict that group. It prints:
+predict that group. A cause is named on the conditions of [diagnoses](../decisions/0082-four-conditions-of-a-cause.md).
+Aggregate figures permit less than a recording does: there are no repeats, so the noise is an assumption; a group that
+alone shows a cause is held out fact by fact; what one fact shows, nothing tests. It prints:
 """
 
 DISCUSSION_SECTION = """\
@@ -83,6 +85,8 @@ JSON_KEYS = """\
 `--diagnose --json` prints one object, SI units, temperatures as rises in K:
 
 - `parameter_set`: the parameter set that is diagnosed
+- `verdict`, `sets` (the causes named), `reasons`, as of a diagnosis
+- `probabilities`: `no_effect`, `none_of_these`, `causes` (each set above 1 %: `causes`, `probability`)
 - `facts`: each `id`, `group`, `value`, `relative_error`, `reading` (`relative_error`, `source`), `nominal_ratio`,
   `extended_ratio`, `error_sigma`
 - `excluded`: outcome → reason why it is not a measurement
@@ -90,15 +94,13 @@ JSON_KEYS = """\
 - `aicc_per_cause`, `aicc_indistinguishable`: thresholds
 - `causes`: each `cause`, `description`, `parameter`, `value`, `unit`, `ci95`, `chi2_reduction`, `evidence`,
   `alternatives`, `deciding_measurement`
-- `candidates`, the other causes: each `cause`, `description`, `verdict`, `value` (beside the identified ones), `unit`,
-  `chi2_reduction_alone`, `chi2_reduction_added`, `replaces`, `replaced_fraction`
+- `candidates`, the other causes: each `cause`, `description`, `probability`, `value` (beside the identified ones),
+  `unit`, `chi2_reduction_alone`, `chi2_reduction_added`, `replaces`, `replaced_fraction`, `is_observable`,
+  `is_alternative_law`
 - `contradictions`: each `assumption`, `description`, `ratio`
 - `unexplained`: facts that deviate by more than two standard errors
 - `gain`: `groups` and `facts`, each `held_out`, `facts`, `causes`, `unobservable`, `nominal_ratio`, `extended_ratio`,
   `nominal_factor`, `extended_factor`; `factor_groups` and `factor_each`, each `nominal`, `extended`
-
-Verdicts of candidates: `alternative cause` (fits as well in place of a cause), `alternative law` (fits as well beside
-them), `ruled out`, `not needed`, `not observable`.
 """
 
 

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from optodrive.cli.output import announce_compilation, print_json, show_step
+from optodrive.core.extras import import_extra
 
 if TYPE_CHECKING:
     from optodrive.lab.validation.study import StudyResult
@@ -14,6 +15,7 @@ MIN_TABLE_WIDTH = 110
 
 def diagnose_paper_facts(json: bool = False) -> None:
     """Print the narrative, or one JSON object."""
+    import_extra("scipy")
     from optodrive.lab.validation.narrative import build_study_answer
     from optodrive.lab.validation.study import run_study
     from optodrive.physics.paper_facts import load_paper_facts
@@ -49,7 +51,7 @@ def _print_narrative(study_result: "StudyResult") -> None:
     print_lines(describe_findings(study_result))
     table = Table(title="Predictions of held-out facts: causes selected and fitted without them, model over measured")
     for heading in HEADINGS:
-        table.add_column(heading, justify="right" if heading == "off by" else "left")
+        table.add_column(heading)
     for row in build_rows(study_result):
         table.add_row(*row)
     print_lines([""])

@@ -13,7 +13,7 @@ from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.field_loader import build_settling_table
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.lab.recording import write_recording
-from optodrive.lab.servo_identification.common_servo import move_sizes_rad
+from optodrive.lab.servo_identification.gate import move_sizes_rad
 
 SERVOS = HiddenServo(1100.0, 0.62, 5e-5, 80.0), HiddenServo(1250.0, 0.55, 3e-5, 95.0)
 CAP = "galvo_acceleration_rms_max_rad_per_s2"

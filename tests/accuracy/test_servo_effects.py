@@ -2,16 +2,24 @@
 
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hidden_nonlinear_servo import EFFECT_OF, KINDS, HiddenServo, recording
 
+from displays import DISPLAYS
+from exclusive_rig import ExclusiveRig
+from hidden_servo import HiddenServo as LinearServo
+from hidden_servo import recording as step_recording
 from optodrive.cli.main import run
+from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.lab.commissioning.mirror_steps import plan_step_runs, play_step_runs
 from optodrive.lab.recording import write_recording
-from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, find_effect
-from optodrive.lab.servo_identification.excitation import estimate_noise, extract_records
-from optodrive.lab.servo_identification.gate_effect import CERTAIN
+from optodrive.lab.servo_identification.effect_fit import LINEAR, find_effect
+from optodrive.lab.servo_identification.identify import identify
+from optodrive.lab.servo_identification.records import estimate_noise, extract_records, extract_trace
+from optodrive.link.simulator.galvos import measure_position_outputs
 
 FORMS = ("multisine", "noise", "sweep", "holds")
 
@@ -23,8 +31,7 @@ def judge(kind, seed):
     form, noise = FORMS[random.integers(4)], float(np.exp(random.uniform(np.log(0.002), np.log(0.05))))
     records = extract_records("r", recording((servo, servo), random, form, noise=noise), 0)
     found = find_effect(records, 2.0 * np.pi * servo.hz * random.uniform(0.7, 1.4))
-    name = max(found.probability, key=lambda each: found.probability[each])
-    return (name if found.probability[name] >= CERTAIN and name != OTHER else None), found
+    return found.effect, found
 
 
 @pytest.mark.parametrize("kind", ["linear with a lag", "slew", "arctangent", "smooth friction", "play", "Duffing"])
@@ -175,3 +182,56 @@ def test_what_an_npz_lacks_is_one_line(tmp_path, capsys, arguments, words):
     np.savez(tmp_path / "r.npz", u_1=np.zeros((64, 1, 2, 2)))
     assert run(["calibrate", "servo", f"{tmp_path}/r.npz", *arguments]) == 2
     assert words in capsys.readouterr().err
+
+
+def rehearse(display):
+    """Return what a scope would record of `calibrate steps` on a display's configured mirrors."""
+    rig, runs = ExclusiveRig(display, lambda *_: None), []
+
+    def record(run, commands):
+        t_s, x_rad, y_rad = measure_position_outputs(display.config, commands, commands[-1, 0] + 0.015, len(runs)).T
+        signals = {
+            f"mirror_{axis}_rad": Signal(0, t_s.copy(), each.copy())
+            for axis, each in zip("xy", (x_rad, y_rad), strict=True)
+        }
+        runs.append(Run(run.name, 295.0, np.zeros((0, 4)), signals, {}, commands))
+
+    with rig.armed() as held:
+        play_step_runs(plan_step_runs(held, 24), held, 0.1, record)
+    return Measurement(tuple(runs))
+
+
+def name_effect(measurement, axis):
+    servo = identify("r", extract_trace("r", measurement, axis), 100.0).servo
+    return find_effect(extract_records("r", measurement, axis), 2.0 * np.pi * servo.frequency, servo)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[] if each == "display-16" else pytest.mark.slow) for each in sorted(DISPLAYS)]
+)
+def test_a_rehearsal_names_the_slew_limit_of_the_configured_servo_and_nothing_else(name):
+    measurement = rehearse(DISPLAYS[name])
+    for axis in range(1 if name == "display-16" else 2):
+        found = name_effect(measurement, axis)
+        assert (found.claim.verdict, found.effect) == ("cause", "slew_limit")
+        assert found.fits["slew_limit"].effect[0] == pytest.approx(100.0, rel=0.05)
+        assert found.fits["slew_limit"].misfit2 < 1.1
+
+
+@pytest.mark.parametrize("seed", [900, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(901, 906))])
+def test_steps_of_a_linear_servo_name_no_effect(seed):
+    random = np.random.default_rng(seed)
+    servos = [replace(LinearServo.sample(random), slew=1e7) for _ in range(2)]
+    rate_hz, noise = (float(np.exp(random.uniform(*np.log(ends)))) for ends in ((1e4, 1e5), (1e-3, 1e-2)))
+    measurement = step_recording(servos, random, rate_hz, noise)
+    assert name_effect(measurement, 0).claim.causes == ()
+
+
+def test_a_whole_amplitude_is_held_out_where_each_was_recorded_once():
+    random = np.random.default_rng(1)
+    servo = LinearServo(900.0, 0.6, 4e-5, 90.0)
+    once = extract_records("r", step_recording((servo, servo), random), 0)
+    assert [each.held_out for each in once] == [False, True, False]
+    assert len({each.level for each in once}) == 3
+    twice = recording((HiddenServo("linear", 0.0, 900.0, 0.6, 0.0),) * 2, random, count=512)
+    assert [each.held_out for each in extract_records("r", twice, 0)] == [False, True] * 3

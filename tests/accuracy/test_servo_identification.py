@@ -12,9 +12,8 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.device.config_file import load_config
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.identify import identify
-from optodrive.lab.servo_identification.step_response import Steps, step_response_rad
-from optodrive.lab.servo_identification.step_trace import extract_trace
+from optodrive.lab.servo_identification.identify import Steps, identify, step_response_rad
+from optodrive.lab.servo_identification.records import extract_trace
 
 CONFIG = load_config()
 ONE, OTHER = HiddenServo(900.0, 0.6, 4e-5, 90.0), HiddenServo(1400.0, 0.45, 2e-5, 120.0)

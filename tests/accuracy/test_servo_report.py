@@ -8,13 +8,11 @@ import pytest
 from hidden_servo import HiddenServo, recording
 from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.device.config_file import load_config
-from optodrive.lab.servo_identification.common_servo import DAMPING_MAX, find_common_servo
 from optodrive.lab.servo_identification.effect_fit import find_effect
-from optodrive.lab.servo_identification.excitation import extract_records
-from optodrive.lab.servo_identification.gate_effect import assess
+from optodrive.lab.servo_identification.gate import DAMPING_MAX, assess, find_common_servo
 from optodrive.lab.servo_identification.identify import identify
+from optodrive.lab.servo_identification.records import extract_records, extract_trace
 from optodrive.lab.servo_identification.report import build_report, format_report_lines
-from optodrive.lab.servo_identification.step_trace import extract_trace
 
 CONFIG = load_config()
 SLOW, QUICK = HiddenServo(700.0, 0.99, 6e-5, 90.0), HiddenServo(1500.0, 0.6, 2e-5, 90.0)

@@ -10,7 +10,7 @@ from hidden_servo import commands
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.servo import ServoRange
 from optodrive.lab.servo_identification.identify import identify
-from optodrive.lab.servo_identification.step_trace import extract_trace
+from optodrive.lab.servo_identification.records import extract_trace
 from smooth_judge import TrueServo, follow, judge
 from smooth_plans import CODE_RAD, CONFIG, PITCH_RAD, TOLERANCE_RAD, sample_plan
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from optodrive.cli.main import run
+from optodrive.lab.inference.claim import claim
 from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
 from optodrive.lab.validation.cause_search import CauseSearch
 from optodrive.lab.validation.contradictions import find_contradictions
@@ -66,6 +67,30 @@ def rate(parameters, height_m):
 
 def named(facts):
     return set(CauseSearch(LITERAL, build_measured_facts(facts, LITERAL)).choose().keys)
+
+
+def judged(facts):
+    """Return the claim on facts as the study makes it, without its predictions."""
+    search = CauseSearch(LITERAL, build_measured_facts(facts, LITERAL))
+    search.choose()
+    return claim(search.collect_evidence())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_is_claimed_of_generated_facts_is_so(seed):
+    assert judged(generate_facts(LITERAL, seed)).verdict == "none"
+    lagging = judged(generate_facts(changed(tau_g=0.1), seed))
+    assert (lagging.verdict, lagging.causes) == ("cause", ("gas_lag",))
+    forced = judged(generate_facts(changed(phi=0.2), seed))
+    assert forced.verdict == "ambiguous"
+    assert set(forced.causes) == ALIKE
+
+
+def test_an_error_outside_the_hypotheses_names_no_cause():
+    facts = dict(load_paper_facts())
+    for name, factor in (("z_peak_w020", 5.0), ("z_peak_w075", 0.2), ("F_peak_w020", 8.0), ("F_peak_w055", 0.1)):
+        facts[name] = replace(facts[name], value=facts[name].value * factor)
+    assert judged(facts).verdict == "unexplained"
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -143,11 +168,22 @@ def test_the_papers_facts_name_lag_force_and_dead_time(found):
     assert not found.fit.at_limit
 
 
+def test_the_claim_on_the_papers_facts_names_both_explanations_of_the_force(found):
+    assert found.claim.verdict == "ambiguous"
+    assert {frozenset(keys) for keys in found.claim.sets} == {frozenset(("gas_lag", "dead_time", key)) for key in ALIKE}
+    assert found.untested == {"dead_time": "N_50um"}
+    headline = describe_findings(found)[0]
+    assert "which this data cannot separate" in headline
+    assert all(key in headline for key in ALIKE)
+
+
 def test_the_facts_refuse_plate_and_constant_volume_by_themselves(found):
     assert {item.key for item in found.contradictions} == {"constant_volume", "small_deflection"}
-    verdicts = {item.key: item.verdict for item in found.unchosen}
-    assert verdicts["gas_membrane"] == "alternative law"
-    assert verdicts["membrane_plate"] == "ruled out"
+    others = {item.key: item for item in found.unchosen}
+    assert others["gas_membrane"].is_alternative_law
+    assert others["membrane_plate"].probability < 0.01
+    assert others["membrane_plate"].chi2_reduction_alone > 500.0
+    assert {key for key, item in others.items() if not item.is_observable} == {"wall_heating", "panel_heating"}
     text = "\n".join(describe_findings(found))
     assert "right by chance" in text
     assert "constant volume" in text
@@ -203,6 +239,10 @@ def test_the_answer_as_json(found):
     document = json.loads(json.dumps(build_study_answer(found), allow_nan=False))
     assert set(document) == {
         "parameter_set",
+        "verdict",
+        "sets",
+        "reasons",
+        "probabilities",
         "facts",
         "excluded",
         "chi2",
@@ -243,9 +283,11 @@ def test_the_command_prints_one_json_object(found, capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out)["chi2"] == pytest.approx(build_study_answer(found)["chi2"])
 
 
-def test_it_needs_no_extra():
-    check = "import sys; sys.modules['scipy'] = None; import optodrive.lab.validation.narrative"
-    subprocess.run([sys.executable, "-c", check], check=True)
+def test_without_the_extra_it_says_what_it_needs():
+    code = "import sys; sys.modules['scipy'] = None; from optodrive.cli.main import run; sys.exit(run(sys.argv[1:]))"
+    done = subprocess.run([sys.executable, "-c", code, "validate", "--diagnose"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "optodrive[analysis]" in done.stderr
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(8, marks=pytest.mark.slow)])

@@ -31,13 +31,11 @@ def servo(
     from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.recording_checks import check_recording_units
     from optodrive.lab.recording import read_recording
-    from optodrive.lab.servo_identification.common_servo import find_common_servo
     from optodrive.lab.servo_identification.effect_fit import find_effect
-    from optodrive.lab.servo_identification.excitation import extract_records, is_excitation
-    from optodrive.lab.servo_identification.gate_effect import assess
+    from optodrive.lab.servo_identification.gate import assess, find_common_servo
     from optodrive.lab.servo_identification.identify import identify, identify_excitation
+    from optodrive.lab.servo_identification.records import extract_records, extract_trace, is_excitation
     from optodrive.lab.servo_identification.report import build_report, format_report_lines, write_mirrors
-    from optodrive.lab.servo_identification.step_trace import extract_trace
     from optodrive.physics.parameters import load_parameters
 
     if recording.suffix == ".npz":
@@ -57,7 +55,8 @@ def servo(
             servos.append(identify_excitation(source, records, axis, found, slew_rad_per_s))
         else:
             servos.append(identify(source, extract_trace(source, measurement, axis), slew_rad_per_s))
-            found = find_effect(records, 2.0 * pi * servos[-1].servo.frequency)
+            identified = servos[-1].servo
+            found = find_effect(records, 2.0 * pi * identified.frequency, identified)
         effects.append(assess(found, servos[-1].residual_rad, loaded, axis))
     mirrors, mirror_effects = (servos[0], servos[1]), (effects[0], effects[1])
     common = find_common_servo(mirrors, loaded, lambda axis, move, tolerance: effects[axis].settling_s(move, tolerance))
@@ -94,6 +93,8 @@ def _assess_responses(path: Path, sample_rate_hz: float | None, out: Path | None
         found = [find_effect(*build_records(responses, axis)) for axis in range(responses.u.shape[1])]
         report = {"axes": [{"linearity": report_linearity(each)} for each in found]}
         lines = [
-            f"axis {axis}           {describe_linearity(each['linearity'])}" for axis, each in enumerate(report["axes"])
+            f"axis {axis}           {line}"
+            for axis, each in enumerate(report["axes"])
+            for line in describe_linearity(each["linearity"])
         ]
     print_answer(report, lines, json)

@@ -46,6 +46,27 @@ def _build_headline(found: Discrepancy, causes: Sequence[Term]) -> str:
     return f"{wrong}, and no known cause explains it{others}."
 
 
+def describe_sufficiency(
+    found: Claim, probabilities: Probabilities, model: str, labels: Mapping[str, str]
+) -> list[str]:
+    """Return whether a model suffices, and why the answer is not more definite.
+
+    model: its name, at the beginning of a sentence; labels: of the causes, by key
+    """
+    named = ["; ".join(" and ".join(labels[key] for key in keys) for keys in found.sets)]
+    if len(found.sets) == 1:
+        probability = min((probabilities.sum_of(key) for key in found.causes), default=0.0)
+        named.append(f"({format_probability(probability)})")
+    headline = {
+        "none": f"{model} suffices ({format_probability(probabilities.no_effect)}).",
+        "undecided": f"Undecided: this data shows neither that {model} suffices nor that it does not.",
+        "cause": f"{model} does not suffice: {' '.join(named)}.",
+        "ambiguous": f"{model} does not suffice, perhaps: {' '.join(named)}"
+        + (", which this data cannot separate." if len(found.sets) > 1 else "."),
+    }.get(found.verdict, f"{model} does not suffice, and nothing known explains it.")
+    return [headline, *found.reasons]
+
+
 def _describe_difference(causes: Iterable[Term]) -> str:
     """Return a clause on the model or on the recording."""
     if any(term.is_instrument for term in causes):

@@ -12,8 +12,16 @@ import numpy as np
 
 from optodrive.core.errors import MISSING, InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
-from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, SYSTEMATIC_WEIGHT, ServoRecord, normalise
-from optodrive.lab.servo_identification.effects import FRICTION, HYSTERESIS, STIFFNESS
+from optodrive.lab.inference.claim import Alternative, Evidence, HeldOutChange, claim
+from optodrive.lab.inference.sentences import describe_sufficiency
+from optodrive.lab.servo_identification.effect_fit import (
+    LINEAR,
+    OTHER,
+    SYSTEMATIC_WEIGHT,
+    ServoRecord,
+    build_probabilities,
+)
+from optodrive.lab.servo_identification.effects import FRICTION, HYSTERESIS, LABELS, STIFFNESS
 
 HALF_WINDOW, DEGREE = 5, 2
 """Lines on either side of a local polynomial, and its degree."""
@@ -175,7 +183,8 @@ def build_records(responses: PeriodicResponses, axis: int) -> tuple[list[ServoRe
     for row, held_out in enumerate(responses.held_out):
         u, y = (np.tile(each[:, axis, row], 2) for each in (responses.u, responses.y))
         use = (np.arange(2 * n) >= n) & (np.arange(2 * n) % max(1, n // 8000) == 0)
-        records.append(ServoRecord(t_s, u, t_s, y, use, bool(held_out), responses.noise))
+        level = float(responses.level[row])
+        records.append(ServoRecord(t_s, u, t_s, y, use, bool(held_out), responses.noise, level))
     gain = np.abs(fit_response(responses, ~responses.held_out, (0.0,)).terms[:, axis, axis])
     gain = np.convolve(gain, np.ones(9) / 9.0, "same")
     lines = np.flatnonzero(gain > 0.0)
@@ -205,9 +214,21 @@ def assess_coupled(responses: PeriodicResponses) -> dict[str, Any]:
         score[name] = -SYSTEMATIC_WEIGHT * np.log(mean2[name]) + phase
     unknown = mean2["model"] + OTHER_SHARE * max(mean2[LINEAR] - mean2["model"], 0.0)
     score[OTHER] = -SYSTEMATIC_WEIGHT * np.log(unknown) + np.log(OTHER_ODDS)
+    probabilities = build_probabilities(score)
+    excess = mean2[LINEAR] - min(mean2.values())
+    alternatives = []
+    for (name,), _ in probabilities.ranked:
+        share = (mean2[LINEAR] - mean2[name]) / max(excess, 1e-300)
+        alternatives.append(
+            Alternative((name,), (share, share), _list_changes(responses, errors[name], errors[LINEAR]))
+        )
+    found = claim(Evidence(probabilities, tuple(alternatives)))
     return {
+        "verdict": found.verdict,
+        "sentences": describe_sufficiency(found, probabilities, "One linear servo", LABELS),
         "formula": "G(A) = G0 + A G1 + A² G2, A: rms of the drive",
-        "probability": normalise(score),
+        "probability": {keys[0]: each for keys, each in probabilities.causes.items()}
+        | {LINEAR: probabilities.no_effect, OTHER: probabilities.none_of_these},
         "noise": responses.noise,
         "error": {name: {f"{level:.4g}": each for level, each in of.items()} for name, of in errors.items()},
         "gain": 1.0 - float(np.sqrt(mean2["model"] / mean2[LINEAR])),
@@ -218,6 +239,25 @@ def assess_coupled(responses: PeriodicResponses) -> dict[str, Any]:
         "consequence": f"a linear servo misses a target by up to {0.5 * abs(change):.2%} of the move after any "
         "settling time: gates need a tolerance above that, or a position sensor; plans cannot load this response",
     }
+
+
+def _list_changes(
+    responses: PeriodicResponses, found: dict[float, float], linear: dict[float, float]
+) -> tuple[HeldOutChange, ...]:
+    """Return the change of χ² by a law in each held-out realisation.
+
+    The errors are systematic, so what counts as noise is that of their mean square over the lines of a realisation.
+    """
+    size = responses.y[:, :, 0].size
+    return tuple(
+        HeldOutChange(
+            f"{level:.3g} rms",
+            "the output",
+            size * (error**2 - linear[level] ** 2) / responses.noise**2,
+            np.sqrt(2.0 * size) * (error / responses.noise) ** 2,
+        )
+        for level, error in found.items()
+    )
 
 
 def _measure_static_change(responses: PeriodicResponses, linear: AmplitudeResponse) -> tuple[complex, float]:
@@ -259,11 +299,10 @@ def _list_resonances(
 
 def describe_coupled(report: dict[str, Any]) -> list[str]:
     """Describe the answer for coupled axes as text lines."""
-    probability = report["probability"]
-    name = max(probability, key=lambda each: probability[each])
+    headline, *reasons = report["sentences"]
     lines = [
-        f"coupled axes     one linear servo suffices with probability {probability[LINEAR]:.3f}; "
-        f"{name} {probability[name]:.3f}",
+        f"coupled axes     {headline}",
+        *(f"                 {line}" for line in reasons),
         f"model            {report['formula']}",
         f"noise            {report['noise']:.3g} rms",
     ]

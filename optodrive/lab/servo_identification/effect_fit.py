@@ -1,17 +1,19 @@
-"""Which effect a servo has beside its linear response: every form fitted, compared on runs that no fit has seen.
+"""Which effect a servo has beside its linear response: every form fitted, compared on data that no fit has seen.
 
 Every candidate, the linear one included, also has a free linear response, so that linear dynamics beyond the second
-order are no effect.
+order are no effect. The verdict is `lab.inference`'s: this module states the evidence.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import expm
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.core.types.discrepancy import Probabilities
+from optodrive.device.servo import Servo
+from optodrive.lab.inference.claim import Alternative, Claim, Evidence, HeldOutChange, claim
 from optodrive.lab.inference.fit import Prior, fit_residuals
 from optodrive.lab.servo_identification.effects import (
     EFFECTS,
@@ -19,8 +21,11 @@ from optodrive.lab.servo_identification.effects import (
     LINEAR_FORM,
     SATURATION,
     SLEW_LIMIT,
-    Form,
+    ServoNonlinearity,
+    build_drive,
     integrate,
+    propagate,
+    sample_angle,
 )
 
 LINEAR, OTHER = "linear", "none_of_these"
@@ -33,13 +38,15 @@ UNSTABLE = 1e9
 """Angle in units of the noise beyond which a simulation is unstable."""
 FIT_SAMPLES_MAX = 3000
 PRIOR = np.array([10.0, 10.0, 10.0])
-"""Weak prior deviation of log ω, ζ and delay (s), which keeps near the linear fit what nothing identifies."""
+"""Weak prior deviation of log ω, ζ and delay (in periods), which keeps near the linear fit what nothing identifies."""
 FREQUENCY_SHIFTS = (0.0, 0.4, 0.8)
-"""Starts of log ω above the linear fit's for effects that slow a servo down."""
+"""Starts of log ω above the linear fit's for effects that slow a servo down, beside the expected one."""
 START_FACTORS, STARTS_REFINED = (0.3, 0.5, 0.8, 1.25, 2.0, 3.3), 3
 """Starts of the linear fit's frequency relative to the expected one, and how many of them are refined."""
-CONTENDER = 4.0
-"""Forms within this factor of the least mean squares are fitted completely."""
+CONTENDER, OUTSIDER = 4.0, 10.0
+"""Forms within this factor of the least mean squares of their effect, or of this factor of all, are fitted completely.
+
+The best form of each effect always is."""
 MODEL_ERROR = 3e-4
 """Relative error of a model, rms, that says nothing against it."""
 SYSTEMATIC_WEIGHT = 5.0
@@ -47,13 +54,15 @@ SYSTEMATIC_WEIGHT = 5.0
 OTHER_SHARE, OTHER_ODDS = 0.2, 0.05
 """An unknown effect would leave this share of the linear residual's excess; prior odds of one."""
 LINEAR_ODDS = 1000.0
+AT_END = 0.01
+"""Part of a parameter's range beside an end within which a fit has ended there."""
 
 
 @dataclass(frozen=True, eq=False)
 class ServoRecord:
     """One run of one axis: commands [k] that hold from at_s on, angles [m] at t_s, rms noise of a sample.
 
-    use: [m], False where a sample is not compared; held_out: the run is for comparison only
+    use: [m], False where a sample is not compared; held_out: the run is for comparison only; level: rms of the commands
     """
 
     at_s: FloatArray
@@ -63,119 +72,133 @@ class ServoRecord:
     use: BoolArray
     held_out: bool
     noise: float
+    level: float = 0.0
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FormFit:
     """A fitted form.
 
-    base: log ω, ζ, delay in s; effect, scale: parameters of `integrate`; misfit2: mean squares of held-out
-    samples in units of the noise
+    base: log ω, ζ, delay in s; effect, scale: parameters of `integrate`; residual: of the samples that are compared, in
+    units of the noise; misfit2: its mean square; doubt: why its size is uncertain, or ""
     """
 
-    form: Form
+    form: ServoNonlinearity
     base: tuple[float, float, float]
     effect: tuple[float, float]
     scale: float
+    residual: FloatArray
     misfit2: float
+    doubt: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Linearity:
     """Answer.
 
-    probability: of each effect, of LINEAR and of OTHER; fits: the best form of each; gain: share of the rms error of
-    held-out samples that the best one removes; linear: log ω, ζ and delay (s) of the linear servo
+    fits: the best form of each effect, and LINEAR; gain: share of the rms error that the best one removes; linear:
+    log ω, ζ and delay (s) of the linear servo
     """
 
-    probability: dict[str, float]
+    claim: Claim
+    probabilities: Probabilities
     fits: dict[str, FormFit]
     gain: float
     linear: FloatArray
+
+    @property
+    def probability(self) -> dict[str, float]:
+        """Probability of each effect, of LINEAR and of OTHER."""
+        effects = {keys[0]: each for keys, each in self.probabilities.causes.items()}
+        return effects | {LINEAR: self.probabilities.no_effect, OTHER: self.probabilities.none_of_these}
+
+    @property
+    def effect(self) -> str | None:
+        """The effect that the claim names, LINEAR if it names none, None if it is not certain."""
+        return {"cause": self.claim.causes[:1], "none": (LINEAR,)}.get(self.claim.verdict, (None,))[0]
 
 
 class ServoData:
     """Records of one axis on the grids of the integration."""
 
-    def __init__(self, records: list[ServoRecord], omega: float) -> None:
+    def __init__(self, records: list[ServoRecord], omega: float, fastest: float = 0.0) -> None:
+        """omega, fastest: rad/s of the linear response, and of a servo that an effect slows down to that."""
         self.records = records
         self.tap_s = 2.0 * np.pi / omega / TAPS_PER_PERIOD
         span_s = sum(float(each.t_s[-1] - each.at_s[0]) for each in records)
-        self.h_s = max(1.0 / (STEPS_PER_TIME_CONSTANT * omega), span_s / STEPS_MAX)
-        self.grids = [np.arange(each.at_s[0], each.t_s[-1] + self.h_s, self.h_s) for each in records]
-        self.areas = [np.concatenate([[0.0], np.cumsum(np.diff(each.at_s) * each.command[:-1])]) for each in records]
+        self.h_s = max(1.0 / (STEPS_PER_TIME_CONSTANT * max(omega, fastest)), span_s / STEPS_MAX)
+        self.cells = [int((each.t_s[-1] - each.at_s[0]) / self.h_s) + 2 for each in records]
+        self.used_s = [each.t_s[each.use] for each in records]
+        self.noise = np.concatenate(
+            [np.full(len(t_s), each.noise) for each, t_s in zip(records, self.used_s, strict=True)]
+        )
         self.target = np.concatenate([(each.value / each.noise)[each.use] for each in records])
         self.drives = lru_cache(maxsize=6)(self._drives)
-        self.sample_times_s = lru_cache(maxsize=2)(self._sample_times_s)
 
-    def _area(self, row: int, t_s: FloatArray) -> FloatArray:
-        """Return the integral of a record's command from its beginning, also before and after it."""
-        each = self.records[row]
-        before, after = np.minimum(t_s - each.at_s[0], 0.0), np.maximum(t_s - each.at_s[-1], 0.0)
-        inside = np.interp(t_s, each.at_s, self.areas[row])
-        area: FloatArray = inside + each.command[0] * before + each.command[-1] * after
-        return area
+    def _drives(
+        self, form: ServoNonlinearity, effect: tuple[float, float], delay_s: float, parts: int
+    ) -> list[FloatArray]:
+        """Return mean and slope of each record's command in the parts of its cells, [n, 2]."""
+        h_s = self.h_s / parts
+        return [
+            build_drive(form, effect, each.at_s, each.command, (each.at_s[0] - h_s - delay_s, h_s, parts * cells))
+            for each, cells in zip(self.records, self.cells, strict=True)
+        ]
 
-    def _drives(self, delay_s: float) -> list[FloatArray]:
-        edges = [np.append(grid - self.h_s, grid[-1]) - delay_s for grid in self.grids]
-        return [np.diff(self._area(row, each)) / self.h_s for row, each in enumerate(edges)]
-
-    def _sample_times_s(self, stride: int) -> list[FloatArray]:
-        """Return the times of every stride-th of all used samples, by record."""
-        used_s = [each.t_s[each.use] for each in self.records]
-        begins = np.cumsum([0, *map(len, used_s)]).tolist()
-        return [t_s[-begin % stride :: stride] for begin, t_s in zip(begins, used_s, strict=False)]
-
-    def integrate(self, form: Form, base: FloatArray, effect: tuple[float, float], scale: float) -> list[FloatArray]:
-        """Return the angle on the grid of each record."""
-        omega, zeta = float(np.exp(base[0])), float(base[1])
-        system = np.array([[0.0, 1.0, 0.0], [-omega * omega, -2.0 * zeta * omega, 1.0], [0.0, 0.0, 0.0]])
-        step = np.ascontiguousarray(expm(system * self.h_s)[:2])
-        angles = []
-        for drive in self.drives(float(base[2])):
-            angles.append(np.empty(len(drive)))
-            integrate(form.kind, *effect, omega, zeta, step, drive, self.h_s, scale, angles[-1])
-        return angles
+    def integrate(
+        self, form: ServoNonlinearity, base: FloatArray, effect: tuple[float, float], scale: float
+    ) -> list[FloatArray]:
+        """Return angle and speed on the grid of each record, [n, 2]."""
+        omega, zeta, h_s = float(np.exp(base[0])), float(base[1]), self.h_s / form.substeps
+        of_command = (form, effect) if form.changes_command else (LINEAR_FORM, (1.0, 1.0))
+        step, states = propagate(omega, zeta, h_s), []
+        for drive in self.drives(*of_command, float(base[2]), form.substeps):
+            states.append(np.empty_like(drive))
+            integrate(form.kind, *effect, omega, zeta, step, drive, h_s, scale, states[-1])
+        return states
 
     def simulate(
         self,
-        form: Form,
+        form: ServoNonlinearity,
         base: FloatArray,
-        effect: tuple[float, float],
-        scale: float,
+        effect: tuple[float, float] = (1.0, 1.0),
+        scale: float = 1.0,
         taps: int = FORM_TAPS,
         stride: int = 1,
     ) -> FloatArray:
         """Return the angles at every stride-th used sample, and each tap earlier, in units of noise, [m, taps]."""
-        parts = []
-        angles, times_s = self.integrate(form, base, effect, scale), self.sample_times_s(stride)
-        for each, grid, angle, t_s in zip(self.records, self.grids, angles, times_s, strict=True):
-            shifted = [np.interp(t_s - at * self.tap_s, grid, angle) for at in range(taps)]
-            parts.append(np.column_stack(shifted) / each.noise)
-        return np.concatenate(parts)
+        columns, begin, row = np.empty((len(self.target[::stride]), taps)), 0, 0
+        for each, states, t_s in zip(self.records, self.integrate(form, base, effect, scale), self.used_s, strict=True):
+            mine, angle = t_s[-begin % stride :: stride], np.empty(len(t_s[-begin % stride :: stride]))
+            for tap in range(taps):
+                sample_angle(states, each.at_s[0], self.h_s / form.substeps, mine - tap * self.tap_s, angle)
+                columns[row : row + len(mine), tap] = angle / each.noise
+            begin, row = begin + len(t_s), row + len(mine)
+        return columns
 
     def free_response(self, base: FloatArray) -> FloatArray:
         """Return the columns of a free linear response, [m, …]: offset, taps of command and of linear angle."""
         blocks = []
-        for row, each in enumerate(self.records):
-            t_s = each.t_s[each.use]
-            area = np.column_stack([self._area(row, t_s - at * self.tap_s) for at in range(COMMAND_TAPS + 1)])
-            blocks.append(np.column_stack([np.ones(len(t_s)), -np.diff(area, axis=1) / self.tap_s]) / each.noise)
-        return np.column_stack([np.concatenate(blocks), self.simulate(LINEAR_FORM, base, (1.0, 1.0), 1.0, ANGLE_TAPS)])
+        for each, t_s in zip(self.records, self.used_s, strict=True):
+            area = np.concatenate([[0.0], np.cumsum(np.diff(each.at_s) * each.command[:-1])])
+            shifted_s = t_s[:, None] - np.arange(COMMAND_TAPS + 1) * self.tap_s
+            before, after = np.minimum(shifted_s - each.at_s[0], 0.0), np.maximum(shifted_s - each.at_s[-1], 0.0)
+            areas = np.interp(shifted_s, each.at_s, area) + each.command[0] * before + each.command[-1] * after
+            blocks.append(np.column_stack([np.ones(len(t_s)), -np.diff(areas, axis=1) / self.tap_s]) / each.noise)
+        return np.column_stack([np.concatenate(blocks), self.simulate(LINEAR_FORM, base, taps=ANGLE_TAPS)])
 
 
 def fit_linear(records: list[ServoRecord], omega: float) -> FloatArray:
     """Fit a linear second-order servo with delay, gain and offset from about omega: log ω, ζ, delay in s."""
     data = ServoData(records, omega)
     stride = max(1, len(data.target) // FIT_SAMPLES_MAX)
-    constant = np.concatenate([np.full(each.use.sum(), 1.0 / each.noise) for each in records])[::stride]
-    target = data.target[::stride]
+    constant, target = 1.0 / data.noise[::stride], data.target[::stride]
 
     def residual(base: FloatArray) -> FloatArray:
-        model = np.column_stack([constant, data.simulate(LINEAR_FORM, base, (1.0, 1.0), 1.0, 1, stride)])
+        model = np.column_stack([constant, data.simulate(LINEAR_FORM, base, taps=1, stride=stride)])
         return np.asarray(target - model @ np.linalg.lstsq(model, target, rcond=None)[0])
 
     period_s = 2.0 * np.pi / omega
@@ -186,138 +209,189 @@ def fit_linear(records: list[ServoRecord], omega: float) -> FloatArray:
         fit_residuals(residual, each, (low, high), np.array([1e-4, 1e-4, 1e-4 * period_s]), evaluations=30)
         for each in starts[:STARTS_REFINED]
     ]
-    return min(found, key=lambda each: each.chi2).x
+    best: FloatArray = min(found, key=lambda each: each.chi2).x
+    return best
 
 
-def find_effect(records: list[ServoRecord], omega: float) -> Linearity:
-    """Fit every form to the runs that are not held out, and weigh them on those that are.
+def find_effect(records: list[ServoRecord], omega: float, servo: Servo | None = None) -> Linearity:
+    """Fit every form to the training runs, and make the claim that the held-out runs permit.
 
-    omega: rad/s, roughly the servo's
+    omega: rad/s, roughly the servo's; servo: identified from steps, a further start of a servo with a slew limit
     """
-    train, test = ([each for each in records if each.held_out is held_out] for held_out in (False, True))
-    base = fit_linear(train, omega)
-    fits = EffectFits(train, test, base)
+    base = fit_linear([each for each in records if not each.held_out], omega)
+    fits = EffectFits(records, base, omega)
     screened = {form: fits.fit(form, completely=False) for form in FORMS}
     best = min(each.misfit2 for each in screened.values())
-    firsts = [
-        min((form for form in FORMS if form.effect == effect), key=lambda each: screened[each].misfit2)
-        for effect in EFFECTS
-    ]
-    refined = {
-        form: fits.fit(form, True, found) if form in firsts or found.misfit2 <= CONTENDER * best else found
-        for form, found in screened.items()
-    }
     named = {LINEAR: fits.fit(LINEAR_FORM, completely=True)}
     for effect in EFFECTS:
-        named[effect] = min(
-            (each for form, each in refined.items() if form.effect == effect), key=lambda each: each.misfit2
-        )
-    return _weigh(named, test, base)
+        forms = sorted((each for each in FORMS if each.effect == effect), key=lambda each: screened[each].misfit2)
+        limit = CONTENDER * min(screened[forms[0]].misfit2, OUTSIDER * best)
+        contenders = [each for each in forms if each is forms[0] or screened[each].misfit2 <= limit]
+        refined = [fits.fit(each, True, (screened[each].base, screened[each].effect)) for each in contenders]
+        if effect == SLEW_LIMIT and servo is not None:
+            core = float(np.log(2.0 * np.pi * servo.frequency)), servo.damping, servo.delay
+            refined.append(fits.fit(FORMS[0], True, (core, (servo.slew, 1.0))))
+        named[effect] = min(refined, key=lambda each: each.misfit2)
+    probabilities = fits.weigh(named)
+    linear, winner = named[LINEAR], min(named.values(), key=lambda each: each.misfit2)
+    excess = max(linear.misfit2 - min(1.0, winner.misfit2), 1e-12)
+    alternatives = []
+    for (effect,), _ in probabilities.ranked:
+        found = named[effect]
+        share = (linear.misfit2 - found.misfit2) / excess
+        doubts = {effect: found.doubt} if found.doubt else {}
+        alternatives.append(Alternative((effect,), (share, share), fits.list_changes(found, linear), doubts))
+    evidence = Evidence(probabilities, tuple(alternatives))
+    gain = 1.0 - float(np.sqrt(winner.misfit2 / linear.misfit2))
+    return Linearity(claim(evidence), probabilities, named, gain, base)
 
 
-def _weigh(fits: dict[str, FormFit], test: list[ServoRecord], base: FloatArray) -> Linearity:
-    linear, winner = fits[LINEAR].misfit2, min(each.misfit2 for each in fits.values())
-    error2 = float(np.mean([MODEL_ERROR**2 * np.var(each.value[each.use]) / each.noise**2 for each in test]))
-    count = float(sum(each.use.sum() for each in test))
-    # What exceeds the noise is systematic: more samples do not make it more certain.
-    systematic = (max(winner - 1.0, 0.0) + error2) / (winner + error2)
-    count /= 1.0 + count / (2.0 * SYSTEMATIC_WEIGHT) * systematic
-    score = {name: -0.5 * count * np.log(each.misfit2 + error2) for name, each in fits.items()}
-    floor = min(1.0, winner)
-    unknown = floor + OTHER_SHARE * max(linear - floor, 0.0)
-    score[OTHER] = -0.5 * count * np.log(unknown + error2) + np.log(OTHER_ODDS)
-    score[LINEAR] += np.log(LINEAR_ODDS)
-    return Linearity(normalise(score), fits, 1.0 - float(np.sqrt(winner / linear)), base)
-
-
-def normalise(score: dict[str, float]) -> dict[str, float]:
-    """Return probabilities from logarithms of weights."""
+def build_probabilities(score: Mapping[str, float]) -> Probabilities:
+    """Return the probabilities of effects from logarithms of weights, those of LINEAR and OTHER among them."""
     peak = max(score.values())
     weight = {name: float(np.exp(value - peak)) for name, value in score.items()}
-    return {name: value / sum(weight.values()) for name, value in weight.items()}
+    probability = {name: value / sum(weight.values()) for name, value in weight.items()}
+    no_effect, none_of_these = probability.pop(LINEAR), probability.pop(OTHER)
+    return Probabilities(no_effect, none_of_these, {(name,): each for name, each in probability.items()})
 
 
 class EffectFits:
-    """Fits of forms to training runs, each with a free linear response, and their errors on the others."""
+    """Fits of forms to training runs, each with a free linear response, and their errors in the runs compared.
 
-    def __init__(self, train: list[ServoRecord], test: list[ServoRecord], base: FloatArray) -> None:
+    Where each amplitude was recorded again, the last run of each is held out, and compared alone. Where a whole
+    amplitude is held out, all are compared: what shows at the largest one only would else remain unseen.
+    """
+
+    def __init__(self, records: list[ServoRecord], base: FloatArray, expected: float) -> None:
         self.base, omega = base, float(np.exp(base[0]))
-        self.train, self.test = ServoData(train, omega), ServoData(test, omega)
-        self.columns, self.test_columns = self.train.free_response(base), self.test.free_response(base)
+        self.shift = float(np.log(expected / omega))
+        train, test = ([each for each in records if each.held_out is held_out] for held_out in (False, True))
+        self.sees_training = {each.level for each in test} != {each.level for each in records}
+        self.judged = [*test, *(train if self.sees_training else [])]
+        self.train, self.test = (ServoData(each, omega, expected) for each in (train, self.judged))
         self.scales = self._measure_scales()
-        self.stride = max(1, len(self.columns) // FIT_SAMPLES_MAX)
-        u, singular, _ = np.linalg.svd(self.columns[:: self.stride], full_matrices=False)
-        self.q = u[:, singular > 1e-7 * singular[0]]
+        columns = self.train.free_response(base)
+        u, singular, v = np.linalg.svd(columns, full_matrices=False)
+        kept = singular > 1e-7 * singular[0]
+        self.q = u[:, kept]
+        """The free linear response to the training runs, orthonormal: [m, k]."""
+        self.test_q = self.test.free_response(base) @ (v[kept].T / singular[kept])
+        """The same response to what is compared."""
+        self.stride = max(1, len(columns) // FIT_SAMPLES_MAX)
+        self.part = np.linalg.qr(self.q[:: self.stride])[0]
         y = self.train.target[:: self.stride]
-        self.y = y - self.q @ (self.q.T @ y)
+        self.y = y - self.part @ (self.part.T @ y)
 
     def _measure_scales(self) -> dict[str, float]:
         omega, zeta, h_s = float(np.exp(self.base[0])), float(self.base[1]), self.train.h_s
-        command = np.concatenate(self.train.drives(float(self.base[2])))
-        angle = np.concatenate(self.train.integrate(LINEAR_FORM, self.base, (1.0, 1.0), 1.0))
-        speed, largest = np.gradient(angle, h_s), float(np.abs(command).max())
+        command = np.concatenate(self.train.drives(LINEAR_FORM, (1.0, 1.0), float(self.base[2]), 1))[:, 0]
+        angle, speed = np.concatenate(self.train.integrate(LINEAR_FORM, self.base, (1.0, 1.0), 1.0)).T
+        largest = float(np.abs(command).max())
         return {
             "one": 1.0,
             "command": largest,
-            "slope": min(float(np.abs(np.diff(command)).max() / h_s), largest * omega),
+            "slope": min(float(np.abs(np.diff(command)).max() / h_s), float(np.ptp(command)) * omega),
             "angle": float(np.abs(angle).max()),
             "speed": float(np.abs(speed).max()),
             "error": float(np.abs(command - angle).max()),
             "acceleration": float(np.abs(command - angle - 2.0 * zeta / omega * speed).max()),
         }
 
-    def fit(self, form: Form, completely: bool, start: FormFit | None = None) -> FormFit:
-        """Fit a form: the effect's parameters alone, or all of them."""
+    def fit(
+        self,
+        form: ServoNonlinearity,
+        completely: bool,
+        start: tuple[tuple[float, float, float], tuple[float, float]] | None = None,
+    ) -> FormFit:
+        """Fit a form: the effect's parameters alone, or all of them. start: base and effect."""
         period_s = 2.0 * np.pi / float(np.exp(self.base[0]))
-        unit = np.array([1.0, 1.0, period_s])
-        spans = (form.first, form.second)
+        unit, spans = np.array([1.0, 1.0, period_s]), (form.first, form.second)
         size = np.array([self.scales[each.scale] for each in spans])
-        free = np.array([True] * 3 + [each.low < each.high for each in spans])
-        free[:3] &= completely
         is_log = np.array([each.low > 0.0 for each in spans])
 
-        def pack(pair: Sequence[float] | FloatArray) -> FloatArray:
+        def pack(pair: tuple[float, ...] | FloatArray) -> FloatArray:
             packed: FloatArray = np.where(is_log, np.log(np.where(is_log, pair, 1.0)), pair)
             return packed
 
-        low = np.concatenate(
-            [[-0.7, 0.02 - self.base[1], -self.base[2] / period_s], pack([each.low for each in spans])]
-        )
-        high = np.concatenate([[1.2, 1.0, 0.5], pack([each.high for each in spans])])
-        shifts = FREQUENCY_SHIFTS if form.effect in (LINEAR, SLEW_LIMIT, SATURATION) else (0.0,)
-        starts = [np.array([at, 0.0, 0.0, *pack(pair)]) for pair in form.starts for at in shifts]
-        if start is not None:
-            starts = [np.array([*((np.array(start.base) - self.base) / unit), *pack(np.array(start.effect) / size)])]
-
         def unpack(x: FloatArray) -> tuple[FloatArray, tuple[float, float]]:
-            first, second = np.where(is_log, np.exp(np.where(is_log, x[3:], 0.0)), x[3:]) * size
-            return self.base + x[:3] * unit, (float(first), float(second))
+            first, second = (np.where(is_log, np.exp(np.where(is_log, x[3:], 0.0)), x[3:]) * size).tolist()
+            return self.base + x[:3] * unit, (first, second)
 
         def residual(x: FloatArray) -> FloatArray:
             simulated = self.train.simulate(form, *unpack(x), self.scales["angle"], stride=self.stride)
             if not np.abs(simulated).max() < UNSTABLE:
                 return np.asarray(self.y * UNSTABLE)
-            simulated = simulated - self.q @ (self.q.T @ simulated)
-            left = self.y - simulated @ np.linalg.lstsq(simulated, self.y, rcond=1e-8)[0]
-            return np.asarray(left)
+            simulated = simulated - self.part @ (self.part.T @ simulated)
+            return np.asarray(self.y - simulated @ np.linalg.lstsq(simulated, self.y, rcond=1e-8)[0])
 
-        prior = Prior(np.zeros(5), np.append(PRIOR / np.sqrt(len(self.y)), [np.inf, np.inf]))
-        best = min(starts, key=lambda each: float((residual(each) ** 2).sum()))
-        found = fit_residuals(
-            residual, best, (low, high), 1e-3, free=free, prior=prior, evaluations=25 if completely else 6
+        low = np.array([-0.7, 0.02 - self.base[1], -self.base[2] / period_s, *pack(tuple(each.low for each in spans))])
+        high = np.array([max(1.2, self.shift + 0.4), 1.0, 0.5, *pack(tuple(each.high for each in spans))])
+        shifts = (
+            (*FREQUENCY_SHIFTS, max(self.shift, 0.0)) if form.effect in (LINEAR, SLEW_LIMIT, SATURATION) else (0.0,)
         )
-        best = found.x
-        base, effect = unpack(best)
+        starts = [np.array([at, 0.0, 0.0, *pack(pair)]) for pair in form.starts for at in shifts]
+        if start is not None:
+            starts = [np.array([*((np.array(start[0]) - self.base) / unit), *pack(np.array(start[1]) / size)])]
+        found = fit_residuals(
+            residual,
+            min(starts, key=lambda each: float((residual(each) ** 2).sum())),
+            (low, high),
+            1e-3,
+            free=np.array([completely] * 3 + [True] * 2),
+            prior=Prior(np.zeros(5), np.append(PRIOR / np.sqrt(len(self.y)), [np.inf, np.inf])),
+            evaluations=25 if completely else 6,
+        )
+        base, effect = unpack(found.x)
+        left = self._compare(form, base, effect)
+        doubt = ""
+        if form.first.low < form.first.high:
+            spread = 1.96 * found.sigma[3] * max(1.0, float(np.sqrt((found.residual**2).mean())))
+            end = AT_END * (high[3] - low[3])
+            if found.x[3] < low[3] + end or found.x[3] > high[3] - end:
+                doubt = f"the fit of its {form.name} ended at a limit of its range"
+            elif not is_log[0] and abs(found.x[3]) < spread:
+                doubt = f"the 95 % interval of its {form.name} contains no effect"
         core = float(base[0]), float(base[1]), float(base[2])
-        return FormFit(form, core, effect, self.scales["angle"], self._misfit2(form, base, effect))
+        return FormFit(form, core, effect, self.scales["angle"], left, float((left**2).mean()), doubt)
 
-    def _misfit2(self, form: Form, base: FloatArray, effect: tuple[float, float]) -> float:
-        scale = self.scales["angle"]
-        model = np.column_stack([self.columns, self.train.simulate(form, base, effect, scale)])
-        if not np.abs(model).max() < UNSTABLE:
-            return np.inf
-        weights = np.linalg.lstsq(model, self.train.target, rcond=1e-8)[0]
-        model = np.column_stack([self.test_columns, self.test.simulate(form, base, effect, scale)])
-        if not np.abs(model).max() < UNSTABLE:
-            return np.inf
-        return float(((self.test.target - model @ weights) ** 2).mean())
+    def _compare(self, form: ServoNonlinearity, base: FloatArray, effect: tuple[float, float]) -> FloatArray:
+        """Return the residual in the runs compared, infinite if the model is unstable."""
+        trained, tested = (each.simulate(form, base, effect, self.scales["angle"]) for each in (self.train, self.test))
+        if not max(np.abs(trained).max(), np.abs(tested).max()) < UNSTABLE:
+            return np.full(len(self.test.target), np.inf)
+        y = self.train.target
+        inside, y_inside = self.q.T @ trained, self.q.T @ y
+        weights = np.linalg.lstsq(trained - self.q @ inside, y - self.q @ y_inside, rcond=1e-8)[0]
+        return np.asarray(self.test.target - tested @ weights - self.test_q @ (y_inside - inside @ weights))
+
+    def list_changes(self, found: FormFit, linear: FormFit) -> tuple[HeldOutChange, ...]:
+        """Return the change of χ² by a form in each held-out run, and that by noise and by the form's error."""
+        changes, begin = [], 0
+        for each, t_s in zip(self.judged, self.test.used_s, strict=True):
+            part = slice(begin, begin + len(t_s))
+            begin = part.stop
+            if each.held_out:
+                mine, other = found.residual[part], linear.residual[part]
+                error = max(1.0, float(np.sqrt((mine**2).mean())))
+                noise = 2.0 * error * float(np.sqrt(((mine - other) ** 2).sum()))
+                chi2 = float((mine**2).sum() - (other**2).sum())
+                changes.append(HeldOutChange(f"{each.level:.3g} rms", "the angle", chi2, noise))
+        return tuple(changes)
+
+    def weigh(self, fits: dict[str, FormFit]) -> Probabilities:
+        """Return the probabilities of all effects, of none and of an unknown one."""
+        linear, winner = fits[LINEAR].misfit2, min(each.misfit2 for each in fits.values())
+        error2 = float(np.mean([MODEL_ERROR**2 * np.var(each.value[each.use]) / each.noise**2 for each in self.judged]))
+        samples = float(len(self.test.target))
+        # What exceeds the noise is systematic: more samples do not make it more certain.
+        systematic = (max(winner - 1.0, 0.0) + error2) / (winner + error2)
+        count = samples / (1.0 + samples / (2.0 * SYSTEMATIC_WEIGHT) * systematic)
+        score = {name: -0.5 * count * np.log(each.misfit2 + error2) for name, each in fits.items()}
+        if self.sees_training:  # what was fitted to the samples that are compared follows their noise, too
+            for effect in EFFECTS:
+                score[effect] -= 0.5 * (FORM_TAPS + 2) * np.log(samples)
+        floor = min(1.0, winner)
+        unknown = floor + OTHER_SHARE * max(linear - floor, 0.0)
+        score[OTHER] = -0.5 * count * np.log(unknown + error2) + np.log(OTHER_ODDS)
+        score[LINEAR] += np.log(LINEAR_ODDS)
+        return build_probabilities(score)

@@ -12,11 +12,12 @@ from optodrive.device.config import Config
 from optodrive.device.config_file import MIRRORS_FORMAT, MIRRORS_VERSION
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.common_servo import CommonServo, find_half_widths, move_sizes_rad
+from optodrive.lab.inference.sentences import describe_sufficiency
 from optodrive.lab.servo_identification.effect_fit import LINEAR, Linearity
-from optodrive.lab.servo_identification.gate_effect import MirrorEffect
+from optodrive.lab.servo_identification.effects import LABELS
+from optodrive.lab.servo_identification.gate import CommonServo, MirrorEffect, find_half_widths, move_sizes_rad
 from optodrive.lab.servo_identification.identify import IdentifiedServo
-from optodrive.lab.servo_identification.step_trace import AXES
+from optodrive.lab.servo_identification.records import AXES
 
 INTERVAL_SIGMAS = 1.96
 """Half-width of a 95 % interval."""
@@ -64,8 +65,12 @@ def build_report(
 
 
 def report_linearity(linearity: Linearity) -> dict[str, Any]:
-    """Return probabilities, rms misfits of held-out samples in units of the noise, and the best form's gain."""
+    """Return the claim with its sentences, probabilities, and the rms misfits of the best forms in units of noise."""
+    lines = describe_sufficiency(linearity.claim, linearity.probabilities, "One linear servo", LABELS)
     return {
+        "verdict": linearity.claim.verdict,
+        "effects": list(linearity.claim.causes),
+        "sentences": lines,
         "probability": linearity.probability,
         "misfit": {name: float(np.sqrt(each.misfit2)) for name, each in linearity.fits.items()},
         "form": {name: each.form.name for name, each in linearity.fits.items()},
@@ -73,19 +78,14 @@ def report_linearity(linearity: Linearity) -> dict[str, Any]:
     }
 
 
-def describe_linearity(report: dict[str, Any]) -> str:
-    """Describe whether one linear servo suffices, and the best effect."""
-    probability, misfit = report["probability"], report["misfit"]
-    name = max(probability, key=lambda each: probability[each])
-    text = f"one linear servo suffices with probability {probability[LINEAR]:.3f}"
-    if name == LINEAR:
-        return text
-    detail = (
-        f" ({report['form'][name]}; held-out error {misfit[LINEAR]:.3g} to {misfit[name]:.3g} × noise)"
-        if name in misfit
-        else ""
-    )
-    return f"{text}; {name} {probability[name]:.3f}{detail}"
+def describe_linearity(report: dict[str, Any]) -> list[str]:
+    """Return the claim, and how well the form that it names fits, as lines."""
+    headline, *reasons = report["sentences"]
+    misfit = report["misfit"]
+    fits = [
+        f"{report['form'][name]}: {misfit[name]:.3g} × noise, linear {misfit[LINEAR]:.3g}" for name in report["effects"]
+    ]
+    return [" ".join([headline, *(f"{each}." for each in fits)]), *reasons]
 
 
 def _effect_remarks(axis: str, effect: MirrorEffect, tolerance_rad: float) -> list[str]:
@@ -125,7 +125,7 @@ def format_report_lines(report: dict[str, Any]) -> list[str]:
             f"                 residual {1e6 * axis['residual_rad']:.1f} µrad rms, "
             f"noise {1e6 * axis['noise_rad']:.1f}; "
             f"gain {axis['gain']:.4f}; {axis['steps']} steps",
-            f"                 {describe_linearity(axis['linearity'])}",
+            *(f"                 {line}" for line in describe_linearity(axis["linearity"])),
         ]
         for row in axis["settling"]:
             lines.append(f"  step {1e3 * row['step_rad']:8.3f} mrad  " + _describe_settling(row))

@@ -1,12 +1,20 @@
-"""Search for the causes that explain the measured facts: least squares and a corrected information criterion."""
+"""Search for the causes that explain the measured facts: least squares and a corrected information criterion.
 
-from collections.abc import Sequence
+The criterion and a prior per cause give the probabilities of all sets that were fitted; `lab.inference` claims from
+these.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, log
+from math import exp, inf, log
+from types import MappingProxyType
 
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.discrepancy import Probabilities
+from optodrive.lab.inference.claim import Alternative, Evidence, HeldOutChange
+from optodrive.lab.inference.fit import fit_residuals
 from optodrive.lab.validation.candidate_causes import CAUSES, CAUSES_BY_KEY, CauseHypothesis
 from optodrive.lab.validation.corrected_model import CorrectedModel
 from optodrive.lab.validation.measured_facts import Datum
@@ -16,11 +24,8 @@ START_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Start positions of a fit in the range of a parameter."""
 FRACTION_STEP = 1e-3
 """Step of finite differences."""
-MAX_ITERATIONS = 25
-CHI2_CONVERGED = 1e-2
-"""Decrease of χ² per iteration below which a fit ends."""
 CHI2_DIGITS = 2
-"""Decimal digits of χ² that are determined by then."""
+"""Decimal digits of χ² that a fit determines."""
 BEAM_WIDTH = 3
 """Number of sets of each size that are extended."""
 REQUIRED_ODDS = 20.0
@@ -33,10 +38,14 @@ AICC_INDISTINGUISHABLE = 2.0 * log(REQUIRED_ODDS)
 
 @dataclass(frozen=True)
 class CauseFit:
-    """Set of causes with the positions in their ranges that fit best, χ² and the criterion. Lower is better."""
+    """Set of causes with the positions in their ranges that fit best, χ² and the criterion. Lower is better.
+
+    sigma: standard deviations of the positions
+    """
 
     keys: tuple[str, ...]
     fractions: tuple[float, ...]
+    sigma: tuple[float, ...]
     chi2: float
     aicc: float
 
@@ -53,6 +62,12 @@ class CauseFit:
         """Criterion plus the cost of the causes."""
         return compute_cost(self.aicc, len(self.keys))
 
+    def interval(self, key: str) -> tuple[float, float]:
+        """Return the linearised 95 % interval of a cause's parameter, clipped to its range."""
+        row, compute = self.keys.index(key), CAUSES_BY_KEY[key].parameter.compute_value
+        low, high = (min(max(self.fractions[row] + side * self.sigma[row], 0.0), 1.0) for side in (-1.96, 1.96))
+        return compute(low), compute(high)
+
     @property
     def at_limit(self) -> tuple[str, ...]:
         """Causes whose parameter lies at a limit of its range."""
@@ -67,7 +82,7 @@ class CauseSearch:
         self.base, self.data = base, tuple(data)
         self._sigma = np.array([datum.sigma for datum in data])
         self._fits: dict[frozenset[str], CauseFit] = {}
-        self.nominal = self._evaluate((), np.zeros(0))
+        self.nominal = self._fit_from_starts((), None)
         self._fits[frozenset()] = self.nominal
 
     def build_model(self, fit: CauseFit) -> CorrectedModel:
@@ -125,21 +140,42 @@ class CauseSearch:
         """Return the contribution of each fact to χ²."""
         return np.asarray(self._compute_residuals(fit.keys, np.array(fit.fractions)) ** 2)
 
-    def compute_interval(self, fit: CauseFit, key: str) -> tuple[float, float]:
-        """Return the linearised 95 % interval of a cause's parameter, clipped to its range."""
-        fractions = np.array(fit.fractions)
-        jacobian = self._compute_jacobian(fit.keys, fractions, self._compute_residuals(fit.keys, fractions))
-        index = fit.keys.index(key)
-        sigma = float(np.sqrt(np.linalg.pinv(jacobian.T @ jacobian)[index, index]))
-        low, high = np.clip(
-            [fit.fractions[index] - 1.96 * sigma, fit.fractions[index] + 1.96 * sigma], 0.0, 1.0
-        ).tolist()
-        return CAUSES_BY_KEY[key].parameter.compute_value(low), CAUSES_BY_KEY[key].parameter.compute_value(high)
-
     def compute_max_chi2_increase(self, fit: CauseFit, key: str) -> float:
         """Return the largest increase of χ² by a further cause at the limits of its range, all else as fitted."""
-        ends = (self._evaluate((*fit.keys, key), np.array([*fit.fractions, fraction])) for fraction in (0.0, 1.0))
-        return max(end.chi2 for end in ends) - fit.chi2
+        keys = (*fit.keys, key)
+        ends = (self._compute_residuals(keys, np.array([*fit.fractions, end])) for end in (0.0, 1.0))
+        return max(float(end @ end) for end in ends) - fit.chi2
+
+    def weigh(self) -> Probabilities:
+        """Return the probabilities of all sets that were fitted, and of one that is not among them.
+
+        An unknown explanation would meet the facts within their errors, and cost a cause more than the best set does.
+        """
+        best = min(self._fits.values(), key=lambda fit: fit.cost)
+        cost = {tuple(sorted(fit.keys)): fit.cost for fit in self._fits.values()}
+        unknown = len(self.data) + CAUSE_COST * (len(best.keys) + 1)
+        lowest = min(unknown, best.cost)
+        total = sum(exp(0.5 * (lowest - each)) for each in (*cost.values(), unknown))
+        probability = {keys: exp(0.5 * (lowest - each)) / total for keys, each in cost.items()}
+        return Probabilities(probability.pop(()), exp(0.5 * (lowest - unknown)) / total, probability)
+
+    def collect_evidence(
+        self, held_out: Sequence[HeldOutChange] = (), doubts: Mapping[str, str] = MappingProxyType({})
+    ) -> Evidence:
+        """Return the evidence for all sets that were fitted.
+
+        held_out: changes of facts predicted by causes chosen and fitted without them; doubts: on causes
+        """
+        probabilities = self.weigh()
+        excess = max(self.nominal.chi2 - len(self.data), 1e-12)
+        alternatives = []
+        for keys, _ in probabilities.ranked:
+            fit = self._fits[frozenset(keys)]
+            share = min(1.0, (self.nominal.chi2 - fit.chi2) / excess)
+            limits = dict.fromkeys(fit.at_limit, "its fit ended at a limit of its range")
+            mine = {key: clause for key, clause in (dict(doubts) | limits).items() if key in keys}
+            alternatives.append(Alternative(fit.keys, (share, share), tuple(held_out), mine))
+        return Evidence(probabilities, tuple(alternatives))
 
     def _list_allowed(self, keys: Sequence[str]) -> list[CauseHypothesis]:
         excluded = {other for key in keys for other in CAUSES_BY_KEY[key].excludes}
@@ -156,62 +192,23 @@ class CauseSearch:
         }
         return np.asarray(CorrectedModel(self.base, values).compute_log_errors(self.data) / self._sigma)
 
-    def _evaluate(self, keys: tuple[str, ...], fractions: FloatArray) -> CauseFit:
-        chi2 = float((self._compute_residuals(keys, fractions) ** 2).sum())
-        return CauseFit(keys, tuple(fractions.tolist()), chi2, compute_aicc(chi2, len(keys), len(self.data)))
-
-    def _fit_from_starts(self, keys: tuple[str, ...], start_fit: CauseFit) -> CauseFit:
-        start_values = dict(zip(start_fit.keys, start_fit.fractions, strict=True))
-        new_keys = [key for key in keys if key not in start_values]
+    def _fit_from_starts(self, keys: tuple[str, ...], start_fit: "CauseFit | None") -> CauseFit:
+        """Fit from the best of several starts of the causes that are not in start_fit."""
+        start_values = {} if start_fit is None else dict(zip(start_fit.keys, start_fit.fractions, strict=True))
+        is_new = any(key not in start_values for key in keys)
         starts = [
             np.array([start_values.get(key, start) for key in keys])
-            for start in (START_FRACTIONS if new_keys else (0.0,))
+            for start in (START_FRACTIONS if is_new else (0.0,))
         ]
-        start = min(starts, key=lambda fractions: float((self._compute_residuals(keys, fractions) ** 2).sum()))
-        return self._evaluate(keys, self._minimize(keys, start))
-
-    def _minimize(self, keys: tuple[str, ...], fractions: FloatArray) -> FloatArray:
-        """Minimise χ² by Levenberg–Marquardt with bounds."""
-        if not keys:
-            return fractions
-        damping, residuals = 1e-2, self._compute_residuals(keys, fractions)
-        chi2 = float(residuals @ residuals)
-        for _ in range(MAX_ITERATIONS):
-            jacobian = self._compute_jacobian(keys, fractions, residuals)
-            descent = -jacobian.T @ residuals
-            # A parameter that pushes against its limit is held there, so that the others move freely.
-            is_held = ((fractions <= 0.0) & (descent < 0.0)) | ((fractions >= 1.0) & (descent > 0.0))
-            free = ~is_held
-            reduction = 0.0
-            while free.any() and damping < 1e6:
-                normal = jacobian[:, free].T @ jacobian[:, free]
-                step = np.linalg.solve(
-                    normal + damping * (np.diag(np.diag(normal)) + 1e-9 * np.eye(len(normal))), descent[free]
-                )
-                trial = fractions.copy()
-                trial[free] = np.clip(fractions[free] + step, 0.0, 1.0)
-                trial_residuals = self._compute_residuals(keys, trial)
-                reduction = chi2 - float(trial_residuals @ trial_residuals)
-                if reduction > 0.0:
-                    fractions, residuals, chi2, damping = (
-                        trial,
-                        trial_residuals,
-                        chi2 - reduction,
-                        max(damping / 10.0, 1e-9),
-                    )
-                    break
-                damping *= 10.0
-            if reduction < CHI2_CONVERGED:
-                return fractions
-        return fractions
-
-    def _compute_jacobian(self, keys: tuple[str, ...], fractions: FloatArray, residuals: FloatArray) -> FloatArray:
-        columns = []
-        for number in range(len(keys)):
-            shifted = fractions.copy()
-            shifted[number] += FRACTION_STEP if shifted[number] < 0.5 else -FRACTION_STEP
-            columns.append((self._compute_residuals(keys, shifted) - residuals) / (shifted[number] - fractions[number]))
-        return np.stack(columns, axis=1)
+        found = fit_residuals(
+            lambda fractions: self._compute_residuals(keys, fractions),
+            min(starts, key=lambda fractions: float((self._compute_residuals(keys, fractions) ** 2).sum())),
+            (np.zeros(len(keys)), np.ones(len(keys))),
+            FRACTION_STEP,
+            method="dogbox",
+        )
+        aicc = compute_aicc(found.chi2, len(keys), len(self.data))
+        return CauseFit(keys, tuple(found.x.tolist()), tuple(found.sigma.tolist()), found.chi2, aicc)
 
 
 def _rank(fit: CauseFit, criterion: float) -> tuple[float, list[int]]:

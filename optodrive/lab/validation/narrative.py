@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from optodrive.core.quantity import format_quantity
+from optodrive.lab.inference.claim import format_probability
+from optodrive.lab.inference.sentences import MIN_SHOWN, describe_probabilities, describe_sufficiency
 from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
 from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST
 from optodrive.lab.validation.measured_facts import EXCLUDED, READING_ERROR
@@ -29,16 +31,16 @@ def format_value(key: str, value: float) -> str:
 
 
 def describe_findings(result: StudyResult) -> list[str]:
-    """Return the lines on the error, its causes, contradictions among the facts and rejected causes."""
-    facts = len(result.data)
+    """Return the lines on the claim, the chosen causes, contradictions among the facts and the other causes."""
+    facts, labels = len(result.data), {key: key for key in CAUSES_BY_KEY}
     lines = [
-        f"Text S1 as it stands ({result.base}) misses {facts} measured facts by a factor of "
-        f"{compute_error_factor(result.nominal_ratios):.2f}, χ² {result.nominal_fit.chi2:.0f}."
+        *describe_sufficiency(result.claim, result.probabilities, f"Text S1 as it stands ({result.base})", labels),
+        describe_probabilities(result.probabilities),
+        f"It misses {facts} measured facts by a factor of {compute_error_factor(result.nominal_ratios):.2f}, "
+        f"χ² {result.nominal_fit.chi2:.0f}.",
     ]
-    if not result.named:
-        lines.append("No cause is needed: it agrees with the facts within their errors.")
-    else:
-        lines += ["", "Causes:"]
+    if result.named:
+        lines += ["", "Causes of the best set:"]
         lines += [line for item in result.named for line in _describe_named_cause(item)]
         lines += [
             "",
@@ -50,9 +52,7 @@ def describe_findings(result: StudyResult) -> list[str]:
         lines.append(
             f"Unexplained, by more than {UNEXPLAINED_SIGMA:g} standard errors: {', '.join(result.unexplained)}."
         )
-    lines += _describe_contradictions(result)
-    lines += _describe_ruled_out(result.unchosen)
-    return lines
+    return [*lines, *_describe_contradictions(result), *_describe_others(result.unchosen)]
 
 
 def _describe_named_cause(item: NamedCause) -> list[str]:
@@ -80,7 +80,7 @@ def _describe_contradictions(result: StudyResult) -> list[str]:
     unchosen = {item.key: item for item in result.unchosen}
     membrane, plate = unchosen.get("gas_membrane"), unchosen.get("membrane_plate")
     law = CAUSES_BY_KEY["gas_membrane"].description
-    if result.contradictions and membrane and membrane.verdict == "alternative law" and membrane.value is not None:
+    if result.contradictions and membrane and membrane.is_alternative_law and membrane.value is not None:
         best_factor = "" if plate is None or plate.value is None else f", {plate.value:.2f} times it fits best"
         lines.append(
             "  The heights do not show it, because the displacement per kelvin of Text S1 is right by "
@@ -90,29 +90,17 @@ def _describe_contradictions(result: StudyResult) -> list[str]:
     return lines
 
 
-def _describe_ruled_out(candidates: Sequence[UnchosenCause]) -> list[str]:
-    ruled_out = [item for item in candidates if item.verdict == "ruled out"]
-    lines = []
-    if ruled_out:
-        lines += [
-            "",
-            "Ruled out: each reduces χ² much alone or in place of a cause above, but leaves much and adds little:",
-        ]
-        lines += [
-            f"- {CAUSES_BY_KEY[item.key].description} ({item.key}): {max(0.0, item.chi2_reduction_alone):.0f} alone"
-            + (
-                f", {100 * item.replaced_fraction:.0f} % of the reduction by {item.replaces} in its place"
-                if item.replaces
-                else ""
-            )
-            + f", {abs(item.chi2_reduction_added):.1f} in addition"
-            for item in ruled_out
-        ]
-    for verdict, title in (("not needed", "Not needed"), ("not observable", "Not observable in these facts")):
-        keys = [item.key for item in candidates if item.verdict == verdict]
-        if keys:
-            lines.append(f"{title}: {', '.join(keys)}.")
-    return lines
+def _describe_others(candidates: Sequence[UnchosenCause]) -> list[str]:
+    """Return lines on the other causes, each with its reductions of χ²."""
+    lines = ["", "Other causes, with the reduction of χ² alone, in place of a cause above, and in addition:"]
+    for item in (item for item in candidates if item.is_observable):
+        place = f"{item.replaced_fraction:.0%} of that by {item.replaces}" if item.replaces else "none"
+        lines.append(
+            f"- {CAUSES_BY_KEY[item.key].description} ({item.key}, {format_probability(item.probability)}): "
+            f"{max(0.0, item.chi2_reduction_alone):.0f}, {place}, {abs(item.chi2_reduction_added):.1f}"
+        )
+    hidden = [item.key for item in candidates if not item.is_observable]
+    return [*lines, *([f"Not observable in these facts: {', '.join(hidden)}."] if hidden else [])]
 
 
 def build_rows(result: StudyResult) -> list[tuple[str, ...]]:
@@ -152,7 +140,7 @@ def describe_predictions(result: StudyResult) -> list[str]:
         if cause.alternatives or len(cause.evidence) == 1:
             measurements[CAUSES_BY_KEY[cause.key].deciding_measurement] = None
     for candidate in result.unchosen:
-        if candidate.verdict == "alternative law":
+        if candidate.is_alternative_law:
             measurements[CAUSES_BY_KEY[candidate.key].deciding_measurement] = None
     if measurements:
         lines += ["", "Measure next:", *(f"- {measurement}." for measurement in measurements)]
@@ -173,8 +161,8 @@ def describe_assumptions(result: StudyResult) -> list[str]:
     return [
         f"Errors: {100 * scatter:.0f} % between samples (the scatter of R and C in Table S3), and of reading as stated "
         f"in the paper, else {100 * READING_ERROR:.0f} %; the two laws of Fig. 3D by their r².",
-        f"A cause is identified if it reduces AICc by {CAUSE_COST:.1f}; explanations within "
-        f"{AICC_INDISTINGUISHABLE:.1f} are indistinguishable.",
+        f"A cause costs {CAUSE_COST:.1f} of AICc, its prior odds; explanations within {AICC_INDISTINGUISHABLE:.1f} are "
+        "indistinguishable.",
     ]
 
 
@@ -184,6 +172,18 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
     sides = zip(result.data, result.nominal_ratios, result.extended_ratios, result.errors_sigma, strict=True)
     return {
         "parameter_set": result.base,
+        "verdict": result.claim.verdict,
+        "sets": [list(keys) for keys in result.claim.sets],
+        "reasons": list(result.claim.reasons),
+        "probabilities": {
+            "no_effect": result.probabilities.no_effect,
+            "none_of_these": result.probabilities.none_of_these,
+            "causes": [
+                {"causes": list(keys), "probability": probability}
+                for keys, probability in result.probabilities.ranked
+                if probability >= MIN_SHOWN
+            ],
+        },
         "facts": [
             {
                 "id": datum.id,
@@ -228,13 +228,15 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
             {
                 "cause": item.key,
                 "description": CAUSES_BY_KEY[item.key].description,
-                "verdict": item.verdict,
+                "probability": item.probability,
                 "value": item.value,
                 "unit": CAUSES_BY_KEY[item.key].parameter.unit,
                 "chi2_reduction_alone": item.chi2_reduction_alone,
                 "chi2_reduction_added": item.chi2_reduction_added,
                 "replaces": item.replaces,
                 "replaced_fraction": item.replaced_fraction,
+                "is_observable": item.is_observable,
+                "is_alternative_law": item.is_alternative_law,
             }
             for item in result.unchosen
         ],

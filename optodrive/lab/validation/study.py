@@ -1,12 +1,14 @@
 """Study of Text S1: necessary causes, their alternatives, and predictions of held-out facts."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from optodrive.core.types.discrepancy import Probabilities
+from optodrive.lab.inference.claim import Claim, HeldOutChange, claim
 from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
-from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST, CauseFit, CauseSearch
+from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CauseFit, CauseSearch
 from optodrive.lab.validation.contradictions import Contradiction, find_contradictions
 from optodrive.lab.validation.measured_facts import GROUPS, Datum, build_measured_facts
 from optodrive.physics.paper_facts import PaperFact
@@ -16,8 +18,6 @@ CHI2_NOT_OBSERVABLE = 4.0
 """A cause that changes χ² by less than this at both limits of its range is not observable: two σ."""
 EVIDENCE_FRACTION = 0.8
 """The evidence for a cause is the facts that hold this share of its reduction of χ²."""
-RULED_OUT_FRACTION = 0.5
-"""A cause that achieves this share of another's reduction counts as ruled out rather than as not needed."""
 UNEXPLAINED_SIGMA = 2.0
 """Deviation in standard errors from which a fact counts as unexplained."""
 
@@ -43,27 +43,30 @@ class NamedCause:
 class UnchosenCause:
     """Cause outside the chosen set.
 
-    verdict: "alternative cause" for a chosen one; "alternative law" in addition to the chosen causes; "not observable"
-    in these facts; "ruled out" although it reduces χ² enough alone or by RULED_OUT_FRACTION in place of a chosen cause;
-    or "not needed". value: its parameter beside the chosen causes, None where it is incompatible with them.
+    probability: that it acts; value: its parameter beside the chosen causes, None where it is incompatible with them;
     chi2_reduction_alone, chi2_reduction_added: from the nominal model, and from the chosen causes; replaces: the chosen
-    cause that it replaces best, or ''; replaced_fraction: the share of that cause's reduction of χ² that it achieves
+    cause that it replaces best, or ''; replaced_fraction: the share of that cause's reduction of χ² that it achieves;
+    is_observable: whether it changes χ² by more than noise at a limit of its range; is_alternative_law: whether it fits
+    as well beside the chosen causes, in place of a law that no parameter of the nominal model changes
     """
 
     key: str
-    verdict: str
+    probability: float
     value: float | None
     chi2_reduction_alone: float
     chi2_reduction_added: float
     replaces: str
     replaced_fraction: float
+    is_observable: bool
+    is_alternative_law: bool
 
 
 @dataclass(frozen=True)
 class HeldOutPrediction:
     """Prediction of facts held out of choice and fit.
 
-    nominal, extended: ratios model over measured; unobservable: named causes that no remaining fact shows
+    nominal, extended: ratios model over measured; changes: of their χ²; unobservable: named causes that no remaining
+    fact shows
     """
 
     label: str
@@ -72,6 +75,7 @@ class HeldOutPrediction:
     unobservable: tuple[str, ...]
     nominal: tuple[float, ...]
     extended: tuple[float, ...]
+    changes: tuple[HeldOutChange, ...]
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,8 @@ class StudyResult:
 
     base: str
     data: tuple[Datum, ...]
+    claim: Claim
+    probabilities: Probabilities
     nominal_ratios: tuple[float, ...]
     extended_ratios: tuple[float, ...]
     errors_sigma: tuple[float, ...]
@@ -108,6 +114,11 @@ class StudyResult:
             for item in (*self.group_predictions, *self.fact_predictions)
             if item.label in held_out_alone or not item.unobservable
         )
+
+    @property
+    def untested(self) -> dict[str, str]:
+        """Causes that a single fact shows, with that fact: no prediction tests them."""
+        return {key: item.label for item in self.fact_predictions for key in item.unobservable}
 
     @property
     def unexplained(self) -> tuple[str, ...]:
@@ -137,14 +148,15 @@ def run_study(
         group_predictions.append(prediction)
         if prediction.unobservable:
             fact_predictions += [predict_held_out(base, data, name, (name,), named) for name in names]
-    return StudyResult(
+    model = search.build_model(chosen)
+    result = StudyResult(
         base=base.name,
         data=data,
+        claim=claim(search.collect_evidence()),
+        probabilities=search.weigh(),
         nominal_ratios=_compute_ratios(search, search.nominal, data),
         extended_ratios=_compute_ratios(search, chosen, data),
-        errors_sigma=tuple(
-            (search.build_model(chosen).compute_log_errors(data) / [datum.sigma for datum in data]).tolist()
-        ),
+        errors_sigma=tuple((model.compute_log_errors(data) / [datum.sigma for datum in data]).tolist()),
         nominal_fit=search.nominal,
         fit=chosen,
         named=named,
@@ -153,6 +165,9 @@ def run_study(
         group_predictions=tuple(group_predictions),
         fact_predictions=tuple(fact_predictions),
     )
+    tested = [change for item in result.predictions if not item.unobservable for change in item.changes]
+    doubts = {key: f"only {fact} shows it, so no prediction tests it" for key, fact in result.untested.items()}
+    return replace(result, claim=claim(search.collect_evidence(tested, doubts)), probabilities=search.weigh())
 
 
 def predict_held_out(
@@ -166,11 +181,14 @@ def predict_held_out(
     chosen = search.choose()
     held_out_data = [datum for datum in data if datum.id in names]
     unobservable = [item.key for item in named if not {item.key, *item.alternatives} & set(chosen.keys)]
-    nominal, extended = (
-        _compute_ratios(search, search.nominal, held_out_data),
-        _compute_ratios(search, chosen, held_out_data),
+    fits = search.nominal, chosen
+    nominal, extended = (_compute_ratios(search, fit, held_out_data) for fit in fits)
+    errors = [search.build_model(fit).compute_log_errors(held_out_data) for fit in fits]
+    changes = tuple(
+        HeldOutChange(label, datum.id, (after**2 - before**2) / datum.sigma**2, 2.0 * abs(after - before) / datum.sigma)
+        for datum, before, after in zip(held_out_data, *(each.tolist() for each in errors), strict=True)
     )
-    return HeldOutPrediction(label, tuple(names), chosen.keys, tuple(unobservable), nominal, extended)
+    return HeldOutPrediction(label, tuple(names), chosen.keys, tuple(unobservable), nominal, extended, changes)
 
 
 def _compute_ratios(search: CauseSearch, fit: CauseFit, data: Sequence[Datum]) -> tuple[float, ...]:
@@ -187,7 +205,7 @@ def _build_named_causes(search: CauseSearch, chosen: CauseFit) -> tuple[NamedCau
             for (chosen_key, other), fit in exchanged.items()
             if chosen_key == key and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE
         ]
-        low, high = search.compute_interval(chosen, key)
+        low, high = chosen.interval(key)
         chi2_reduction = removed[key].chi2 - chosen.chi2
         evidence = _find_evidence(search, removed[key], chosen)
         out.append(NamedCause(key, chosen.values[key], low, high, chi2_reduction, evidence, tuple(alternatives)))
@@ -210,48 +228,27 @@ def _find_evidence(search: CauseSearch, without: CauseFit, chosen: CauseFit) -> 
 def _judge_unchosen(search: CauseSearch, chosen: CauseFit) -> tuple[UnchosenCause, ...]:
     exchanged, removed = search.fit_exchanges(chosen), search.fit_removals(chosen)
     added = {fit.keys[-1]: fit for fit in search.fit_additions(chosen)}
-    out = []
-    for key, cause in CAUSES_BY_KEY.items():
-        if key in chosen.keys:
-            continue
-        chi2_reduction_alone = search.nominal.chi2 - search.fit((key,)).chi2
-        swaps = {chosen_key: fit for (chosen_key, other), fit in exchanged.items() if other == key}
-        replaced_fractions = {
-            chosen_key: _compute_replaced_fraction(removed[chosen_key], fit, chosen)
-            for chosen_key, fit in swaps.items()
+    alone = {key: search.nominal.chi2 - search.fit((key,)).chi2 for key in CAUSES_BY_KEY if key not in chosen.keys}
+    probabilities, out = search.weigh(), []
+    for key, reduction in sorted(alone.items(), key=lambda item: -item[1]):
+        shares = {
+            mine: (removed[mine].chi2 - fit.chi2) / (removed[mine].chi2 - chosen.chi2)
+            for (mine, other), fit in exchanged.items()
+            if other == key
         }
-        replaces = max(replaced_fractions, key=lambda chosen_key: replaced_fractions[chosen_key], default="")
-        chi2_reduction_added = chosen.chi2 - added[key].chi2 if key in added else 0.0
-        if any(fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE for fit in swaps.values()):
-            verdict = "alternative cause"
-        elif key in added and cause.replaces_law and added[key].aicc - chosen.aicc < AICC_INDISTINGUISHABLE:
-            verdict = "alternative law"
-        elif (
-            key in added
-            and not cause.replaces_law
-            and search.compute_max_chi2_increase(chosen, key) < CHI2_NOT_OBSERVABLE
-        ):
-            verdict = "not observable"
-        else:
-            is_plausible = (
-                chi2_reduction_alone >= CAUSE_COST or replaced_fractions.get(replaces, 0.0) >= RULED_OUT_FRACTION
-            )
-            verdict = "ruled out" if is_plausible else "not needed"
-        value = added[key].values[key] if key in added else None
+        replaces, fit = max(shares, key=lambda mine: shares[mine], default=""), added.get(key)
+        is_law = CAUSES_BY_KEY[key].replaces_law
         out.append(
             UnchosenCause(
                 key,
-                verdict,
-                value,
-                chi2_reduction_alone,
-                chi2_reduction_added,
+                probabilities.sum_of(key),
+                None if fit is None else fit.values[key],
+                reduction,
+                0.0 if fit is None else chosen.chi2 - fit.chi2,
                 replaces,
-                replaced_fractions.get(replaces, 0.0),
+                shares.get(replaces, 0.0),
+                fit is None or is_law or search.compute_max_chi2_increase(chosen, key) >= CHI2_NOT_OBSERVABLE,
+                fit is not None and is_law and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE,
             )
         )
-    return tuple(sorted(out, key=lambda item: -item.chi2_reduction_alone))
-
-
-def _compute_replaced_fraction(without: CauseFit, swapped: CauseFit, chosen: CauseFit) -> float:
-    """Return the share of one cause's reduction of χ² that another achieves in its place."""
-    return (without.chi2 - swapped.chi2) / (without.chi2 - chosen.chi2)
+    return tuple(out)

@@ -6,7 +6,7 @@ import pytest
 
 from optodrive.cli.doctor_host import MEASURED, check_mirrors
 from optodrive.device.config_file import load_config
-from optodrive.lab.servo_identification.common_servo import HALF_WIDTH_MIN
+from optodrive.lab.servo_identification.gate import HALF_WIDTH_MIN
 from optodrive.planning.display_model import DisplayModel
 
 

@@ -14,7 +14,7 @@ from optodrive.device.config import Config
 from optodrive.lab.commissioning import mirror_steps
 from optodrive.lab.commissioning.mirror_steps import LEAD_IN_S, plan_step_runs, play_step_runs
 from optodrive.lab.servo_identification.identify import identify
-from optodrive.lab.servo_identification.step_trace import extract_trace
+from optodrive.lab.servo_identification.records import extract_trace
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.planning.display_model import DisplayModel
 

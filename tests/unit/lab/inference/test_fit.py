@@ -34,7 +34,7 @@ def test_a_linear_problem_within_bounds_is_solved_like_its_normal_equations(seed
     assert found.x == pytest.approx(expected, abs=1e-6)
     assert found.covariance == pytest.approx(np.linalg.inv(hessian), rel=1e-5, abs=1e-9)
     assert found.residual == pytest.approx(y - matrix @ expected, abs=1e-5)
-    prior_terms = (((expected - mean) / sigma) ** 2).sum()
+    prior_terms = (((found.x - mean) / sigma) ** 2).sum()
     assert found.chi2 == pytest.approx((found.residual**2).sum() + prior_terms, rel=1e-9)
 
 

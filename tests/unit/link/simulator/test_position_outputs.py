@@ -6,7 +6,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.servo_identification.identify import identify
-from optodrive.lab.servo_identification.step_trace import extract_trace
+from optodrive.lab.servo_identification.records import extract_trace
 from optodrive.link.simulator.galvos import CENTRE_CODE, measure_position_outputs
 
 CONFIG = DISPLAYS["display-16"].config

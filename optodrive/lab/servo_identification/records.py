@@ -1,13 +1,17 @@
-"""Extraction of one mirror's steps and angles from a recording, with checks of axes, sign and units."""
+"""One mirror's commands and angles from a recording: as steps with checks of axes, sign and units, and as records.
 
+Steps identify a servo; records of any excitation, with the noise and what is held out, show effects beside it.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from optodrive.core.errors import MISSING, InputError
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.core.types.measurements import Measurement, Run
-from optodrive.lab.servo_identification.step_response import Steps
+from optodrive.lab.servo_identification.effect_fit import ServoRecord
 
 AXES = ("x", "y")
 STEPS_MIN = 3
@@ -21,11 +25,40 @@ STUCK_GAIN = 0.02
 """A mirror with a smaller gain than this is stuck."""
 GAIN_TOLERANCE = 0.25
 NOISE_MIN = 1e-4
+LEVEL_TOLERANCE = 1.15
+"""Runs whose commands differ by less in rms have one amplitude."""
+LEVELS_MIN = 3
+"""Amplitudes of one run each from which the middle one is held out."""
+HELD_OUT_SHARE = 1.0 / 3.0
+"""Part held out of each run where fewer amplitudes were recorded, once each: its end."""
+SAMPLES_MIN = 200
+DIFFERENCE_ORDERS = (2, 4, 6, 8)
+"""Orders of differences from which the noise is estimated: a response is smooth, white noise is not."""
+RECORD_NOISE_MIN = 1e-5
+RANGE_MAX = 8000
+"""Samples of one record that are compared."""
 
 
 def is_dense(changes_s: FloatArray) -> bool:
     """Return whether commands that change at changes_s are an excitation: too dense for steps that settle."""
     return len(changes_s) > 2 and float(np.median(np.diff(changes_s))) < DENSE_HOLD_S
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Commands of one mirror, all [k]: command_rad from at_s (s) on. The first one holds from the beginning."""
+
+    at_s: FloatArray
+    command_rad: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def sizes_rad(self) -> FloatArray:
+        """Absolute size of each step, rad, [k − 1]."""
+        sizes: FloatArray = np.abs(np.diff(self.command_rad))
+        return sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,3 +205,89 @@ def _noise_rad(steps: Steps, t_s: FloatArray, value_rad: FloatArray) -> float:
     second_differences = np.abs(np.diff(value_rad, 2)[(row[:-2] == row[2:]) & (row[:-2] >= 0)])
     sigma_rad = 1.4826 * float(np.median(second_differences)) / np.sqrt(6.0) if len(second_differences) else 0.0
     return max(sigma_rad, NOISE_MIN * float(steps.sizes_rad.mean()))
+
+
+def is_excitation(measurement: Measurement, axis: int) -> bool:
+    """Return whether the commands of mirror x or y are an excitation rather than steps."""
+    tables = [run.commands for run in measurement.runs if run.commands is not None and len(run.commands)]
+    return any(is_dense(table[1:, 0][np.diff(table[:, 1 + axis]) != 0.0]) for table in tables)
+
+
+def extract_records(where: str, measurement: Measurement, axis: int) -> list[ServoRecord]:
+    """Extract the records of mirror x or y. Raise InputError.
+
+    The last run of each amplitude is held out, or the middle amplitude if each was recorded once.
+    """
+    name = f"mirror_{AXES[axis]}_rad"
+    runs = [
+        run for run in measurement.runs if name in run.signals and run.commands is not None and _level(run, axis) > 0.0
+    ]
+    if not runs:
+        raise InputError(f"{where}: {name}", MISSING, "a run with this signal and commands that move this mirror")
+    levels = _group_levels(runs, axis)
+    held_out: list[Run] = [level[-1] for level in levels if len(level) > 1]
+    if not held_out and len(levels) >= LEVELS_MIN:
+        held_out = levels[len(levels) // 2]
+    return [
+        record
+        for level in levels
+        for run in level
+        for record in _build_records(where, run, axis, run in held_out, not held_out, _level(level[0], axis))
+    ]
+
+
+def _level(run: Run, axis: int) -> float:
+    assert run.commands is not None  # noqa: S101
+    return float(np.std(run.commands[:, 1 + axis])) if len(run.commands) > 1 else 0.0
+
+
+def _group_levels(runs: list[Run], axis: int) -> list[list[Run]]:
+    levels: list[list[Run]] = []
+    for run in sorted(runs, key=lambda each: _level(each, axis)):
+        if levels and _level(run, axis) < LEVEL_TOLERANCE * _level(levels[-1][0], axis):
+            levels[-1].append(run)
+        else:
+            levels.append([run])
+    return levels
+
+
+def _build_records(
+    where: str, run: Run, axis: int, is_held_out: bool, is_divided: bool, level: float
+) -> Iterator[ServoRecord]:
+    """Yield the record of a run, or those of both parts of a run whose end is held out."""
+    signal, commands = run.signals[f"mirror_{AXES[axis]}_rad"], run.commands
+    assert commands is not None  # noqa: S101
+    good = np.isfinite(signal.value) & (signal.t_s >= commands[0, 0])
+    t_s, value = signal.t_s[good], signal.value[good]
+    if len(t_s) < SAMPLES_MIN:
+        raise InputError(f"{where}: {run.name}/mirror_{AXES[axis]}_rad", len(t_s), f"at least {SAMPLES_MIN} samples")
+    noise = estimate_noise(value)
+    until = int(len(t_s) * (1.0 - HELD_OUT_SHARE)) if is_divided else len(t_s)
+    for part, held_out in ((slice(0, until), is_held_out), (slice(until, None), True)):
+        use = np.zeros(len(t_s), dtype=np.bool_)
+        use[part] = True
+        use = _keep_every_nth(use)
+        if use.any():
+            end = int(np.flatnonzero(use)[-1]) + 1
+            rows = commands[:, 0] <= t_s[end - 1]
+            at_s, command = commands[rows, 0], commands[rows, 1 + axis]
+            yield ServoRecord(at_s, command, t_s[:end], value[:end], use[:end], held_out, noise, level)
+
+
+def _keep_every_nth(use: BoolArray) -> BoolArray:
+    rows = np.flatnonzero(use)
+    kept = np.zeros_like(use)
+    kept[rows[:: max(1, -(-len(rows) // RANGE_MAX))]] = True
+    return kept
+
+
+def estimate_noise(value: FloatArray) -> float:
+    """Return the rms noise of a sample, the least of estimates from differences of several orders."""
+    estimates = []
+    for order in DIFFERENCE_ORDERS:
+        weights = np.ones(1)
+        for _ in range(order):
+            weights = np.convolve(weights, [1.0, -1.0])
+        difference = np.convolve(value, weights, "valid")
+        estimates.append(1.4826 * float(np.median(np.abs(difference))) / float(np.sqrt((weights**2).sum())))
+    return max(min(estimates), RECORD_NOISE_MIN * float(np.std(value)), 1e-300)
