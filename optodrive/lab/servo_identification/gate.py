@@ -1,4 +1,4 @@
-"""What plans rely on at the gate: one servo that settles no sooner than either mirror, and the error that stays.
+"""The servo and the resting error by which plans open the gate: one for both mirrors, no faster than either.
 
 Settling times and the error of a nonlinear mirror are those of simulated moves across the display.
 """
