@@ -5,7 +5,7 @@ from typing import Any
 
 from optodrive.core.document import to_json
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.discrepancy import Discrepancy, Estimate, HeightError
+from optodrive.core.types.discrepancy import Discrepancy, Estimate, HeightError, ResidualTrace
 from optodrive.lab.inference.claim import NOTHING_FOUND, format_probability
 from optodrive.lab.inference.sentences import (
     describe_claim,
@@ -108,20 +108,27 @@ def _count_pushes(error: HeightError) -> str:
     return f"{pushes} of {error.experiments} experiment{'s' if error.experiments > 1 else ''}"
 
 
-def _describe_locations(discrepancy: Discrepancy) -> list[str]:
-    """Return the two groups with the largest change of residuals, or the largest residuals if unexplained."""
-    if discrepancy.verdict in NOTHING_FOUND:
+def _list_visible(found: Discrepancy) -> list[tuple[ResidualTrace, float, float]]:
+    """Return the two traces with the largest change of residuals, or the largest residuals if unexplained.
+
+    With each the rms residuals of the nominal and the extended model, in units of the noise of one sample.
+    """
+    if found.verdict in NOTHING_FOUND:
         return []
     rows = []
-    for trace in discrepancy.residual_traces:
+    for trace in found.residual_traces:
         nominal, extended = float((trace.nominal**2).mean()), float((trace.extended**2).mean())
-        rows.append((nominal if discrepancy.verdict == "unexplained" else nominal - extended, nominal, extended, trace))
+        rows.append((nominal if found.verdict == "unexplained" else nominal - extended, trace, nominal, extended))
     rows.sort(key=lambda row: -row[0])
+    return [(trace, nominal**0.5, extended**0.5) for _, trace, nominal, extended in rows[:2] if nominal > 0]
+
+
+def _describe_locations(found: Discrepancy) -> list[str]:
+    """Return where the error is visible."""
     return [
-        f"Visible in {trace.signal} of {trace.group}: residuals of {nominal**0.5:.1f} σ per sample"
-        + (f", {extended**0.5:.1f} σ with the cause." if discrepancy.causes else ".")
-        for _, nominal, extended, trace in rows[:2]
-        if nominal > 0
+        f"Visible in {trace.signal} of {trace.group}: residuals of {nominal:.1f} σ per sample"
+        + (f", {extended:.1f} σ with the cause." if found.causes else ".")
+        for trace, nominal, extended in _list_visible(found)
     ]
 
 
@@ -149,6 +156,10 @@ def build_answer(found: Discrepancy) -> dict[str, Any]:
         "doubts": found.doubts,
         "failures": found.failures,
         "omissions": found.omissions,
+        "visible": [
+            {"group": trace.group, "signal": trace.signal, "rms_sigma_nominal": nominal, "rms_sigma_extended": extended}
+            for trace, nominal, extended in _list_visible(found)
+        ],
         "height_error": {
             "held_out": to_json(found.height_error_held_out),
             "fitted": to_json(found.height_error_fitted),
