@@ -35,15 +35,16 @@ def low_pass_both_ways(t_s: FloatArray, value: FloatArray, tau_s: float) -> Floa
     return low_pass(-t_s[::-1], low_pass(t_s, value, tau_s)[::-1], tau_s)[::-1]
 
 
-def moving_mean(t_s: FloatArray, value: FloatArray, width_s: float) -> FloatArray:
-    """Return the mean [n] over width_s around each sample, or over the part that the signal covers."""
+def moving_mean(t_s: FloatArray, value: FloatArray, width_s: float, late_s: float = 0.0) -> FloatArray:
+    """Return the mean [n] over width_s around late_s before each sample, or over the part that the signal covers."""
     if len(value) < 2:
         return value
     steps = np.diff(t_s)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (value[1:] + value[:-1]) * steps)])
-    ends = [np.clip(t_s + side * 0.5 * width_s, t_s[0], t_s[-1]) for side in (-1.0, 1.0)]
+    ends = [np.clip(t_s - late_s + side * 0.5 * width_s, t_s[0], t_s[-1]) for side in (-1.0, 1.0)]
     before, after = (_integrate_to(t_s, value, total, end) for end in ends)
-    return np.asarray((after - before) / np.maximum(ends[1] - ends[0], 1e-12))
+    covered_s = ends[1] - ends[0]
+    return np.where(covered_s > 1e-12, (after - before) / np.maximum(covered_s, 1e-12), value[0])
 
 
 def _integrate_to(t_s: FloatArray, value: FloatArray, total: FloatArray, end_s: FloatArray) -> FloatArray:

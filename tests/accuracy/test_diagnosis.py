@@ -9,6 +9,7 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 
 from labs import lab
 from optodrive.core.provenance import Provenance
@@ -112,6 +113,21 @@ def test_two_hidden_causes_are_named_together():
     found = diagnose(lab(13, TWO))
     assert found.verdict == "cause"
     assert set(found.causes) == set(TWO)
+
+
+def test_a_cause_is_found_beside_a_mean_of_past_samples_at_two_intervals():
+    runs = []
+    for rate, groups in ((2000.0, ("weak", "middle", "strong", "short")), (500.0, ("train",))):
+        for run in lab(9, {"bridge_conductivity": {"exponent": 0.6}}, groups=groups, rate=rate).runs:
+            signal = run.signals["displacement_m"]
+            there = np.isfinite(signal.value)
+            value = np.interp(signal.t_s, signal.t_s[there], signal.value[there])
+            averaged = replace(signal, value=uniform_filter1d(value, 15, origin=7))
+            runs.append(replace(run, name=f"run{len(runs)}", signals=run.signals | {"displacement_m": averaged}))
+    found = diagnose(Measurement(tuple(runs)))
+    assert (found.verdict, set(found.causes)) == ("cause", {"smoothing", "bridge_conductivity"})
+    assert found.parameters["smoothing.displacement"].value == pytest.approx(0.015, rel=0.05)
+    assert found.parameters["bridge_conductivity.exponent"].value == pytest.approx(0.6, rel=0.1)
 
 
 def move_zeros(recording, size_m=5e-6):

@@ -119,7 +119,8 @@ def test_a_leak_of_another_form_states_the_error_of_heights_planned_with_it(leak
     assert real_rms > 0.03
     for error in (held_out, fitted):
         assert 0.5 * real_rms < error.extended_rms < 2.0 * real_rms
-    assert held_out.extended_rms < 0.7 * held_out.nominal_rms
+    # Of the nominal model, a single held-out push may be near by chance; all others are not.
+    assert fitted.extended_rms < 0.3 * fitted.nominal_rms
     assert (held_out.experiments, fitted.experiments) == (1, 5)
     assert fitted.pushes == 4 + len(GROUPS["train"])
 

@@ -1,6 +1,6 @@
 """Diagnosis of a recording, separately for pixels and mirrors and then combined."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from time import perf_counter
@@ -69,6 +69,7 @@ from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, igno
 from optodrive.lab.inference.claim import HeldOutChange, claim, combine_claims
 from optodrive.lab.inspection.inspection import inspect_recording
 from optodrive.physics.hypothesis import Hypothesis
+from optodrive.physics.term import TermValues
 from optodrive.physics.terms import discover_terms
 
 MIN_CHANGE_RATIO = 16.0
@@ -145,7 +146,7 @@ def diagnose(
             candidates = [item for item in candidates if len(discover_terms()[item.key].subsystems) == 1]
         subsystems.append(
             _diagnose_subsystem(
-                *(part, candidates, seed, prior, epsilon, timing_s, _find_clock_offset_s(subsystems)),
+                *(part, candidates, seed, prior, epsilon, timing_s, _find_shared_terms(subsystems)),
                 SearchLog(on_progress),
                 hold_out,
             )
@@ -241,21 +242,21 @@ def _diagnose_subsystem(
     prior: BaseParameterPrior,
     epsilon: float,
     min_timing_sigma_s: float,
-    clock_offset_s: float,
+    shared: Mapping[str, TermValues],
     log: SearchLog,
     hold_out: bool,
 ) -> _SubsystemFit:
     fitted, held_out_runs = split_runs(data) if hold_out else (list(range(len(data.runs))), [])
     fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
     log.on_progress("noise and nominal model")
-    problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
+    problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, shared)
     nothing: tuple[tuple[InstrumentDisturbance, ...], FloatArray] = ((), np.zeros(len(data.value)))
     disturbances, added = log.attempt("disturbances of instruments", _find_disturbances, nothing, data, problem, base)
     if disturbances:
         log.on_progress("nominal model without the instruments' disturbances")
         data = remove_disturbances(data, added)
         fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
-        problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
+        problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, shared)
     residual = problem.data.value - base.prediction
     coupled = log.attempt("zeros of the runs", find_dc_coupled, frozenset[str](), problem.data, residual, problem.noise)
     hypotheses = [
@@ -267,7 +268,8 @@ def _diagnose_subsystem(
         "noise beside an effect", _revise_noise, (problem, base), problem, base, hypotheses, min_timing_sigma_s, log
     )
     selection = compare_explanations(problem, base, hypotheses, log)
-    first = claim(selection.collect_evidence())
+    # Twins stay twins with more runs, so what they leave open is no reason to give up the held-out ones.
+    first = claim(replace(selection.collect_evidence(), twins={}))
     all_data = FitProblem(data, problem.noise, prior, epsilon)
     if first.verdict in ("none", "undecided", "ambiguous") and held_out_runs:
         # The held-out, hottest runs may show an effect, or which one: compare the explanations with all runs.
@@ -275,7 +277,10 @@ def _diagnose_subsystem(
         chosen = selection.choose(first)
         all_base = fit(all_data, base.point, base.free)
         wider = compare_explanations(all_data, all_base, hypotheses, log)
-        if claim(wider.collect_evidence()).verdict not in ("none", first.verdict) or chosen is not None:
+        if (
+            claim(replace(wider.collect_evidence(), twins={})).verdict not in ("none", first.verdict)
+            or chosen is not None
+        ):
             problem, base, held_out, selection = all_data, all_base, data.select([]), wider
     unchanged = tuple[HeldOutChange, ...]()
     changes = {
@@ -354,11 +359,12 @@ def _revise_noise(
     Jitter sensitivities are those of the true model; a large effect changes them, and repeats seem to differ. An effect
     that changes from run to run makes them differ indeed, and passes for jitter.
     """
-    scores = detect(problem, base, hypotheses, log).scores
+    detection = detect(problem, base, hypotheses, log)
+    scores = detection.scores
     changes = bool(scores) and scores[0].ratio > MIN_CHANGE_RATIO and scores[0].hypothesis.key in _list_varying_causes()
     if not changes and not has_replicate_excess(problem):
         return problem, base
-    best = next(iter(refit_strongest(problem, base, (), scores, log)), None)
+    best = next(iter(refit_strongest(problem, base, (), detection, log)), None)
     if best is None:
         return problem, base
     other = update_noise(problem, best.fit, min_timing_sigma_s)
@@ -387,15 +393,14 @@ def _compute_held_out_errors(subsystem: _SubsystemFit) -> list[HeldOutError]:
     return compute_held_out_errors(subsystem.problem, subsystem.held_out, *subsystem.blind_points)
 
 
-def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
-    """Return the identified common offset of all clocks, s, or 0."""
-    for subsystem in subsystems:
-        terms = subsystem.final.point.terms
-        for key in subsystem.verdict.causes:
-            delay_s = discover_terms()[key].signal_delays(terms[key]).mirrors if key in terms else 0.0
-            if delay_s != 0.0:
-                return delay_s
-    return 0.0
+def _find_shared_terms(subsystems: list[_SubsystemFit]) -> dict[str, TermValues]:
+    """Return the identified terms of the clock that all instruments share."""
+    return {
+        key: values
+        for subsystem in subsystems
+        for key, values in subsystem.final.point.terms.items()
+        if key in subsystem.verdict.causes and values.get("mirrors") and len(discover_terms()[key].subsystems) > 1
+    }
 
 
 def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:

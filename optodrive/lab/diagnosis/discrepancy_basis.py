@@ -57,15 +57,17 @@ def compute_discrepancy_basis(
         others = {key: values for key, values in terms.items() if key != item.key}
         effect = fitted.prediction - predict(data, ParameterPoint(fitted.point.base, others), problem.epsilon)
         columns += _separate_signals(data, effect)
-        if discover_terms()[item.key].is_exact:
+        term = discover_terms()[item.key]
+        if term.is_exact:
             continue
-        columns += [
-            effect * power,
-            effect / np.maximum(power, MIN_POWER_FRACTION),
-            effect * dose,
-            effect * session,
-            effect * heat,
-        ]
+        if any(term.kernels):  # a record's filter does not know power, dose or heat
+            columns += [
+                effect * power,
+                effect / np.maximum(power, MIN_POWER_FRACTION),
+                effect * dose,
+                effect * session,
+                effect * heat,
+            ]
         alternatives: list[ParameterPoint] = []
         for other in all_hypotheses:
             if other.key == item.key and other.label != item.label:

@@ -20,7 +20,7 @@ that cannot be computed is recorded in the log with its reason.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log, log1p, prod
 
 import numpy as np
@@ -44,8 +44,9 @@ from optodrive.lab.diagnosis.evidence import (
     compute_probabilities,
     compute_score_evidence,
 )
-from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.noise_certainty import NoiseCertainty, count_noise_degrees
+from optodrive.lab.diagnosis.prediction import predict
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
 from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.inference.claim import Alternative, Claim, Evidence, HeldOutChange
@@ -60,6 +61,8 @@ RESTART_GAIN = 1.0
 """Gain in log evidence of a refit from where a pair ended that begins the search again."""
 PAIR_SCORE = 12.0
 """Likelihood ratio of a second cause from which pairs are refitted."""
+NO_EFFECT_SHARE = 1e-5
+"""Share of a signal's range below which a change is an error of the integration, whose steps terms may refine."""
 CERTAIN = 0.995
 """Probability of none of these where repeats differ by more than noise."""
 MAX_REPLICATE_EXCESS = 6.0
@@ -192,7 +195,7 @@ def compare_explanations(
     if has_replicate_excess(problem):
         probabilities = Probabilities(1.0 - CERTAIN, CERTAIN, {(item.key,): 0.0 for item in hypotheses})
         return Selection(probabilities, (), {}, nominal_detection, base.chi2, True, repeats_differ=True)
-    singles = refit_strongest(problem, base, (), nominal_detection.scores, log)
+    singles = refit_strongest(problem, base, (), nominal_detection, log)
     return compare_from_single_causes(problem, base, hypotheses, nominal_detection, singles, log)
 
 
@@ -224,7 +227,7 @@ def compare_from_single_causes(
                 )
         for item in select_near(base, pairs)[:EXAMINED_PAIRS]:
             _examine(problem, base, hypotheses, item, examined, log)
-    explanations = _list_explanations(problem, base, hypotheses, nominal_detection, [*singles, *pairs], examined)
+    explanations = _list_explanations(problem, base, hypotheses, nominal_detection, [*singles, *pairs], examined, log)
     probabilities = compute_probabilities(explanations)
     best: dict[tuple[str, ...], RefittedCandidate] = {}
     for item in sorted([*singles, *pairs], key=lambda candidate: -candidate.log_evidence):
@@ -292,6 +295,7 @@ def _list_explanations(
     nominal_detection: Detection,
     refits: list[RefittedCandidate],
     examined: _Examined,
+    search_log: SearchLog,
 ) -> list[Explanation]:
     """Return every explanation of the recording with its prior and its evidence."""
     degrees_of = _count_degrees(problem, base, refits)
@@ -314,6 +318,8 @@ def _list_explanations(
         hidden = compute_hidden_share(base.chi2 - item.chi2)
         out.append(Explanation(item.causes, prior, item.log_evidence, degrees_of[item], hidden=hidden))
         single, share = _find_sufficient_single(item, refits, examined)
+        if single is not None and _is_seen_beside(problem, base, single, item, search_log):
+            single, share = None, 0.0
         if single is not None:
             mended = priors.compute(single.hypotheses) + log(OTHER_ODDS * share / priors.catalogue)
             out.append(Explanation(single.causes, mended, item.log_evidence, degrees_of[item]))
@@ -386,3 +392,33 @@ def _find_sufficient_single(
     ]
     best, share = max(singles, key=lambda pair: pair[1], default=(None, 0.0))
     return (best, min(share, MAX_FORM_PROBABILITY)) if share > 0.0 else (None, 0.0)
+
+
+def _is_seen_beside(
+    problem: FitProblem, base: ModelFit, single: RefittedCandidate, pair: RefittedCandidate, search_log: SearchLog
+) -> bool:
+    """Return whether the second cause of a pair mends no form of the first one.
+
+    A cause that has no other form needs no mending. Any other acts on its own signals alone: a second cause that the
+    rest of them show by themselves, beside the nominal model, is a cause.
+    """
+    (first,) = single.hypotheses
+    if discover_terms()[first.key].is_exact:
+        return True
+    data, point = problem.data, single.fit.point
+    others = {key: values for key, values in point.terms.items() if key != first.key}
+    effect = single.fit.prediction - predict(data, replace(point, terms=others), problem.epsilon)
+    acting = {
+        block.kind
+        for block in data.blocks
+        if not np.allclose(effect[block.part], 0.0, atol=NO_EFFECT_SHARE * float(np.ptp(data.value[block.part])))
+    }
+    kinds = tuple(kind for kind in data.kinds if kind not in acting)
+    if not kinds:
+        return False
+    part = replace(
+        problem, data=data.select(sorted({block.run for block in data.blocks if block.kind in kinds}), kinds)
+    )
+    second = [item for item in pair.hypotheses if item.key != first.key]
+    scores = detect(part, fit(part, base.point, base.free), second, search_log).scores
+    return bool(scores) and scores[0].ratio > PAIR_SCORE

@@ -1,5 +1,6 @@
 """Noise model from repeats, and the nominal model fitted under it."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, Mode
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, estimate_noise_model
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import ParameterPoint
-from optodrive.physics.terms.clock_offset import TERM as CLOCK_OFFSET
+from optodrive.physics.term import TermValues
 
 DEFAULT_EPSILON = 0.66
 BROAD_PRIOR = BaseParameterPrior(
@@ -25,18 +26,17 @@ def fit_nominal(
     prior: BaseParameterPrior = BROAD_PRIOR,
     epsilon: float = DEFAULT_EPSILON,
     min_timing_sigma_s: float = 0.0,
-    clock_offset_s: float = 0.0,
+    shared: Mapping[str, TermValues] | None = None,
 ) -> tuple[FitProblem, ModelFit]:
     """Estimate the noise model and fit the nominal model.
 
-    min_timing_sigma_s: lower limit of the timing jitter, from other signals; clock_offset_s: known offset of all clocks
+    min_timing_sigma_s: lower limit of the timing jitter, from other signals; shared: known terms of the clock
+    that all signals share
     """
     crude_noise = _estimate_crude_noise(data)
-    clocks = [item.name for item in CLOCK_OFFSET.parameters]
-    fixed_terms = {CLOCK_OFFSET.key: dict.fromkeys(clocks, clock_offset_s)} if clock_offset_s else {}
     problem = FitProblem(data, crude_noise, prior, epsilon)
     trials = [
-        fit(problem, ParameterPoint((float(np.log(r)), *prior.mean[1:]), fixed_terms), iterations=3)
+        fit(problem, ParameterPoint((float(np.log(r)), *prior.mean[1:]), shared or {}), iterations=3)
         for r in R_STARTS_K_PER_W
     ]
     base = fit(problem, min(trials, key=lambda item: item.chi2).point, iterations=10)

@@ -15,14 +15,14 @@ from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
 CHI2_ABANDON = 300.0
 """A fit that is predicted to stay this far above the best χ² is abandoned."""
-CHI2_UNCONVERGED = 1.0
-"""A fit that ends so far above the χ² of its score has not converged."""
+CHI2_UNCONVERGED, UNCONVERGED_SHARE = 1.0, 0.02
+"""A fit that ends so far above the χ² of its score, or by so much less of it, may have ended in another minimum."""
 MIN_RATIO = 6.0
 """Likelihood ratio from which a hypothesis is refitted."""
 MAX_REFITS = 9
 """Number of the strongest hypotheses that are refitted."""
-MAX_STARTS, MAX_RESTARTS = 6, 6
-"""Number of starts refitted of a hypothesis with many, and maximum number of restarts of each."""
+MAX_STARTS, MAX_RESTARTS, MAX_RETRIES = 6, 6, 3
+"""Number of starts refitted of a hypothesis with many, of restarts of each, and of other starts of a failed fit."""
 AMPLITUDES = (0.2, 5.0)
 """Factors on a number with a logarithm within which its effect is proportional to it."""
 MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
@@ -33,7 +33,7 @@ MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
 class RefittedCandidate:
     """One or two hypotheses, refitted.
 
-    chi2: of the fit, or by the score where the fit ended above it; log_evidence: of this χ²
+    chi2: of the fit, under the jitters at its end; log_evidence: of this χ²
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -56,46 +56,58 @@ def refit_strongest(
     problem: FitProblem,
     base: ModelFit,
     given: tuple[Hypothesis, ...],
-    scores: Sequence[Score],
+    detection: Detection,
     log: SearchLog,
+    count: int = MAX_REFITS,
 ) -> list[RefittedCandidate]:
-    """Refit the strongest scores in full, best first."""
-    candidates: list[RefittedCandidate] = []
-    promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(MIN_RATIO, 0.05 * scores[0].ratio)]
+    """Refit the strongest scores beside a fit in full, best first."""
+    scores, fits = detection.scores[:count], list[tuple[Score, ModelFit]]()
     chi2_abandon = np.inf
-    for score in promising:
+    for score in scores:
+        if score.ratio <= max(MIN_RATIO, 0.05 * scores[0].ratio):
+            break
         log.on_progress(f"fitting {score.hypothesis.label}")
         free = (*base.free, *score.hypothesis.free)
-        start = _build_start(base.point, score)
         try:
             if score.hypothesis.fit_every_start:
                 result = _refit_every_start(problem, base, score.hypothesis, free)
             else:
-                result = fit(problem, start, free, chi2_abandon=chi2_abandon)
+                result = fit(problem, _build_start(base.point, score), free, chi2_abandon=chi2_abandon)
         except UNCOMPUTABLE as error:
             log.add_failure(score.hypothesis.label, error)
             continue
-        chi2_by_score = base.chi2 - score.ratio if _is_within_ranges(score) else np.inf
-        if result.chi2 > chi2_by_score + CHI2_UNCONVERGED:
-            result = _retry(problem, base, score, free, result)
-        chi2 = min(result.chi2, chi2_by_score)
-        chi2_abandon = min(chi2_abandon, chi2 + CHI2_ABANDON)
-        evidence = compute_log_evidence(problem, result, chi2)
-        candidates.append(RefittedCandidate((*given, score.hypothesis), result, chi2, evidence))
+        tolerance = max(CHI2_UNCONVERGED, UNCONVERGED_SHARE * score.ratio)
+        if _is_within_ranges(score) and result.chi2 > detection.residual_chi2 - score.ratio + tolerance:
+            result = _retry(problem, base, score.hypothesis, free, result)
+        fits.append((score, result))
+        chi2_abandon = min(chi2_abandon, result.chi2 + CHI2_ABANDON)
+    candidates = []
+    for score, result in fits:
+        settled = _settle(problem, result) if result.chi2 < chi2_abandon else result
+        evidence = compute_log_evidence(problem, settled, settled.chi2)
+        candidates.append(RefittedCandidate((*given, score.hypothesis), settled, settled.chi2, evidence))
     return sorted(candidates, key=lambda item: -item.log_evidence)
 
 
+def _settle(problem: FitProblem, result: ModelFit) -> ModelFit:
+    """Return a fit begun again at its end until χ² stays: jitters act along the sensitivities at the start of a fit."""
+    for _ in range(MAX_RESTARTS):
+        again = fit(problem, result.point, result.free)
+        if abs(again.chi2 - result.chi2) < CHI2_UNCONVERGED:
+            return again
+        result = again
+    return result
+
+
 def _retry(
-    problem: FitProblem, base: ModelFit, score: Score, free: Sequence[FreeParameter], result: ModelFit
+    problem: FitProblem, base: ModelFit, hypothesis: Hypothesis, free: Sequence[FreeParameter], result: ModelFit
 ) -> ModelFit:
-    """Return the best fit from the score's start, never abandoned, and from every other start of the hypothesis."""
-    points = [_build_start(base.point, score)]
-    if not score.hypothesis.fit_every_start:
-        starts = score.hypothesis.starts
-        points += [ParameterPoint(base.point.base, {**base.point.terms, score.hypothesis.key: s}) for s in starts]
-    for point in points:
+    """Return the best fit from the nearest starts of the hypothesis, each abandoned where it stays above the best."""
+    if hypothesis.fit_every_start:
+        return result
+    for point in _select_nearest_starts(problem, base, hypothesis)[:MAX_RETRIES]:
         with suppress(*UNCOMPUTABLE):
-            result = min(result, fit(problem, point, free), key=lambda item: item.chi2)
+            result = min(result, fit(problem, point, free, chi2_abandon=result.chi2), key=lambda item: item.chi2)
     return result
 
 
@@ -123,7 +135,7 @@ def refit_pairs(
     for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
         others = [item for item in hypotheses if item.key not in first.causes]
         detection = residual_detection if row == 0 else detect(problem, first.fit, others, log)
-        candidates += refit_strongest(problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], log)
+        candidates += refit_strongest(problem, first.fit, first.hypotheses, detection, log, MAX_SECOND_CAUSES)
     unique: dict[frozenset[str], RefittedCandidate] = {}
     for item in sorted(candidates, key=lambda candidate: -candidate.log_evidence):
         unique.setdefault(frozenset(part.label for part in item.hypotheses), item)
@@ -142,12 +154,14 @@ def refit_alone(
     A fit alone may have ended in another minimum; the pair would then be named for what one of its causes explains.
     """
     best = {item.label: item for item in singles}
+    chi2_abandon = min(item.chi2 for item in singles) + CHI2_ABANDON
     for item in pair.hypotheses:
         log.on_progress(f"fitting {item.label} again")
         point = ParameterPoint(pair.fit.point.base, {**base.point.terms, item.key: pair.fit.point.terms[item.key]})
         free = (*base.free, *item.free)
         try:
-            result = fit(problem, point, free)
+            result = fit(problem, point, free, chi2_abandon=chi2_abandon)
+            result = _settle(problem, result) if result.chi2 < chi2_abandon else result
         except UNCOMPUTABLE as error:
             log.add_failure(item.label, error)
             continue
@@ -175,19 +189,8 @@ def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
 def _refit_every_start(
     problem: FitProblem, base: ModelFit, item: Hypothesis, free: Sequence[FreeParameter]
 ) -> ModelFit:
-    """Return the best fit from the nearest starts, each restarted at its end until χ² is stationary.
-
-    Jitters act along the sensitivities at the start of a fit, so an end point is judged by a fit that starts there.
-    """
-    fits: list[ModelFit] = []
-    for point in _select_nearest_starts(problem, base, item):
-        for _ in range(MAX_RESTARTS):
-            first = fit(problem, point, free)
-            second = fit(problem, first.point, free, iterations=1)
-            fits.append(second)
-            if abs(second.chi2 - first.chi2) < 1.0:
-                break
-            point = second.point
+    """Return the best fit from the nearest starts, each begun again at its end until χ² is stationary."""
+    fits = (_settle(problem, fit(problem, point, free)) for point in _select_nearest_starts(problem, base, item))
     return min(fits, key=lambda item: item.chi2)
 
 

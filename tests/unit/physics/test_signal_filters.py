@@ -29,7 +29,7 @@ def test_a_high_pass_is_that_of_a_circuit():
 
 def test_smoothing_is_a_moving_mean_or_a_filter_run_both_ways():
     term, width_s = discover_terms()["smoothing"], 0.015
-    values = {"temperature": 0.0, "displacement": width_s, "force": 0.0, "tails": 0.0, "late": 0.0}
+    values = {"temperature": 0.0, "displacement": width_s, "force": 0.0, "tails": 0.0, "late": 0.0, "by_samples": 0.0}
     mean = np.convolve(SIGNAL, np.ones(15) / 15, "same")
     inside = slice(20, -20)
     assert term.record(values, "displacement", T_S, SIGNAL)[inside] == pytest.approx(mean[inside], abs=4e-4)
@@ -39,6 +39,21 @@ def test_smoothing_is_a_moving_mean_or_a_filter_run_both_ways():
     wide = term.record(values | {"tails": 1.0}, "displacement", T_S, SIGNAL)
     assert wide[inside] == pytest.approx(both[inside], abs=2e-4)
     assert low_pass_both_ways(T_S, SIGNAL, 1e-7) == pytest.approx(SIGNAL, abs=1e-4)
+
+
+@pytest.mark.parametrize("interval_s", [1e-3, 4e-3])
+def test_a_mean_of_samples_is_as_wide_as_its_samples_and_late_if_of_past_ones(interval_s):
+    t_s = np.arange(0.0, 0.5, interval_s)
+    signal = np.sin(5.0 * t_s)
+    forms = {"tails": 0.0, "late": 0.0, "by_samples": 1.0}
+    values = {"temperature": 0.0, "displacement": 0.015, "force": 0.0} | forms
+    mean = np.convolve(signal, np.ones(15) / 15, "valid")
+    term, inside = discover_terms()["smoothing"], slice(20, -20)
+    centred = term.record(values, "displacement", t_s, signal)
+    assert centred[inside] == pytest.approx(mean[13 : 13 + len(t_s) - 40], abs=4e-4)
+    past = term.record(values | {"late": 7.0 / 15.0}, "displacement", t_s, signal)
+    assert past[inside] == pytest.approx(centred[13 : 13 + len(t_s) - 40], abs=4e-4)
+    assert np.isfinite(past).all()
 
 
 def test_a_moving_mean_of_what_is_linear_is_itself():

@@ -46,10 +46,10 @@ def test_a_fit_of_the_true_cause_is_no_worse_than_the_truth(key, values, tmp_pat
     problem, base = fit_nominal(data, prior, epsilon)
     hypotheses = build_hypotheses(data)
     (own,) = (item for item in hypotheses if item.key == key)
-    (candidate,) = refit_strongest(problem, base, (), detect(problem, base, [own]).scores, SearchLog())
+    (candidate,) = refit_strongest(problem, base, (), detect(problem, base, [own]), SearchLog())
     # A fit's χ² depends on the jitter sensitivities at its start, so both points are judged by fits that start there.
     truth = fit(problem, ParameterPoint(prior.mean, {key: values}), candidate.fit.free, iterations=1)
     found = fit(problem, candidate.fit.point, candidate.fit.free, iterations=1)
     assert found.chi2 <= truth.chi2 + TOLERANCE, found.point.terms
-    best = refit_strongest(problem, base, (), detect(problem, base, hypotheses).scores, SearchLog())[0]
+    best = refit_strongest(problem, base, (), detect(problem, base, hypotheses), SearchLog())[0]
     assert best.causes == (key,), best.fit.point.terms
