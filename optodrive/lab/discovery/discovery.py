@@ -106,9 +106,10 @@ class _Search:
         self.few = prepare_search(records, self.splits[0])
         progress("compiling", 0.0)
         self.simulation = Simulation(model, hold=0 if model.from_rest else 1)
-        noise = estimate_noise(records)
         self.is_white = all(record.whiten is not None for record in records)
-        self.noise = noise if self.is_white else np.maximum(noise, 1e-4 * output_sizes(records))
+        self.noise = np.ones(len(model.outputs))  # in its own units where records whiten their errors
+        if not self.is_white:
+            self.noise = np.maximum(estimate_noise(records), 1e-4 * output_sizes(records))
         self.judge = Judge(self.simulation, records, self.splits, self.noise)
         self.state_sizes = np.ones(len(model.states))
         self.rate_sizes = np.ones(len(model.states))

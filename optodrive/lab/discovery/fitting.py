@@ -1,21 +1,23 @@
 """A model with terms on prepared records: free run, filter, and fit of all free numbers by their prediction errors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.lab.discovery.integration import STEP, Kernels, allocate_work, build_kernels
 from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.model import OdeModel, Record
+from optodrive.lab.inference.fit import fit_residuals
 
 Gains = Sequence[FloatArray] | None
 """Gains [m, n, o] by which a filter corrects the states, per record; None for free runs."""
 DIVERGED = 1e3
 """Residual in standard deviations of an output that stands for a diverged one."""
+TOLERANCE = 1e-7
+"""Relative change of squares and point at which a fit ends."""
 CONVERGED = 1e-3
 """Change of a free run, relative to the outputs, at which the integration step is short enough."""
 LONGEST_FROM_REST = 8.0
@@ -233,7 +235,6 @@ def fit(
     weights: Sequence[FloatArray],
     gains: Gains = None,
     evaluations: int = 30,
-    on_progress: Callable[[], None] = lambda: None,
 ) -> tuple[Point, float]:
     """Return the point that minimises the weighted squared prediction errors, and their sum.
 
@@ -248,29 +249,24 @@ def fit(
             predicted, _ = simulation.run(record, trial, None if gains is None else gains[k])
             error = weigh(record, record.outputs - predicted, weights[k])[used[k]]
             parts.append(np.nan_to_num(np.clip(error, -DIVERGED, DIVERGED), nan=DIVERGED))
-        on_progress()
         return np.concatenate(parts)
 
     vector, low, high = simulation.to_vector(point)
-    span = high - low
-    unit = np.maximum(np.abs(vector), np.where(np.isfinite(span), 1e-6 * span, 1e-12))
-    unit[unit == 0.0] = 1.0
-    margin = np.where(np.isfinite(span), 1e-9 * span, 0.0)
-    start = np.clip(vector, low + margin, high - margin) / unit
-    best = least_squares(
+    span = np.where(np.isfinite(high - low), high - low, 0.0)
+    # In units of themselves: an amplitude of 1e-6 would else count as settled beside a threshold of 10.
+    unit = np.maximum(np.abs(vector), np.maximum(1e-6 * span, 1e-12))
+    start = np.clip(vector, low + 1e-9 * span, high - 1e-9 * span)
+    found = fit_residuals(
         residuals,
-        start,
-        bounds=(low / unit, high / unit),
+        start / unit,
+        (low / unit, high / unit),
+        STEP,
+        evaluations=evaluations,
+        tolerance=TOLERANCE,
         # Free runs near the data have one minimum, which "dogbox" reaches in a few steps; filters have valleys.
         method="dogbox" if simulation.model.from_rest else "trf",
-        x_scale="jac",
-        diff_step=STEP,
-        ftol=1e-6,
-        xtol=1e-7,
-        gtol=1e-10,
-        max_nfev=evaluations,
     )
-    return simulation.from_vector(best.x * unit, point), float(2.0 * best.cost)
+    return simulation.from_vector(found.x * unit, point), found.chi2
 
 
 def weigh(record: Record, errors: FloatArray, weights: FloatArray) -> FloatArray:
@@ -285,11 +281,8 @@ def weigh(record: Record, errors: FloatArray, weights: FloatArray) -> FloatArray
 def estimate_noise(records: Sequence[Record]) -> FloatArray:
     """Return an upper estimate of the measurement noise of each output [o], from fourth differences.
 
-    They vanish for a signal that is a cubic over five samples; the estimate is robust against steps. That of records
-    which state their noise follows from what whitening makes of alternating errors of one.
+    They vanish for a signal that is a cubic over five samples; the estimate is robust against steps.
     """
-    if all(record.whiten is not None for record in records):
-        return _find_stated_noise(records)
     columns = range(records[0].outputs.shape[1])
     estimates = []
     for column in columns:
@@ -297,21 +290,6 @@ def estimate_noise(records: Sequence[Record]) -> FloatArray:
         joined = np.concatenate([d[np.isfinite(d)] for d in differences]) if differences else np.zeros(0)
         estimates.append(1.4826 * float(np.median(np.abs(joined))) if len(joined) else 0.0)
     return np.array(estimates)
-
-
-def _find_stated_noise(records: Sequence[Record]) -> FloatArray:
-    """Return the noise of a sample of each output [o], as the records state it, or 1 without samples."""
-    squares, counts = np.zeros(records[0].outputs.shape[1]), np.zeros(records[0].outputs.shape[1])
-    for record in records:
-        measured = np.isfinite(record.outputs)
-        signs = np.where(np.arange(len(record.t_s)) % 2, 1.0, -1.0)
-        for column in np.flatnonzero(measured.any(axis=0)):
-            errors = np.zeros(record.outputs.shape)
-            errors[:, column] = signs
-            squares[column] += float(np.sum(weigh(record, errors, measured.astype(np.float64)) ** 2))
-            counts[column] += measured[:, column].sum()
-    noise: FloatArray = 1.0 / np.sqrt(np.where(counts > 0.0, squares / np.maximum(counts, 1.0), 1.0))
-    return noise
 
 
 def output_sizes(records: Sequence[Record]) -> FloatArray:

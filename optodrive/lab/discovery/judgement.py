@@ -35,7 +35,7 @@ PARTS, EVIDENCE_PARTS = 64, 256
 """Parts of a split's held-out samples in which forms are compared, and in which the evidence for a term is summed."""
 WITHIN_NOISE = 1.1
 """Error in units of noise below which nothing is left to gain."""
-START_NOISE = 5.0
+START_NOISE = 10.0
 """Error of free runs in units of noise, below which it may be that of the first sample, from which the run starts."""
 SAME = 0.01
 """Squared difference of two functions, relative to the smaller one, below which they are one."""

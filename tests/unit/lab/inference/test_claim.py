@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,16 +23,29 @@ from optodrive.lab.inference.claim import (
     Claim,
     Evidence,
     HeldOutChange,
+    SplitGain,
+    TermClaim,
+    TermForm,
     claim,
     combine_claims,
+    compute_no_effect,
+    sum_in_sigma,
+    weigh_forms,
 )
-from optodrive.lab.inference.sentences import describe_claim, describe_gain, describe_probabilities
+from optodrive.lab.inference.sentences import (
+    build_term_document,
+    describe_claim,
+    describe_gain,
+    describe_probabilities,
+    describe_term,
+)
 from optodrive.physics.terms import discover_terms
 
 CAUSES = ("gas_leak", "laser_droop", "high_pass", "membrane_stiffening")
 SETS = (*((key,) for key in CAUSES), ("gas_leak", "laser_droop"), ("high_pass", "laser_droop"))
 BETTER = HeldOutChange("strong", "displacement_m", -400.0, 40.0)
 WORSE = HeldOutChange("strong", "absorber_temperature_K", 50.0, 10.0)
+LITTLE, UNTESTED, HARM = (SplitGain("friday", *each) for each in ((0.9, 0.1), (0.0, 0.9), (0.9, -0.2)))
 DOUBT = {"gas_leak": "the 95 % interval of gas_leak.rate, −1 to 2, contains zero"}
 
 
@@ -55,6 +69,10 @@ def test_a_cause_that_meets_all_conditions_is_named():
         ({"explained": (0.8, 0.85)}, "ambiguous", "85.0 % of the excess in all", "MIN_EXPLAINED_WITH_FORMS"),
         ({"held_out": (BETTER, WORSE)}, "ambiguous", "absorber_temperature_K .* strong .* 5.0 σ", "MAX_WORSE_SIGMA"),
         ({"held_out": (WORSE,)}, "unexplained", "predicted worse, by 5.0 σ", "MAX_WORSE_SIGMA"),
+        ({"gains": (LITTLE,)}, "ambiguous", "removes 90.0 % .* where it was fitted, 10.0 % in friday", "MIN_KEPT"),
+        ({"gains": (UNTESTED,)}, "ambiguous", "Without friday, no data shows gas_leak", "MIN_TRAINED"),
+        ({"gains": (HARM,)}, "unexplained", "With gas_leak, friday is predicted worse, by 20.0 %", ""),
+        ({"nameless": "a curve"}, "unexplained", "gas_leak is no name: a curve", ""),
         ({"doubts": DOUBT}, "ambiguous", "gas_leak is not certain: the 95 % interval .* contains zero", ""),
     ],
 )
@@ -68,7 +86,7 @@ def test_each_condition_keeps_a_cause_from_being_named(monkeypatch, changes, ver
             monkeypatch.setattr(judge, name, 1e9 if limit == "MAX_WORSE_SIGMA" else -1e9)
         assert claim(make_evidence(**changes)).verdict == "cause"
     else:
-        assert claim(make_evidence(**changes | {"doubts": {}})).verdict == "cause"
+        assert claim(make_evidence(**changes | {"doubts": {}, "gains": (), "nameless": ""})).verdict == "cause"
 
 
 def test_without_repeats_nothing_is_certain():
@@ -109,12 +127,15 @@ def draw_evidence(draw):
     probabilities = Probabilities(no_effect, none, {tuple(sorted(k)): p for k, p in zip(sets, causes, strict=True)})
     shares = st.one_of(st.none(), st.tuples(st.floats(-2.0, 1.0), st.floats(0.0, 1.0)))
     change = st.builds(HeldOutChange, st.sampled_from("ab"), st.just("force_N"), st.floats(-99, 99), st.floats(0.1, 9))
+    gain = st.builds(SplitGain, st.sampled_from("ab"), st.floats(-0.1, 1.0), st.floats(-1.0, 1.0))
     alternatives = tuple(
         Alternative(
             keys,
             draw(shares),
             tuple(draw(st.lists(change, max_size=3))),
             {keys[0]: "a clause"} if draw(st.booleans()) else {},
+            tuple(draw(st.lists(gain, max_size=2))),
+            draw(st.sampled_from(("", "", "a curve"))),
         )
         for keys in sorted(sets, key=lambda keys: -probabilities.causes[tuple(sorted(keys))])
     )
@@ -129,12 +150,15 @@ def test_every_claim_keeps_the_conditions(evidence):
     named = [item for item in evidence.alternatives if item.causes in found.sets]
     for item in named:
         assert item.explained is None or item.explained[0] >= 0.5
+        assert not item.nameless
+        assert all(each.held_out >= 0.0 for each in item.gains)
         total, noise = sum(each.chi2 for each in item.held_out), sum(each.noise**2 for each in item.held_out) ** 0.5
         assert not item.held_out or total <= MAX_WORSE_SIGMA * noise * (1 + 1e-9)
     if found.verdict == "cause":
         (item,) = named
         assert evidence.has_repeats
         assert not item.doubts
+        assert all(each.trained > 0.0 and each.held_out >= 0.5 * each.trained for each in item.gains)
         assert item.explained is None or item.explained[1] >= 0.9
         assert all(each.chi2 <= 3.0 * each.noise for each in item.held_out)
         assert all(probabilities.sum_of(key) >= 0.97 for key in item.causes)
@@ -240,3 +264,46 @@ def test_the_worst_part_decides(verdicts, fails, is_disturbed):
     others = [*verdicts, *(["incomplete"] if fails else []), *(["instrument"] if is_disturbed else [])]
     assert found.verdict == min(others, key=WORST_FIRST.index)
     assert bool(found.causes) == (found.verdict in names)
+
+
+@given(draw_evidence(), st.floats(0.0, 1.0))
+@settings(max_examples=200, deadline=None)
+def test_the_three_numbers_of_a_term_stay_apart(evidence, probability):
+    forms = tuple(
+        TermForm("dv/dt", (variable,), kind, f"1 {kind}", share, 0.5)
+        for variable, kind, share in (
+            ("v", "drag", probability),
+            ("v", "friction", 0.0),
+            ("x", "drag", 1.0 - probability),
+        )
+    )
+    term = TermClaim(claim(evidence), 1.0 - evidence.probabilities.no_effect, forms, forms[0], (LITTLE,), "another one")
+    text = "\n".join(describe_term(term))
+    stated = re.search(r"missing: (.*); of what was tried, in dv/dt on v: (.*); as drag there: (.*)", text)
+    numbers = (term.missing, term.place_probability, forms[0].probability)
+    for words, number in zip(stated.groups(), numbers, strict=True):
+        assert_states(words, number)
+    document = build_term_document(term)
+    assert tuple(document[f"probability_{key}"] for key in ("missing", "place", "form")) == numbers
+    assert ("dv/dt lacks 1 drag" in text) == (term.claim.verdict == "cause") == term.is_sure
+    assert ("perhaps" in text) == (term.claim.verdict == "ambiguous")
+    assert ("or drag in dv/dt on x" in text) == (1.0 - probability >= judge.MIN_LISTED)
+    assert "10% in friday (90% where fitted)" in text
+    assert all(reason in text for reason in term.claim.reasons)
+
+
+def test_correlated_errors_are_no_evidence_of_an_effect():
+    rng, correlated = np.random.default_rng(1), np.zeros(256)
+    sigmas, parts = [], []
+    for _ in range(400):
+        for row in range(1, 256):
+            correlated[row] = 0.8 * correlated[row - 1] + rng.standard_normal()
+        sigma, count = sum_in_sigma(correlated, correlated)
+        sigmas.append(sigma)
+        parts.append(count)
+    assert np.std(sigmas) < 1.3  # 3.0 without the products of neighbours
+    assert 256 / 9 * 0.5 < np.median(parts) < 256 / 9 * 2.0  # a part in (1 + 0.8) / (1 − 0.8) is independent
+    assert compute_no_effect(0.0, 256.0) > MIN_NO_EFFECT
+    assert compute_no_effect(5.0, 256.0) < MAX_NO_EFFECT
+    assert compute_no_effect(3.2, 256.0) < compute_no_effect(3.2, 256.0, tries=100)
+    assert weigh_forms([0.0, 0.0, 9.0], [1.0, 0.5, 1.0]) == pytest.approx([2 / 3, 1 / 3, 0.0], abs=1e-9)
