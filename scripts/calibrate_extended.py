@@ -11,7 +11,7 @@ import sys
 import numpy as np
 from scipy.optimize import least_squares
 
-from optodrive.lab.validation.extended_outcomes import simulate_outcomes
+from optodrive.lab.validation.outcomes import simulate_outcomes
 from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import Parameter, load_parameters
 

@@ -8,7 +8,7 @@ from statistics import stdev
 from scipy.optimize import brentq
 
 from optodrive.device.config_file import locate_shipped
-from optodrive.lab.validation.paper_outcomes import FITTED_ON, OUTCOMES
+from optodrive.lab.validation.outcomes import FITTED_ON, OUTCOMES
 from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import Parameter, ParameterSet, load_parameters
 

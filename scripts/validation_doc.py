@@ -5,8 +5,8 @@ from pathlib import Path
 
 from optodrive.cli.validation_table import HEADINGS, build_validation_rows, format_cells
 from optodrive.lab.validation import narrative
-from optodrive.lab.validation.measured_facts import EXCLUDED
-from optodrive.lab.validation.paper_outcomes import NOT_MODELLED
+from optodrive.lab.validation.facts import EXCLUDED
+from optodrive.lab.validation.outcomes import NOT_MODELLED
 from optodrive.lab.validation.study import run_study
 from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import load_parameters
@@ -54,7 +54,7 @@ DIAGNOSIS_SECTION = """\
 ## Results of `optodrive validate --diagnose`
 
 The command treats the twelve measured outcomes as a recording and the literal set as the model, weighs sets of the
-causes of `optodrive/lab/validation/candidate_causes.py`, and repeats selection and fit without each group of facts to
+causes of `optodrive/lab/validation/causes.py`, and repeats selection and fit without each group of facts to
 predict that group. A cause is named on the conditions of [diagnoses](../decisions/0082-four-conditions-of-a-cause.md).
 Aggregate figures permit less than a recording does: there are no repeats, so the noise is an assumption; a group that
 alone shows a cause is held out fact by fact; what one fact shows, nothing tests. It prints:
@@ -87,20 +87,21 @@ JSON_KEYS = """\
 - `parameter_set`: the parameter set that is diagnosed
 - `verdict`, `sets` (the causes named), `reasons`, as of a diagnosis
 - `probabilities`: `no_effect`, `none_of_these`, `causes` (each set above 1 %: `causes`, `probability`)
-- `facts`: each `id`, `group`, `value`, `relative_error`, `reading` (`relative_error`, `source`), `nominal_ratio`,
-  `extended_ratio`, `error_sigma`
+- `facts`: each `id`, `group`, `value`, `relative_error` (from `reading_error`, of a `source`, and `scatter`),
+  `nominal_ratio`, `extended_ratio`, `error_sigma`
 - `excluded`: outcome → reason why it is not a measurement
 - `chi2`, `factor`: `nominal`, `extended`; of χ² also `degrees_of_freedom`
 - `aicc_per_cause`, `aicc_indistinguishable`: thresholds
-- `causes`: each `cause`, `description`, `parameter`, `value`, `unit`, `ci95`, `chi2_reduction`, `evidence`,
-  `alternatives`, `deciding_measurement`
-- `candidates`, the other causes: each `cause`, `description`, `probability`, `value` (beside the identified ones),
+- `causes`: each `cause`, `description`, `parameter`, `value`, `low`, `high` (95 %), `unit`, `chi2_reduction`,
+  `evidence`, `alternatives`, `deciding_measurement`
+- `candidates`, the other causes: each `cause`, `description`, `probability`, `parameter`, `value` (beside the others),
   `unit`, `chi2_reduction_alone`, `chi2_reduction_added`, `replaces`, `replaced_fraction`, `is_observable`,
-  `is_alternative_law`
+  `is_alternative_law`, `deciding_measurement`
 - `contradictions`: each `assumption`, `description`, `ratio`
 - `unexplained`: facts that deviate by more than two standard errors
-- `gain`: `groups` and `facts`, each `held_out`, `facts`, `causes`, `unobservable`, `nominal_ratio`, `extended_ratio`,
-  `nominal_factor`, `extended_factor`; `factor_groups` and `factor_each`, each `nominal`, `extended`
+- `gain`: `groups` and `facts`, each `held_out`, `facts`, `causes`, `unobservable`, `nominal`, `extended` (ratios model
+  over measured), `changes` of χ² (`signal`, `chi2`, its deviation `noise`); `factor_groups` and `factor_each`, each
+  `nominal`, `extended`
 """
 
 

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from optodrive.cli.output import print_json
-from optodrive.lab.validation.extended_outcomes import simulate_outcomes
-from optodrive.lab.validation.paper_outcomes import (
+from optodrive.lab.validation.outcomes import (
     DERIVED_FROM_FITTED,
     EXTENDED_DERIVED_FROM_FITTED,
     EXTENDED_FITTED_ON,
@@ -16,6 +15,7 @@ from optodrive.lab.validation.paper_outcomes import (
     NOT_MODELLED,
     OUTCOMES,
     REMARKS,
+    simulate_outcomes,
 )
 from optodrive.physics.paper_facts import PaperFact, load_paper_facts
 from optodrive.physics.parameters import load_parameters

@@ -10,15 +10,19 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.lab.inference.claim import claim
-from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
-from optodrive.lab.validation.cause_search import CauseSearch
-from optodrive.lab.validation.contradictions import find_contradictions
+from optodrive.lab.validation.causes import CAUSES_BY_KEY, CauseSearch
 from optodrive.lab.validation.corrected_model import MAX_PULSE_S, CorrectedModel
-from optodrive.lab.validation.extended_outcomes import simulate_outcomes
-from optodrive.lab.validation.measured_facts import EXCLUDED, GROUPS, MEASURED_IDS, RATE_HEIGHTS_M, build_measured_facts
+from optodrive.lab.validation.facts import (
+    EXCLUDED,
+    GROUPS,
+    MEASURED_IDS,
+    RATE_HEIGHTS_M,
+    build_measured_facts,
+    find_contradictions,
+)
 from optodrive.lab.validation.narrative import build_rows, build_study_answer, describe_findings, describe_predictions
-from optodrive.lab.validation.paper_outcomes import FULL_POWER_W, OUTCOMES
-from optodrive.lab.validation.stimulus_response import width_to_reach_s
+from optodrive.lab.validation.outcomes import OUTCOMES, simulate_outcomes
+from optodrive.lab.validation.stimuli import FULL_POWER_W, width_to_reach_s
 from optodrive.lab.validation.study import compute_error_factor, predict_held_out, run_study
 from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
 from optodrive.physics.parameters import Parameter, load_parameters
@@ -259,7 +263,7 @@ def test_the_answer_as_json(found):
     keys = {item["cause"] for item in document["causes"]} | {item["cause"] for item in document["candidates"]}
     assert keys == set(CAUSES_BY_KEY)
     for item in document["causes"]:
-        assert item["ci95"][0] < item["value"] < item["ci95"][1]
+        assert item["low"] < item["value"] < item["high"]
     assert {item["held_out"] for item in document["gain"]["groups"]} == set(GROUPS)
     assert document["gain"]["factor_each"]["extended"] < document["gain"]["factor_each"]["nominal"]
 

@@ -144,16 +144,12 @@ def _settling_times_s(servo: Servo, moves: list[tuple[float, float, int]]) -> Fl
 def _settling_excess(
     mirrors: tuple[IdentifiedServo, IdentifiedServo], servo: Servo, moves: list[tuple[float, float, int]]
 ) -> tuple[float, float]:
-    shares = []
-    for axis in range(2):
-        axis_moves = [move for move in moves if move[2] == axis]
-        shares.append(
-            float(
-                _settling_times_s(servo, axis_moves).mean() / _settling_times_s(mirrors[axis].servo, axis_moves).mean()
-            )
-            - 1.0
-        )
-    return shares[0], shares[1]
+    def excess(axis: int) -> float:
+        mine = [move for move in moves if move[2] == axis]
+        times_s = (_settling_times_s(each, mine).mean() for each in (servo, mirrors[axis].servo))
+        return float(next(times_s) / next(times_s)) - 1.0
+
+    return excess(0), excess(1)
 
 
 def _acceleration_energy(servo: Servo, move_rad: float) -> float:

@@ -41,26 +41,26 @@ def build_report(
     effects: tuple[MirrorEffect, MirrorEffect],
 ) -> dict[str, Any]:
     """Build the report in SI units. Intervals are 95 %."""
+    axes = [_axis_report(mirror, config, effect.linearity) for mirror, effect in zip(mirrors, effects, strict=True)]
+    half_widths = dict(zip(HALF_WIDTHS, find_half_widths(mirrors, common.servo), strict=True))
+    remarks = [
+        remark
+        for mirror, axis in zip(mirrors, axes, strict=True)
+        for remark in _axis_remarks(mirror, axis["settling"], config)
+    ]
+    remarks += _common_servo_remarks(mirrors, common)
+    remarks += [
+        remark
+        for row, effect in enumerate(effects)
+        for remark in _effect_remarks(row, effect, config.tolerance_rad[row])
+    ]
     return {
-        "scanner": scanner_table(common.servo)
-        | dict(zip(HALF_WIDTHS, find_half_widths(mirrors, common.servo), strict=True)),
+        "scanner": scanner_table(common.servo) | half_widths,
         "galvo": {"share": common.galvo_share},
         "settling_excess": dict(zip(AXES, common.settling_excess, strict=True)),
-        "effect": {
-            "name": [each.name for each in effects],
-            "error_rad": [each.error_rad for each in effects],
-        },
-        "axes": {
-            AXES[mirror.trace.axis]: _axis_report(mirror, config) | {"linearity": report_linearity(effect.linearity)}
-            for mirror, effect in zip(mirrors, effects, strict=True)
-        },
-        "remarks": [remark for mirror in mirrors for remark in _axis_remarks(mirror, config)]
-        + _common_servo_remarks(mirrors, common)
-        + [
-            remark
-            for axis, effect in enumerate(effects)
-            for remark in _effect_remarks(AXES[axis], effect, config.tolerance_rad[axis])
-        ],
+        "effect": {"name": [each.name for each in effects], "error_rad": [each.error_rad for each in effects]},
+        "axes": dict(zip(AXES, axes, strict=True)),
+        "remarks": remarks,
     }
 
 
@@ -88,18 +88,15 @@ def describe_linearity(report: dict[str, Any]) -> list[str]:
     return [" ".join([headline, *(f"{each}." for each in fits)]), *reasons]
 
 
-def _effect_remarks(axis: str, effect: MirrorEffect, tolerance_rad: float) -> list[str]:
+def _effect_remarks(row: int, effect: MirrorEffect, tolerance_rad: float) -> list[str]:
     if effect.error_rad == 0.0:
         return []
-    sizes = (
-        f"{format_quantity(effect.error_rad, 'rad')} of the gate's tolerance of {format_quantity(tolerance_rad, 'rad')}"
-    )
+    error, tolerance = (format_quantity(each, "rad") for each in (effect.error_rad, tolerance_rad))
+    consequence = "no settling time opens the gate, and plans refuse this file"
     if effect.error_rad < tolerance_rad:
-        return [f"{axis}: {effect.name} leaves an error of up to {sizes}; plans keep it as aim error"]
-    return [
-        f"{axis}: {effect.name} leaves an error of up to {sizes}: no settling time opens the gate, "
-        "and plans refuse this file"
-    ]
+        consequence = "plans keep it as aim error"
+    found = f"{effect.name} leaves an error of up to {error} of the gate's tolerance of {tolerance}"
+    return [f"{AXES[row]}: {found}: {consequence}"]
 
 
 def scanner_table(servo: Servo) -> dict[str, float]:
@@ -137,6 +134,7 @@ def format_report_lines(report: dict[str, Any]) -> list[str]:
 def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
     """Write mirrors.toml atomically. source: description of the recording."""
     printable = "".join(letter for letter in source if letter.isprintable() and letter not in '"\\')
+    effect = report["effect"]
     text = [
         f'format = "{MIRRORS_FORMAT}"',
         f"version = {MIRRORS_VERSION}",
@@ -147,20 +145,13 @@ def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
     ]
     text += ["[scanner] # for both mirrors, instead of the configuration's", *_format_pairs(report["scanner"])]
     text += ["", "[galvo] # factor on the galvo cap, for the faster mirror", *_format_pairs(report["galvo"])]
-    if any(error_rad > 0.0 for error_rad in report["effect"]["error_rad"]):
-        text += [
-            "",
-            "[effect] # of x and y: what stays after a move, beyond the servo",
-            *_format_effect(report["effect"]),
-        ]
+    if any(error_rad > 0.0 for error_rad in effect["error_rad"]):
+        names = ", ".join(f'"{name}"' for name in effect["name"])
+        text += ["", "[effect] # of x and y: what stays after a move, beyond the servo", f"name = [{names}]"]
+        text += [f"error_rad = {effect['error_rad']!r}"]
     for name, axis in report["axes"].items():
         text += ["", f"[axes.{name}] # as measured, for information", *_format_pairs(axis)]
     write_text(path, "\n".join(text) + "\n")
-
-
-def _format_effect(effect: dict[str, Any]) -> list[str]:
-    names = ", ".join(f'"{name}"' for name in effect["name"])
-    return [f"name = [{names}]", f"error_rad = {effect['error_rad']!r}"]
 
 
 def _format_pairs(table: dict[str, Any]) -> list[str]:
@@ -170,26 +161,23 @@ def _format_pairs(table: dict[str, Any]) -> list[str]:
     ]
 
 
-def _axis_report(mirror: IdentifiedServo, config: Config) -> dict[str, Any]:
+def _axis_report(mirror: IdentifiedServo, config: Config, linearity: Linearity) -> dict[str, Any]:
     servo, half_widths = mirror.servo, INTERVAL_SIGMAS * mirror.sigma
-    slew_interval = [
-        1.0 / (1.0 / servo.slew + sign * half_widths[3])
-        for sign in (1, -1)
-        if 1.0 / servo.slew + sign * half_widths[3] > 0
-    ]
+    inverse = 1.0 / servo.slew + half_widths[3] * np.array([1.0, -1.0])
     return {
         **scanner_table(servo),
-        "bandwidth_interval_hz": [servo.frequency * float(np.exp(sign * half_widths[0])) for sign in (-1, 1)],
+        "bandwidth_interval_hz": (servo.frequency * np.exp(half_widths[0] * np.array([-1.0, 1.0]))).tolist(),
         "damping_half_width": float(half_widths[1]),
         "delay_half_width_s": float(half_widths[2]),
         "slew_identified": mirror.slew_identified,
-        "slew_interval_rad_per_s": slew_interval if mirror.slew_identified else None,
+        "slew_interval_rad_per_s": (1.0 / inverse[inverse > 0.0]).tolist() if mirror.slew_identified else None,
         "gain": mirror.gain,
         "offset_rad": mirror.offset_rad,
         "residual_rad": mirror.residual_rad,
         "noise_rad": mirror.trace.noise_rad,
         "steps": len(mirror.trace.steps_rad),
         "settling": [_settling_row(mirror, step_rad, config) for step_rad in _list_sizes_rad(mirror, config)],
+        "linearity": report_linearity(linearity),
     }
 
 
@@ -239,7 +227,7 @@ def _describe_settling(row: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _axis_remarks(mirror: IdentifiedServo, config: Config) -> list[str]:
+def _axis_remarks(mirror: IdentifiedServo, settling: list[dict[str, Any]], config: Config) -> list[str]:
     name, half_widths, servo = AXES[mirror.trace.axis], INTERVAL_SIGMAS * mirror.sigma, mirror.servo
     remarks = []
     if not mirror.slew_identified:
@@ -262,7 +250,7 @@ def _axis_remarks(mirror: IdentifiedServo, config: Config) -> list[str]:
         remarks.append(
             f"{name}: critically damped or overdamped within the uncertainty; a configuration is always underdamped"
         )
-    for row in (_settling_row(mirror, step_rad, config) for step_rad in _list_sizes_rad(mirror, config)):
+    for row in settling:
         low_s, high_s = row["share"]["interval_s"]
         if high_s - low_s > 2.0 * SETTLING_TOLERANCE * row["share"]["measured_s"]:
             remarks.append(

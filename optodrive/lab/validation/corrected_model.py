@@ -8,10 +8,10 @@ from math import log, pi, sqrt
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.validation.extended_outcomes import AMBIENT_K
-from optodrive.lab.validation.measured_facts import RATE_HEIGHTS_M, Datum
-from optodrive.lab.validation.paper_outcomes import LONG_PULSE_S
-from optodrive.lab.validation.stimulus_heat import (
+from optodrive.lab.validation.facts import RATE_HEIGHTS_M, Datum
+from optodrive.lab.validation.stimuli import (
+    AMBIENT_K,
+    LONG_PULSE_S,
     FrozenTerms,
     PulseStimulus,
     TrainStimulus,

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
+from optodrive.core.document import to_json
 from optodrive.core.quantity import format_quantity
 from optodrive.lab.inference.claim import format_probability
 from optodrive.lab.inference.sentences import MIN_SHOWN, describe_probabilities, describe_sufficiency
-from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
-from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST
-from optodrive.lab.validation.measured_facts import EXCLUDED, READING_ERROR
+from optodrive.lab.validation.causes import AICC_INDISTINGUISHABLE, CAUSE_COST, CAUSES_BY_KEY
+from optodrive.lab.validation.facts import EXCLUDED, READING_ERROR
 from optodrive.lab.validation.study import (
     UNEXPLAINED_SIGMA,
     HeldOutPrediction,
@@ -170,98 +170,54 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
     """Return the result as JSON values, SI units, temperatures as rises, K."""
     groups, each = compute_overall_factors(result.group_predictions), compute_overall_factors(result.predictions)
     sides = zip(result.data, result.nominal_ratios, result.extended_ratios, result.errors_sigma, strict=True)
+    probable = [keys for keys, probability in result.probabilities.ranked if probability >= MIN_SHOWN]
     return {
         "parameter_set": result.base,
-        "verdict": result.claim.verdict,
-        "sets": [list(keys) for keys in result.claim.sets],
-        "reasons": list(result.claim.reasons),
+        **to_json(result.claim),
         "probabilities": {
             "no_effect": result.probabilities.no_effect,
             "none_of_these": result.probabilities.none_of_these,
-            "causes": [
-                {"causes": list(keys), "probability": probability}
-                for keys, probability in result.probabilities.ranked
-                if probability >= MIN_SHOWN
-            ],
+            "causes": [{"causes": list(keys), "probability": result.probabilities.causes[keys]} for keys in probable],
         },
         "facts": [
-            {
-                "id": datum.id,
-                "group": datum.group,
-                "value": datum.value,
+            to_json(datum)
+            | {
                 "relative_error": datum.sigma,
-                "reading": {"relative_error": datum.reading_error, "source": datum.source},
                 "nominal_ratio": nominal,
                 "extended_ratio": extended,
                 "error_sigma": error,
             }
             for datum, nominal, extended, error in sides
         ],
-        "excluded": dict(EXCLUDED),
+        "excluded": EXCLUDED,
         "chi2": {
             "nominal": result.nominal_fit.chi2,
             "extended": result.fit.chi2,
             "degrees_of_freedom": len(result.data) - len(result.named),
         },
-        "factor": {
-            "nominal": compute_error_factor(result.nominal_ratios),
-            "extended": compute_error_factor(result.extended_ratios),
-        },
+        "factor": _state_factors(
+            (compute_error_factor(result.nominal_ratios), compute_error_factor(result.extended_ratios))
+        ),
         "aicc_per_cause": CAUSE_COST,
         "aicc_indistinguishable": AICC_INDISTINGUISHABLE,
-        "causes": [
-            {
-                "cause": item.key,
-                "description": CAUSES_BY_KEY[item.key].description,
-                "parameter": CAUSES_BY_KEY[item.key].parameter.symbol,
-                "value": item.value,
-                "unit": CAUSES_BY_KEY[item.key].parameter.unit,
-                "ci95": [item.low, item.high],
-                "chi2_reduction": item.chi2_reduction,
-                "evidence": list(item.evidence),
-                "alternatives": list(item.alternatives),
-                "deciding_measurement": CAUSES_BY_KEY[item.key].deciding_measurement,
-            }
-            for item in result.named
-        ],
-        "candidates": [
-            {
-                "cause": item.key,
-                "description": CAUSES_BY_KEY[item.key].description,
-                "probability": item.probability,
-                "value": item.value,
-                "unit": CAUSES_BY_KEY[item.key].parameter.unit,
-                "chi2_reduction_alone": item.chi2_reduction_alone,
-                "chi2_reduction_added": item.chi2_reduction_added,
-                "replaces": item.replaces,
-                "replaced_fraction": item.replaced_fraction,
-                "is_observable": item.is_observable,
-                "is_alternative_law": item.is_alternative_law,
-            }
-            for item in result.unchosen
-        ],
-        "contradictions": [
-            {"assumption": item.key, "description": item.description, "ratio": item.ratio}
-            for item in result.contradictions
-        ],
+        "causes": [_state_cause(item) for item in result.named],
+        "candidates": [_state_cause(item) for item in result.unchosen],
+        "contradictions": to_json(result.contradictions, key="assumption"),
         "unexplained": list(result.unexplained),
         "gain": {
-            "groups": [_prediction_to_json(item) for item in result.group_predictions],
-            "facts": [_prediction_to_json(item) for item in result.fact_predictions],
-            "factor_groups": {"nominal": groups[0], "extended": groups[1]},
-            "factor_each": {"nominal": each[0], "extended": each[1]},
+            "groups": to_json(result.group_predictions, label="held_out"),
+            "facts": to_json(result.fact_predictions, label="held_out"),
+            "factor_groups": _state_factors(groups),
+            "factor_each": _state_factors(each),
         },
     }
 
 
-def _prediction_to_json(item: HeldOutPrediction) -> dict[str, Any]:
-    return {
-        "held_out": item.label,
-        "facts": list(item.facts),
-        "causes": list(item.causes),
-        "unobservable": list(item.unobservable),
-        "nominal_ratio": list(item.nominal),
-        "extended_ratio": list(item.extended),
-        "nominal_factor": compute_error_factor(item.nominal),
-        "extended_factor": compute_error_factor(item.extended),
-    }
+def _state_factors(factors: tuple[float, float]) -> dict[str, float]:
+    return dict(zip(("nominal", "extended"), factors, strict=True))
+
+
+def _state_cause(item: NamedCause | UnchosenCause) -> dict[str, Any]:
+    cause, stated = CAUSES_BY_KEY[item.key], to_json(item, key="cause")
+    about = {"parameter": cause.parameter.symbol, "unit": cause.parameter.unit}
+    return {**stated, "description": cause.description, **about, "deciding_measurement": cause.deciding_measurement}

@@ -7,10 +7,8 @@ import numpy as np
 
 from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.inference.claim import Claim, HeldOutChange, claim
-from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
-from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CauseFit, CauseSearch
-from optodrive.lab.validation.contradictions import Contradiction, find_contradictions
-from optodrive.lab.validation.measured_facts import GROUPS, Datum, build_measured_facts
+from optodrive.lab.validation.causes import AICC_INDISTINGUISHABLE, CAUSES_BY_KEY, CauseFit, CauseSearch
+from optodrive.lab.validation.facts import GROUPS, Contradiction, Datum, build_measured_facts, find_contradictions
 from optodrive.physics.paper_facts import PaperFact
 from optodrive.physics.parameters import ParameterSet
 

@@ -8,7 +8,7 @@ import pytest
 
 from optodrive.cli import main
 from optodrive.cli.validation_table import build_validation_rows, format_cells
-from optodrive.lab.validation.paper_outcomes import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, NOT_MODELLED, OUTCOMES
+from optodrive.lab.validation.outcomes import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, NOT_MODELLED, OUTCOMES
 
 
 @pytest.fixture(scope="module")

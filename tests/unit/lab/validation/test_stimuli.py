@@ -5,7 +5,7 @@ from math import exp, inf
 import numpy as np
 import pytest
 
-from optodrive.lab.validation.stimulus_response import compute_steady_train, pulse_peak_k, width_to_reach_s
+from optodrive.lab.validation.stimuli import compute_steady_train, pulse_peak_k, width_to_reach_s
 from optodrive.physics.pixel import Pixel, advance
 
 PIXEL = Pixel(145.0, 99e-6, 0.66, 3e-3, 4e-6, 2e-4)

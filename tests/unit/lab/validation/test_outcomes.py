@@ -6,7 +6,7 @@ from math import exp, pi
 import pytest
 
 from optodrive.device.config_file import locate_shipped
-from optodrive.lab.validation.paper_outcomes import (
+from optodrive.lab.validation.outcomes import (
     DERIVED_FROM_FITTED,
     FITTED_ON,
     INPUTS,
@@ -14,7 +14,7 @@ from optodrive.lab.validation.paper_outcomes import (
     OUTCOMES,
     REMARKS,
 )
-from optodrive.lab.validation.stimulus_response import pulse_peak_k, width_to_reach_s
+from optodrive.lab.validation.stimuli import pulse_peak_k, width_to_reach_s
 from optodrive.physics.paper_facts import PaperFact, load_paper_facts
 from optodrive.physics.parameters import load_parameters
 

@@ -2,8 +2,7 @@
 
 import pytest
 
-from optodrive.lab.validation.extended_outcomes import simulate_outcomes
-from optodrive.lab.validation.paper_outcomes import OUTCOMES
+from optodrive.lab.validation.outcomes import OUTCOMES, simulate_outcomes
 from optodrive.physics.parameters import load_parameters
 
 CALIBRATED = load_parameters("calibrated")
