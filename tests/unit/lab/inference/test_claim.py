@@ -244,16 +244,101 @@ def build_answer(found, probabilities, failures, disturbances):
     )
 
 
-def list_claims(source):
-    """Return the lines of a module on which it makes a claim of its own."""
-    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
-    return [node.lineno for node in calls if ast.unparse(node.func).rpartition(".")[2] == "Claim"]
+CLIENTS = ("discovery", "pixel_discovery", "servo_identification", "validation")
+"""Packages that name causes, terms or effects, beside the diagnosis."""
+CERTAINTIES = ("is_sure", "is_certain", "is_named", "sure", "certain")
+
+
+def list_claims(source, is_client=False):
+    """Return the lines of a module on which it makes a claim of its own: a `Claim`, or one of the judge's verdicts.
+
+    A verdict is stated where a word is given for it, rather than one that was read. is_client: a client that judges by
+    a comparison whether something is sure, makes a claim, too
+    """
+    lines = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func).rpartition(".")[2]
+            if name == "Claim" or (name[:1].isupper() and any(map(is_verdict, node.args))):
+                lines.add(node.lineno)
+        for name, value in list_values(node):
+            if (name == "verdict" and has_verdict(value)) or (is_client and name in CERTAINTIES and judges(value)):
+                lines.add(value.lineno)
+    return sorted(lines)
+
+
+def list_values(node):
+    """Return names with the values that a node gives them: arguments, variables, fields, keys and functions."""
+    if isinstance(node, ast.Call):
+        return [(item.arg, item.value) for item in node.keywords]
+    if isinstance(node, ast.Assign):
+        return [(ast.unparse(target).rpartition(".")[2], node.value) for target in node.targets]
+    if isinstance(node, ast.AnnAssign | ast.NamedExpr) and node.value is not None:
+        return [(ast.unparse(node.target).rpartition(".")[2], node.value)]
+    if isinstance(node, ast.Dict):
+        pairs = zip(node.keys, node.values, strict=True)
+        return [(key.value, value) for key, value in pairs if isinstance(key, ast.Constant)]
+    if isinstance(node, ast.FunctionDef):
+        returns = [item for item in ast.walk(node) if isinstance(item, ast.Return) and item.value is not None]
+        return [(node.name, item.value) for item in returns]
+    return []
+
+
+def is_verdict(node):
+    return isinstance(node, ast.Constant) and node.value in WORST_FIRST
+
+
+def has_verdict(node):
+    """Return whether an expression may be a verdict's word. One that it is compared with is none."""
+    if isinstance(node, ast.Compare):
+        return False
+    return is_verdict(node) or any(map(has_verdict, ast.iter_child_nodes(node)))
+
+
+def judges(node):
+    """Return whether an expression compares numbers, or says yes without a reason."""
+    if isinstance(node, ast.Compare):
+        return not any(is_verdict(item) for part in node.comparators for item in ast.walk(part))
+    return (isinstance(node, ast.Constant) and node.value is True) or any(map(judges, ast.iter_child_nodes(node)))
 
 
 def test_only_the_judge_makes_claims():
-    for path in Path(optodrive.lab.__file__).parent.rglob("*.py"):
-        assert path.parts[-2:] == ("inference", "claim.py") or not list_claims(path.read_text()), path
-    assert list_claims('found = claim(evidence) or judge.Claim("cause", (("gas_leak",),))') == [1]
+    folder = Path(optodrive.lab.__file__).parent
+    for path in (*folder.rglob("*.py"), *folder.with_name("cli").rglob("*.py")):
+        is_client = path.is_relative_to(folder) and path.relative_to(folder).parts[0] in CLIENTS
+        assert path.parent.name == "inference" or not list_claims(path.read_text(), is_client), path
+
+
+BYPASSES = (
+    'found = claim(evidence) or judge.Claim("cause", (("gas_leak",),))',
+    'found = replace(claim(evidence), verdict="cause")',
+    'verdict = "cause" if probability > 0.97 else "ambiguous"',
+    'self.verdict = claimed.verdict if gain > 0.5 else "unexplained"',
+    'answer = {"verdict": "cause"}',
+    'finding = Finding("cause", ("friction",))',
+    "class Finding:\n    verdict: str = 'cause'",
+    "def verdict(self):\n    return 'none' if self.probability < 0.05 else self.claim.verdict",
+    "finding = Finding(name, is_sure=probability > 0.97)",
+    "is_certain = True",
+    "def is_sure(self):\n    return self.probability > 0.97",
+)
+"""Mutants: clients that name something without the judge."""
+READINGS = (
+    "found = claim(evidence)\nanswer = Answer(verdict=found.verdict, causes=found.causes)",
+    'if verdict == "cause":\n    sets = found.sets',
+    "is_sure = found.verdict == 'cause'",
+    "answer = {'verdict': claimed.verdict}\nverdict = combine_claims(claims, {}, False).verdict",
+)
+
+
+@pytest.mark.parametrize("source", BYPASSES)
+def test_a_client_that_judges_by_itself_is_caught(source):
+    assert list_claims(source, is_client=True)
+
+
+@pytest.mark.parametrize("source", READINGS)
+def test_a_client_that_reads_the_verdict_is_not(source):
+    assert not list_claims(source, is_client=True)
 
 
 @given(st.lists(st.sampled_from(WORST_FIRST), min_size=1, max_size=2), st.booleans(), st.booleans())
