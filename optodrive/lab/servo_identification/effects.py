@@ -55,6 +55,13 @@ class Span(NamedTuple):
 
 FIXED = Span("one", (1.0,), 1.0, 1.0)
 _THRESHOLD = (0.35, 0.6, 0.85), 0.02, 1.5
+_SLEW = Span("slope", (0.03, 0.08, 0.2, 0.5), 0.005, 1.5)
+_PEAK_FRICTION, _STRIBECK = Span("angle", (0.02, 0.08), 1e-5, 1.0), Span("one", (0.5,), 0.0, 2.0)
+_FRICTION, _PRESLIDING = Span("angle", (0.01, 0.08), 1e-5, 1.0), Span("angle", (0.01,), 0.001, 0.04)
+_LAG, _LAG_WIDTH = Span("one", (0.1, -0.1), -0.9, 5.0), Span("command", (0.2,), 0.03, 2.0)
+_RAYLEIGH, _RAYLEIGH_WIDTH = Span("one", (0.1, -0.1), -0.9, 9.0), Span("command", (1.0,), 0.1, 2.0)
+_SPRING_LAG, _SPRING_WIDTH = Span("one", (0.2, 0.05), 0.0, 5.0), Span("angle", (0.2, 0.5), 0.08, 2.0)
+_SPRING, _SPRING_POWER = Span("one", (0.1, -0.05), -0.9, 20.0), Span("one", (3.0,), 1.5, 6.0)
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,7 @@ class ServoNonlinearity:
 
 LINEAR_FORM = ServoNonlinearity("linear", "linear", NONE, FIXED)
 FORMS = (
-    ServoNonlinearity("slew limit of the command", SLEW_LIMIT, SLEW, Span("slope", (0.03, 0.08, 0.2, 0.5), 0.005, 1.5)),
+    ServoNonlinearity("slew limit of the command", SLEW_LIMIT, SLEW, _SLEW),
     ServoNonlinearity("velocity limit of the mirror", SLEW_LIMIT, VELOCITY, Span("speed", *_THRESHOLD)),
     ServoNonlinearity("clipped command", SATURATION, CLIP, Span("command", *_THRESHOLD)),
     ServoNonlinearity("gradually saturating command", SATURATION, SOFT_CLIP, Span("command", (0.7, 2.0), 0.1, 20.0)),
@@ -94,56 +101,14 @@ FORMS = (
     ServoNonlinearity("saturated acceleration", SATURATION, ACCELERATION, Span("acceleration", *_THRESHOLD)),
     ServoNonlinearity("end stops", SATURATION, STOP, Span("angle", *_THRESHOLD)),
     ServoNonlinearity("Coulomb friction", FRICTION, COULOMB, Span("angle", (0.005, 0.03, 0.15), 1e-5, 1.0)),
-    ServoNonlinearity(
-        "Coulomb friction with the Stribeck effect",
-        FRICTION,
-        STRIBECK,
-        Span("angle", (0.02, 0.08), 1e-5, 1.0),
-        Span("one", (0.5,), 0.0, 2.0),
-    ),
-    ServoNonlinearity(
-        "friction with presliding",
-        FRICTION,
-        PRESLIDING,
-        Span("angle", (0.01, 0.08), 1e-5, 1.0),
-        Span("angle", (0.01,), 0.001, 0.04),
-    ),
+    ServoNonlinearity("Coulomb friction with the Stribeck effect", FRICTION, STRIBECK, _PEAK_FRICTION, _STRIBECK),
+    ServoNonlinearity("friction with presliding", FRICTION, PRESLIDING, _FRICTION, _PRESLIDING),
     ServoNonlinearity("backlash of the command", HYSTERESIS, BACKLASH, Span("command", (0.01, 0.05, 0.2), 1e-4, 0.9)),
-    ServoNonlinearity(
-        "Bouc–Wen hysteresis of the command",
-        HYSTERESIS,
-        INPUT_LAG,
-        Span("one", (0.1, -0.1), -0.9, 5.0),
-        Span("command", (0.2,), 0.03, 2.0),
-    ),
-    ServoNonlinearity(
-        "Rayleigh hysteresis of the command",
-        HYSTERESIS,
-        RAYLEIGH,
-        Span("one", (0.1, -0.1), -0.9, 9.0),
-        Span("command", (1.0,), 0.1, 2.0),
-    ),
-    ServoNonlinearity(
-        "smooth Bouc–Wen hysteresis of the command",
-        HYSTERESIS,
-        SMOOTH_LAG,
-        Span("one", (0.1, -0.1), -0.9, 5.0),
-        Span("command", (0.2,), 0.03, 2.0),
-    ),
-    ServoNonlinearity(
-        "Bouc–Wen hysteresis of the suspension",
-        HYSTERESIS,
-        SPRING_LAG,
-        Span("one", (0.2, 0.05), 0.0, 5.0),
-        Span("angle", (0.2, 0.5), 0.08, 2.0),
-    ),
-    ServoNonlinearity(
-        "stiffness that changes with the deflection",
-        STIFFNESS,
-        SPRING,
-        Span("one", (0.1, -0.05), -0.9, 20.0),
-        Span("one", (3.0,), 1.5, 6.0),
-    ),
+    ServoNonlinearity("Bouc–Wen hysteresis of the command", HYSTERESIS, INPUT_LAG, _LAG, _LAG_WIDTH),
+    ServoNonlinearity("Rayleigh hysteresis of the command", HYSTERESIS, RAYLEIGH, _RAYLEIGH, _RAYLEIGH_WIDTH),
+    ServoNonlinearity("smooth Bouc–Wen hysteresis of the command", HYSTERESIS, SMOOTH_LAG, _LAG, _LAG_WIDTH),
+    ServoNonlinearity("Bouc–Wen hysteresis of the suspension", HYSTERESIS, SPRING_LAG, _SPRING_LAG, _SPRING_WIDTH),
+    ServoNonlinearity("stiffness that changes with the deflection", STIFFNESS, SPRING, _SPRING, _SPRING_POWER),
 )
 
 

@@ -40,7 +40,7 @@ class ParameterRange:
 class CauseHypothesis:
     """Hypothesis on an error of Text S1, with one free parameter.
 
-    source: of the range; deciding_measurement: the measurement that would confirm it; excludes: causes for the same
+    deciding_measurement: the measurement that would confirm it; excludes: causes for the same
     quantity, which make no sense together; replaces_law: it replaces a law of the nominal model that no value of its
     parameter reproduces
     """
@@ -48,7 +48,6 @@ class CauseHypothesis:
     key: str
     description: str
     parameter: ParameterRange
-    source: str
     deciding_measurement: str
     excludes: tuple[str, ...] = ()
     replaces_law: bool = False
@@ -65,31 +64,31 @@ CAUSES = (
     CauseHypothesis(
         "gas_lag",
         "the gas lags the absorber by a time constant other than R_air C_air / 2",
+        # Conduction over half the cavity, 1.2 ms, to 64 ms of Text S1 and slower corners.
         ParameterRange("tau_g", "s", 1e-3, 0.1),
-        "conduction over half the cavity, 1.2 ms, to 64 ms of Text S1 and slower corners",
         "displacement at 10 kHz through the first 10 ms of a pulse",
     ),
     CauseHypothesis(
         "gas_share",
         "the gas settles at a share of the absorber's rise other than half",
+        # Half at most, conduction both ways.
         ParameterRange("share", "1", 0.1, 0.5),
-        "half at most, conduction both ways",
         "pressure in a closed cavity together with displacement",
         GAS_CAUSES,
     ),
     CauseHypothesis(
         "membrane_plate",
         "the constant of the membrane's plate formula differs from 3/1280",
+        # 3/16 of a clamped plate is 80 times as much; the added gas volume compensates part of it.
         ParameterRange("kappa_factor", "1", 0.05, 80.0),
-        "3/16 of a clamped plate is 80 times as much; the added gas volume compensates part of it",
         "displacement against a known static pressure, to 1 mm",
         LIFT_CAUSES,
     ),
     CauseHypothesis(
         "gas_membrane",
         "the membrane stretches and the gas volume grows: neither plate nor constant volume",
+        # Half at most, conduction both ways; E, ν, h, r, V are the paper's.
         ParameterRange("share", "1", 0.1, 0.5),
-        "half at most, conduction both ways; E, ν, h, r, V are the paper's",
         "displacement against a known static pressure, to 1 mm",
         (*LIFT_CAUSES, *GAS_CAUSES),
         replaces_law=True,
@@ -97,94 +96,94 @@ CAUSES = (
     CauseHypothesis(
         "force_area",
         "the blocked force was measured on less than the whole aperture",
+        # At most the aperture.
         ParameterRange("area", "m^2", 0.1e-6, 7.07e-6),
-        "at most the aperture",
         "blocked force with probes of two areas, and the pressure in the cavity beside it",
         FORCE_CAUSES,
     ),
     CauseHypothesis(
         "load_cell_gives",
         "the blocked membrane yielded: the gas volume grew against the load cell",
+        # Volume per pascal: 0.08 µL to several cavities at 8 kPa.
         ParameterRange("compliance", "m^3/Pa", 1e-14, 1e-11),
-        "volume per pascal: 0.08 µL to several cavities at 8 kPa",
         "blocked force with probes of two areas, and the pressure in the cavity beside it",
         FORCE_CAUSES,
     ),
     CauseHypothesis(
         "absorber_resistance",
         "all bridge resistances are wrong by one factor",
+        # R was fitted to the first 30 ms of a longer rise.
         ParameterRange("r_factor", "1", 0.7, 1.4),
-        "R was fitted to the first 30 ms of a longer rise",
         THERMAL_MEASUREMENT,
     ),
     CauseHypothesis(
         "absorber_capacity",
         "all heat capacities of the absorbers are wrong by one factor",
+        # The gas's share of 10 %, and C scattered by 16 %.
         ParameterRange("c_factor", "1", 0.7, 1.4),
-        "the gas's share of 10 %, and C scattered by 16 %",
         THERMAL_MEASUREMENT,
     ),
     CauseHypothesis(
         "absorbed_power",
         "the absorbed power is wrong by one factor",
+        # 2.45 W or 2.5 W, two estimates of the absorption.
         ParameterRange("power_factor", "1", 0.8, 1.2),
-        "2.45 W or 2.5 W, two estimates of the absorption",
         THERMAL_MEASUREMENT,
     ),
     CauseHypothesis(
         "bridge_conductivity",
         "the bridges conduct worse when hot",
+        # k ~ 1/T is 1 (Text S2).
         ParameterRange("exponent", "1", 0.0, 1.3),
-        "k ~ 1/T is 1 (Text S2)",
         THERMAL_MEASUREMENT,
     ),
     CauseHypothesis(
         "radiation",
         "the hot absorber radiates",
+        # Both faces of absorber and bridges.
         ParameterRange("emitting_area", "m^2", 0.0, 2e-5),
-        "both faces of absorber and bridges",
         THERMAL_MEASUREMENT,
     ),
     CauseHypothesis(
         "wall_heating",
         "the wall at the outer end of the bridges warms up",
+        # A cell of the laminate to its surroundings, 1.2 s with its capacity.
         ParameterRange("resistance", "K/W", 0.0, 40.0),
-        "a cell of the laminate to its surroundings, 1.2 s with its capacity",
         "displacement through a train of seconds",
     ),
     CauseHypothesis(
         "panel_heating",
         "the whole panel around the walls warms up",
+        # Still air around 162 × 162 mm, 2 K/W, to a sample of 30 × 30 mm; 200 s with its capacity.
         ParameterRange("resistance", "K/W", 0.0, 60.0),
-        "still air around 162 × 162 mm, 2 K/W, to a sample of 30 × 30 mm; 200 s with its capacity",
         "displacement of a pixel without light through ten minutes of light on another",
     ),
     CauseHypothesis(
         "laser_late",
         "the light of every pulse starts late",
+        # Driver and diode, 0.02 to 3 ms, less at 200 Hz; a ramp loses as much energy as a delay.
         ParameterRange("delay", "s", 1e-5, 2.4e-3),
-        "driver and diode, 0.02 to 3 ms, less at 200 Hz; a ramp loses as much energy as a delay",
         "a photodiode beside the sample",
     ),
     CauseHypothesis(
         "dead_time",
         "a pixel rate includes time without light per pulse: move and settling of the mirrors",
+        # Small steps of low-cost mirrors 0.3 ms, large steps several ms; the paper states pulse times only.
         ParameterRange("dead_time", "s", 1e-4, 5e-3),
-        "small steps of low-cost mirrors 0.3 ms, large steps several ms; the paper states pulse times only",
         "pixel rates at two pixel distances, with mirror positions",
     ),
     CauseHypothesis(
         "rate_pixel",
         "the pixel rates belong to a bridge width other than 0.55 mm",
+        # The widths of Table S3.
         ParameterRange("width", "m", 0.2e-3, 0.75e-3),
-        "the widths of Table S3",
         "displacement against pulse width on the pixel of Fig. 3F",
     ),
     CauseHypothesis(
         "rate_power",
         "the pixel rates were taken with less than full power",
+        # Fig. 3F states full power; the scanning optics attenuate it.
         ParameterRange("power_factor", "1", 0.3, 1.0),
-        "Fig. 3F states full power; the scanning optics attenuate it",
         "power at the sample during the scan of Fig. 3F",
     ),
 )

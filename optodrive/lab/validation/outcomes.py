@@ -135,19 +135,14 @@ def _capacity(width_mm: float) -> OutcomeFunction:
     return lambda s: s.build_pixel(width_mm * 1e-3).c_j_per_k
 
 
+WIDTHS_MM = (0.20, 0.25, 0.40, 0.55, 0.75)
+"""Bridge widths of Table S3."""
+
 INPUTS: dict[str, OutcomeFunction] = {
     "absorbed_power": lambda s: s.epsilon.value * FULL_POWER_W,
     "epsilon": lambda s: s.epsilon.value,
-    "R_w020": _resistance(0.20),
-    "R_w025": _resistance(0.25),
-    "R_w040": _resistance(0.40),
-    "R_w055": _resistance(0.55),
-    "R_w075": _resistance(0.75),
-    "C_w020": _capacity(0.20),
-    "C_w025": _capacity(0.25),
-    "C_w040": _capacity(0.40),
-    "C_w055": _capacity(0.55),
-    "C_w075": _capacity(0.75),
+    **{f"R_w{100.0 * width_mm:03.0f}": _resistance(width_mm) for width_mm in WIDTHS_MM},
+    **{f"C_w{100.0 * width_mm:03.0f}": _capacity(width_mm) for width_mm in WIDTHS_MM},
     "C_mean": lambda s: sum(row.C.value for row in s.bridge) / len(s.bridge),
     "R_of_w": _r_width_product_k_m_per_w,
     "energy_range_high": lambda s: FULL_POWER_W * LONG_PULSE_S,

@@ -29,6 +29,7 @@ from optodrive.lab.inference.claim import (
     claim,
     combine_claims,
     compute_no_effect,
+    format_probability,
     sum_in_sigma,
     weigh_forms,
 )
@@ -37,6 +38,7 @@ from optodrive.lab.inference.sentences import (
     describe_claim,
     describe_gain,
     describe_probabilities,
+    describe_sufficiency,
     describe_term,
 )
 from optodrive.physics.terms import discover_terms
@@ -140,6 +142,21 @@ def draw_evidence(draw):
         for keys in sorted(sets, key=lambda keys: -probabilities.causes[tuple(sorted(keys))])
     )
     return Evidence(probabilities, alternatives, {}, draw(st.booleans()), draw(st.integers(0, 9)) == 0)
+
+
+@given(draw_evidence())
+@settings(deadline=None)
+def test_whether_a_model_suffices_is_said_as_the_claim_states(evidence):
+    found = claim(evidence)
+    headline, *reasons = describe_sufficiency(found, evidence.probabilities, "The model", {key: key for key in CAUSES})
+    assert tuple(reasons) == found.reasons
+    assert headline.startswith("The model suffices") is (found.verdict == "none")
+    assert headline.startswith("Undecided") is (found.verdict == "undecided")
+    assert ("does not suffice" in headline) is (found.verdict in ("cause", "ambiguous", "unexplained"))
+    assert ("perhaps" in headline) is (found.verdict == "ambiguous")
+    assert {key for key in CAUSES if key in headline} == set(found.causes)
+    if found.verdict == "none":
+        assert format_probability(evidence.probabilities.no_effect) in headline
 
 
 @given(draw_evidence())
