@@ -12,17 +12,16 @@ import numpy as np
 from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.plausibility import RECORDING
 from optodrive.core.quantity import format_quantity
-from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.core.types.measurements import DataFinding, Measurement, Run, Signal
+from optodrive.core.types.arrays import BoolArray, FloatArray
+from optodrive.core.types.measurements import DataFinding, Measurement, Signal
+from optodrive.lab.inspection.repeat_faults import SAME_PHASE, find_gains, find_lost, find_noisy, find_outliers
 from optodrive.lab.inspection.response_faults import RESPONSE_STEPS, find_saturation
 from optodrive.lab.inspection.signal_faults import (
     find_ceiling,
     find_hold,
     find_interpolation,
-    find_outlier_candidates,
     find_sentinels,
     find_stuck,
-    measure_deviation,
     measure_noise,
     select_near_ceiling,
 )
@@ -45,10 +44,6 @@ from optodrive.lab.inspection.work import (
 LOWEST_K, HIGHEST_K = 1.0, 5000.0
 """Limits of a possible temperature."""
 TEMPERATURE = "absorber_temperature_K"
-SAME_PHASE, EDGE_SAMPLES, EDGE_S, REPEAT_SIGMAS, NEAR = 0.05, 4.0, 3e-3, 4.5, 8
-"""Distance of samples of repeats that are compared, in intervals; of an outlier from an edge of the drive, in intervals
-and s; its deviation from a repeat, and the number of samples on either side that judge it."""
-MAX_PASSES, MAX_REPEATS, MIN_SAMPLES = 3, 3, 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,98 +210,6 @@ def _find_clipped(work: Work, name: str) -> Found:
     return edits, findings
 
 
-def _find_outliers(work: Work, name: str) -> Found:
-    edits, largest = [], 0.0
-    for number, signal in work.list_signals(name):
-        _, t_s, value = select_finite(signal)
-        if len(value) < MIN_SAMPLES:
-            continue
-        rows, is_bad = np.arange(len(value)), np.zeros(len(value), dtype=bool)
-        repeats = _list_alike(work, number, name, t_s)
-        for _ in range(MAX_PASSES):
-            kept = rows[~is_bad]
-            new = _list_outliers(work.runs[number], t_s[kept], value[kept], [other[kept] for other in repeats])
-            for first, width, score in new:
-                is_bad[kept[first : first + width]] = True
-                largest = max(largest, score)
-            if not new:
-                break
-        if is_bad.any():
-            edits.append(remove_samples(number, name, signal, is_bad))
-    if not edits:
-        return [], []
-    samples, runs = count(sum(item.samples for item in edits), "sample"), count(len(edits), "run")
-    where = list_names([work.runs[item.run].name for item in edits])
-    text = f"{name}: {samples} of {runs} ({where}) up to {largest:.0f} σ off the samples beside them, and no repeat is"
-    return edits, [describe(work, "outlier", name, edits, text)]
-
-
-def _list_alike(work: Work, run: int, name: str, t_s: FloatArray) -> list[FloatArray]:
-    """Return the values of repeats at the same times, NaN where they have none."""
-    interval_s = float(np.median(np.diff(t_s)))
-    alike = []
-    for other in work.find_repeats(run):
-        signal = work.signals.get((other, name))
-        if signal is None:
-            continue
-        _, other_s, value = select_finite(signal)
-        if len(other_s) < MIN_SAMPLES:
-            continue
-        row = np.clip(np.searchsorted(other_s, t_s), 1, len(other_s) - 1)
-        row -= np.abs(other_s[row - 1] - t_s) < np.abs(other_s[row] - t_s)
-        is_same = np.abs(other_s[row] - t_s) < SAME_PHASE * interval_s
-        if is_same.mean() > 0.5:
-            alike.append(np.where(is_same, value[row], np.nan))
-    return alike[:MAX_REPEATS]
-
-
-def _list_outliers(
-    run: Run, t_s: FloatArray, value: FloatArray, repeats: list[FloatArray]
-) -> list[tuple[int, int, float]]:
-    """Return first sample, number of samples and σ of outliers that no repeat shares."""
-    edges_s = _list_edges(run)
-    reach_s = max(EDGE_SAMPLES * float(np.median(np.diff(t_s))), EDGE_S)
-    noise = measure_noise(value)
-    sigma = max(noise.sigma, 0.5 * noise.quantum)
-    found = []
-    for first, width, score in find_outlier_candidates(t_s, value):
-        own = np.arange(first, first + width)
-        compared = [other for other in repeats if np.isfinite(other[own]).all()]
-        is_far = not len(edges_s) or float(np.abs(edges_s[:, None] - t_s[own]).min()) > reach_s
-        if all(_differs(value - other, own, sigma) for other in compared) and (compared or is_far):
-            found.append((first, width, score))
-    taken = {row for first, width, _ in found for row in range(first, first + width)}
-    for at, other in enumerate(repeats):  # in a difference of repeats the signal itself is no longer in the way
-        is_common = np.isfinite(other)
-        rows = np.flatnonzero(is_common)
-        for first, width, score in find_outlier_candidates(t_s[rows], (value - other)[rows], noise.quantum):
-            own = rows[first : first + width]
-            others = [item for number, item in enumerate(repeats) if number != at and np.isfinite(item[own]).all()]
-            is_mine = all(_differs(value - item, own, sigma) for item in others)
-            if not others:
-                mine, its = (measure_deviation(t_s[rows], item[rows], first, width)[0] for item in (value, other))
-                is_mine = mine > its
-            if is_mine and not taken.intersection(own.tolist()):
-                taken.update(own.tolist())
-                found += [(int(row), 1, score) for row in own]
-    return found
-
-
-def _differs(difference: FloatArray, own: IntArray, sigma: float) -> bool:
-    """Return whether samples of a difference of repeats deviate from those beside them."""
-    near = difference[max(own[0] - NEAR, 0) : own[-1] + NEAR + 1]
-    near = near[np.isfinite(near)]
-    centre = float(np.median(near))
-    spread = max(1.4826 * float(np.median(np.abs(near - centre))), 1.4 * sigma)
-    return bool((np.abs(difference[own] - centre) > REPEAT_SIGMAS * spread).all())
-
-
-def _list_edges(run: Run) -> FloatArray:
-    """Return the times at which light or mirrors change."""
-    commands_s = np.zeros(0) if run.commands is None else run.commands[:, 0]
-    return np.concatenate([run.pulses[:, 0], run.pulses[:, 0] + run.pulses[:, 1], commands_s])
-
-
 def _note_start_times(work: Work, _: str) -> Found:
     return [], list(read_start_times(work.runs).findings)
 
@@ -370,8 +273,11 @@ STEPS = (
     Step("interpolated", _find_interpolated),
     Step("stuck", _find_stuck),
     Step("clipped", _find_clipped),
-    Step("outlier", _find_outliers),
+    Step("outlier", find_outliers),
+    Step("noisy", find_noisy),
     *RESPONSE_STEPS,
+    Step("lost", find_lost),
+    Step("gain", find_gains),
     Step(START_TIMES, _note_start_times, is_joint=True),
     Step("sampling", _note_sampling),
     Step("noise", _note_noise),

@@ -101,7 +101,7 @@ _Means = tuple[FloatArray, FloatArray, int, FloatArray]
 Member = tuple[int, Signal, FloatArray, FloatArray, FloatArray]
 
 
-def _compute_template(pulses: FloatArray, t_s: FloatArray, tau_s: float, second_s: float) -> FloatArray:
+def compute_template(pulses: FloatArray, t_s: FloatArray, tau_s: float, second_s: float) -> FloatArray:
     """Return the response of one or two lags to the light, W."""
     since_on = np.maximum(t_s[:, None] - pulses[:, 0], 0.0)
     since_off = np.maximum(t_s[:, None] - (pulses[:, 0] + pulses[:, 1]), 0.0)
@@ -114,7 +114,7 @@ def _compute_template(pulses: FloatArray, t_s: FloatArray, tau_s: float, second_
     return np.asarray(first @ pulses[:, 2])
 
 
-def _list_responding(work: Work, name: str) -> list[Member]:
+def list_responding(work: Work, name: str) -> list[Member]:
     """Return runs whose light falls on the measured pixel: run, signal, pulses, thinned times and values."""
     return work.remember(("members", name), lambda: _select_responding(work, name))
 
@@ -154,14 +154,19 @@ def measure_responses(work: Work, name: str) -> list[Response]:
     return work.remember(("responses", name), lambda: _measure(work, name))[1]
 
 
+def measure_time_constant(work: Work, name: str) -> float:
+    """Return the time constant that suits most runs, s."""
+    return work.remember(("responses", name), lambda: _measure(work, name))[0]
+
+
 def _measure(work: Work, name: str) -> tuple[float, list[Response]]:
-    second_s = _get_second_s(name)
+    second_s = get_second_s(name)
     best: tuple[float, list[Response]] = TAUS_S[0], []
     best_share = -1.0
     for tau_s in TAUS_S:
         trial = []
-        for number, signal, pulses, t_s, value in _list_responding(work, name):
-            template = _compute_template(pulses, t_s, tau_s, second_s)
+        for number, signal, pulses, t_s, value in list_responding(work, name):
+            template = compute_template(pulses, t_s, tau_s, second_s)
             trial.append(Response(number, name, signal.pixel, *_fit(template, value), float(template.max())))
         total = float(np.median([abs(item.share) for item in trial])) if trial else 0.0
         if total > best_share:
@@ -245,7 +250,7 @@ def _measure_shifts(pulses: FloatArray, t_s: FloatArray, value: FloatArray, seco
     centred = value - value.mean()
     left = []
     for tau_s in TAUS_S:
-        even = _compute_template(pulses, grid_s, tau_s, second_s)
+        even = compute_template(pulses, grid_s, tau_s, second_s)
         shifted = np.interp(t_s - SHIFTS_S[:, None], grid_s, even)
         shifted -= shifted.mean(axis=1, keepdims=True)
         gain, size = shifted @ centred, np.maximum((shifted**2).sum(axis=1), 1e-9 * float(even @ even) + 1e-300)
@@ -268,9 +273,9 @@ def _find_shifts_of(work: Work, name: str) -> tuple[float, dict[int, float]]:
     shares = [item.share for item in measure_responses(work, name)]
     if not shares or min(shares) > FITS_UNSHIFTED:
         return 0.0, {}
-    second_s = _get_second_s(name)
+    second_s = get_second_s(name)
     left: dict[int, FloatArray] = {}
-    for number, _, pulses, t_s, value in _list_responding(work, name):
+    for number, _, pulses, t_s, value in list_responding(work, name):
         is_early = t_s < (pulses[6, 0] if len(pulses) > 6 else np.inf)
         if is_early.sum() >= MIN_SAMPLES:
             left[number] = _measure_shifts(pulses[:6], t_s[is_early], value[is_early], second_s)
@@ -329,7 +334,7 @@ def _fit_bend(members: list[_Means], name: str, value: FloatArray, *, is_own: bo
     y, best = value - value.mean(), _Bend(np.inf, 1.0, 1.0, 0.0, value)
     for tau_s in BEND_TAUS_S:
         own = [
-            _compute_template(pulses, t_s, tau_s, _get_second_s(name)).reshape(-1, size).mean(axis=1)
+            compute_template(pulses, t_s, tau_s, get_second_s(name)).reshape(-1, size).mean(axis=1)
             for pulses, t_s, size, _ in members
         ]
         x = np.concatenate(own)
@@ -359,7 +364,7 @@ def _bend(x: FloatArray) -> FloatArray:
 def _list_means(work: Work, name: str) -> list[_Means]:
     """Return pulses, times, samples in a mean, and means of the runs that respond, of the pixel measured most."""
     seen = [item.run for item in measure_responses(work, name) if item.is_seen]
-    members = [item for item in _list_responding(work, name) if item[0] in seen]
+    members = [item for item in list_responding(work, name) if item[0] in seen]
     pixels = [signal.pixel for _, signal, _, _, _ in members]
     out = []
     for _, signal, pulses, _, _ in members:
@@ -372,7 +377,8 @@ def _list_means(work: Work, name: str) -> list[_Means]:
     return out
 
 
-def _get_second_s(name: str) -> float:
+def get_second_s(name: str) -> float:
+    """Return the second lag of a signal, s."""
     return 0.0 if name == TEMPERATURE else SECOND_S
 
 
@@ -385,9 +391,14 @@ def _find_shifts(work: Work, _: str) -> Found:
         late_s = float(np.median(list(common.values())))
         text = f"all signals respond {_describe_shift(late_s)} the light in all runs: correct t_s or start_s by it."
         return [], [DataFinding(runs, "", "trigger", text, "refused", numbers={"shift": (late_s, "s")})]
+    late: dict[int, list[float]] = {}
+    for shift_s, number in ((item, run) for _, differing in found.values() for run, item in differing.items()):
+        late.setdefault(number, []).append(shift_s)
+    off = {run: min(some) for run, some in late.items() if len(some) > 1 and np.ptp(some) < 2.0 * SHIFT_AGREES_S}
     edits, findings = [], []
     for name, (common_s, differing) in found.items():
-        own = {number: common_s for number, _ in work.list_signals(name)} if common_s else differing
+        others = {run: shift_s for run, shift_s in off.items() if (run, name) in work.signals}  # one trigger for all
+        own = {number: common_s for number, _ in work.list_signals(name)} if common_s else others | differing
         if not own:
             continue
         mine = [drop_signal(number, name, work.signals[number, name]) for number in own]
@@ -406,11 +417,11 @@ def _describe_shift(late_s: float) -> str:
 def _find_exchanged(work: Work, name: str) -> Found:
     """Find runs whose signal suits the light of another run, and the other's theirs."""
     responses = {item.run: item for item in measure_responses(work, name)}
-    second_s = _get_second_s(name)
-    members = {number: (pulses, t_s, value) for number, _, pulses, t_s, value in _list_responding(work, name)}
+    second_s = get_second_s(name)
+    members = {number: (pulses, t_s, value) for number, _, pulses, t_s, value in list_responding(work, name)}
     if len(responses) < 3:
         return [], []
-    tau_s = work.remember(("responses", name), lambda: _measure(work, name))[0]
+    tau_s = measure_time_constant(work, name)
     expected: dict[int, tuple[float, float, float]] = {}  # gain, its tolerance and the share, of the repeats or of all
     deviations = []
     for run, item in responses.items():
@@ -435,7 +446,7 @@ def _find_exchanged(work: Work, name: str) -> Found:
 
     def suits(run: int, light: int) -> bool:
         _, t_s, value = members[run]
-        share, gain, _ = _fit(_compute_template(members[light][0], t_s, tau_s, second_s), value)
+        share, gain, _ = _fit(compute_template(members[light][0], t_s, tau_s, second_s), value)
         usual, tolerance, min_share = expected[light]
         return share > max(min_share, responses[run].share - 0.01) and abs(_log_ratio(gain, usual)) < tolerance
 

@@ -288,6 +288,56 @@ def test_a_dead_signal_is_left_out_of_its_runs(runs, level, name):
     assert {n for n, run in enumerate(inspection.measurement.runs) if name not in run.signals} == runs
 
 
+@pytest.mark.parametrize("name", [HEIGHT, HEAT])
+def test_a_loud_run_is_left_out(name):
+    rng, sigma = np.random.default_rng(3), {HEIGHT: 2e-6, HEAT: 0.3}[name]
+
+    def add(t_s, value):
+        return value + 10.0 * sigma * rng.standard_normal(len(t_s))
+
+    kinds, inspection = find(change(build_clean(), name, add, {5}))
+    assert kinds == {"noisy"}
+    assert {n for n, run in enumerate(inspection.measurement.runs) if name not in run.signals} == {5}
+
+
+@pytest.mark.parametrize(("run", "first", "lost"), [(4, 40, 5), (7, 5, 5), (10, 60, 15), (13, 300, 12)])
+def test_a_run_that_lost_samples_is_left_out(run, first, lost):
+    def lose(t_s, value):
+        return t_s[:-lost], np.delete(value, np.s_[first : first + lost])
+
+    kinds, inspection = find(change(build_clean(), HEIGHT, lose, {run}))
+    assert kinds == {"lost"}
+    assert {n for n, item in enumerate(inspection.measurement.runs) if HEIGHT not in item.signals} == {run}
+
+
+def test_a_run_beside_one_with_a_gap_has_lost_nothing():
+    def lose(t_s, value):
+        kept = np.ones(len(t_s), dtype=bool)
+        kept[30:90] = False
+        return t_s[kept], value[kept]
+
+    assert find(change(build_clean(), HEAT, lose, {6}))[0] == set()
+
+
+@pytest.mark.parametrize("gain", [0.9, 1.1])
+@pytest.mark.parametrize("run", [4, 9])
+@pytest.mark.parametrize("name", [HEIGHT, HEAT])
+def test_a_run_of_another_gain_is_left_out(name, run, gain):
+    rest = {HEIGHT: 0.0, HEAT: 293.15}[name]
+    measurement = change(build_clean(), name, lambda _, value: rest + gain * (value - rest), {run})
+    kinds, inspection = find(measurement)
+    assert kinds == {"gain"}
+    assert {n for n, item in enumerate(inspection.measurement.runs) if name not in item.signals} == {run}
+
+
+def test_what_changes_in_order_of_time_is_no_gain():
+    runs = [
+        replace(run, signals={HEIGHT: replace(run.signals[HEIGHT], value=run.signals[HEIGHT].value * (1.0 - 0.02 * n))})
+        for n, run in enumerate(build_clean().runs)
+    ]
+    assert find(Measurement(tuple(runs)))[0] == set()
+
+
 def test_a_signal_that_responds_in_no_run_is_left_out():
     rng = np.random.default_rng(2)
     kinds, inspection = find(change(build_clean(), HEIGHT, lambda t_s, _: 2e-6 * rng.standard_normal(len(t_s))))
