@@ -11,7 +11,7 @@ from optodrive.lab.diagnosis import candidate_judgement
 from optodrive.lab.diagnosis.candidate_judgement import NOISE_CHI2, judge_candidates
 from optodrive.lab.diagnosis.detection import Detection, Score
 from optodrive.lab.diagnosis.evidence import Explanation, compute_probabilities, compute_score_evidence
-from optodrive.lab.diagnosis.model_selection import Selection, Verdict
+from optodrive.lab.diagnosis.model_selection import Selection
 from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES
 from optodrive.lab.inference.claim import Claim
 from optodrive.physics.hypothesis import Hypothesis
@@ -58,8 +58,8 @@ def judge(chi2, occam, refitted, noise_degrees, nominal_chi2=1e5):
     ranked = [keys[0] for keys, _ in found.ranked if refitted[KEYS.index(keys[0])]]
     refits = tuple(SimpleNamespace(causes=(key,), hypotheses=(hypotheses[key],), chi2=fits[key]) for key in ranked)
     detection = Detection(scores, SimpleNamespace(), 0.0)
-    verdict = Verdict(Claim("ambiguous"), Selection(found, refits, {}, detection, nominal_chi2, True))
-    return {item.cause: item.verdict for item in judge_candidates(verdict, {})}, found
+    selection = Selection(found, refits, {}, detection, nominal_chi2, True, claim=Claim("ambiguous"))
+    return {item.cause: item.verdict for item in judge_candidates(selection, {})}, found
 
 
 @pytest.fixture(autouse=True)
@@ -101,8 +101,7 @@ def test_nothing_is_ruled_out_where_nothing_could_be_compared():
     found = Probabilities(0.005, 0.995, dict.fromkeys([(KEYS[0],)], 0.0))
     score = Score(Hypothesis(KEYS[0], KEYS[0], ({},), ()), {}, 500.0, (1.0,), (0,), 1.0, 1.0)
     selection = Selection(found, (), {}, Detection((score,), SimpleNamespace(), 0.0), 1e5, True)
-    verdict = Verdict(Claim("unexplained"), selection)
-    assert judge_candidates(verdict, {})[0].verdict == "possible"
+    assert judge_candidates(selection, {})[0].verdict == "possible"
 
 
 @given(st.floats(0.0, 1e4), st.floats(0.0, 1e4))

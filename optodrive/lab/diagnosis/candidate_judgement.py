@@ -7,7 +7,7 @@ import numpy as np
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.discrepancy import CandidateCause, RivalModel
 from optodrive.lab.diagnosis.detection import Score
-from optodrive.lab.diagnosis.model_selection import Verdict
+from optodrive.lab.diagnosis.model_selection import Selection
 from optodrive.physics.terms import discover_terms
 
 DETECTABLE_RATIO = 30.0
@@ -21,21 +21,21 @@ MIN_INDEPENDENT_FRACTION = 1e-4
 """Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
 
 
-def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[CandidateCause, ...]:
+def judge_candidates(selection: Selection, gains: dict[str, float]) -> tuple[CandidateCause, ...]:
     """Return the judgement of every hypothesis.
 
     gains: reduction on held-out runs by label
     """
-    chosen = verdict.chosen
-    near = _list_near(verdict)
+    chosen = selection.chosen
+    near = _list_near(selection)
     out = []
-    for score in verdict.nominal_detection.scores:
+    for score in selection.nominal_detection.scores:
         item = score.hypothesis
-        probability = verdict.probabilities.sum_of(item.key)
+        probability = selection.probabilities.sum_of(item.key)
         if chosen is not None and item.label in {part.label for part in chosen.hypotheses}:
-            judgement = "identified" if verdict.verdict == "cause" else "indistinguishable"
-        elif item.key in verdict.causes:
-            judgement = "indistinguishable" if verdict.verdict == "ambiguous" else "alternative form"
+            judgement = "identified" if selection.claim.verdict == "cause" else "indistinguishable"
+        elif item.key in selection.claim.causes:
+            judgement = "indistinguishable" if selection.claim.verdict == "ambiguous" else "alternative form"
         elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
             judgement = "not observable"
         elif probability > MAX_RULED_OUT or item.label in near:
@@ -56,25 +56,25 @@ def judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candida
     return tuple(out)
 
 
-def _list_near(verdict: Verdict) -> set[str]:
+def _list_near(selection: Selection) -> set[str]:
     """Return the labels of the hypotheses near the winner, by χ² of their refit or score, or by their probability.
 
     A prior or an Occam's factor makes a hypothesis of such a χ² improbable, but the data do not exclude it. The winner
     was refitted; it may itself be improbable beside hypotheses that count by their score.
     """
-    nominal, stated = verdict.nominal_chi2, verdict.probabilities
+    nominal, stated = selection.nominal_chi2, selection.probabilities
     winner, min_probability = nominal, stated.no_effect
-    if verdict.verdict != "none" and verdict.candidates:
-        best = verdict.candidates[0]
+    if selection.claim.verdict != "none" and selection.ranked:
+        best = selection.ranked[0]
         winner, min_probability = best.chi2, stated.causes[tuple(sorted({part.key for part in best.hypotheses}))]
     min_probability *= exp(-0.5 * NOISE_CHI2)
     refits: dict[str, float] = {}
-    for item in verdict.candidates:
+    for item in selection.ranked:
         for part in item.hypotheses:
             refits[part.label] = min(refits.get(part.label, item.chi2), item.chi2)
-    scores = {score.hypothesis.label: nominal - score.ratio for score in verdict.nominal_detection.scores}
+    scores = {score.hypothesis.label: nominal - score.ratio for score in selection.nominal_detection.scores}
     near = {label for label, chi2 in (scores | refits).items() if chi2 <= winner + NOISE_CHI2}
-    hypotheses = (score.hypothesis for score in verdict.nominal_detection.scores)
+    hypotheses = (score.hypothesis for score in selection.nominal_detection.scores)
     return near | {item.label for item in hypotheses if stated.sum_of(item.key) >= min_probability}
 
 
@@ -93,17 +93,17 @@ def _describe_detection_limit(score: Score) -> str:
     return f"{'all' if len(free.names) > 1 else free.names[0]} {format_quantity(size, free.parameter.unit, 2)}"
 
 
-def list_rivals(verdict: Verdict, gains: dict[str, float]) -> tuple[RivalModel, ...]:
+def list_rivals(selection: Selection, gains: dict[str, float]) -> tuple[RivalModel, ...]:
     """Return the refitted candidates, best first.
 
     gains: reduction on held-out runs by label
     """
-    candidates = verdict.candidates
+    candidates = selection.ranked
     if not candidates:
         return ()
     chi2 = min(item.chi2 for item in candidates)
     evidence = max(item.log_evidence for item in candidates)
-    probabilities = verdict.probabilities.causes
+    probabilities = selection.probabilities.causes
     return tuple(
         RivalModel(
             item.label,
@@ -112,7 +112,7 @@ def list_rivals(verdict: Verdict, gains: dict[str, float]) -> tuple[RivalModel, 
             item.log_evidence - evidence,
             probabilities.get(tuple(sorted(item.causes)), 0.0),
             gains.get(item.label),
-            item is verdict.chosen,
+            item is selection.chosen,
             {
                 f"{free.key}.{name}": (item.fit.point.terms[free.key][name], free.parameter.unit)
                 for free in item.fit.free

@@ -55,7 +55,7 @@ from optodrive.lab.diagnosis.model_comparison import ModelComparison, compute_he
 from optodrive.lab.diagnosis.model_selection import (
     MAX_INTRA_PULSE_POWER_EXCESS,
     MAX_REPLICATE_EXCESS,
-    Verdict,
+    Selection,
     compare_explanations,
     has_replicate_excess,
 )
@@ -91,7 +91,7 @@ class _SubsystemFit:
     held_out: Dataset
     problem: FitProblem
     base: ModelFit
-    verdict: Verdict
+    selection: Selection
     final: ModelFit
     estimates: dict[str, Estimate]
     gain: HeldOutGain | None
@@ -109,7 +109,7 @@ class _SubsystemFit:
     @property
     def blind_points(self) -> tuple[ParameterPoint, ParameterPoint]:
         """The nominal and the extended model, both fitted without the held-out runs."""
-        chosen = self.verdict.chosen
+        chosen = self.selection.chosen
         return self.base.point, self.base.point if chosen is None else chosen.fit.point
 
 
@@ -156,7 +156,7 @@ def diagnose(
         log.failures.update(subsystem.log.failures)
         log.omissions.update(subsystem.log.omissions)
     disturbances = tuple(item for subsystem in subsystems for item in subsystem.disturbances)
-    claimed = combine_claims([subsystem.verdict.claim for subsystem in subsystems], log.failures, bool(disturbances))
+    claimed = combine_claims([subsystem.selection.claim for subsystem in subsystems], log.failures, bool(disturbances))
     main = subsystems[0]
     parameters: dict[str, Estimate] = {}
     terms: dict[str, dict[str, float]] = {}
@@ -164,7 +164,7 @@ def diagnose(
     for subsystem in subsystems:
         estimates = subsystem.estimates
         parameters |= estimates
-        chosen = subsystem.verdict.chosen
+        chosen = subsystem.selection.chosen
         if chosen is not None:
             doubts |= describe_doubts(chosen.hypotheses, estimates) | describe_limits(chosen.hypotheses, estimates)
         terms |= {key: dict(values) for key, values in subsystem.final.point.terms.items()}
@@ -175,7 +175,7 @@ def diagnose(
     held_out = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.held_out.runs}))
     fitted = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.data.runs}.difference(held_out)))
     explained_fractions = [
-        subsystem.verdict.explained_fraction for subsystem in subsystems if subsystem.verdict.chosen is not None
+        subsystem.selection.explained_fraction for subsystem in subsystems if subsystem.selection.chosen is not None
     ]
     comparisons = [
         item for item in (log.attempt("traces", _compare, None, subsystem) for subsystem in subsystems) if item
@@ -185,17 +185,17 @@ def diagnose(
         verdict=claimed.verdict,
         causes=claimed.causes,
         disturbances=disturbances,
-        probabilities=reduce(Probabilities.combine, (subsystem.verdict.probabilities for subsystem in subsystems)),
+        probabilities=reduce(Probabilities.combine, (subsystem.selection.probabilities for subsystem in subsystems)),
         hypothesis_labels=tuple(
             item.label
             for subsystem in subsystems
-            if subsystem.verdict.chosen is not None
-            for item in subsystem.verdict.chosen.hypotheses
+            if subsystem.selection.chosen is not None
+            for item in subsystem.selection.chosen.hypotheses
         ),
         parameters=parameters,
         base=base,
         terms=terms if claimed.causes else {},
-        gain=next((subsystem.gain for subsystem in subsystems if subsystem.verdict.chosen is not None), None),
+        gain=next((subsystem.gain for subsystem in subsystems if subsystem.selection.chosen is not None), None),
         candidates=tuple(item for subsystem in subsystems for item in subsystem.candidates),
         next_experiment=next(
             (subsystem.next_experiment for subsystem in subsystems if subsystem.next_experiment is not None), None
@@ -274,7 +274,7 @@ def _diagnose_subsystem(
     if first.verdict in ("none", "undecided", "ambiguous") and held_out_runs:
         # The held-out, hottest runs may show an effect, or which one: compare the explanations with all runs.
         log.on_progress("fitting all runs")
-        chosen = selection.choose(first)
+        chosen = replace(selection, claim=first).chosen
         all_base = fit(all_data, base.point, base.free)
         wider = compare_explanations(all_data, all_base, hypotheses, log)
         if (
@@ -289,18 +289,18 @@ def _diagnose_subsystem(
         )
         for item in selection.candidates
     }
-    first = claim(selection.collect_evidence(changes))
-    chosen = selection.choose(first)
+    selection = replace(selection, claim=claim(selection.collect_evidence(changes)))
+    chosen = selection.chosen
     final, estimates = _fit_all(all_data, base, chosen, hypotheses, log)
     doubts = {} if chosen is None else {chosen: describe_doubts(chosen.hypotheses, estimates)}
-    verdict = Verdict(claim(selection.collect_evidence(changes, doubts)), selection)
-    if verdict.chosen is not chosen:
-        final, estimates = _fit_all(all_data, base, verdict.chosen, hypotheses, log)
+    selection = replace(selection, claim=claim(selection.collect_evidence(changes, doubts)))
+    if selection.chosen is not chosen:
+        final, estimates = _fit_all(all_data, base, selection.chosen, hypotheses, log)
     gains: dict[str, HeldOutGain | None] = {
         item.label: log.attempt(
             "held-out gain", compute_held_out_gain, None, problem, held_out, base.point, item.fit.point, seed
         )
-        for item in verdict.candidates
+        for item in selection.candidates
     }
     reductions = {label: gain.reduction for label, gain in gains.items() if gain is not None}
     return _SubsystemFit(
@@ -308,13 +308,13 @@ def _diagnose_subsystem(
         held_out,
         problem,
         base,
-        verdict,
+        selection,
         final,
         estimates,
-        None if verdict.chosen is None else gains[verdict.chosen.label],
-        judge_candidates(verdict, reductions),
-        list_rivals(verdict, reductions),
-        log.attempt("the next experiment", propose_for_verdict, None, problem, base, verdict, log.on_progress),
+        None if selection.chosen is None else gains[selection.chosen.label],
+        judge_candidates(selection, reductions),
+        list_rivals(selection, reductions),
+        log.attempt("the next experiment", propose_for_verdict, None, problem, base, selection, log.on_progress),
         log,
         disturbances,
     )
@@ -399,7 +399,9 @@ def _find_shared_terms(subsystems: list[_SubsystemFit]) -> dict[str, TermValues]
         key: values
         for subsystem in subsystems
         for key, values in subsystem.final.point.terms.items()
-        if key in subsystem.verdict.causes and values.get("mirrors") and len(discover_terms()[key].subsystems) > 1
+        if key in subsystem.selection.claim.causes
+        and values.get("mirrors")
+        and len(discover_terms()[key].subsystems) > 1
     }
 
 
@@ -424,10 +426,10 @@ def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
                 "Repeats are equal to the last digit, as copies or simulations without noise are: the noise is taken "
                 "from the resolution of the data."
             )
-        if subsystem.verdict.verdict == "cause" and subsystem.verdict.explained_fraction < NEARLY_EXPLAINED:
-            causes = " and ".join(subsystem.verdict.causes)
+        if subsystem.selection.claim.verdict == "cause" and subsystem.selection.explained_fraction < NEARLY_EXPLAINED:
+            causes = " and ".join(subsystem.selection.claim.causes)
             out.append(
-                f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of the excess χ² remains, because the "
+                f"{causes}: {1 - subsystem.selection.explained_fraction:.1%} of the excess χ² remains, because the "
                 "real effect deviates slightly from the form of its term."
             )
         out += _describe_range_limits(subsystem.final)

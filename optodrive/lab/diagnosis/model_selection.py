@@ -65,6 +65,7 @@ NO_EFFECT_SHARE = 1e-5
 """Share of a signal's range below which a change is an error of the integration, whose steps terms may refine."""
 CERTAIN = 0.995
 """Probability of none of these where repeats differ by more than noise."""
+UNJUDGED = Claim("unexplained")
 MAX_REPLICATE_EXCESS = 6.0
 """Maximum replicate excess, in σ, for runs of one group to count as repeats."""
 MAX_INTRA_PULSE_POWER_EXCESS = 25.0
@@ -76,7 +77,8 @@ class Selection:
     """The explanations of a subsystem, compared.
 
     candidates: refits, most probable first; shares: of the excess that each explains alone and with other forms of its
-    effect, where examined; twins as in `Evidence`; nominal_detection: beside the nominal fit; nominal_chi2: of that fit
+    effect, where examined; twins as in `Evidence`; claim: the judge's; nominal_detection: beside the nominal fit;
+    nominal_chi2: of that fit
     """
 
     probabilities: Probabilities
@@ -87,6 +89,7 @@ class Selection:
     has_repeats: bool
     twins: Mapping[str, str] = field(default_factory=dict)
     repeats_differ: bool = False
+    claim: Claim = UNJUDGED
 
     def collect_evidence(
         self,
@@ -105,60 +108,23 @@ class Selection:
         )
         return Evidence(self.probabilities, alternatives, self.twins, self.has_repeats, self.repeats_differ)
 
-    def choose(self, claimed: Claim) -> RefittedCandidate | None:
-        """Return the model for all later steps: that of the first set which the claim names."""
-        named = {tuple(sorted(keys)) for keys in claimed.sets[:1]}
-        return next((item for item in self.candidates if tuple(sorted(item.causes)) in named), None)
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Claim about a subsystem, with the explanations that it follows from."""
-
-    claim: Claim
-    selection: Selection
-
-    @property
-    def verdict(self) -> str:
-        """The verdict, as in `Discrepancy`."""
-        return self.claim.verdict
-
-    @property
-    def causes(self) -> tuple[str, ...]:
-        """The causes named."""
-        return self.claim.causes
-
-    @property
-    def probabilities(self) -> Probabilities:
-        """Probabilities of all explanations."""
-        return self.selection.probabilities
-
     @property
     def chosen(self) -> RefittedCandidate | None:
-        """The model for all later steps, None without a cause."""
-        return self.selection.choose(self.claim)
+        """The model for all later steps: that of the first set that the claim names, None without one."""
+        named = {tuple(sorted(keys)) for keys in self.claim.sets[:1]}
+        return next((item for item in self.candidates if tuple(sorted(item.causes)) in named), None)
 
     @property
-    def candidates(self) -> tuple[RefittedCandidate, ...]:
+    def ranked(self) -> tuple[RefittedCandidate, ...]:
         """Refits, the chosen one first, then by probability."""
         chosen = self.chosen
-        return tuple(sorted(self.selection.candidates, key=lambda item: item is not chosen))
-
-    @property
-    def nominal_detection(self) -> Detection:
-        """Detection beside the nominal fit."""
-        return self.selection.nominal_detection
-
-    @property
-    def nominal_chi2(self) -> float:
-        """χ² of the nominal fit."""
-        return self.selection.nominal_chi2
+        return tuple(sorted(self.candidates, key=lambda item: item is not chosen))
 
     @property
     def explained_fraction(self) -> float:
         """Share of the detected excess that the chosen model explains."""
         chosen = self.chosen
-        return 0.0 if chosen is None else self.selection.shares.get(chosen, (0.0, 0.0))[0]
+        return 0.0 if chosen is None else self.shares.get(chosen, (0.0, 0.0))[0]
 
 
 @dataclass(frozen=True, eq=False)

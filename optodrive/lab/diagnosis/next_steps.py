@@ -25,7 +25,7 @@ from optodrive.lab.diagnosis.fitting import (
     compute_normal_equations,
     solve,
 )
-from optodrive.lab.diagnosis.model_selection import Verdict
+from optodrive.lab.diagnosis.model_selection import Selection
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.prediction import predict
 from optodrive.lab.diagnosis.search_log import ProgressCallback
@@ -54,18 +54,18 @@ OUT = "answer"
 
 
 def propose_for_verdict(
-    problem: FitProblem, base: ModelFit, verdict: Verdict, on_progress: ProgressCallback
+    problem: FitProblem, base: ModelFit, selection: Selection, on_progress: ProgressCallback
 ) -> NextExperiment | None:
     """Return the experiment that separates the two most probable models, None if one explanation is certain.
 
     Of an ambiguity, these are two of its causes; else the nominal model is one of the rivals.
     """
-    probabilities = verdict.probabilities
-    rivals = [(probabilities.causes[tuple(sorted(item.causes))], item.label, item.fit) for item in verdict.candidates]
-    if verdict.verdict == "ambiguous":
-        is_named = [set(item.causes) <= set(verdict.causes) for item in verdict.candidates]
+    probabilities = selection.probabilities
+    rivals = [(probabilities.causes[tuple(sorted(item.causes))], item.label, item.fit) for item in selection.ranked]
+    if selection.claim.verdict == "ambiguous":
+        is_named = [set(item.causes) <= set(selection.claim.causes) for item in selection.ranked]
         rivals = rivals[:1] + [rival for rival, named in zip(rivals[1:], is_named[1:], strict=True) if named]
-    elif verdict.verdict == "cause" or max(probabilities.no_effect, probabilities.none_of_these) >= CERTAIN:
+    elif selection.claim.verdict == "cause" or max(probabilities.no_effect, probabilities.none_of_these) >= CERTAIN:
         return None
     else:
         rivals = sorted([(probabilities.no_effect, "no effect", base), *rivals], key=lambda rival: -rival[0])
