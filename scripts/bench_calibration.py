@@ -96,7 +96,7 @@ def run_task(task: Task) -> dict[str, str]:
 def compute_code() -> str:
     """Return a short digest of the code that diagnoses: rows of other code do not describe this one."""
     digest = sha256()
-    for folder in ("lab/diagnosis", "physics"):
+    for folder in ("lab/diagnosis", "lab/inference", "lab/inspection", "physics"):
         for path in sorted((ROOT / "optodrive" / folder).rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
