@@ -41,9 +41,13 @@ from optodrive.lab.inspection.work import (
     select_finite,
 )
 
+DRIFT_SIGMAS = 1.5
+"""Drift within runs and shift by the light, relative to the noise, from which they are stated."""
 LOWEST_K, HIGHEST_K = 1.0, 5000.0
 """Limits of a possible temperature."""
 TEMPERATURE = "absorber_temperature_K"
+Slow = tuple[float, FloatArray, FloatArray] | None
+"""Interval of a slower channel, s, and its own times and values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,39 +149,31 @@ def _find_stuck(work: Work, name: str) -> Found:
     return edits, [describe(work, "stuck", name, edits, f"{name}: {samples} of {runs} are stuck at {shown}")]
 
 
-def _find_held(work: Work, name: str) -> Found:
+def _find_slow(work: Work, name: str, kind: str, find: Callable[[FloatArray, FloatArray], Slow], text: str) -> Found:
+    """Find a slower channel whose own samples alone are kept."""
     edits, intervals_s = [], []
     for number, signal in work.list_signals(name):
         _, t_s, value = select_finite(signal)
-        held = find_hold(t_s, value)
-        if held is not None:
-            intervals_s.append(held[0])
-            edits.append(remove_samples(number, name, signal, ~held[1]))
+        found = find(t_s, value)
+        if found is not None:
+            intervals_s.append(found[0])
+            edit = Edit(number, name, replace(signal, t_s=found[1], value=found[2]), len(value) - len(found[1]), value)
+            edits.append(edit)
     if not edits:
         return [], []
     every = format_span(np.array(intervals_s), "s")
-    text = (
-        f"{name}: in {count(len(edits), 'run')} each sample is repeated until the next, every {every}; the first counts"
-    )
-    return edits, [describe(work, "held", name, edits, text)]
+    text = f"{name}: in {count(len(edits), 'run')} {text.format(every=every)}"
+    return edits, [describe(work, kind, name, edits, text)]
+
+
+def _find_held(work: Work, name: str) -> Found:
+    text = "each sample is repeated until the next, every {every}; the first counts"
+    return _find_slow(work, name, "held", find_hold, text)
 
 
 def _find_interpolated(work: Work, name: str) -> Found:
-    edits, intervals_s = [], []
-    for number, signal in work.list_signals(name):
-        _, t_s, value = select_finite(signal)
-        found = find_interpolation(t_s, value)
-        if found is not None:
-            interval_s, knots_s, knots = found
-            intervals_s.append(interval_s)
-            edits.append(Edit(number, name, replace(signal, t_s=knots_s, value=knots), len(value) - len(knots), value))
-    if not edits:
-        return [], []
-    every = format_span(np.array(intervals_s), "s")
-    text = (
-        f"{name}: in {count(len(edits), 'run')} samples lie on lines between points {every} apart; these points count"
-    )
-    return edits, [describe(work, "interpolated", name, edits, text)]
+    text = "samples lie on lines between points {every} apart; these points count"
+    return _find_slow(work, name, "interpolated", find_interpolation, text)
 
 
 def _find_clipped(work: Work, name: str) -> Found:
@@ -259,12 +255,28 @@ def _note_noise(work: Work, name: str) -> Found:
     if quantum:
         coarse = ", coarser than the noise" if quantum > 2.0 * sigma else ""
         text += f", resolution {format_quantity(quantum, unit)}{coarse}"
-    numbers = {"noise": (sigma, unit), "resolution": (quantum, unit)}
+    drift, shift = _measure_drift(work, name)
+    text += f"; repeats drift apart by {format_quantity(drift, unit)} in a run" if drift > DRIFT_SIGMAS * sigma else ""
+    if -shift > DRIFT_SIGMAS * sigma:
+        text += f"; {format_quantity(-shift, unit)} lower after the light than before it, as behind a high-pass"
+    numbers = {"noise": (sigma, unit), "resolution": (quantum, unit), "drift": (drift, unit), "shift": (shift, unit)}
     return [], [
         DataFinding(
             tuple(work.runs[n].name for n, _ in work.list_signals(name)), name, "noise", f"{text}.", numbers=numbers
         )
     ]
+
+
+def _measure_drift(work: Work, name: str) -> tuple[float, float]:
+    """Return by how much ends of repeats differ that begin alike, rms, and ends from beginnings, the median."""
+    ends = {}
+    for number, signal in work.list_signals(name):
+        _, t_s, value = select_finite(signal)
+        rows = int(np.searchsorted(t_s, work.runs[number].pulses[:, 0].min(initial=np.inf)))  # before any light
+        if 3 < rows < len(value) // 2:
+            ends[number] = float(value[-rows:].mean() - value[:rows].mean())
+    pairs = [ends[run] - ends[other] for run in ends for other in work.find_repeats(run) if other in ends]
+    return float(np.sqrt(np.mean(np.square(pairs or [0.0])) / 2.0)), float(np.median(list(ends.values()) or [0.0]))
 
 
 STEPS = (
@@ -276,7 +288,7 @@ STEPS = (
     Step("outlier", find_outliers),
     Step("noisy", find_noisy),
     *RESPONSE_STEPS,
-    Step("lost", find_lost),
+    Step("lost", find_lost, is_joint=True),
     Step("gain", find_gains),
     Step(START_TIMES, _note_start_times, is_joint=True),
     Step("sampling", _note_sampling),

@@ -72,32 +72,44 @@ def find_noisy(work: Work, name: str) -> Found:
     return edits, [describe(work, "noisy", name, edits, text)]
 
 
-def find_lost(work: Work, name: str) -> Found:
+def find_lost(work: Work, _: str) -> Found:
     """Find runs whose samples come too early from some sample on, because samples before it were lost."""
+    found = {name: _list_early(work, name) for name in work.names if not name.startswith("mirror")}
+    runs = [run for early in found.values() for run in early]
+    edits, findings = [], []
+    for name, early in found.items():
+        # what two signals of a run show is its trigger's, and holds for all of them
+        all_of = {run: next(own[run] for own in found.values() if run in own) for run in runs if runs.count(run) > 1}
+        off = {run: item for run, item in (all_of | early).items() if (run, name) in work.signals}
+        if not off:
+            continue
+        own = [drop_signal(number, name, work.signals[number, name]) for number in off]
+        shown = list_names(
+            [f"{work.runs[n].name} (by {format_quantity(s, 's', 2)} from {t:.3g} s on)" for n, (t, s) in off.items()]
+        )
+        text = f"{name} of {shown} is earlier than in repeats: samples were lost, or trigger or clock are off"
+        edits += own
+        findings.append(describe(work, "lost", name, own, text))
+    return edits, findings
+
+
+def _list_early(work: Work, name: str) -> dict[int, tuple[float, float]]:
+    """Return from when on, s, and by how much runs are earlier than most others of equal light, s."""
     shares = {item.run: abs(item.share) for item in measure_responses(work, name)}
     lost: dict[int, tuple[float, float]] = {}
-    for number, signal in work.list_signals(name):
-        _, t_s, value = select_finite(signal)
+    for number, share in shares.items():
         pulses = work.runs[number].pulses  # groups of equal light tell more together
         repeats = [run for run in shares if run != number and np.array_equal(work.runs[run].pulses, pulses)]
-        if len(t_s) < MIN_SAMPLES or number not in shares:
-            continue
+        own = select_finite(work.signals[number, name])[1:]
         found = [
             early
             for other in repeats
-            if shares[other] > shares[number]
-            and (early := _find_early(t_s, value, *select_finite(work.signals[other, name])[1:])) is not None
+            if shares[other] > share
+            and (early := _find_early(*own, *select_finite(work.signals[other, name])[1:])) is not None
         ]
         if 2 * len(found) > len(repeats):
             lost[number] = found[0]
-    if not lost:
-        return [], []
-    edits = [drop_signal(number, name, work.signals[number, name]) for number in lost]
-    shown = list_names(
-        [f"{work.runs[n].name} (by {format_quantity(s, 's', 2)} from {t:.3g} s on)" for n, (t, s) in lost.items()]
-    )
-    text = f"{name} of {shown} is earlier than in all repeats: samples were lost, or the clock is off"
-    return edits, [describe(work, "lost", name, edits, text)]
+    return lost
 
 
 def _find_early(

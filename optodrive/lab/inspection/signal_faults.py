@@ -180,8 +180,8 @@ def select_near_ceiling(value: FloatArray, ceiling: float, reach: float) -> Bool
     return np.asarray(np.convolve(is_near, np.ones(5), mode="same") > 0.5)
 
 
-def find_hold(t_s: FloatArray, value: FloatArray) -> tuple[float, BoolArray] | None:
-    """Return the interval of a slower channel whose samples are repeated, s, and which samples are fresh, or None."""
+def find_hold(t_s: FloatArray, value: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
+    """Return the interval of a slower channel whose samples are repeated, s, its times and values, or None."""
     if len(value) < 2 * HOLD_BLOCKS:
         return None
     starts, lengths = _find_rows(value)
@@ -201,9 +201,7 @@ def find_hold(t_s: FloatArray, value: FloatArray) -> tuple[float, BoolArray] | N
     is_large = steps > 1.5 * find_quantum(value, 2)
     if float(is_regular.mean()) < HOLD_REGULAR or float(is_large.mean()) < HOLD_STEPS:
         return None
-    is_fresh = np.zeros(len(value), dtype=bool)
-    is_fresh[starts[1:]] = True  # the first block began before the recording
-    return period_s, is_fresh
+    return period_s, t_s[starts[1:]], value[starts[1:]]  # the first block began before the recording
 
 
 def find_interpolation(t_s: FloatArray, value: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
