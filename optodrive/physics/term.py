@@ -130,6 +130,13 @@ class BySignal(NamedTuple):
     mirrors: float = 0.0
 
 
+def build_signal_parameters(
+    unit: str, default: float, low: float, high: float, source: str, names: tuple[str, ...] = BySignal._fields
+) -> tuple[TermParameter, ...]:
+    """Return one parameter for each signal, without effect at 0."""
+    return tuple(TermParameter(name, unit, default, low, high, source, neutral=0.0) for name in names)
+
+
 class Term:
     """One physical effect. A term overrides the members that differ from the defaults, which leave the model unchanged.
 
@@ -142,6 +149,7 @@ class Term:
     Diagnosis: signature, where the effect shows in recorded data, empty if it is no possible cause of a discrepancy;
     subsystems, the kinds of recording that can show it; varies_between_runs, whether repeats of one drive differ by it;
     is_exact, whether the effect has no other form than the term's, but for its share in each signal;
+    starts_by_signal, of a term with one number per signal: where the search for one of all and for each begins;
     is_linear and fit_every_start as in `Hypothesis`; detection_limit, replaces the computed smallest visible effect;
     remedy, what to do at an instrument to see whether it is this, in a sentence; removes_zero, whether the zero of a
     signal on which it acts is equal in all runs; twin, the cause that no recording tells from it, of any law.
@@ -164,6 +172,7 @@ class Term:
     subsystems: tuple[str, ...] = ("pixels",)
     varies_between_runs: bool = False
     is_exact: bool = False
+    starts_by_signal: tuple[float, ...] = ()
     is_linear: bool = False
     fit_every_start: bool = False
     detection_limit: str = ""
@@ -224,19 +233,20 @@ class Term:
 
         By default one, with every parameter free and every combination of the parameters' starts.
         """
+        if self.starts_by_signal:
+            return self._build_hypotheses_by_signal(scope)
         grid = {item.name: item.starts or (item.default,) for item in self.parameters}
         starts = tuple(dict(zip(grid, values, strict=True)) for values in product(*grid.values()))
         free = tuple(self.free(name) for name in grid)
         return [Hypothesis(self.key, self.key, starts, free, self.is_linear, self.fit_every_start)]
 
-    def build_hypotheses_by_signal(self, scope: RecordingScope, *starts: float) -> list[Hypothesis]:
-        """Return the hypotheses of one number for all signals and of one for each, of a term with one per signal."""
+    def _build_hypotheses_by_signal(self, scope: RecordingScope) -> list[Hypothesis]:
         names = tuple(item.name for item in self.parameters)
         return [
             Hypothesis(
                 self.key,
                 f"{self.key} of {describe_signals(acting)}",
-                tuple(dict.fromkeys(names, 0.0) | dict.fromkeys(acting, start) for start in starts),
+                tuple(dict.fromkeys(names, 0.0) | dict.fromkeys(acting, start) for start in self.starts_by_signal),
                 (self.free(*acting),),
                 is_linear=True,
             )

@@ -3,9 +3,9 @@
 from math import pi
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter, describe_signals
+from optodrive.physics.hypothesis import Hypothesis, RecordingScope, describe_signals
 from optodrive.physics.signal_filters import low_pass
-from optodrive.physics.term import BySignal, Term, TermValues
+from optodrive.physics.term import BySignal, Term, TermValues, build_signal_parameters
 
 SIGNALS = BySignal._fields[:3]
 STARTS_HZ = (0.03, 0.3, 3.0)
@@ -16,11 +16,8 @@ class HighPass(Term):
 
     key = "high_pass"
     label = "an instrument's input is AC coupled"
-    parameters = tuple(
-        TermParameter(
-            name, "Hz", 0.3, 0.0, 30.0, "AC inputs of oscilloscopes and amplifiers, 0.1 to 10 Hz", neutral=0.0
-        )
-        for name in SIGNALS
+    parameters = build_signal_parameters(
+        "Hz", 0.3, 0.0, 30.0, "AC inputs of oscilloscopes and amplifiers, 0.1 to 10 Hz", SIGNALS
     )
     cannot_add_heat = True
     signature = "a signal that falls while the drive is held, and undershoots after it"

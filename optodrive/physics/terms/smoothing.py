@@ -5,7 +5,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter, describe_signals
 from optodrive.physics.signal_filters import low_pass_both_ways, moving_mean
-from optodrive.physics.term import BySignal, Term, TermValues
+from optodrive.physics.term import BySignal, Term, TermValues, build_signal_parameters
 
 SIGNALS = BySignal._fields
 STARTS_S = (1e-3, 5e-3, 2e-2)
@@ -25,10 +25,7 @@ class Smoothing(Term):
     key = "smoothing"
     label = "a signal was smoothed before it was recorded"
     parameters = (
-        *(
-            TermParameter(name, "s", 5e-3, 0.0, 0.1, "moving means and filters of loggers, to 50 ms", neutral=0.0)
-            for name in SIGNALS[:3]
-        ),
+        *build_signal_parameters("s", 5e-3, 0.0, 0.1, "moving means and filters of loggers, to 50 ms", SIGNALS[:3]),
         TermParameter("tails", "1", 0.0, 0.0, 1.0, "0 moving mean, 1 filter run both ways", (0.0, 1.0), True),
         TermParameter("late", "1", 0.0, 0.0, 0.5, "0 centred, 0.5 mean of the last samples", (0.0, 0.5), True),
         TermParameter("by_samples", "1", 0.0, 0.0, 1.0, "0 width in time, 1 in samples", (0.0, 1.0), True),

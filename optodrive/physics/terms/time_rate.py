@@ -1,10 +1,6 @@
 """Time rate: the clock that times the samples of one instrument, or of all, is fast or slow."""
 
-from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
-from optodrive.physics.term import BySignal, Term, TermValues
-
-START, LARGE = 2e-3, 1e-2
-"""Rates from which a search begins; edges at the end of a train move by more than their width at the large ones."""
+from optodrive.physics.term import BySignal, Term, TermValues, build_signal_parameters
 
 
 class TimeRate(Term):
@@ -12,12 +8,8 @@ class TimeRate(Term):
 
     key = "time_rate"
     label = "an instrument's time axis has a wrong rate"
-    parameters = (
-        TermParameter("temperature", "1", START, -0.05, 0.05, "nominal sampling rates, within 2 %", neutral=0.0),
-        TermParameter("displacement", "1", START, -0.05, 0.05, "as above", neutral=0.0),
-        TermParameter("force", "1", START, -0.05, 0.05, "as above", neutral=0.0),
-        TermParameter("mirrors", "1", START, -0.05, 0.05, "as above", neutral=0.0),
-    )
+    parameters = build_signal_parameters("1", 2e-3, -0.05, 0.05, "nominal sampling rates, within 2 %")
+    starts_by_signal = (2e-3, 1e-2, -1e-2)  # edges late in a train move by more than their width at the large ones
     cannot_add_heat = True
     is_exact = True
     subsystems = ("pixels", "mirrors")
@@ -27,10 +19,6 @@ class TimeRate(Term):
     def signal_rates(self, values: TermValues) -> BySignal:
         """Return the rates of the four clocks."""
         return BySignal(**values)
-
-    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
-        """Return a common rate of all clocks and, for a recording of several signals, one rate per signal."""
-        return self.build_hypotheses_by_signal(scope, START, LARGE, -LARGE)
 
 
 TERM = TimeRate()
