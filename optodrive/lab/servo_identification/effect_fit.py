@@ -54,6 +54,8 @@ SYSTEMATIC_WEIGHT = 5.0
 OTHER_SHARE, OTHER_ODDS = 0.2, 0.05
 """An unknown effect would leave this share of the linear residual's excess; prior odds of one."""
 LINEAR_ODDS = 1000.0
+ROUNDING = 1e-6
+"""Part of simulated columns below which nothing is left of them beside the free linear response."""
 AT_END = 0.01
 """Part of a parameter's range beside an end within which a fit has ended there."""
 
@@ -255,6 +257,17 @@ def build_probabilities(score: Mapping[str, float]) -> Probabilities:
     return Probabilities(no_effect, none_of_these, {(name,): each for name, each in probability.items()})
 
 
+def _weigh_columns(beside: FloatArray, simulated: FloatArray, y: FloatArray) -> FloatArray:
+    """Return weights [taps] of the parts of simulated columns beside the free linear response.
+
+    A linear servo has nothing beside it but rounding errors, which must not be scaled up to fit the noise.
+    """
+    share = ROUNDING * float(np.linalg.norm(simulated)) / max(float(np.linalg.norm(beside)), 1e-300)
+    if share >= 1.0:
+        return np.zeros(beside.shape[1])
+    return np.asarray(np.linalg.lstsq(beside, y, rcond=share)[0], dtype=np.float64)
+
+
 class EffectFits:
     """Fits of forms to training runs, each with a free linear response, and their errors in the runs compared.
 
@@ -321,8 +334,8 @@ class EffectFits:
             simulated = self.train.simulate(form, *unpack(x), self.scales["angle"], stride=self.stride)
             if not np.abs(simulated).max() < UNSTABLE:
                 return np.asarray(self.y * UNSTABLE)
-            simulated = simulated - self.part @ (self.part.T @ simulated)
-            return np.asarray(self.y - simulated @ np.linalg.lstsq(simulated, self.y, rcond=1e-8)[0])
+            beside = simulated - self.part @ (self.part.T @ simulated)
+            return np.asarray(self.y - beside @ _weigh_columns(beside, simulated, self.y))
 
         low = np.array([-0.7, 0.02 - self.base[1], -self.base[2] / period_s, *pack(tuple(each.low for each in spans))])
         high = np.array([max(1.2, self.shift + 0.4), 1.0, 0.5, *pack(tuple(each.high for each in spans))])
@@ -357,7 +370,7 @@ class EffectFits:
             return np.full(len(self.test.target), np.inf)
         y = self.train.target
         inside, y_inside = self.q.T @ trained, self.q.T @ y
-        weights = np.linalg.lstsq(trained - self.q @ inside, y - self.q @ y_inside, rcond=1e-8)[0]
+        weights = _weigh_columns(trained - self.q @ inside, trained, y - self.q @ y_inside)
         return np.asarray(self.test.target - tested @ weights - self.test_q @ (y_inside - inside @ weights))
 
     def list_changes(self, found: FormFit, linear: FormFit) -> tuple[HeldOutChange, ...]:
