@@ -25,7 +25,8 @@ class Change:
     """Squared errors of one signal of a group with both models, in squares of the noise of a sample.
 
     noise: standard deviation of the extended one's minus the nominal one's, by the residuals of the better model;
-    repeat_noise: the same by repeats, in which no model has a part; floor: expected square of noise alone
+    repeat_noise: the same by repeats, in which no model has a part; floor: expected square of noise alone, with its
+    standard deviation in floor_noise
     """
 
     group: str
@@ -35,6 +36,7 @@ class Change:
     noise: float
     repeat_noise: float
     floor: float
+    floor_noise: float
 
     @property
     def sigma(self):
@@ -52,7 +54,9 @@ def measure_changes(traces, measurement):
         better = min(nominal, extended, key=lambda each: float(each @ each))
         noises = (2.0 * each**0.5 for each in (compute_variance(step, better), spread))
         squares = (float(each @ each) for each in (nominal, extended))
-        changes.append(Change(trace.group, trace.signal, *squares, *noises, floor))
+        # Of coloured noise, about one sample in four is independent; that of the trace itself adds to the repeats'.
+        floor_noise = 2.0 * floor * (2.0 / max(len(step) / 4.0, 1.0)) ** 0.5
+        changes.append(Change(trace.group, trace.signal, *squares, *noises, floor, floor_noise))
     return changes
 
 
@@ -112,7 +116,8 @@ def list_faults_of_claim(found, measurement):
     gained = sum(change.nominal - change.extended for change in changes)
     excess = sum(max(change.nominal - change.floor, 0.0) for change in changes)
     noise = sum((change.repeat_noise or change.noise) ** 2 for change in changes) ** 0.5
-    if gained < EXPLAINED_MIN * excess - WORSE_SIGMA * noise:
+    excess_noise = sum(change.floor_noise**2 for change in changes) ** 0.5
+    if gained < EXPLAINED_MIN * excess - WORSE_SIGMA * np.hypot(noise, EXPLAINED_MIN * excess_noise):
         faults.append(f"{' and '.join(found.causes)} explains {gained:.0f} ± {noise:.0f} of {excess:.0f}")
     return faults
 

@@ -243,7 +243,7 @@ def find_interpolation(t_s: FloatArray, value: FloatArray) -> tuple[float, Float
 
 
 def find_outlier_candidates(t_s: FloatArray, value: FloatArray, quantum: float = 0.0) -> list[tuple[int, int, float]]:
-    """Return first sample, number of samples and σ of deviations from both sides.
+    """Return first sample, number of samples and σ of deviations from both sides, near an end from the other one.
 
     quantum: step of the converter, where the values do not show it
     """
@@ -264,10 +264,13 @@ def find_outlier_candidates(t_s: FloatArray, value: FloatArray, quantum: float =
     taken = np.zeros(count, dtype=bool)
     for width in range(MAX_WIDTH, 0, -1):  # a narrower one inside a wider one is a part of it
         score = np.full(count - width + 1, np.inf)
+        firsts = np.arange(len(score))
+        is_begin, is_end = firsts < SIDE, firsts + width > count - SIDE
         for at in range(width):
             a = scores[0][at][at : count - width + 1 + at]
             b = scores[1][width - 1 - at][at : count - width + 1 + at]
             both = np.where(a * b > 0.0, np.minimum(np.abs(a), np.abs(b)), 0.0)
+            both = np.select([is_begin, is_end], [np.abs(b), np.abs(a)], both)
             score = np.minimum(score, np.nan_to_num(both))
         for first in np.flatnonzero(score > (OUTLIER_SIGMAS if noise.is_rough else SMOOTH_SIGMAS)).tolist():
             own = slice(first, first + width)
@@ -305,8 +308,9 @@ def _is_isolated(t_s: FloatArray, value: FloatArray, first: int, width: int, sig
 
 def measure_deviation(t_s: FloatArray, value: FloatArray, first: int, width: int) -> tuple[float, float]:
     """Return the smallest deviation of samples from a cubic through their neighbours, and that of these, rms."""
-    rows = np.concatenate([np.arange(first - SIDE, first), np.arange(first + width, first + width + SIDE)])
-    if rows[0] < 0 or rows[-1] >= len(value):
+    begin = min(max(first - SIDE, 0), max(len(value) - width - 2 * SIDE, 0))  # near an end more of the other side
+    rows = np.setdiff1d(np.arange(begin, min(begin + width + 2 * SIDE, len(value))), np.arange(first, first + width))
+    if len(rows) < 2 * SIDE:
         return 0.0, 0.0
     span_s = float(t_s[rows[-1]] - t_s[rows[0]])
     centre_s = float(t_s[first : first + width].mean())

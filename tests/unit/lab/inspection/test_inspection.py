@@ -105,6 +105,21 @@ def test_outliers_are_left_out_and_nothing_else(seed, size, width, count, name):
     assert list_missing(measurement, find(measurement, ["outlier"])[1].measurement, name) == []
 
 
+@pytest.mark.parametrize("row", [0, 1, 4, -5, -2, -1])
+@pytest.mark.parametrize(("name", "sigma"), [(HEIGHT, 2e-6), (HEAT, 0.3)])
+def test_an_outlier_near_an_end_is_left_out_with_at_most_the_samples_beside_it(row, name, sigma):
+    clean = build_clean()
+    count = len(clean.runs[6].signals[name].value)
+
+    def add(_, value):
+        value[row] = np.nanmedian(value[:8] if row >= 0 else value[-8:]) + 25.0 * sigma
+        return value
+
+    lost = list_missing(clean, find(change(clean, name, add, {6}))[1].measurement, name)
+    assert (6, row % count) in lost
+    assert all(run == 6 and abs(other - row % count) <= 5 for run, other in lost)
+
+
 def test_a_glitch_that_repeats_share_is_no_outlier():
     clean = build_clean()
 
