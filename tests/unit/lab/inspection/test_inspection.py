@@ -153,8 +153,7 @@ def test_a_ceiling_is_left_out_with_what_is_near(share, quantum, noise):
         assert (kept & far).sum() > 0.9 * (far & np.isfinite(old.signals[HEIGHT].value)).sum()
 
 
-@pytest.mark.parametrize("width", [0.0, 0.05])
-@pytest.mark.parametrize(("share", "side"), [(0.6, 1.0), (0.85, 1.0), (0.3, -1.0)])
+@pytest.mark.parametrize(("share", "side", "width"), [(0.6, 1.0, 0.05), (0.85, 1.0, 0.0), (0.3, -1.0, 0.0)])
 @pytest.mark.parametrize("name", [HEIGHT, HEAT])
 def test_a_sensor_that_saturates_before_the_noise_is_left_out_there(name, share, side, width):
     clean, rng = build_clean(5, 1000.0, 0.0), np.random.default_rng(8)
@@ -369,8 +368,7 @@ def test_a_run_beside_one_with_a_gap_has_lost_nothing():
     assert find(change(build_clean(), HEAT, lose, {6}))[0] == set()
 
 
-@pytest.mark.parametrize("gain", [0.9, 1.1])
-@pytest.mark.parametrize("run", [4, 9])
+@pytest.mark.parametrize(("run", "gain"), [(4, 0.9), (9, 1.1)])
 @pytest.mark.parametrize("name", [HEIGHT, HEAT])
 def test_a_run_of_another_gain_is_left_out(name, run, gain):
     rest = {HEIGHT: 0.0, HEAT: 293.15}[name]
