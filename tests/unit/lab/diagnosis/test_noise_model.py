@@ -8,7 +8,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, filtfilt
 
 from labs import PIXEL, lab
-from optodrive.core.types.measurements import Measurement
+from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.device.servo import simulate_servo
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.model_selection import MAX_INTRA_PULSE_POWER_EXCESS, MAX_REPLICATE_EXCESS
@@ -76,6 +77,19 @@ def test_noise_and_base_are_recovered_from_repeats():
     assert r == pytest.approx(PIXEL.r_k_per_w, rel=0.01)
     assert c == pytest.approx(PIXEL.c_j_per_k, rel=0.01)
     assert tau_g == pytest.approx(PIXEL.tau_g_s, rel=0.03)
+
+
+def test_a_rate_of_all_clocks_is_that_of_the_mirrors():
+    rng, runs, t_s = np.random.default_rng(4), [], np.arange(0.0, 0.4, 2e-4)
+    commands = np.column_stack([0.02 * np.arange(20), rng.uniform(-0.1, 0.1, (20, 2))])
+    for number in range(3):
+        angle = simulate_servo(commands[:, 0], commands[:, 1], t_s / 1.01, None) + 1e-5 * rng.standard_normal(len(t_s))
+        signals = {"mirror_x_rad": Signal(0, t_s, angle)}
+        runs.append(Run(f"run{number}", 293.15, np.zeros((0, 4)), signals, {"group": "steps"}, commands))
+    data = build_dataset(Measurement(tuple(runs)))
+    rates = {"time_rate": dict.fromkeys(("temperature", "displacement", "force", "mirrors"), 0.01)}
+    residuals = [data.value - fit_nominal(data, shared=shared)[1].prediction for shared in (None, rates)]
+    assert np.std(residuals[1]) < 2e-5 < 1e-3 < np.std(residuals[0])
 
 
 def test_without_repeats_the_noise_is_a_guess():
