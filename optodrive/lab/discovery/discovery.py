@@ -17,15 +17,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.discovery.fitting import (
-    Point,
-    Simulation,
-    Terms,
-    choose_step,
-    estimate_noise,
-    fit,
-    output_sizes,
-)
+from optodrive.lab.discovery.fitting import Point, Simulation, Terms, choose_step, estimate_noise, fit, output_sizes
 from optodrive.lab.discovery.forms import CURVE, Form
 from optodrive.lab.discovery.held_out import choose_splits, prepare_search
 from optodrive.lab.discovery.judgement import Judge, Measured, Proposal, name_form
@@ -123,11 +115,8 @@ class _Search:
             self.progress(f"term {number + 1}", 0.2 + 0.16 * number)
             if current.rmse[0, 1] < MIN_ERROR and not self.is_white:
                 break
-            if (
-                found
-                and self.is_white
-                and (current.rmse[0, 1] - 1.0) < MIN_FURTHER_GAIN_WHITE * (base.rmse[0, 1] - 1.0)
-            ):
+            left, first_left = float(current.rmse[0, 1]) - 1.0, float(base.rmse[0, 1]) - 1.0
+            if found and self.is_white and left < MIN_FURTHER_GAIN_WHITE * first_left:
                 break
             further = self._extend(base, current)
             if further is None:
@@ -287,15 +276,16 @@ class _Search:
 
     @staticmethod
     def _choose_judged(proposals: Sequence[Proposal], changes: set[int]) -> list[Proposal]:
-        """Return the best formulas, few of each place, and two that change with time."""
-        chosen, counts = list[Proposal](), dict[Place, int]()
+        """Return the best formulas, few of each place, and of each one curve, and two that change with time."""
+        chosen, counts, physical = list[Proposal](), dict[tuple[Place, bool], int](), 0
         for each in sorted(proposals, key=lambda p: p.loss):
-            at = each.candidate.screened.at
-            is_change = id(each.candidate.screened) in changes
-            room = 2 if is_change else JUDGED_PER_PLACE
-            if counts.get(at, 0) < room and (is_change or len(chosen) < JUDGED):
+            is_change, is_curve = id(each.candidate.screened) in changes, each.candidate.form.kind == CURVE
+            key = (each.candidate.screened.at, is_curve and not is_change)
+            room = 2 if is_change else 1 if is_curve else JUDGED_PER_PLACE
+            if counts.get(key, 0) < room and (is_change or is_curve or physical < JUDGED):
                 chosen.append(each)
-                counts[at] = counts.get(at, 0) + 1
+                counts[key] = counts.get(key, 0) + 1
+                physical += not is_change and not is_curve
         return chosen
 
     def _measure(self, current: Measured, proposals: Sequence[Proposal]) -> list[Proposal]:
@@ -333,7 +323,7 @@ class _Search:
                 kept.append(replace(each, proposal=chosen, term=term))
             else:
                 current = others
-        return current, kept
+        return self._reconsider(base, current, kept) if 0 < len(kept) < len(found) else (current, kept)
 
     def _is_enough(self, base: Measured, current: Measured, proposal: Proposal, is_further: bool) -> bool:
         """Return whether a term removes enough of the error and helps in every split."""
@@ -351,7 +341,7 @@ class _Search:
         return (
             after < before * (1.0 - minimum)
             and min(shares, default=0.0) >= minimum_gain
-            and all(each.held_out > 0.0 for each in gains)
+            and min((each.held_out for each in gains), default=0.0) > 0.0
         )
 
     def _screen(self, point: Point) -> tuple[Point, list[Filtered], list[Screened]]:

@@ -39,7 +39,8 @@ START_NOISE = 10.0
 """Error of free runs in units of noise, below which it may be that of the first sample, from which the run starts."""
 SAME = 0.01
 """Squared difference of two functions, relative to the smaller one, below which they are one."""
-ALIKE_SIGMA = 2.0
+ALIKE_SIGMA, NEARLY = 2.0, 0.9
+"""How far behind a simpler form may be, and which share of a curve's gain a formula of physics needs, to replace it."""
 PER_NUMBER, PER_CHANGE = 0.5, 0.1
 """Weight of a form beforehand, for each number that it has more than another, and for a change with time."""
 
@@ -114,7 +115,9 @@ class Judge:
 
     def measure_gains(self, base: Measured, before: Measured, after: Measured) -> tuple[SplitGain, ...]:
         """Return the shares of the first model's avoidable error that a term removes, where there is any."""
-        shares = (before.rmse - after.rmse) / np.maximum(base.rmse - np.minimum(self.floor, after.rmse), 1e-12)
+        shares = (np.minimum(before.rmse, base.rmse) - after.rmse) / np.maximum(
+            base.rmse - np.minimum(self.floor, after.rmse), 1e-12
+        )
         is_quiet = np.maximum(before.rmse, after.rmse)[:, 1] <= WITHIN_NOISE * self.floor
         return tuple(
             SplitGain(split.name, *np.clip(share, -9.0, 1.0).tolist())
@@ -166,11 +169,14 @@ class Judge:
         forms = [self.name(each) for each, _ in kept]
         gains = [self.measure_gains(base, before, measured) for _, measured in kept]
         minimum = [min((each.held_out for each in own), default=0.0) for own in gains]
-        # What gains less than half of another one where it was not fitted is no rival of it.
+        # What gains less than half of another one where it was not fitted is no rival of it, and a curve none of a
+        # formula of physics that gains nearly as much.
+        physical = max((g for form, g in zip(forms, minimum, strict=True) if form.kind not in NAMELESS), default=0.0)
         prior = [
             PER_NUMBER**each.candidate.numbers
             * (PER_CHANGE if form.kind == CHANGE else 1.0)
             * (max(minimum) <= 0.0 or gain >= MIN_KEPT * max(minimum))
+            * (form.kind != CURVE or physical < NEARLY * gain)
             for (each, _), form, gain in zip(kept, forms, minimum, strict=True)
         ]
         rivals = [measured for (_, measured), weight in zip(kept, prior, strict=True) if weight > 0.0]
@@ -182,7 +188,7 @@ class Judge:
         ]
         # A term has no other forms of its own, and is a name only beside terms that explain half of all together.
         explained = [
-            (min((each.held_out for each in self.measure_gains(base, base, measured)), default=1.0), 1.0)
+            (min((each.held_out for each in self.measure_gains(base, base, measured)), default=0.0), 1.0)
             for _, measured in kept
         ]
         is_usable = [form.gain > 0.0 and len(own) > 0 for form, own in zip(forms, gains, strict=True)]

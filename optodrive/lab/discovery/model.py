@@ -120,10 +120,7 @@ class Record:
 
     def check(self, model: OdeModel) -> None:
         """Refuse a record whose columns are not those of the model."""
-        for name, values, names in (
-            ("inputs", self.inputs, model.inputs),
-            ("outputs", self.outputs, model.outputs),
-        ):
+        for name, values, names in (("inputs", self.inputs, model.inputs), ("outputs", self.outputs, model.outputs)):
             if values.shape[1] != len(names):
                 raise InputError(f"record.{name}", values.shape[1], f"{len(names)} columns: {', '.join(names)}")
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms, weigh
-from optodrive.lab.discovery.forms import Form, list_forms
+from optodrive.lab.discovery.forms import CURVE, Form, list_forms
 from optodrive.lab.discovery.linearisation import Linearisation
 from optodrive.lab.discovery.model import Curve, Record
 
@@ -291,7 +291,7 @@ def find_twin(filtered: Sequence[Filtered], at: Place, evaluate: Evaluate, names
 
 
 def rank_formulas(found: Screened, count: int) -> list[Candidate]:
-    """Return the best formulas of a place, none of which a parameter can imitate."""
+    """Return the best formulas of a place and one curve, none of which a parameter can imitate."""
     columns, owners = [], []
     for form in list_forms(found.nodes):
         for first, second in form.starts:
@@ -308,8 +308,10 @@ def rank_formulas(found: Screened, count: int) -> list[Candidate]:
     best: dict[tuple[str, str], int] = {}
     for k in np.argsort(-share):
         best.setdefault((owners[k][0].kind, owners[k][0].text), int(k))
+    usable_best = [k for k in best.values() if usable[k]]
+    physical = [k for k in usable_best if owners[k][0].kind != CURVE]
+    curves = [k for k in usable_best if owners[k][0].kind == CURVE]
     return [
         Candidate(found, *owners[k][:3], float(vector[k] / squares[k] / owners[k][3]))
-        for k in list(best.values())[:count]
-        if usable[k]
+        for k in physical[:count] + curves[:1]
     ]

@@ -42,11 +42,7 @@ OUTPUT_PLACES = {
 def compute_rates(t: Any, state: Any, u: Any, p: Any) -> Sequence[Any]:
     """Return the rates of absorber, gas and memory, K/s."""
     absorber, gas, memory = state
-    return [
-        (u[0] - absorber / p.R) / p.C,
-        (0.5 * absorber - gas) / p.tau_g,
-        (absorber - memory) / p.tau_m,
-    ]
+    return [(u[0] - absorber / p.R) / p.C, (0.5 * absorber - gas) / p.tau_g, (absorber - memory) / p.tau_m]
 
 
 def compute_signals(state: Any, u: Any, p: Any) -> Sequence[Any]:
