@@ -18,7 +18,7 @@ import numpy as np
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms, choose_step, estimate_noise, fit, output_sizes
-from optodrive.lab.discovery.forms import CURVE, Form
+from optodrive.lab.discovery.forms import CURVE, NAMELESS, Form
 from optodrive.lab.discovery.held_out import choose_splits, prepare_search
 from optodrive.lab.discovery.judgement import Judge, Measured, Proposal, name_form
 from optodrive.lab.discovery.model import Curve, Discovery, Finding, OdeModel, Record
@@ -121,7 +121,9 @@ class _Search:
             further = self._extend(base, current)
             if further is None:
                 break
-            if not self._is_enough(base, current, further.proposal, bool(found)) or further.term.missing < MIN_MISSING:
+            is_refused = further.term.claim.verdict == "unexplained" and further.term.chosen.kind not in NAMELESS
+            is_enough = self._is_enough(base, current, further.proposal, bool(found))
+            if not is_enough or further.term.missing < MIN_MISSING or (is_refused and not found):
                 claims += [] if found else [further.term.claim]
                 break
             current = further.proposal.measured or current
