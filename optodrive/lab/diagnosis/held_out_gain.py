@@ -124,7 +124,11 @@ def compute_held_out_changes(
             columns = np.column_stack([part.value - before, after - before])
             gram = compute_normal_equations(part, columns, problem.noise, jitter.power, jitter.timing).total
             norm2 = float(gram[1, 1])
-            changes.append(HeldOutChange(group, SIGNALS[kind], norm2 - 2.0 * float(gram[0, 1]), 2.0 * norm2**0.5))
+            floor2 = _compute_noise_floor2(replace(problem, data=part), extended)
+            squares = ((part.value - before) ** 2, (part.value - after) ** 2, floor2)
+            rms = [float(np.sqrt(np.mean(each))) for each in squares]
+            chi2, spread = norm2 - 2.0 * float(gram[0, 1]), 2.0 * norm2**0.5
+            changes.append(HeldOutChange(group, SIGNALS[kind], chi2, spread, (rms[0], rms[1], rms[2])))
     return tuple(changes)
 
 

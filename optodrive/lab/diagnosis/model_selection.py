@@ -49,7 +49,7 @@ from optodrive.lab.diagnosis.noise_certainty import NoiseCertainty, count_noise_
 from optodrive.lab.diagnosis.prediction import predict
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
 from optodrive.lab.diagnosis.search_log import SearchLog
-from optodrive.lab.inference.claim import Alternative, Claim, Evidence, HeldOutChange
+from optodrive.lab.inference.claim import UNJUDGED, Alternative, Claim, Evidence, HeldOutChange
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -65,7 +65,6 @@ NO_EFFECT_SHARE = 1e-5
 """Share of a signal's range below which a change is an error of the integration, whose steps terms may refine."""
 CERTAIN = 0.995
 """Probability of none of these where repeats differ by more than noise."""
-UNJUDGED = Claim("unexplained")
 MAX_REPLICATE_EXCESS = 6.0
 """Maximum replicate excess, in σ, for runs of one group to count as repeats."""
 MAX_INTRA_PULSE_POWER_EXCESS = 25.0

@@ -51,6 +51,8 @@ MIN_EXPLAINED, MIN_EXPLAINED_WITH_FORMS = 0.5, 0.9
 """Smallest share of the excess that a cause explains alone, and with other forms of its effect."""
 MAX_WORSE_SIGMA = 3.0
 """Largest increase of a held-out signal's error, in σ, that counts as noise."""
+MAX_GROWTH = 1.0
+"""Largest increase of a held-out signal's mean square error, relative to that by noise, that counts as noise."""
 MIN_TRAINED = 0.02
 """Share of the avoidable error that a term removes in training, below which a split cannot test it."""
 MIN_KEPT = 0.5
@@ -65,17 +67,28 @@ NOTHING_FOUND = ("none", "instrument", "incomplete", "undecided")
 
 @dataclass(frozen=True)
 class HeldOutChange:
-    """Change of χ² of one signal of a held-out group by an extension, and the standard deviation of it by noise."""
+    """Change of χ² of one signal of a held-out group by an extension, and the standard deviation of it by noise.
+
+    rms: errors without and with the extension, and by noise and jitter alone. χ² counts what differs from run to run
+    little, so an extension that predicts the shape of a response, and its height wrongly, lowers it.
+    """
 
     group: str
     signal: str
     chi2: float
     noise: float
+    rms: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     @property
     def sigma(self) -> float:
         """Increase in σ, negative where the extension is better."""
         return self.chi2 / max(self.noise, 1e-12)
+
+    @property
+    def growth(self) -> float:
+        """Increase of the mean square error, relative to that by noise and jitter."""
+        before, after, noise = self.rms
+        return (after**2 - before**2) / max(noise, 1e-12) ** 2
 
 
 @dataclass(frozen=True)
@@ -234,6 +247,10 @@ def weigh_forms(behind: Sequence[float], prior: Sequence[float]) -> list[float]:
     return [weight / sum(weights) for weight in weights]
 
 
+UNJUDGED = Claim("unexplained")
+"""Claim of what nobody has judged yet."""
+
+
 def claim(evidence: Evidence) -> Claim:
     """Return the strongest claim that the evidence permits."""
     probabilities = evidence.probabilities
@@ -321,6 +338,8 @@ def _list_refusals(item: Alternative) -> tuple[str, ...]:
     total = HeldOutChange("", "", sum(each.chi2 for each in item.held_out), noise)
     if total.sigma > MAX_WORSE_SIGMA:
         out.append(f"With {item.name}, the held-out runs are predicted worse, by {total.sigma:.1f} σ.")
+    if sum(each.growth for each in item.held_out) > MAX_GROWTH:
+        out += _list_growths(item)
     if item.nameless:
         out.append(f"{item.name} is no name: {item.nameless}.")
     out += [
@@ -329,6 +348,16 @@ def _list_refusals(item: Alternative) -> tuple[str, ...]:
         if each.held_out < 0.0
     ]
     return tuple(out)
+
+
+def _list_growths(item: Alternative) -> list[str]:
+    """Return the held-out signals of which an extension makes the rms error larger than noise and jitter explain."""
+    return [
+        f"With {item.name}, the rms error of {each.signal} of the held-out group {each.group} is "
+        f"{each.rms[1] / max(each.rms[0], 1e-12):.1f} times that of the nominal model."
+        for each in item.held_out
+        if each.growth > MAX_GROWTH
+    ]
 
 
 def _list_doubts(item: Alternative) -> tuple[str, ...]:
@@ -350,6 +379,7 @@ def _list_doubts(item: Alternative) -> tuple[str, ...]:
         for each in item.held_out
         if each.sigma > MAX_WORSE_SIGMA
     ]
+    out += _list_growths(item)
     out += [f"{key} is not certain: {clause}." for key, clause in item.doubts.items()]
     return tuple(out)
 

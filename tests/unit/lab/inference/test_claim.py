@@ -46,6 +46,9 @@ from optodrive.physics.terms import discover_terms
 CAUSES = ("gas_leak", "laser_droop", "high_pass", "membrane_stiffening")
 SETS = (*((key,) for key in CAUSES), ("gas_leak", "laser_droop"), ("high_pass", "laser_droop"))
 BETTER = HeldOutChange("strong", "displacement_m", -400.0, 40.0)
+GROWN = HeldOutChange("strong", "displacement_m", -400.0, 40.0, (2.8e-5, 6.7e-5, 2e-6))
+"""Better by χ², since its shape fits, and more than twice as far off: its height differs."""
+SHRUNK = HeldOutChange("strong", "absorber_temperature_K", -400.0, 40.0, (14.0, 1.0, 0.1))
 WORSE = HeldOutChange("strong", "absorber_temperature_K", 50.0, 10.0)
 LITTLE, UNTESTED, HARM = (SplitGain("friday", *each) for each in ((0.9, 0.1), (0.0, 0.9), (0.9, -0.2)))
 DOUBT = {"gas_leak": "the 95 % interval of gas_leak.rate, −1 to 2, contains zero"}
@@ -71,6 +74,8 @@ def test_a_cause_that_meets_all_conditions_is_named():
         ({"explained": (0.8, 0.85)}, "ambiguous", "85.0 % of the excess in all", "MIN_EXPLAINED_WITH_FORMS"),
         ({"held_out": (BETTER, WORSE)}, "ambiguous", "absorber_temperature_K .* strong .* 5.0 σ", "MAX_WORSE_SIGMA"),
         ({"held_out": (WORSE,)}, "unexplained", "predicted worse, by 5.0 σ", "MAX_WORSE_SIGMA"),
+        ({"held_out": (GROWN,)}, "unexplained", "rms error of displacement_m .* strong is 2.4 times", "MAX_GROWTH"),
+        ({"held_out": (SHRUNK, GROWN)}, "ambiguous", "rms error of displacement_m .* is 2.4 times", "MAX_GROWTH"),
         ({"gains": (LITTLE,)}, "ambiguous", "removes 90.0 % .* where it was fitted, 10.0 % in friday", "MIN_KEPT"),
         ({"gains": (UNTESTED,)}, "ambiguous", "Without friday, no data shows gas_leak", "MIN_TRAINED"),
         ({"gains": (HARM,)}, "unexplained", "With gas_leak, friday is predicted worse, by 20.0 %", ""),
@@ -85,7 +90,7 @@ def test_each_condition_keeps_a_cause_from_being_named(monkeypatch, changes, ver
     # The mutant without the condition names the cause.
     if limit:
         for name in ("MIN_EXPLAINED", "MIN_EXPLAINED_WITH_FORMS") if limit == "MIN_EXPLAINED" else (limit,):
-            monkeypatch.setattr(judge, name, 1e9 if limit == "MAX_WORSE_SIGMA" else -1e9)
+            monkeypatch.setattr(judge, name, 1e9 if limit in ("MAX_WORSE_SIGMA", "MAX_GROWTH") else -1e9)
         assert claim(make_evidence(**changes)).verdict == "cause"
     else:
         assert claim(make_evidence(**changes | {"doubts": {}, "gains": (), "nameless": ""})).verdict == "cause"
