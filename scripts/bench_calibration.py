@@ -180,7 +180,7 @@ def find_truth(row: dict[str, str]) -> str:
 
 def is_detected(row: dict[str, str]) -> bool:
     """Return whether the verdict says that something is wrong."""
-    return row["verdict"] not in ("none", "incomplete")
+    return row["verdict"] not in ("none", "undecided", "incomplete")
 
 
 def is_false_name(row: dict[str, str]) -> bool:
@@ -317,6 +317,7 @@ def format_summary(rows: list[dict[str, str]]) -> str:
         f"{len(kept)} recordings ({len(rows) - len(kept)} not sampled: no size of the effect has that strength); "
         f"elapsed {median(float(row['elapsed_s']) for row in kept):.0f} s in the median.",
         f"{sum(row['code'] in codes for row in kept)} of them were diagnosed by other code than this.",
+        f"Undecided nulls: {format_share(sum(row['verdict'] == 'undecided' for row in nulls), len(nulls))}.",
         f"False alarms in nulls: {format_share(sum(map(is_detected, nulls)), len(nulls))}; with AIC "
         + format_share(sum(find_best(row, "aic") != NO_EFFECT for row in nulls), len(nulls))
         + ", with BIC "
