@@ -63,6 +63,8 @@ BENDS, BEND_WIDTHS, BEND_TAUS_S = (
     (0.0, 0.045),
     np.geomspace(0.003, 0.1, 16),
 )
+REST_SHARE = 0.03
+"""Share of the range of displacement or force within which a level part is the rest."""
 BEND_MEANS, BEND_PULSES, MIN_BEND_RUNS, LEVEL_SLOPE, BEND_SIGMAS, BEND_REACH, BEND_ERROR, OWN_LEAVES = (
     *(60, 12, 3, 0.2, 4.5),
     *(3.0, 0.02, 1.3),
@@ -325,6 +327,8 @@ def find_saturation(work: Work, name: str) -> tuple[float, float, float] | None:
     gains = y @ centred / (centred**2).sum(axis=0)
     at = int(np.argmax(gains * (y @ centred)))
     ends = value.mean() - gains * parts.mean(axis=0) + np.tile(BENDS, len(BEND_WIDTHS)) * gains * is_high
+    if not is_high and name != TEMPERATURE and abs(ends[at]) < REST_SHARE * float(np.ptp(value)):
+        return None  # the zero of displacement and force is their rest, at which a slack membrane is level, too
     reach = gains[at] * (BEND_REACH * np.repeat(BEND_WIDTHS, len(BENDS))[at] + BEND_ERROR)
     return (1.0 if is_high else -1.0), float(ends[at]), float(reach)
 

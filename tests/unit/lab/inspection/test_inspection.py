@@ -178,6 +178,17 @@ def test_a_sensor_that_saturates_before_the_noise_is_left_out_there(name, share,
     assert kept_far > 0.9 * far > 0
 
 
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_a_slack_membrane_is_no_floor_of_its_sensor(share):
+    clean, rng = build_clean(5, 1000.0, 0.0), np.random.default_rng(8)
+    slack = share * max(np.nanmax(run.signals[HEIGHT].value) for run in clean.runs)
+
+    def loosen(_, value):
+        return np.maximum(value - slack, 0.0) + 2e-6 * rng.standard_normal(len(value))
+
+    assert "clipped" not in find(change(clean, HEIGHT, loosen))[0]
+
+
 def test_what_settles_is_no_ceiling():
     """Long pulses end in equal samples, exact or in steps of a converter; a settled membrane is none either."""
     runs = []
