@@ -235,7 +235,7 @@ def draining_tank(seed, flow):
 
 
 def driven(seed, force, cubic=0.0, friction=0.0):
-    """Return an oscillator with a cubic spring or dry friction under a force [m] in steps of 0.02 s."""
+    """Return an oscillator with a cubic spring, dry friction, or both under a force [m] in steps of 0.02 s."""
     t = 0.02 * np.arange(len(force))
 
     def rate(_, y, u):

@@ -10,16 +10,20 @@ from numpy.linalg import LinAlgError
 
 from foreign_systems import (
     compute_error,
+    driven,
     first_order_model,
     motor_model,
     motor_record,
+    oscillator_model,
     pendulum_model,
     pendulum_record,
     poor_excitation,
+    smooth_input,
 )
 from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.lab.discovery import OdeModel, Parameter, Record, discover, discovery
+from optodrive.lab.discovery.fitting import estimate_noise
 from optodrive.lab.discovery.input_files import read_record
 
 SILVERBOX = os.environ.get("SILVERBOX_CSV")
@@ -54,6 +58,23 @@ def test_end_stop_of_a_pendulum():
     assert answer.findings[0].term.is_sure
     assert answer.parameters == pytest.approx({"gravity": 30.0, "damping": 0.8, "gain": 12.0}, rel=0.01)
     assert rmse(answer, pendulum_record(2, 0.35)) < 0.1 * answer.base_rmse
+
+
+@pytest.mark.slow
+def test_two_terms_neither_of_which_explains_half_of_the_error():
+    _, force = smooth_input(np.random.default_rng(1), 0.02 * np.arange(1200), 2.0, 6.0)
+    answer = discover(oscillator_model(), [driven(1, force, cubic=2.0, friction=3.0)])
+    forms = {each.term.chosen.kind: each.term.chosen.depends_on for each in answer.findings}
+    assert forms == {"cubic": ("x",), "dry friction": ("v",)}
+    assert all(each.term.is_sure for each in answer.findings)
+    assert answer.extended_rmse < 0.05 * answer.base_rmse
+
+
+@pytest.mark.parametrize("samples_per_period", [200.0, 9.0])
+def test_noise_is_estimated_beside_slow_and_fast_oscillations(samples_per_period):
+    row = np.arange(3000)
+    noisy = np.sin(2.0 * np.pi * row / samples_per_period) + 1e-3 * np.random.default_rng(2).standard_normal(3000)
+    assert estimate_noise([Record(0.01 * row, np.zeros((3000, 0)), noisy)]) == pytest.approx(1e-3, rel=0.1)
 
 
 def test_nothing_is_found_where_nothing_is_missing():

@@ -18,7 +18,7 @@ import numpy as np
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms, choose_step, estimate_noise, fit, output_sizes
-from optodrive.lab.discovery.forms import CURVE, NAMELESS, Form
+from optodrive.lab.discovery.forms import CURVE, CURVES, NAMELESS, Form
 from optodrive.lab.discovery.held_out import choose_splits, prepare_search
 from optodrive.lab.discovery.judgement import Judge, Measured, Proposal, name_form
 from optodrive.lab.discovery.model import Curve, Discovery, Finding, OdeModel, Record
@@ -121,15 +121,20 @@ class _Search:
             further = self._extend(base, current)
             if further is None:
                 break
-            is_refused = further.term.claim.verdict == "unexplained" and further.term.chosen.kind not in NAMELESS
-            is_enough = self._is_enough(base, current, further.proposal, bool(found))
-            if not is_enough or further.term.missing < MIN_MISSING or (is_refused and not found):
+            if (
+                not self._is_enough(base, current, further.proposal, bool(found), is_final=False)
+                or further.term.missing < MIN_MISSING
+            ):
                 claims += [] if found else [further.term.claim]
                 break
             current = further.proposal.measured or current
             found.append(further)
         if len(found) > 1:
             current, found = self._reconsider(base, current, found)
+        # Of two equal terms neither explains half of the error alone, but both do together.
+        if found and all(_is_refused(each.term) for each in found):
+            claims += [found[0].term.claim]
+            current, found = base, []
         self.progress("final fit", 0.85)
         everything = [np.full(len(record.t_s), True) for record in self.records]
         final_base = self.judge.fit([base.points[0]], everything, 15)
@@ -229,8 +234,8 @@ class _Search:
             return None
         time = len(self.model.states) + len(self.model.inputs)
         changes = [each for each in ranked if time in (each.at.variable, each.at.factor)]
-        # The curve of a term shows what its formula lacks at its own place.
-        found = {tuple(row[[0, 2, 3]]) for row in point.terms.table}
+        # The curve of a term shows what its formula lacks at its own place; a curve without one lacks one.
+        found = {tuple(row[[0, 2, 3]]) for row in point.terms.table if row[1] not in CURVES}
         ranked = [
             each
             for each in ranked
@@ -320,20 +325,26 @@ class _Search:
             own = replace(each.proposal, point=first, measured=self.judge.measure(turned))
             judged = [own, *self._measure(others, trials)]
             chosen, term = self.judge.judge(base, others, judged, each.filtered, None)
-            if self._is_enough(base, others, chosen, True):
+            if self._is_enough(base, others, chosen, True, is_final=True):
                 current = chosen.measured or current
                 kept.append(replace(each, proposal=chosen, term=term))
             else:
                 current = others
         return self._reconsider(base, current, kept) if 0 < len(kept) < len(found) else (current, kept)
 
-    def _is_enough(self, base: Measured, current: Measured, proposal: Proposal, is_further: bool) -> bool:
-        """Return whether a term removes enough of the error and helps in every split."""
+    def _is_enough(
+        self, base: Measured, current: Measured, proposal: Proposal, is_further: bool, *, is_final: bool
+    ) -> bool:
+        """Return whether a term removes enough of the error and helps in every split.
+
+        is_final: whether a further term removes enough in every split, as the terms beside it have their final forms;
+        before, these may have stood in for it, and only the search's split counts
+        """
         if proposal.measured is None:
             return False
         before, after = current.rmse[0, 1], proposal.measured.rmse[0, 1]
         gains = self.judge.measure_gains(base, current, proposal.measured)
-        shares = [each.held_out for each in gains if is_further or each.split == self.splits[0].name]
+        shares = [each.held_out for each in gains if is_final or each.split == self.splits[0].name]
         if is_further and proposal.candidate.form.kind == CURVE:
             return False  # beside a term it follows what that one leaves
         minimum = MIN_FURTHER_REDUCTION if is_further else MIN_REDUCTION
@@ -374,7 +385,7 @@ class _Search:
     # The answer
 
     def _describe(self, final: Point, found: Sequence[Found]) -> tuple[Finding, ...]:
-        """Return the findings with the numbers of the final fit.
+        """Return the findings with the numbers of the final fit, that of the largest gain first.
 
         The curve is the formula plus what the data still ask for there; its band is that of a curve without a formula.
         """
@@ -393,7 +404,12 @@ class _Search:
             chosen = replace(named, kind=term.chosen.kind, probability=term.chosen.probability, gain=term.chosen.gain)
             forms = tuple(chosen if form is term.chosen else form for form in term.forms)
             findings.append(Finding(replace(term, chosen=chosen, forms=forms), curve))
-        return tuple(findings)
+        return tuple(sorted(findings, key=lambda each: -each.term.chosen.gain))
+
+
+def _is_refused(term: TermClaim) -> bool:
+    """Return whether the judge of claims refuses the name of a term."""
+    return term.claim.verdict == "unexplained" and term.chosen.kind not in NAMELESS
 
 
 def _evaluate(form: Form, values: FloatArray, z: FloatArray) -> FloatArray:

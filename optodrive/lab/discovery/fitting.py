@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import comb, sqrt
 
 import numpy as np
 
@@ -20,6 +21,8 @@ TOLERANCE = 1e-7
 """Relative change of squares and point at which a fit ends."""
 CONVERGED = 1e-3
 """Change of a free run, relative to the outputs, at which the integration step is short enough."""
+DIFFERENCES, MIN_DIFFERENCES = (4, 8, 12), 32
+"""Orders of differences by which noise is estimated, and how many of one order are needed beside a gap."""
 LONGEST_FROM_REST = 8.0
 """First step tried between samples that are dense where light changes, in their median distance."""
 
@@ -279,16 +282,20 @@ def weigh(record: Record, errors: FloatArray, weights: FloatArray) -> FloatArray
 
 
 def estimate_noise(records: Sequence[Record]) -> FloatArray:
-    """Return an upper estimate of the measurement noise of each output [o], from fourth differences.
+    """Return an upper estimate of the noise of each output [o], the smallest from differences of some orders.
 
-    They vanish for a signal that is a cubic over five samples; the estimate is robust against steps.
+    Those of order n vanish for a signal that is a polynomial of degree n − 1 over n + 1 samples: a high order for an
+    oscillation of few samples per period, a low one beside steps and gaps. Medians are robust against steps.
     """
-    columns = range(records[0].outputs.shape[1])
     estimates = []
-    for column in columns:
-        differences = [np.diff(r.outputs[:, column], 4) / np.sqrt(70.0) for r in records if len(r.t_s) > 8]
-        joined = np.concatenate([d[np.isfinite(d)] for d in differences]) if differences else np.zeros(0)
-        estimates.append(1.4826 * float(np.median(np.abs(joined))) if len(joined) else 0.0)
+    for column in range(records[0].outputs.shape[1]):
+        bounds = []
+        for order in DIFFERENCES:
+            differences = [np.diff(record.outputs[:, column], order) for record in records if len(record.t_s) > order]
+            joined = np.concatenate([d[np.isfinite(d)] for d in differences]) if differences else np.zeros(0)
+            if len(joined) >= MIN_DIFFERENCES:
+                bounds.append(1.4826 * float(np.median(np.abs(joined))) / sqrt(comb(2 * order, order)))
+        estimates.append(min(bounds, default=0.0))
     return np.array(estimates)
 
 

@@ -24,6 +24,7 @@ from optodrive.core.types.arrays import FloatArray
     CLIP,
     DECAY,
 ) = range(14)
+CURVES = (SINE, COSINE, BUMP)
 MAX_EXPONENT = 50.0
 CURVE, CHANGE = "curve", "change with time"
 """Kinds that are no names: what follows the data without a formula of physics, and what no state explains."""

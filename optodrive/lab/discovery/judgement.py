@@ -41,6 +41,8 @@ SAME = 0.01
 """Squared difference of two functions, relative to the smaller one, below which they are one."""
 ALIKE_SIGMA, NEARLY = 2.0, 0.9
 """How far behind a simpler form may be, and which share of a curve's gain a formula of physics needs, to replace it."""
+NO_OFFSET = 0.1
+"""Value of a term where its variable is nearest to zero, relative to its largest, below which it vanishes there."""
 PER_NUMBER, PER_CHANGE = 0.5, 0.1
 """Weight of a form beforehand, for each number that it has more than another, and for a change with time."""
 
@@ -159,9 +161,16 @@ class Judge:
         named = dict[str, tuple[Proposal, Measured]]()
         for each, measured in sorted(fitted, key=lambda item: -float(item[1].logs.mean())):
             named[self.name(each).name] = each, measured  # of one name the best, which is the last
-        # Curves come last: one is as good as a formula of physics nearly everywhere.
+        # Curves come last: one is as good as a formula of physics nearly everywhere. Of equally simple forms one
+        # that vanishes where its variable does comes first, and then the better one: it stands for those like it.
         for each, measured in sorted(
-            named.values(), key=lambda item: (item[0].candidate.form.kind == CURVE, item[0].candidate.numbers)
+            named.values(),
+            key=lambda item: (
+                item[0].candidate.form.kind == CURVE,
+                item[0].candidate.numbers,
+                _has_offset(item[0]),
+                float(item[1].logs.mean()),
+            ),
         ):
             alike = [other for one, other in kept if _is_same(one, each) and _is_behind(other, measured) < ALIKE_SIGMA]
             if not alike:
@@ -299,6 +308,12 @@ def _compute_rms(errors: Sequence[FloatArray], masks: Sequence[BoolArray]) -> fl
     squares = sum(float(np.sum(each[mask] ** 2)) for each, mask in zip(errors, masks, strict=True))
     count = sum(int(np.count_nonzero(each[mask])) for each, mask in zip(errors, masks, strict=True))
     return float(np.sqrt(squares / max(count, 1)))
+
+
+def _has_offset(proposal: Proposal) -> bool:
+    """Return whether a term is not near zero where its variable is nearest to it, as after an offset."""
+    values = np.abs(proposal.evaluate(proposal.candidate.screened.nodes))
+    return bool(values[np.argmin(np.abs(proposal.candidate.screened.nodes))] > NO_OFFSET * values.max())
 
 
 def _is_same(one: Proposal, other: Proposal) -> bool:
