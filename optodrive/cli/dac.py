@@ -60,7 +60,6 @@ GROUP = typer.Typer(help="Play on a laser DAC; see docs/how-to/use-a-laser-dac.m
 @GROUP.command("list")
 def list_dacs(json: JsonOption = False) -> None:
     """Show the laser DACs on USB and in the network within two seconds. None is played because it was found."""
-    from optodrive.cli.dac import summarize_dacs
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.dac.discovery import find_dacs
 

@@ -93,7 +93,6 @@ def _report_changes(examination: "Callable[[], list[Finding]]", json: bool) -> N
     """Print all findings and then, with the time of day, those that change. With `json`, print one line per change."""
     from json import dumps
 
-    from optodrive.cli.doctor import watch
     from optodrive.core.clock import MonotonicClock
 
     for number, changed in enumerate(watch(examination, MonotonicClock())):

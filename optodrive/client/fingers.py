@@ -13,7 +13,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import build_error
+from optodrive.client.problems import build_error
 from optodrive.client.sockets import LoopThread, open_connection
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.numeric_tables import read_columns

@@ -18,7 +18,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
 from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import parse_problem, run_blocking
+from optodrive.client.exchange import run_blocking
+from optodrive.client.problems import parse_problem
 from optodrive.core.errors import OptodriveError
 
 OPEN_TIMEOUT_S = 2.5

@@ -126,6 +126,7 @@ def test_a_signal_that_ends_a_push_ends_its_light(rig, tmp_path, number):
         process.send_signal(number)
         errors = process.stderr.read()
     assert process.returncode == 130
+    wait_for(lambda: daemon.state()["queue"]["running"] is None, "the end of the plan, which a stop reports later")
     (plan,) = daemon.state()["queue"]["plans"][-1:]
     assert plan["status"] in ("cancelled", "stopped"), errors
     assert daemon.board_state() == ("ARMED" if plan["status"] == "cancelled" else "DISARMED")

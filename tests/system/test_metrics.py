@@ -61,6 +61,8 @@ def test_faults_are_counted_once_by_name(armed):
     engine._planner._progress_at_s = -1e9  # as if it had stalled: no lease from now on
     engine._planner._pending_count = 1
     wait_for(lambda: engine.board_state == "FAULT", "the lease to lapse")
+    # The state arrives with a report of the link process, which the engine counts in its next turn.
+    wait_for(lambda: ("optodrive_board_faults_total", "LINK") in read(engine.render_metrics()), "the count")
     for _ in range(3):
         assert read(engine.render_metrics())["optodrive_board_faults_total", "LINK"] == 1
     engine._planner._pending_count = 0

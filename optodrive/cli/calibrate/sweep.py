@@ -169,7 +169,6 @@ def _build_displays(out: Path, config: str | None, aims: "list[Aim]") -> "tuple[
 
     Return the number of pulses, too.
     """
-    from optodrive.cli.calibrate.sweep import write_sweep_files
     from optodrive.cli.options import load_run_config
     from optodrive.planning.display_model import DisplayModel
 

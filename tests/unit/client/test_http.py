@@ -18,8 +18,6 @@ from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import (
     STOP_LOST_TIMEOUTS_S,
     ExchangePolicy,
-    build_error,
-    parse_problem,
     parse_response,
     run_blocking,
 )
@@ -31,6 +29,7 @@ from optodrive.client.http import (
     BlockingHttp,
 )
 from optodrive.client.plan import report_loss
+from optodrive.client.problems import build_error, parse_problem
 from optodrive.client.requests import READ_STATE, STOP, build_push_request, parse_as
 from optodrive.client.sockets import OPEN_TIMEOUT_S, open_connection
 from optodrive.core.errors import (
