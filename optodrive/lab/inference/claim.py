@@ -53,6 +53,8 @@ MAX_WORSE_SIGMA = 3.0
 """Largest increase of a held-out signal's error, in σ, that counts as noise."""
 MAX_GROWTH = 1.0
 """Largest increase of a held-out signal's mean square error, relative to that by noise, that counts as noise."""
+MAX_RATIO = 2.0
+"""Ratio of a held-out signal's rms errors with and without an extension, above which it is no explanation at all."""
 MIN_TRAINED = 0.02
 """Share of the avoidable error that a term removes in training, below which a split cannot test it."""
 MIN_KEPT = 0.5
@@ -338,7 +340,7 @@ def _list_refusals(item: Alternative) -> tuple[str, ...]:
     total = HeldOutChange("", "", sum(each.chi2 for each in item.held_out), noise)
     if total.sigma > MAX_WORSE_SIGMA:
         out.append(f"With {item.name}, the held-out runs are predicted worse, by {total.sigma:.1f} σ.")
-    if sum(each.growth for each in item.held_out) > MAX_GROWTH:
+    if any(each.growth > MAX_GROWTH and each.rms[1] > MAX_RATIO * each.rms[0] for each in item.held_out):
         out += _list_growths(item)
     if item.nameless:
         out.append(f"{item.name} is no name: {item.nameless}.")

@@ -30,6 +30,7 @@ from optodrive.lab.inspection.work import (
     describe,
     drop_signal,
     list_names,
+    measures_alike,
     remove_samples,
     select_finite,
 )
@@ -98,8 +99,14 @@ def _list_early(work: Work, name: str) -> dict[int, tuple[float, float]]:
     shares = {item.run: abs(item.share) for item in measure_responses(work, name)}
     lost: dict[int, tuple[float, float]] = {}
     for number, share in shares.items():
-        pulses = work.runs[number].pulses  # groups of equal light tell more together
-        repeats = [run for run in shares if run != number and np.array_equal(work.runs[run].pulses, pulses)]
+        same = work.runs[number]  # groups of equal light tell more together
+        repeats = [
+            run
+            for run in shares
+            if run != number
+            and np.array_equal(work.runs[run].pulses, same.pulses)
+            and measures_alike(work.runs[run], same)
+        ]
         own = select_finite(work.signals[number, name])[1:]
         found = [
             early

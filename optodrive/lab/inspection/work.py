@@ -86,7 +86,7 @@ class Work:
         )
 
     def find_repeats(self, run: int) -> list[int]:
-        """Return the other runs of a run's group, or with equal light and commands if it states none."""
+        """Return the other runs of a run's group that measure its pixels, or with equal light if it states none."""
         if run not in self._repeats:
             self._repeats[run] = self._list_repeats(run)
         return self._repeats[run]
@@ -103,7 +103,16 @@ class Work:
                 other.attributes.get("group") is None and is_same and (other.commands is None) == (own.commands is None)
             )
 
-        return [number for number, other in enumerate(self.runs) if number != run and is_repeat(other)]
+        return [
+            number
+            for number, other in enumerate(self.runs)
+            if number != run and is_repeat(other) and measures_alike(own, other)
+        ]
+
+
+def measures_alike(own: Run, other: Run) -> bool:
+    """Return whether signals of one name are of one pixel in both runs: one train of light drives many pixels."""
+    return all(signal.pixel == own.signals[name].pixel for name, signal in other.signals.items() if name in own.signals)
 
 
 def select_finite(signal: Signal) -> tuple[BoolArray, FloatArray, FloatArray]:
