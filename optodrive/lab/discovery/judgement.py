@@ -20,6 +20,7 @@ from optodrive.lab.discovery.model import Record
 from optodrive.lab.discovery.screening import Candidate, Filtered, find_twin
 from optodrive.lab.inference.claim import (
     MIN_KEPT,
+    MIN_LISTED,
     Alternative,
     Evidence,
     SplitGain,
@@ -226,7 +227,7 @@ class Judge:
             gains[chosen],
         )
         if found.claim.verdict not in ("cause", "none", "undecided"):
-            rival = next((k for k in ranked if k != chosen and weights[k] >= 0.01), None)
+            rival = next((k for k in ranked if k != chosen and weights[k] >= MIN_LISTED), None)
             found = replace(found, next_record=self._propose_record(kept, forms, chosen, rival, gains[chosen]))
         return kept[chosen][0], found
 

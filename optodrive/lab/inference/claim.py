@@ -336,8 +336,7 @@ def _list_refusals(item: Alternative) -> tuple[str, ...]:
     out = []
     if item.explained is not None and item.explained[0] < MIN_EXPLAINED:
         out.append(f"{item.name} explains {_format_share(item.explained[0])} of the excess, less than half.")
-    noise = sum(each.noise**2 for each in item.held_out) ** 0.5
-    total = HeldOutChange("", "", sum(each.chi2 for each in item.held_out), noise)
+    total = _sum_changes(item.held_out)
     if total.sigma > MAX_WORSE_SIGMA:
         out.append(f"With {item.name}, the held-out runs are predicted worse, by {total.sigma:.1f} σ.")
     if any(each.growth > MAX_GROWTH and each.rms[1] > MAX_RATIO * each.rms[0] for each in item.held_out):
@@ -350,6 +349,11 @@ def _list_refusals(item: Alternative) -> tuple[str, ...]:
         if each.held_out < 0.0
     ]
     return tuple(out)
+
+
+def _sum_changes(changes: Sequence[HeldOutChange]) -> HeldOutChange:
+    """Return the change of all held-out data together."""
+    return HeldOutChange("", "", sum(each.chi2 for each in changes), sum(each.noise**2 for each in changes) ** 0.5)
 
 
 def _list_growths(item: Alternative) -> list[str]:
@@ -382,6 +386,8 @@ def _list_doubts(item: Alternative) -> tuple[str, ...]:
         if each.sigma > MAX_WORSE_SIGMA
     ]
     out += _list_growths(item)
+    if item.held_out and _sum_changes(item.held_out).chi2 >= 0.0:
+        out.append(f"With {item.name}, the held-out runs together are predicted no better.")
     out += [f"{key} is not certain: {clause}." for key, clause in item.doubts.items()]
     return tuple(out)
 

@@ -48,6 +48,7 @@ SETS = (*((key,) for key in CAUSES), ("gas_leak", "laser_droop"), ("high_pass", 
 BETTER = HeldOutChange("strong", "displacement_m", -400.0, 40.0)
 GROWN = HeldOutChange("strong", "displacement_m", -400.0, 40.0, (2.8e-5, 6.7e-5, 2e-6))
 """Better by χ², since its shape fits, and more than twice as far off: its height differs."""
+SAME = HeldOutChange("strong", "displacement_m", 2.0, 1.0)
 OFF = HeldOutChange("strong", "displacement_m", -400.0, 40.0, (5.4e-6, 6.4e-6, 2e-6))
 SHRUNK = HeldOutChange("strong", "absorber_temperature_K", -400.0, 40.0, (14.0, 1.0, 0.1))
 WORSE = HeldOutChange("strong", "absorber_temperature_K", 50.0, 10.0)
@@ -75,6 +76,7 @@ def test_a_cause_that_meets_all_conditions_is_named():
         ({"explained": (0.8, 0.85)}, "ambiguous", "85.0 % of the excess in all", "MIN_EXPLAINED_WITH_FORMS"),
         ({"held_out": (BETTER, WORSE)}, "ambiguous", "absorber_temperature_K .* strong .* 5.0 σ", "MAX_WORSE_SIGMA"),
         ({"held_out": (WORSE,)}, "unexplained", "predicted worse, by 5.0 σ", "MAX_WORSE_SIGMA"),
+        ({"held_out": (SAME,)}, "ambiguous", "the held-out runs together are predicted no better", ""),
         ({"held_out": (GROWN,)}, "unexplained", "rms error of displacement_m .* strong is 2.4 times", "MAX_GROWTH"),
         ({"held_out": (SHRUNK, GROWN)}, "unexplained", "rms error of displacement_m .* is 2.4 times", "MAX_GROWTH"),
         ({"held_out": (SHRUNK, OFF)}, "ambiguous", "rms error of displacement_m .* is 1.2 times", "MAX_GROWTH"),
@@ -93,9 +95,15 @@ def test_each_condition_keeps_a_cause_from_being_named(monkeypatch, changes, ver
     if limit:
         for name in ("MIN_EXPLAINED", "MIN_EXPLAINED_WITH_FORMS") if limit == "MIN_EXPLAINED" else (limit,):
             monkeypatch.setattr(judge, name, 1e9 if limit in ("MAX_WORSE_SIGMA", "MAX_GROWTH") else -1e9)
-        assert claim(make_evidence(**changes)).verdict == "cause"
+        # Held-out data that is worse together is no better either, which is a doubt of its own.
+        assert claim(make_evidence(**changes)).verdict == (
+            "ambiguous" if changes == {"held_out": (WORSE,)} else "cause"
+        )
     else:
-        assert claim(make_evidence(**changes | {"doubts": {}, "gains": (), "nameless": ""})).verdict == "cause"
+        assert (
+            claim(make_evidence(**changes | {"doubts": {}, "gains": (), "nameless": "", "held_out": (BETTER,)})).verdict
+            == "cause"
+        )
 
 
 def test_without_repeats_nothing_is_certain():
