@@ -208,6 +208,7 @@ def _build_output(
     width_m: float | None,
     discovery: "PixelDiscovery | None" = None,
 ) -> _DiagnosisOutput:
+    from optodrive.core.document import Section
     from optodrive.lab.diagnosis.model_file import build_model_toml
     from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
     from optodrive.lab.diagnosis.report import build_report
@@ -215,7 +216,7 @@ def _build_output(
     from optodrive.lab.pixel_discovery.planned_terms import build_planned_terms
     from optodrive.physics.discovered_term import DiscoveredTerm
 
-    document, lines, sections = None, list[str](), list[str]()
+    document, lines, sections = None, list[str](), list[Section]()
     base, terms, discovered = diagnosis.base, diagnosis.terms, list[DiscoveredTerm]()
     if discovery is not None:
         document, lines = narrative.build_document(discovery), narrative.build_lines(discovery)
@@ -223,7 +224,7 @@ def _build_output(
             planned = build_planned_terms(discovery)
             base, terms, discovered = base | planned.base, {}, [*planned.terms]
             lines += narrative.build_planning_lines(planned, str(Path(out) / "model.toml"))
-        sections = narrative.build_sections(discovery, lines)
+        sections = [narrative.build_section(discovery, lines)]
         lines = ["", *lines]
     width_m = width_m or DEFAULT_BRIDGE_WIDTH_M
     model = build_model_toml(base, terms, diagnosis.verdict, title, width_m, discovered=discovered) if base else None

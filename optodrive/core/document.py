@@ -5,9 +5,8 @@ Theory of operation
 A result is told once. Its sentences are lines of text, which the terminal prints as they are: the first is the
 headline, "- " begins an item, and two spaces continue one. A `Document` adds to them sections of paragraphs, tables
 and figures, which only a page shows, and renders all of it as one HTML file without scripts, in light and dark
-colours. Text is escaped where it is rendered, so a document holds plain text; `Markup` is
-the exception.
-The same result as JSON is `to_json` of its dataclasses.
+colours. Text is escaped where it is rendered, so a document holds plain text; `Markup` is the exception. The same
+result as JSON is `to_json` of its dataclasses.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -198,15 +197,3 @@ def to_json(value: Any, /, **names: str) -> Any:
     if isinstance(value, tuple | list):
         return [to_json(item, **names) for item in value]
     return None if isinstance(value, float) and not isfinite(value) else value
-
-
-def render_table(
-    header: Sequence[str],
-    rows: Iterable[Sequence[str]],
-    numeric_columns: Collection[int] = (),
-    label: str = "table",
-    marked_rows: Collection[int] = (),
-) -> str:
-    """Return a table whose cells are HTML."""
-    cells = [tuple(map(Markup, row)) for row in rows]
-    return Table(label, header, cells, numeric_columns, marked_rows).to_html()

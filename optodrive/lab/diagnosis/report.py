@@ -47,21 +47,21 @@ def build_report(
     recordings: Sequence[str] = ("recording.h5",),
     out: str = OUT,
     config: str | None = None,
-    sections: Sequence[str] = (),
+    sections: Sequence[Section] = (),
 ) -> str:
     """Return the report as HTML.
 
     recordings, out, config: what was diagnosed, the report's folder and the configuration, as the command named them;
-    sections: HTML that follows the probabilities
+    sections: those that follow the probabilities
     """
     has_extension = bool(discrepancy.terms)
     models = f"{NOMINAL}, {EXTENDED}" if has_extension else NOMINAL
     steps = SearchLog().attempt("next steps", list_next_steps, list[NextStep](), discrepancy, recordings, out, config)
-    data = Markup("\n".join(build_section(discrepancy.data_findings, discrepancy.inspection_failures)))
+    data = build_section(discrepancy.data_findings, discrepancy.inspection_failures)
     body: list[Section | Markup] = [
         *_build_next_steps(steps),
         _build_probabilities(discrepancy.probabilities),
-        *map(Markup, sections),
+        *sections,
         Section(
             "Measured against model",
             [
@@ -95,7 +95,7 @@ def build_report(
             ],
         ),
     ]
-    opening: list[Section | Markup] = [data, Section("The answer", ())]
+    opening = [data, Section("The answer", ())]
     return Document(title, discrepancy.verdict, build_narrative(discrepancy), body, provenance, opening).to_html()
 
 

@@ -15,7 +15,8 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.measurements import DataFinding, Measurement, Signal
 from optodrive.lab.inspection.repeat_faults import SAME_PHASE, find_gains, find_lost, find_noisy, find_outliers
-from optodrive.lab.inspection.response_faults import RESPONSE_STEPS, find_saturation
+from optodrive.lab.inspection.response_faults import RESPONSE_STEPS
+from optodrive.lab.inspection.saturation import find_saturation
 from optodrive.lab.inspection.signal_faults import (
     find_ceiling,
     find_hold,

@@ -1,10 +1,8 @@
 """The first page about a recording as text, as JSON and as HTML."""
 
-from collections.abc import Iterator
-from html import escape
 from typing import Any
 
-from optodrive.core.document import render_table
+from optodrive.core.document import Markup, Section, Table
 from optodrive.core.types.measurements import DataFinding
 from optodrive.lab.inspection.work import count, list_names
 
@@ -37,25 +35,16 @@ def build_finding(item: DataFinding) -> dict[str, Any]:
     }
 
 
-def build_section(findings: tuple[DataFinding, ...], failures: tuple[str, ...]) -> Iterator[str]:
+def build_section(findings: tuple[DataFinding, ...], failures: tuple[str, ...]) -> Section:
     """Return the page as a section of a report."""
     omitted = sum(item.action == "left out" for item in findings)
-    yield "<h2>The data</h2>"
-    yield "<p>What the samples show before any model is fitted. "
-    yield (
-        f"{count(omitted, 'finding')} left something out, which the verdict does not rest on.</p>"
-        if omitted
-        else f"{NOTHING}</p>"
-    )
-    rows = [
-        (
-            escape(item.kind),
-            f"<span class='nowrap'>{item.action}</span>",
-            escape(item.text),
-            escape(list_names(item.runs)),
-        )
-        for item in sort_findings(findings)
+    left_out = f"{count(omitted, 'finding')} left something out, which the verdict does not rest on."
+    listed = sort_findings(findings)
+    rows: list[tuple[str, str, str, str]] = [
+        (item.kind, Markup(f"<span class='nowrap'>{item.action}</span>"), item.text, list_names(item.runs))
+        for item in listed
     ]
-    rows += [("could not be inspected", "", escape(item), "") for item in failures]
-    marked = frozenset(row for row, item in enumerate(sort_findings(findings)) if item.action != "noted")
-    yield render_table(("kind", "action", "finding", "runs"), rows, label="The data", marked_rows=marked)
+    rows += [("could not be inspected", "", item, "") for item in failures]
+    marked = [row for row, item in enumerate(listed) if item.action != "noted"]
+    opening = f"What the samples show before any model is fitted. {left_out if omitted else NOTHING}"
+    return Section("The data", [opening, Table("The data", ("kind", "action", "finding", "runs"), rows, (), marked)])

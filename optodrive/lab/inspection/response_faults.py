@@ -58,20 +58,6 @@ OWN_FITS, OTHER_FITS, GAIN_AGREES, GAIN_DIFFERS, REPEATS_AGREE, MAX_SUSPICIOUS, 
 """Of exchanged runs: share explained below which a run is suspicious, and above which another's light suits; agreement
 of gains, in logarithms, their difference, and the agreement of those of repeats; largest share of such runs; by
 how much less than repeats the own light explains."""
-BENDS, BEND_WIDTHS, BEND_TAUS_S = (
-    0.5 - 0.5 * np.cos(np.linspace(0.35, 2.79, 24)),
-    (0.0, 0.045),
-    np.geomspace(0.003, 0.1, 16),
-)
-REST_SHARE = 0.03
-"""Share of the range of displacement or force within which a level part is the rest."""
-BEND_MEANS, BEND_PULSES, MIN_BEND_RUNS, LEVEL_SLOPE, BEND_SIGMAS, BEND_REACH, BEND_ERROR, OWN_LEAVES = (
-    *(60, 12, 3, 0.2, 4.5),
-    *(3.0, 0.02, 1.3),
-)
-"""Of saturation, relative to the largest response: where a signal becomes level, and widths of the bend; means and
-pulses of a run; smallest number of runs; largest slope of the level part relative to the other; significance; widths of
-the bend that are left out before it; error of its place; variance that bends of each run at least leave, relative."""
 FEW_TYPICAL = 0.01
 TYPICAL = {TEMPERATURE: 1.0, "displacement_m": 2e-6, "force_N": 1.15e-4}
 """Typical ratios of the signals, per K; a signal below a hundredth of it in all runs does not respond."""
@@ -99,7 +85,6 @@ class Response:
         return abs(self.gain) > 0.5 * VISIBLE * self.error and abs(self.share) > 0.3
 
 
-_Means = tuple[FloatArray, FloatArray, int, FloatArray]
 Member = tuple[int, Signal, FloatArray, FloatArray, FloatArray]
 
 
@@ -294,91 +279,6 @@ def _find_shifts_of(work: Work, name: str) -> tuple[float, dict[int, float]]:
         tau = int(np.argmin(typical[:, is_near].min(axis=1)))
     late = {run: _find_late_s(item[tau], common_s) for run, item in left.items()}
     return common_s, {run: shift_s for run, shift_s in late.items() if shift_s != common_s}
-
-
-@dataclass(frozen=True, eq=False)
-class _Bend:
-    """Signals as a function of the light's response with one bend: rest of variance, slopes, significance, response."""
-
-    left: float
-    below: float
-    beyond: float
-    sigmas: float
-    x: FloatArray
-
-
-def find_saturation(work: Work, name: str) -> tuple[float, float, float] | None:
-    """Return 1 for the highest value or −1 for the lowest, this value, and the reach of the bend before it, or None.
-
-    The signal of all runs is one function of the light's response, which nothing in a pixel makes level at one value.
-    """
-    members = _list_means(work, name)
-    if len(members) < MIN_BEND_RUNS:
-        return None
-    value = np.concatenate([mean for _, _, _, mean in members])
-    found = _fit_bend(members, name, value, is_own=False)
-    if min(found.below, found.beyond) > LEVEL_SLOPE * max(found.below, found.beyond) or found.sigmas < BEND_SIGMAS:
-        return None
-    is_high, excess, y = found.below > found.beyond, _bend(found.x), value - value.mean()
-    if is_high and _fit_bend(members, name, value, is_own=True).left < OWN_LEAVES * found.left:
-        return None  # each run bends at a share of its own largest response, as where the light itself falls
-    parts = found.x[:, None] - excess if is_high else excess
-    centred = parts - parts.mean(axis=0)
-    gains = y @ centred / (centred**2).sum(axis=0)
-    at = int(np.argmax(gains * (y @ centred)))
-    ends = value.mean() - gains * parts.mean(axis=0) + np.tile(BENDS, len(BEND_WIDTHS)) * gains * is_high
-    if not is_high and name != TEMPERATURE and abs(ends[at]) < REST_SHARE * float(np.ptp(value)):
-        return None  # the zero of displacement and force is their rest, at which a slack membrane is level, too
-    reach = gains[at] * (BEND_REACH * np.repeat(BEND_WIDTHS, len(BENDS))[at] + BEND_ERROR)
-    return (1.0 if is_high else -1.0), float(ends[at]), float(reach)
-
-
-def _fit_bend(members: list[_Means], name: str, value: FloatArray, *, is_own: bool) -> _Bend:
-    """Return the best bend, at a value of all runs, or at a share of each run's own largest response."""
-    y, best = value - value.mean(), _Bend(np.inf, 1.0, 1.0, 0.0, value)
-    for tau_s in BEND_TAUS_S:
-        own = [
-            compute_template(pulses, t_s, tau_s, get_second_s(name)).reshape(-1, size).mean(axis=1)
-            for pulses, t_s, size, _ in members
-        ]
-        x = np.concatenate(own)
-        x /= max(float(x.max()), 1e-300)
-        scale = np.concatenate([np.full(len(item), item.max()) for item in own]) if is_own else np.ones(len(x))
-        excess, line = scale[:, None] * _bend(x / scale), x - x.mean()
-        slope, along = float(line @ y / (line @ line)), line @ excess / (line @ line)
-        beside = excess - excess.mean(axis=0) - line[:, None] * along
-        weight = np.maximum((beside**2).sum(axis=0), 1e-9)
-        turns = y @ beside / weight
-        at = int(np.argmax(turns**2 * weight))
-        left = float(((y - slope * line - turns[at] * beside[:, at]) ** 2).sum())
-        if left < best.left:
-            below, error = slope - turns[at] * along[at], np.sqrt(INDEPENDENT * left / len(y) / weight[at])
-            best = _Bend(left, float(below), float(below + turns[at]), float(abs(turns[at]) / error), x)
-    return best
-
-
-def _bend(x: FloatArray) -> FloatArray:
-    """Return by how much the response exceeds each bend [n, widths × bends]."""
-    over = x[:, None] - BENDS
-    return np.concatenate(
-        [width * np.logaddexp(0.0, over / width) if width else np.maximum(over, 0.0) for width in BEND_WIDTHS], axis=1
-    )
-
-
-def _list_means(work: Work, name: str) -> list[_Means]:
-    """Return pulses, times, samples in a mean, and means of the runs that respond, of the pixel measured most."""
-    seen = [item.run for item in measure_responses(work, name) if item.is_seen]
-    members = [item for item in list_responding(work, name) if item[0] in seen]
-    pixels = [signal.pixel for _, signal, _, _, _ in members]
-    out = []
-    for _, signal, pulses, _, _ in members:
-        _, t_s, value = select_finite(signal)
-        end = int(np.searchsorted(t_s, pulses[BEND_PULSES, 0])) if len(pulses) > BEND_PULSES else len(t_s)
-        size = max(end // BEND_MEANS, 1)
-        end -= end % size
-        if signal.pixel == max(pixels, key=pixels.count) and end:
-            out.append((pulses[:BEND_PULSES], t_s[:end], size, value[:end].reshape(-1, size).mean(axis=1)))
-    return out
 
 
 def get_second_s(name: str) -> float:

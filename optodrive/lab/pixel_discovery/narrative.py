@@ -1,9 +1,9 @@
 """A discovery in a pixel as text, as JSON and as a section of the report."""
 
 from collections.abc import Sequence
-from html import escape
 from typing import Any
 
+from optodrive.core.document import Figure, Section
 from optodrive.core.quantity import format_quantity
 from optodrive.core.svg_plot import Axis, Series, draw_plot
 from optodrive.lab.discovery import Curve
@@ -105,14 +105,13 @@ def build_document(discovery: PixelDiscovery) -> dict[str, Any]:
     }
 
 
-def build_sections(discovery: PixelDiscovery, lines: Sequence[str]) -> list[str]:
+def build_section(discovery: PixelDiscovery, lines: Sequence[str]) -> Section:
     """Return the section of the report: lines of text, and the curve of each term with its 95 % band."""
-    parts = ["<h2>Terms that nobody wrote down</h2>", *(f"<p>{escape(line)}</p>" for line in lines)]
     curves = [_draw_curve(each, each.curve) for each in discovery.findings if each.curve is not None]
-    return [*parts, "<div class='grid'>", *curves, "</div>"] if curves else parts
+    return Section("Terms that nobody wrote down", [*lines, *([curves] if curves else [])])
 
 
-def _draw_curve(finding: PixelFinding, curve: Curve) -> str:
+def _draw_curve(finding: PixelFinding, curve: Curve) -> Figure:
     form = finding.term.chosen
     quantity, unit = VARIABLES[form.depends_on[0]]
     factor = VARIABLES[form.depends_on[1]] if len(form.depends_on) > 1 else None
@@ -121,4 +120,4 @@ def _draw_curve(finding: PixelFinding, curve: Curve) -> str:
     plot = draw_plot(f"{form.where} against {quantity}", curve.x, Axis(quantity, unit), y_axis, series, PLOT_HEIGHT)
     span = f"{format_quantity(float(curve.x[0]), unit)} to {format_quantity(float(curve.x[-1]), unit)}"
     caption = f"{form.formula}; over the data, {span}, and not tested outside. Dashed: 95 % band."
-    return f"<figure>{plot}<figcaption>{escape(caption)}</figcaption></figure>"
+    return Figure(plot, caption)
