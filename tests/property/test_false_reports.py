@@ -92,6 +92,11 @@ class Scene:
         """Arm and execute a plan, now that the link is honest."""
         rig = self.rig
         result = self.await_result(WEB, "disarm")
+        if result["error"] is not None:  # a link keeps what HELLO stated until an honest answer contradicts it
+            assert result["error"]["code"] == "link", result
+            assert any(field.message == "HELLO_REPLY" for field in self.tampering[0]), result
+            self.step(SETTLED_S)
+            result = self.await_result(WEB, "disarm")
         assert result["error"] is None, result
         result = self.arm()
         assert result["error"] is None, result

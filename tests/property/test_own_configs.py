@@ -83,7 +83,7 @@ def check_diagnosis(tmp_path, capsys, data, table, seed):
     recording, executed = record(capsys, tmp_path, path, data.draw(frames(display)), seed)
     status, answer, error = call(capsys, "diagnose", recording, "--config", path, "--json", "-")
     assert status == 0 or not executed, error
-    assert answer is None or (answer["verdict"], answer["causes"]) == ("none", [])
+    assert answer is None or (answer["verdict"] in ("none", "undecided") and answer["causes"] == [])
 
 
 @given(st.data(), tables(st.integers(1, 2)), SEEDS)
