@@ -38,7 +38,7 @@ def build_finding(item: DataFinding) -> dict[str, Any]:
 def build_section(findings: tuple[DataFinding, ...], failures: tuple[str, ...]) -> Section:
     """Return the page as a section of a report."""
     omitted = sum(item.action == "left out" for item in findings)
-    left_out = f"{count(omitted, 'finding')} left something out, which the verdict does not rest on."
+    summary = f"{count(omitted, 'finding')} left something out, which the verdict does not rest on."
     listed = sort_findings(findings)
     rows: list[tuple[str, str, str, str]] = [
         (item.kind, Markup(f"<span class='nowrap'>{item.action}</span>"), item.text, list_names(item.runs))
@@ -46,5 +46,5 @@ def build_section(findings: tuple[DataFinding, ...], failures: tuple[str, ...]) 
     ]
     rows += [("could not be inspected", "", item, "") for item in failures]
     marked = [row for row, item in enumerate(listed) if item.action != "noted"]
-    opening = f"What the samples show before any model is fitted. {left_out if omitted else NOTHING}"
+    opening = f"What the samples show before any model is fitted. {summary if omitted else NOTHING}"
     return Section("The data", [opening, Table("The data", ("kind", "action", "finding", "runs"), rows, (), marked)])
