@@ -3,7 +3,7 @@
 Every order starts cold and uses the same pulse rule: each pulse is the shortest that reaches its target from the
 residual heat at its start. The naive order visits the pixels row by row; each of its moves takes 0.4 ms plus the
 distance at the slew rate. The solver is LKH (elkai), with the settling times of the scheduler. The lower bound is
-beam-on time alone: the same pulses without moves and without rounding to whole PWM periods.
+beam-on time alone: the same pulses without moves and at full power, so without rounding to whole PWM periods.
 """
 
 import time
@@ -78,10 +78,10 @@ class OrderBenchmark:
         return path if origin is None else path[1:]
 
     def plan_order(self, frames, order_of, move_us):
-        """Return the total time, the beam-on time with and without rounding to PWM periods, s, and the pulse count."""
+        """Return the total time, the beam-on time as sent and at full power, s, and the pulse count."""
         heat = self.display.build_cold_heat()
         now_us, pixel_before, dwell_us = 0, None, LONG_DWELL_US
-        light_us, exact_us, count = 0, 0.0, 0
+        light_us, full_power_us, count = 0, 0.0, 0
         for target_m in frames:
             for pixel in order_of(np.flatnonzero(target_m > 0), pixel_before).tolist():
                 move = move_us(pixel_before, pixel, dwell_us)
@@ -94,9 +94,14 @@ class OrderBenchmark:
                 heat.apply_pulses(np.array([pixel]), start_s, np.array([width_us * 1e-6]), np.array([power_w]))
                 now_us += move + width_us
                 light_us, count = light_us + width_us, count + 1
-                exact_us += (pulse[0] - 1 + pulse[1]) * self.drive.period_s * 1e6
+                full_power_us += pulse[0] * pulse[1] * self.drive.period_s * 1e6  # the duty holds in every period
                 pixel_before, dwell_us = pixel, width_us
-        return {"total_s": now_us * 1e-6, "light_s": light_us * 1e-6, "exact_s": exact_us * 1e-6, "count": count}
+        return {
+            "total_s": now_us * 1e-6,
+            "light_s": light_us * 1e-6,
+            "full_power_s": full_power_us * 1e-6,
+            "count": count,
+        }
 
 
 def build_cases(bench):
@@ -127,7 +132,7 @@ def measure_case(bench, name, frames):
     solver_s = time.process_time() - begin_s
     ours = bench.plan_order(frames, bench.order_by_scheduler, bench.compute_move_us)
     naive = bench.plan_order(frames, bench.order_by_row, bench.compute_naive_move_us)
-    floor_s = bench.plan_order(frames, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
+    floor_s = bench.plan_order(frames, bench.order_by_scheduler, lambda *_: 0)["full_power_s"]
     yield f"{name}: pixels shown", ours["count"], "1"
     for who, result in (("naive", naive), ("solver", solver), ("scheduler", ours)):
         yield f"{name}: pixels per second, {who}", result["count"] / result["total_s"], "1/s"
@@ -137,8 +142,8 @@ def measure_case(bench, name, frames):
     excess_s = ours["total_s"] - floor_s
     for part, part_s in (
         ("moves", ours["total_s"] - ours["light_s"]),
-        ("whole PWM periods", ours["light_s"] - ours["exact_s"]),
-        ("heat lost meanwhile", ours["exact_s"] - floor_s),
+        ("whole PWM periods", ours["light_s"] - ours["full_power_s"]),
+        ("heat lost meanwhile", ours["full_power_s"] - floor_s),
     ):
         yield f"{name}: excess over lower bound, fraction by {part}", part_s / excess_s, "1"
     yield f"{name}: CPU time of the solver", solver_s, "s CPU"
