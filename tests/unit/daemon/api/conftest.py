@@ -1,6 +1,7 @@
 """Application without the other processes of the daemon, for tests of routes."""
 
 import asyncio
+import json
 from pathlib import Path
 
 import httpx
@@ -16,13 +17,23 @@ from optodrive.device.config_sections import DaemonSection
 from optodrive.planning.display_model import DisplayModel
 
 
-@pytest.fixture(scope="session")
-def app():
-    """Application of the smallest display, with one token per role, whose secret is the role's name."""
+def build_application():
+    """Build the application of the smallest display, with one token per role, whose secret is the role's name."""
     display = DisplayModel.from_config(load_config("display-16"))
     folder = RuntimeFolder(Path("nowhere"), Path("nowhere/link.sock"), 0o600, Path("nowhere"))
     policy = AccessPolicy(Tokens(Token(role, role, role) for role in ROLES), DaemonSection())
     return build_app(DaemonClient(display, folder), policy)
+
+
+@pytest.fixture(scope="session")
+def app():
+    return build_application()
+
+
+@pytest.fixture
+def own_app():
+    """An application of the test's own, which it may change."""
+    return build_application()
 
 
 @pytest.fixture
@@ -40,3 +51,45 @@ def send(app):
         return asyncio.run(exchange())
 
     return send
+
+
+PARAMETERS = {"{plan_id}": "p1", "{name}": "pixel", "{name:path}": "index.html"}
+
+
+@pytest.fixture
+def ask(app):
+    """Function that sends one request, or the handshake of a WebSocket, to a route. It returns status and problem."""
+
+    def ask(key, query="", body=b"", role="armer", to=app, **headers):
+        method, path = key.split(" ")
+        for name, value in PARAMETERS.items():
+            path = path.replace(name, value)
+        is_socket = method == "WEBSOCKET"
+        received = [{"type": "websocket.connect"} if is_socket else {"type": "http.request", "body": body}]
+        sent = []
+        stated = {"host": "localhost", "authorization": role and f"Bearer {role}"}
+        stated |= {"content-length": str(len(body)) if body else None} | headers
+
+        async def receive():
+            return received.pop(0) if received else {"type": "websocket.disconnect" if is_socket else "http.disconnect"}
+
+        async def send(message):
+            sent.append(message)
+
+        scope = {
+            "type": "websocket" if is_socket else "http",
+            "path": path,
+            "raw_path": path.encode(),
+            "root_path": "",
+            "query_string": query.encode(),
+            "headers": [(name.encode(), value.encode()) for name, value in stated.items() if value is not None],
+            "client": ("127.0.0.1", 1),
+            "extensions": {"websocket.http.response": {}},
+            **({} if is_socket else {"method": method}),
+        }
+        asyncio.run(to(scope, receive, send))
+        status = next((message["status"] for message in sent if "status" in message), None)
+        text = b"".join(message.get("body", b"") for message in sent if message["type"].endswith("response.body"))
+        return status, json.loads(text) if text.startswith(b'{"type"') else None
+
+    return ask

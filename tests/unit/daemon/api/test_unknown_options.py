@@ -1,7 +1,5 @@
 """What a request says and its route does not read is refused by name: keys of query and body, values, repetitions."""
 
-import asyncio
-import json
 from urllib.parse import urlencode
 
 import pytest
@@ -13,44 +11,8 @@ from optodrive.daemon.api.route_table import STOP, RoleRoutes, RouteTable
 from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.device.config_sections import DaemonSection
 
-PARAMETERS = {"plan_id": "p1", "name": "pixel", "name:path": "index.html"}
 INVALID = {"name": "\n", "rate_hz": "fast", "dry_run": "maybe", "standing": "maybe"}
 """Values that a parameter may not have; text alone is invalid for the others."""
-
-
-def ask(app, key, query="", body=b"", role="armer"):
-    """Send one request, or the handshake of a WebSocket. Return status and problem document."""
-    method, path = key.split(" ")
-    path = path.format(**PARAMETERS) if "{name:path}" not in path else "/page/index.html"
-    is_socket = method == "WEBSOCKET"
-    received = [{"type": "websocket.connect"} if is_socket else {"type": "http.request", "body": body}]
-    sent = []
-
-    async def receive():
-        return received.pop(0) if received else {"type": "websocket.disconnect" if is_socket else "http.disconnect"}
-
-    async def send(message):
-        sent.append(message)
-
-    scope = {
-        "type": "websocket" if is_socket else "http",
-        "path": path,
-        "raw_path": path.encode(),
-        "root_path": "",
-        "query_string": query.encode(),
-        "headers": [
-            (b"host", b"localhost"),
-            (b"authorization", f"Bearer {role}".encode()),
-            *([(b"content-length", str(len(body)).encode())] if body else []),
-        ],
-        "client": ("127.0.0.1", 1),
-        "extensions": {"websocket.http.response": {}},
-        **({} if is_socket else {"method": method}),
-    }
-    asyncio.run(app(scope, receive, send))
-    status = next((message["status"] for message in sent if "status" in message), None)
-    text = b"".join(message.get("body", b"") for message in sent if message["type"].endswith("response.body"))
-    return status, json.loads(text) if status == 422 else None
 
 
 @pytest.fixture(scope="module")
@@ -62,45 +24,45 @@ def routes(app):
     return [route for route in routes if route.key != STOP]
 
 
-def test_an_unknown_key_of_a_query_is_refused_on_every_route(app, routes):
+def test_an_unknown_key_of_a_query_is_refused_on_every_route(ask, routes):
     for route in routes:
-        status, problem = ask(app, route.key, "surely_unknown=1")
+        status, problem = ask(route.key, "surely_unknown=1")
         assert (status, problem["code"]) == (422, "unknown_key"), route.key
         assert problem["detail"].startswith("query: got 'surely_unknown', expected "), route.key
 
 
-def test_a_misspelt_key_is_refused_with_the_nearest_on_every_route(app, routes):
+def test_a_misspelt_key_is_refused_with_the_nearest_on_every_route(ask, routes):
     for route in routes:
         for option in route.options:
             for wrong in {option[:-1], f"{option}s", option.upper(), option.replace("_", "-"), f" {option}"} - {option}:
-                status, problem = ask(app, route.key, urlencode({wrong: "true"}))
+                status, problem = ask(route.key, urlencode({wrong: "true"}))
                 assert (status, problem["code"]) == (422, "unknown_key"), (route.key, wrong)
                 assert problem["value"] == repr(wrong)
                 assert problem["expected"] == f"a known key, nearest is '{option}'", (route.key, wrong)
 
 
-def test_a_repeated_key_and_an_invalid_value_are_refused_on_every_route(app, routes):
+def test_a_repeated_key_and_an_invalid_value_are_refused_on_every_route(ask, routes):
     for route in routes:
         for option in route.options:
-            status, problem = ask(app, route.key, f"{option}=1&{option}=2")
+            status, problem = ask(route.key, f"{option}=1&{option}=2")
             assert (status, problem["code"]) == (422, "repeated_key"), (route.key, option)
             for value in (INVALID.get(option, "surely-unknown"), ""):
-                status, problem = ask(app, route.key, urlencode({option: value}))
+                status, problem = ask(route.key, urlencode({option: value}))
                 assert (status, problem["where"]) == (422, f"query.{option}"), (route.key, option, value)
                 assert problem["detail"].startswith(f"query.{option}: got {value!r}, expected "), problem
 
 
-def test_a_body_is_refused_on_every_route_that_reads_none(app, routes):
+def test_a_body_is_refused_on_every_route_that_reads_none(ask, routes):
     reading = {route.key for route in routes if route.takes_body}
     assert reading == {"PUT /v1/dim", "POST /v1/plans", "POST /v1/patterns/{name}"}
     for route in routes:
         if not route.takes_body and not route.key.startswith("WEBSOCKET"):
-            status, problem = ask(app, route.key, body=b'{"hold": true}')
+            status, problem = ask(route.key, body=b'{"hold": true}')
             assert (status, problem["where"]) == (422, "body"), route.key
             assert problem["detail"].endswith(f"expected none: {route.key} takes no body")
 
 
-def test_stop_is_never_refused_for_what_it_does_not_read():
+def test_stop_is_never_refused_for_what_it_does_not_read(ask):
     """Another application, whose STOP only counts."""
     stops = []
     app = FastAPI()
@@ -112,7 +74,7 @@ def test_stop_is_never_refused_for_what_it_does_not_read():
     policy = AccessPolicy(Tokens([Token("viewer", "viewer", "viewer")]), DaemonSection())
     app.add_middleware(AccessMiddleware, policy=policy, table=RouteTable(app.routes[-1:]))
     for query, body in (("dry_run=true", b""), ("now&now", b""), ("", b'{"dry_run": true}')):
-        assert ask(app, STOP, query, body, "viewer") == (200, None)
+        assert ask(STOP, query, body, "viewer", to=app) == (200, None)
     assert len(stops) == 3
 
 
@@ -125,6 +87,6 @@ def test_stop_is_never_refused_for_what_it_does_not_read():
         ("", "body: share: missing, expected this key"),
     ],
 )
-def test_the_body_of_a_dimming_is_refused_by_name(app, body, detail):
-    status, problem = ask(app, "PUT /v1/dim", body=body.encode())
+def test_the_body_of_a_dimming_is_refused_by_name(ask, body, detail):
+    status, problem = ask("PUT /v1/dim", body=body.encode())
     assert (status, problem["detail"]) == (422, detail)
