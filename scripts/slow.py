@@ -1,6 +1,6 @@
 """Run one piece of the nightly tests, and add its result to the table tests/slow.csv.
 
-Without a name: the piece whose last row is oldest, so that repeated calls run all of them, whenever they are interrupted.
+Without a name: the piece whose last row is oldest, so that repeated calls run all of them, also after an interruption.
 A piece takes at most 20 minutes on two cores; what it has not finished by then is stopped, and the row says so.
 """
 
@@ -40,7 +40,9 @@ def list_pieces() -> dict[str, list[str]]:
     pieces: dict[str, list[str]] = {}
     for folder, count in FOLDERS.items():
         files = sorted((ROOT / "tests" / folder).rglob("test_*.py"))
-        slow = [str(file.relative_to(ROOT)) for file in files if "mark.slow" in file.read_text() or folder == "property"]
+        slow = [
+            str(file.relative_to(ROOT)) for file in files if "mark.slow" in file.read_text() or folder == "property"
+        ]
         for part in range(count):
             pieces[folder if count == 1 else f"{folder}-{part + 1}"] = slow[part::count]
     return pieces

@@ -7,7 +7,6 @@ import resource
 import socket
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 
 import httpx
 import pytest
