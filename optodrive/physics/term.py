@@ -1,8 +1,8 @@
 """Terms: physical effects that extend the nominal pixel, and everything that the package asks of one.
 
-Each module of `optodrive.physics.terms` defines one term: its parameters, its kernels in the compiled pixel, the heat
-that it may add to the limiter's bound, and the hypotheses by which a diagnosis searches for it. No other module names
-a term that it does not implement itself.
+Each class in a module of `optodrive.physics.terms` is one term: its parameters, its kernels in the compiled pixel, the
+heat that it may add to the limiter's bound, and the hypotheses by which a diagnosis searches for it. No other module
+names a term that it does not implement itself.
 """
 
 from collections.abc import Callable, Mapping

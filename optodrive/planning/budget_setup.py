@@ -13,7 +13,7 @@ from optodrive.device.panel import Neighbours, complete_panel
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
 from optodrive.physics.terms import all_terms
-from optodrive.physics.terms.wall_heating import compute_capacity
+from optodrive.physics.terms.thermal import compute_capacity
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels, HeatBound
 from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
 from optodrive.planning.limiter.nominal_model import (

@@ -22,7 +22,7 @@ from optodrive.physics.term import (
 )
 from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import discover_terms
-from optodrive.physics.terms.radiation import STEFAN_BOLTZMANN
+from optodrive.physics.terms.thermal import STEFAN_BOLTZMANN
 
 KEYS = ("bridge_conductivity", "heat_capacity", "radiation", "wall_heating")
 SUBSETS = [keys for size in range(len(KEYS) + 1) for keys in combinations(KEYS, size)]

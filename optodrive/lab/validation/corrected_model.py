@@ -22,7 +22,7 @@ from optodrive.lab.validation.stimuli import (
 from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import GAS_FRACTION, Pixel
-from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA, equilibrium_height_m
+from optodrive.physics.terms.mechanical import ATMOSPHERE_PA, equilibrium_height_m
 
 CauseValues = Mapping[str, float]
 """Active causes and the parameter of each."""

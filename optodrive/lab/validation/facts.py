@@ -8,7 +8,7 @@ from optodrive.core.quantity import format_quantity
 from optodrive.lab.validation.stimuli import AMBIENT_K
 from optodrive.physics.paper_facts import AMBIENT_C, PaperFact
 from optodrive.physics.parameters import ParameterSet
-from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
+from optodrive.physics.terms.mechanical import ATMOSPHERE_PA
 
 READING_ERROR = 0.05
 """Relative error of a value read from a figure or rounded in the text, where the paper states none."""

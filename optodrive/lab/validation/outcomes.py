@@ -24,7 +24,7 @@ from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import advance, cooling_peak
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
-from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
+from optodrive.physics.terms.mechanical import ATMOSPHERE_PA
 
 OutcomeFunction = Callable[[ParameterSet], float]
 

@@ -1,4 +1,4 @@
-"""Physical effects beyond the nominal pixel, one module per term."""
+"""Physical effects beyond the nominal pixel, one class per term, in one module per part of the display."""
 
 from collections.abc import Collection
 from functools import cache
@@ -12,10 +12,12 @@ from optodrive.physics.term import Term
 
 @cache
 def discover_terms() -> dict[str, Term]:
-    """Return every term by its key. Each module of this package defines one as `TERM`."""
-    modules = (import_module(f"{__name__}.{item.name}") for item in iter_modules(__path__))
-    terms: list[Term] = [module.TERM for module in modules]
-    return {term.key: term for term in terms}
+    """Return every term by its key: one of each class of terms that a module of this package defines."""
+    modules = [import_module(f"{__name__}.{item.name}") for item in iter_modules(__path__)]
+    found = [value for module in modules for value in vars(module).values() if isinstance(value, type)]
+    # What a module only imports is another one's, and `Term` itself is none.
+    terms = [kind() for kind in found if issubclass(kind, Term) and kind.__module__.startswith(f"{__name__}.")]
+    return {term.key: term for term in sorted(terms, key=lambda term: term.key)}
 
 
 @cache

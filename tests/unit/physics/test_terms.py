@@ -14,7 +14,7 @@ from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_s
 from optodrive.physics.stability import check_time_constants
 from optodrive.physics.term_kernels import CHAINS
 from optodrive.physics.terms import check_requirements, discover_terms, find_term
-from optodrive.physics.terms.gas_membrane import equilibrium_height_m
+from optodrive.physics.terms.mechanical import equilibrium_height_m
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
 AMBIENT_K = 293.15

@@ -1,0 +1,272 @@
+"""Terms of instruments, between the pixel and its record.
+
+- Sensor lag: the thermometer follows the absorber with a lag and a delay.
+- Sensor scale: the thermometer's gain is wrong.
+- Ambient drift: the ambient temperature differs from the stated one and changes.
+- Clock offset: the clock of one instrument, or of all, is late.
+- Time rate: the clock that times the samples of one instrument, or of all, is fast or slow.
+- High-pass: an instrument's input is AC coupled.
+- Smoothing: a program averages each sample of a signal with those before and after it.
+"""
+
+from math import pi
+
+import numpy as np
+
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
+from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter, describe_signals
+from optodrive.physics.signal_filters import low_pass, low_pass_both_ways, moving_mean
+from optodrive.physics.term import (
+    SESSION_TIME,
+    TIME_S,
+    BySignal,
+    HeatGainBound,
+    Kernels,
+    OperatingEnvelope,
+    Term,
+    TermValues,
+    build_signal_parameters,
+)
+
+
+@kernel
+def sensor_lag_sensor_lag(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """Add the thermometer's time constant, s."""
+    return float(x + v[0])
+
+
+class SensorLag(Term):
+    """time · dT/dt = T_true − T, delayed as a whole by delay_share · time."""
+
+    key = "sensor_lag"
+    label = "the thermometer lags"
+    parameters = (
+        TermParameter(
+            "time", "s", 5e-4, 1e-6, 5e-3, "0.05 to 3 ms, camera exposure or detector", starts=(1e-4, 5e-4, 2e-3)
+        ),
+        TermParameter(
+            "delay_share",
+            "1",
+            0.0,
+            0.0,
+            1.0,
+            "additional delay; 0.73 for the moving mean of an exposure",
+            starts=(0.0, 0.7),
+            is_shape=True,
+        ),
+    )
+    kernels = Kernels(sensor_lag=sensor_lag_sensor_lag)
+    is_fast = True
+    cannot_add_heat = True
+    signature = "edges of temperature against those of displacement"
+    remedy = "record a step of light with a faster detector, or at a shorter exposure."
+
+    def signal_delays(self, values: TermValues) -> BySignal:
+        """Return the thermometer's delay."""
+        return BySignal(temperature=values["time"] * values["delay_share"])
+
+
+@kernel
+def sensor_scale_sensor_reading(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """Apply the gain to the rise and add the offset, K."""
+    return float(v[0] * x + v[1])
+
+
+class SensorScale(Term):
+    """gain · θ + offset in place of the rise θ above ambient."""
+
+    key = "sensor_scale"
+    label = "the thermometer's scale is wrong"
+    parameters = (
+        TermParameter("gain", "1", 1.03, 0.85, 1.15, "emissivity taken wrongly by 10 %", neutral=1.0),
+        TermParameter("offset", "K", 0.0, -20.0, 20.0, "reading at ambient", neutral=0.0),
+    )
+    kernels = Kernels(sensor_reading=sensor_scale_sensor_reading)
+    cannot_add_heat = True
+    signature = "a reference temperature only"
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return the offset alone: a gain acts as R, C and κ together, and no data tells it from them."""
+        start = {"gain": 1.0, "offset": 1.0}
+        return [Hypothesis(self.key, f"{self.key}: offset", (start,), (self.free("offset"),), is_linear=True)]
+
+
+DRIFT_SETS = (("offset",), ("offset", "ramp", "bend"), ("offset", "ramp", "bend", "rate"), ("rate",))
+"""Sets of parameters that are fitted together, one hypothesis each."""
+
+
+@kernel
+def ambient_drift_sensor_reading(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """Add an offset, a ramp and a parabola in session time, and a ramp in the run's time."""
+    u = c[SESSION_TIME]
+    return float(x + v[0] + v[1] * u + v[2] * (1.5 * u * u - 0.5) + v[3] * c[TIME_S])
+
+
+class AmbientDrift(Term):
+    """offset + ramp · u + bend · (3u² − 1)/2 + rate · t, with u the session time from −1 to 1 and t the run's time."""
+
+    key = "ambient_drift"
+    label = "the ambient temperature differs from the stated one"
+    parameters = (
+        TermParameter("offset", "K", 0.5, -10.0, 10.0, "ambient against stated temperature, within 5 K", neutral=0.0),
+        TermParameter("ramp", "K", 0.5, -10.0, 10.0, "over the recording, within 5 K", neutral=0.0),
+        TermParameter("bend", "K", 0.2, -10.0, 10.0, "a parabola over the recording", neutral=0.0),
+        TermParameter("rate", "K/s", 0.05, -10.0, 10.0, "within a run", neutral=0.0),
+    )
+    kernels = Kernels(sensor_reading=ambient_drift_sensor_reading)
+    varies_between_runs = True
+    signature = "baselines before the pulse"
+
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
+        """Return the largest excess of the ambient over the stated temperature as a rise of everything."""
+        return HeatGainBound(uniform_rise_k=abs(values["offset"]) + abs(values["ramp"]) + abs(values["bend"]))
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return one linear hypothesis per set of `DRIFT_SETS`, started at 1 in each of its parameters."""
+        zero = {item.name: 0.0 for item in self.parameters}
+        return [
+            Hypothesis(
+                self.key,
+                f"{self.key}: {names[-1]}",
+                tuple(zero | {name: 1.0} for name in names),
+                tuple(self.free(name) for name in names),
+                is_linear=True,
+            )
+            for names in DRIFT_SETS
+        ]
+
+
+class ClockOffset(Term):
+    """A constant delay of each instrument's time axis."""
+
+    key = "clock_offset"
+    label = "an instrument's clock is offset"
+    parameters = build_signal_parameters("s", 1e-4, -5e-3, 5e-3, "0.05 to 3 ms in either direction")
+    starts_by_signal = (2e-4,)
+    cannot_add_heat = True
+    is_exact = True
+    subsystems = ("pixels", "mirrors")
+    signature = "every edge, in proportion to the slope"
+    remedy = "trigger the instrument by the light itself, and record again."
+
+    def signal_delays(self, values: TermValues) -> BySignal:
+        """Return the offsets of the four clocks."""
+        return BySignal(**values)
+
+
+class TimeRate(Term):
+    """Stated time = (1 + rate) · true time since the start of the run, for each instrument."""
+
+    key = "time_rate"
+    label = "an instrument's time axis has a wrong rate"
+    parameters = build_signal_parameters("1", 2e-3, -0.05, 0.05, "nominal sampling rates, within 2 %")
+    starts_by_signal = (2e-3, 1e-2, -1e-2)  # edges late in a train move by more than their width at the large ones
+    cannot_add_heat = True
+    is_exact = True
+    subsystems = ("pixels", "mirrors")
+    signature = "edges, the later in a run the further off"
+    remedy = "time the samples by a second clock; late edges of a pixel or a laser do not move with it."
+
+    def signal_rates(self, values: TermValues) -> BySignal:
+        """Return the rates of the four clocks."""
+        return BySignal(**values)
+
+
+HIGH_PASS_SIGNALS = BySignal._fields[:3]
+HIGH_PASS_STARTS_HZ = (0.03, 0.3, 3.0)
+
+
+class HighPass(Term):
+    """dy/dt = dx/dt − 2π · cut-off frequency · y, with x the signal and y its record."""
+
+    key = "high_pass"
+    label = "an instrument's input is AC coupled"
+    parameters = build_signal_parameters(
+        "Hz", 0.3, 0.0, 30.0, "AC inputs of oscilloscopes and amplifiers, 0.1 to 10 Hz", HIGH_PASS_SIGNALS
+    )
+    cannot_add_heat = True
+    signature = "a signal that falls while the drive is held, and undershoots after it"
+    removes_zero = True
+    twin = "gas_leak"
+    remedy = "couple the input DC, state coupling = DC in the runs and record again: what remains is the pixel."
+
+    def record(self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray) -> FloatArray:
+        """Return the signal behind the high-pass, [n]."""
+        cutoff_hz = values.get(signal, 0.0)
+        return value if cutoff_hz <= 0.0 else value - low_pass(t_s, value, 1.0 / (2.0 * pi * cutoff_hz))
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return one cut-off frequency of each signal, and one of all signals where there are several."""
+        return [
+            Hypothesis(
+                self.key,
+                f"{self.key} of {describe_signals(names)}",
+                tuple(
+                    dict.fromkeys(HIGH_PASS_SIGNALS, 0.0) | dict.fromkeys(names, start) for start in HIGH_PASS_STARTS_HZ
+                ),
+                (self.free(*names),),
+            )
+            for names in scope.list_signal_sets(HIGH_PASS_SIGNALS)
+        ]
+
+
+SIGNALS = BySignal._fields
+SMOOTHING_STARTS_S = (1e-3, 5e-3, 2e-2)
+SMOOTHING_FORMS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0), (0.0, 0.5, 1.0))
+"""Tails, lateness and whether the width is in samples, from which a search begins."""
+SAME_SPREAD = 24.0**-0.5
+"""Time constant of a filter run both ways that spreads an edge as far as a moving mean of unit width."""
+UNIT_INTERVAL_S = 1e-3
+
+
+class Smoothing(Term):
+    """A moving mean over the width, or with tails = 1 a low-pass run both ways as wide, late by late · width.
+
+    With by_samples = 1, the width is that at one sample per millisecond, and a mean over as many samples elsewhere.
+    """
+
+    key = "smoothing"
+    label = "a signal was smoothed before it was recorded"
+    parameters = (
+        *build_signal_parameters("s", 5e-3, 0.0, 0.1, "moving means and filters of loggers, to 50 ms", SIGNALS[:3]),
+        TermParameter("tails", "1", 0.0, 0.0, 1.0, "0 moving mean, 1 filter run both ways", (0.0, 1.0), True),
+        TermParameter("late", "1", 0.0, 0.0, 0.5, "0 centred, 0.5 mean of the last samples", (0.0, 0.5), True),
+        TermParameter("by_samples", "1", 0.0, 0.0, 1.0, "0 width in time, 1 in samples", (0.0, 1.0), True),
+    )
+    cannot_add_heat = True
+    is_fast = True
+    signature = "edges that begin before the light does, or are rounded in one signal alone"
+    remedy = "record again without averaging or filter."
+
+    def record(self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray) -> FloatArray:
+        """Return the smoothed signal, [n]."""
+        width_s, tails = values.get(signal, 0.0), values["tails"]
+        if width_s <= 0.0 or len(t_s) < 2:
+            return value
+        if values["by_samples"] > 0.5:
+            width_s *= float(np.median(np.diff(t_s))) / UNIT_INTERVAL_S
+        late_s = values["late"] * width_s
+        mean = moving_mean(t_s, value, width_s, late_s) if tails < 1.0 else value
+        if tails <= 0.0:
+            return mean
+        both = np.interp(t_s - late_s, t_s, low_pass_both_ways(t_s, value, SAME_SPREAD * width_s))
+        return np.asarray(mean + tails * (both - mean))
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return one width for all signals, and one of each signal alone where there are several."""
+        return [
+            Hypothesis(
+                self.key,
+                f"{self.key} of {describe_signals(names)}",
+                tuple(
+                    dict.fromkeys(SIGNALS[:3], 0.0) | dict.fromkeys(names, width_s) | form
+                    for width_s in SMOOTHING_STARTS_S
+                    for form in (
+                        dict(zip(("tails", "late", "by_samples"), numbers, strict=True)) for numbers in SMOOTHING_FORMS
+                    )
+                ),
+                (self.free(*names), self.free("tails"), self.free("late")),
+            )
+            for names in scope.list_signal_sets(SIGNALS[:3])
+        ]
