@@ -18,7 +18,7 @@ from measuring import ROOT, format_number
 
 PAGE = ROOT / "docs" / "reference" / "benchmarks.md"
 BEGIN, END = "<!-- scripts/figures -->", "<!-- end -->"
-FIGURES = {
+SHOWN = {
     "plan": r".",
     "start": r".",
     "limit": r"full frame|1,000,000|after all",
@@ -43,7 +43,7 @@ def measure(name):
     begin_s = time.monotonic()
     command = [sys.executable, str(ROOT / "scripts" / "bench.py"), name, "--json", *OPTIONS.get(name, ())]
     rows = json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True).stdout)
-    return [row for row in rows if re.search(FIGURES[name], row["quantity"])], time.monotonic() - begin_s
+    return [row for row in rows if re.search(SHOWN[name], row["quantity"])], time.monotonic() - begin_s
 
 
 def format_row(name, row):
@@ -71,15 +71,15 @@ def describe_machine():
 
 def main():
     parser = argparse.ArgumentParser(prog="scripts/figures", description=__doc__)
-    parser.add_argument("names", nargs="*", choices=[[], *FIGURES], help="measure these alone, and print their lines")
-    names = parser.parse_args().names or list(FIGURES)
+    parser.add_argument("names", nargs="*", choices=[[], *SHOWN], help="measure these alone, and print their lines")
+    names = parser.parse_args().names or list(SHOWN)
     lines, spent = [], []
     for name in names:
         rows, seconds = measure(name)
         lines += [format_row(name, row) for row in rows]
         spent.append(f"{name} {seconds:.0f}")
         print(f"{name}: {len(rows)} rows in {seconds:.0f} s", file=sys.stderr, flush=True)
-    if names != list(FIGURES):
+    if names != list(SHOWN):
         print("\n".join(lines))
         return
     heading = ("| benchmark | quantity | median | p99 | values | ratio |", "|---|---|---|---|---|---|")
