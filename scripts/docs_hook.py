@@ -11,6 +11,8 @@ from named_code import find_missing
 ROOT = Path(__file__).resolve().parent.parent
 PROTOCOL_FOLDER = "firmware_protocol"
 PROTOCOL_PAGES = ("PROTOCOL.md", "SENSOR.md")
+DECISION_WORDS_MAX = 150
+"""Words of a decision, its title and date apart."""
 
 
 def on_config(config):
@@ -33,8 +35,16 @@ def on_files(files, config):
     return files
 
 
+def count_words(markdown):
+    """Count the words of a decision without its title and date."""
+    lines = markdown.splitlines()
+    return sum(len(line.split()) for line in lines if not line.startswith(("# ", "Date: ")))
+
+
 def on_page_markdown(markdown, page, config, files):
-    """Look up named code. Adapt links: to the protocol pages, and from them to files outside docs/, as plain text."""
+    """Look up named code and bound decisions. Adapt links: to the protocol pages, and from them as plain text."""
+    if page.file.src_uri.startswith("decisions/") and (words := count_words(markdown)) > DECISION_WORDS_MAX:
+        raise PluginError(f"{page.file.src_uri} has {words} words: a decision has {DECISION_WORDS_MAX} at most")
     if missing := find_missing(markdown):
         raise PluginError(f"{page.file.src_uri} names code that does not exist: {', '.join(missing)}")
     if page.file.src_uri.removeprefix("reference/") in PROTOCOL_PAGES:

@@ -3,10 +3,10 @@
 A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed plan
 leave only `lead_s` before they are due; a newer plan cuts the running one at the first point that has not left
 (`build_cut_snapshot`) and is spliced behind it, one job for the board. If all points have left it follows them, with
-a pause if it comes early, as long as the light of the last one is not about to end (decision 80). Its first point is
+a pause if it comes early, as long as the light of the last one is not about to end (decision 16). Its first point is
 held back if yet another plan is expected before it must leave, and always for a refresh of a standing page: that one
 then withdraws the plan as a whole and begins where it would have begun. The lead is longer without real-time priority,
-because a stall of the host longer than the lead is an underrun (decision 38). A splice that comes too late is refused
+because a stall of the host longer than the lead is an underrun (decision 16). A splice that comes too late is refused
 by link, and the plan is made again; after two such plans `truncate` cuts the running one at once, and the third begins
 behind it without a deadline.
 

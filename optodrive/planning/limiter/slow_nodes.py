@@ -28,7 +28,7 @@ Invariants. Without credit the result is a lower bound of the power with credit,
 credit never costs power. The result never exceeds the requested power. A power of 0 always passes, because the state
 before the pulse was within the set, unless the panel has taken the cap away.
 
-What it is worth: decision 7 (cost, and what was rejected). Decisions 40 and 45 say how the panel enters.
+What it is worth: decision 7 (cost, and what was rejected). Decision 45 says how the panel enters.
 """
 
 from math import exp, inf, log
