@@ -16,7 +16,7 @@ from measuring import Row, to_ms
 
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_scales
-from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.link.simulator.board_core import BoardClock
 from optodrive.planning.display_model import DisplayModel
 from rig import Board, Daemon, long_train, wait_for  # of the tests
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from firmware_ports import require
 from optodrive.link.protocol import messages as m
-from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.guards import BoardSettings
 
 FIRMWARE = Path(__file__).parents[1] / "firmware_protocol"
 SHIM = Path(__file__).with_name("firmware") / "shim.c"

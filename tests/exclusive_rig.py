@@ -4,7 +4,7 @@ from optodrive.core.clock import ManualClock
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.link.board_setup import build_port_settings
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import build_settings
+from optodrive.link.simulator.guards import build_settings
 from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.planning.display_model import DisplayModel
 

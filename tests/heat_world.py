@@ -21,7 +21,7 @@ from optodrive.link.board_setup import build_port_settings, build_scales
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import build_settings
+from optodrive.link.simulator.guards import build_settings
 from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.planning import heat_record
 from optodrive.planning.pipeline import plan_sequence

@@ -3,7 +3,7 @@
 import random
 import subprocess
 
-from optodrive.planning.stimuli import liblouis
+from optodrive.planning.stimuli import braille
 
 ALPHABETS = {
     "en-ueb-g1": "abcdefghijklmnopqrstuvwxyzABCXYZ0123456789,.;:!?-()'\"",
@@ -50,7 +50,7 @@ def judge(table, lines):
     The German tables give a full stop after a figure a dot of liblouis's own, for which the program has no character of
     that block: such lines, at most one in a hundred, are left out.
     """
-    (file,) = [path.name for path in liblouis.TABLES.glob(f"{table}.*") if path.suffix in liblouis.SUFFIXES]
+    (file,) = [path.name for path in braille.TABLES.glob(f"{table}.*") if path.suffix in braille.SUFFIXES]
     given = "".join(line + "\n" for line in lines)
     done = subprocess.run(
         ["lou_translate", f"unicode.dis,{file}"], input=given, capture_output=True, text=True, check=True

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import serial
 import usb.core
 
-from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.link.simulator.board_core import BoardClock
 from optodrive.link.simulator.virtual_run import MemoryLink
 from optodrive.link.transport import port_state, serial_port
 from optodrive.link.transport.serial_port import SerialPort

@@ -8,11 +8,10 @@ from displays import DISPLAYS
 from link_service_rig import CuttableLink
 from optodrive.core.errors import LinkError
 from optodrive.device.config_sections import StageSection
-from optodrive.link.service.link_settings_builder import build_board_settings
+from optodrive.link.board_setup import build_board_settings
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
-from optodrive.link.simulator.board_clock import BoardClock
-from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_core import BoardClock, BoardCore
 from optodrive.planning.display_model import DisplayModel
 from planner_rig import PlannerRig
 

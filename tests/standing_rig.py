@@ -5,7 +5,7 @@ import numpy as np
 from link_service_rig import OPERATOR, WEB
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.daemon.api.standing_stream import REFRESH_MAX_S, REFRESH_MIN_S
+from optodrive.daemon.api.live_stream import REFRESH_MAX_S, REFRESH_MIN_S
 from optodrive.daemon.engine import plan_making, planner
 from optodrive.daemon.engine.page_refresh import PageRefresh
 from optodrive.daemon.engine.plan_making import PlanningRequest
@@ -13,7 +13,7 @@ from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.push import Push
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements, build_port_settings
-from optodrive.link.simulator.board_limits import build_settings
+from optodrive.link.simulator.guards import build_settings
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.stimuli.standing_page import REFRESH_PERIOD_S

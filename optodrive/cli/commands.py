@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from optodrive.cli.exit_status import SUMMARY
-from optodrive.cli.invocation import Invocation
+from optodrive.cli.invocation import SUMMARY, Invocation
 from optodrive.cli.signals import INTERRUPTED, report_interruption
 from optodrive.core.daemon_url import check_environment
 from optodrive.core.errors import InputError, OptodriveError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 import typer
 
-from optodrive.cli.exit_status import exit_unless_fits
+from optodrive.cli.invocation import exit_unless_fits
 from optodrive.cli.options import (
     ConfigOption,
     JsonOption,
@@ -19,7 +19,7 @@ from optodrive.cli.options import (
     load_run_config,
 )
 from optodrive.cli.output import announce_compilation, print_answer, show_progress
-from optodrive.cli.plan_text import format_plan_summary
+from optodrive.cli.plan import format_plan_summary
 from optodrive.cli.push_options import add_push_options
 from optodrive.core.errors import OptodriveError
 from optodrive.core.quantity import format_quantity
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from optodrive.core.clock import Clock
     from optodrive.core.types.plans import BudgetState
     from optodrive.link.dac.laser_dac import LaserDac
-    from optodrive.link.dac.player import PlaybackReport
-    from optodrive.link.dac.verification import VerifiedChunks
+    from optodrive.link.dac.player import PlaybackReport, VerifiedChunks
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.heat_record import HeatRecord
     from optodrive.planning.planned_sequence import PlannedSequence
@@ -109,8 +108,8 @@ def play(
     """Plan, limit and verify frames, play them on a DAC, report the sent pulses. Ctrl-C switches the light off."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.dac.encoding import PointScale
+    from optodrive.link.dac.player import encode_verified
     from optodrive.link.dac.registry import build_dac
-    from optodrive.link.dac.verification import encode_verified
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.heat_record import HeatRecord

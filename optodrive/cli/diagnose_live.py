@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from optodrive.cli.board_access import confirm_emission, open_board
+from optodrive.cli.commissioning import confirm_emission, open_board
 from optodrive.core.errors import MISSING, InputError
 
 if TYPE_CHECKING:

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.doctor_finding import Finding
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
-from optodrive.cli.output import print_json
+from optodrive.cli.output import Finding, print_json
 from optodrive.core.clock import Clock
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optodrive.cli.doctor_finding import Finding
+    from optodrive.cli.output import Finding
     from optodrive.core.clock import Clock
     from optodrive.device.config import Config
 
@@ -114,7 +113,7 @@ def examine(config: str | None, root: Path = Path("/"), stage: str | None = None
     """
     from optodrive.cli import doctor_host as host
     from optodrive.cli.config import EXCHANGE_REMEDY
-    from optodrive.cli.doctor_finding import report_problem, report_warning
+    from optodrive.cli.output import report_problem, report_warning
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.errors import InputError
     from optodrive.device.config_file import load_config

@@ -4,12 +4,12 @@ import secrets
 from typing import TypeVar
 
 from optodrive.cli.doctor_board import check_inputs, check_trip, describe_failure
-from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
+from optodrive.cli.output import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
-from optodrive.link.protocol.describe import describe_reset_cause
+from optodrive.link.protocol.transcript import describe_reset_cause
 from optodrive.link.session.arming import FRAME_BYTES, PROTOCOL_MAJOR, TICK_HZ
 from optodrive.link.session.board_view import get_fault_hint
 from optodrive.link.session.clock_sync import DRIFT_MAX

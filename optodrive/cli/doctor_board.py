@@ -1,6 +1,6 @@
 """Checks of the board by a handshake, without arming it."""
 
-from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
+from optodrive.cli.output import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import Config

@@ -4,7 +4,7 @@ The DAC is stopped, and its light switched off.
 """
 
 from optodrive.cli.doctor_board import check_heat
-from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
+from optodrive.cli.output import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.core.quantity import format_quantity

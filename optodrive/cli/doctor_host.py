@@ -8,7 +8,7 @@ import time
 from importlib import metadata
 from pathlib import Path
 
-from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
+from optodrive.cli.output import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
+from optodrive.cli.output import Finding, report_ok, report_problem, report_warning
 from optodrive.core.errors import escape_unprintable
 from optodrive.device.config_sections import BoardSection
 from optodrive.link.transport.port_state import (

@@ -3,18 +3,44 @@
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.film_source import RecordOption, open_film
 from optodrive.cli.options import UrlOption
 from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import MISSING, InputError, Unquoted
 
 if TYPE_CHECKING:
+    from optodrive.tracking.contacts import ContactReport, FilmAxes
+if TYPE_CHECKING:
     from optodrive.core.types.fingers import FingerReport
+
+
+RecordOption = Annotated[
+    Path | None,
+    typer.Option("--record", metavar="FILE", help="Record the events of the film's device, to replay them."),
+]
+
+
+@contextmanager
+def open_film(path: Path, record: Path | None) -> Iterator[tuple["FilmAxes", Iterator["ContactReport"]]]:
+    """Yield the axes of a film and its contacts. Those of a recording come at once, at times from 0."""
+    from optodrive.tracking.evdev_film import EvdevFilm, is_device
+    from optodrive.tracking.film import FilmRecorder, FilmRecording, follow_contacts, replay_contacts
+
+    if not is_device(path):
+        if record is not None:
+            raise InputError("--record", str(record), "a film's device to record, not a recording")
+        recording = FilmRecording(path)
+        yield recording.axes, replay_contacts(recording)
+        return
+    with ExitStack() as stack:
+        film = stack.enter_context(EvdevFilm(path))
+        recorder = None if record is None else stack.enter_context(FilmRecorder(record, film.axes))
+        yield film.axes, follow_contacts(film, recorder)
 
 
 def fingers(

@@ -1,6 +1,6 @@
 """The command line `optodrive`.
 
-An error is one line on stderr; `exit_status.py` states the exit statuses.
+An error is one line on stderr; `invocation.py` states the exit statuses.
 
 STOP leaves first. A command of a few milliseconds is what a person counts on who presses Enter with the laser on, so
 `optodrive stop` imports sockets and JSON, sends, and only then imports the command line and prints the state. What is

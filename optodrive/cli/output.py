@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 TABLE_WIDTH_MAX = 500
 """Maximum width of a table, which otherwise fits its content, in characters."""
@@ -115,3 +115,30 @@ def show_step(first_step: str) -> Iterator[Callable[[str], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(first_step, total=None)
         yield lambda step: bar.update(task, description=step)
+
+
+FindingStatus = Literal["ok", "warning", "problem"]
+
+
+class Finding(NamedTuple):
+    """One check: its name, status, observation, and the remedy ('' where none is needed)."""
+
+    check: str
+    status: FindingStatus
+    observation: str
+    remedy: str = ""
+
+
+def report_ok(check: str, observation: str) -> Finding:
+    """Return a finding without a problem."""
+    return Finding(check, "ok", observation)
+
+
+def report_warning(check: str, observation: str, remedy: str) -> Finding:
+    """Return a finding of a condition that can cause a failure."""
+    return Finding(check, "warning", observation, remedy)
+
+
+def report_problem(check: str, observation: str, remedy: str) -> Finding:
+    """Return a finding of a condition that prevents operation."""
+    return Finding(check, "problem", observation, remedy)

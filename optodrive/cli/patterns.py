@@ -9,7 +9,7 @@ import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import print_answer
-from optodrive.cli.pattern_parameters import parse_parameters
+from optodrive.cli.push_options import parse_parameters
 from optodrive.core.errors import MISSING, InputError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def patterns(
 
 
 def _list_tables(language: str, json: bool) -> None:
-    from optodrive.planning.stimuli.liblouis import TABLES, list_tables
+    from optodrive.planning.stimuli.braille import TABLES, list_tables
 
     found = list_tables(language)
     if not found:

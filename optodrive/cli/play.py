@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Unpack
 
 import typer
 
-from optodrive.cli.exit_status import exit_unless_fits
+from optodrive.cli.invocation import exit_unless_fits
 from optodrive.cli.options import (
     HoldOption,
     JsonOption,
     UrlOption,
 )
 from optodrive.cli.output import print_json, show_progress
-from optodrive.cli.pattern_parameters import parse_parameters
-from optodrive.cli.plan_text import format_plan_summary
-from optodrive.cli.push_options import add_push_options
+from optodrive.cli.plan import format_plan_summary
+from optodrive.cli.push_options import add_push_options, parse_parameters
 from optodrive.cli.signals import end_as_interrupted
 from optodrive.core.daemon_url import DEFAULT_URL
 from optodrive.core.errors import InputError, OptodriveError

@@ -39,8 +39,7 @@ def add(
     """Add a token with a random secret, which is shown once on the terminal or written to a file for its holder."""
     from optodrive.core.errors import suggest_nearest
     from optodrive.core.files import check_output
-    from optodrive.daemon.api.token_file import add_token, create_token, write_holder_file
-    from optodrive.daemon.api.tokens import ROLES, read_private_tokens
+    from optodrive.daemon.api.tokens import ROLES, add_token, create_token, read_private_tokens, write_holder_file
 
     known = {each: each for each in ROLES}
     if role not in known:
@@ -80,7 +79,7 @@ def list_tokens(file: FileOption = None, config: ConfigOption = None, json: Json
 @GROUP.command()
 def revoke(name: NameArgument, file: FileOption = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Remove a token. A reload ends everything begun with it at once, also while the board is armed."""
-    from optodrive.daemon.api.token_file import remove_token
+    from optodrive.daemon.api.tokens import remove_token
 
     path = _locate(file, config)
     token = remove_token(path, name)

@@ -45,7 +45,7 @@ def dump(file: CaptureArgument, json: JsonOption = False) -> None:
 
 
 def _build_document(line: "TranscriptEntry", capture: "LinkCapture") -> dict[str, Any]:
-    from optodrive.link.protocol.describe import describe
+    from optodrive.link.protocol.transcript import describe
 
     document: dict[str, Any] = {"t_s": line.host_s - capture.host_s, "to": "board" if line.to_board else "host"}
     if line.message is None or line.frame is None:
@@ -130,7 +130,7 @@ def _run_replay(file: Path, board: str, seed: int | None, limits: Path | None, b
     from optodrive.core.clock import ManualClock, MonotonicClock
     from optodrive.link.session.replay import Replay, clock_shift_s
     from optodrive.link.simulator.board_core import BoardCore
-    from optodrive.link.simulator.board_limits import BoardSettings, load_settings
+    from optodrive.link.simulator.guards import BoardSettings, load_settings
     from optodrive.link.simulator.virtual_run import MemoryLink
     from optodrive.link.transport.link_capture import LinkCapture
     from optodrive.link.transport.serial_port import SerialPort

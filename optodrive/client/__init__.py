@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from optodrive.client.async_display import AsyncDisplay
-    from optodrive.client.async_stream import AsyncStream
     from optodrive.client.display import Display
     from optodrive.client.plan import Plan
-    from optodrive.client.stream import Stream
+    from optodrive.client.stream import AsyncStream, Stream
     from optodrive.daemon.responses.messages import FrameResult
     from optodrive.daemon.responses.state import StateReport
 
 __all__ = ["AsyncDisplay", "AsyncStream", "Display", "FrameResult", "Plan", "StateReport", "Stream"]
 _MODULES = {
     "AsyncDisplay": "optodrive.client.async_display",
-    "AsyncStream": "optodrive.client.async_stream",
+    "AsyncStream": "optodrive.client.stream",
     "Display": "optodrive.client.display",
     "FrameResult": "optodrive.daemon.responses.messages",
     "Plan": "optodrive.client.plan",

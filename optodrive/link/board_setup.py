@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, fields, replace
 from math import ceil
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from optodrive.device.pixel_map import build_aim_layout
 from optodrive.device.scan_field import list_adjacent_pixels
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
+from optodrive.link.service.settings import BoardSettings, LinkSettings
 from optodrive.link.session.arming import TICK_HZ, BoardRequirements, ConfiguredValues
 from optodrive.link.session.plan_job import RETIMING_MAX_TICKS
 from optodrive.link.transport.base import PortSettings
@@ -164,3 +166,31 @@ def _compute_settling(config: Config, scale: WireScale) -> tuple[int, int]:
         settle_us = min(RETIMING_MAX_TICKS, int(times_us.min()))
         ns_per_code = int(((times_us - settle_us) * 1000 // codes).min())
     return min(WIRE_MAX, settle_us), ns_per_code
+
+
+def build_link_settings(config: Config, socket_path: Path, socket_mode: int, capture_path: Path | None) -> LinkSettings:
+    """Build the settings of the link process.
+
+    socket_path: the socket on which it listens; socket_mode: its mode
+    """
+    return LinkSettings(
+        boards=build_board_settings(config),
+        skew_max_s=config.limits.stage_skew_max_s,
+        socket_path=socket_path,
+        socket_mode=socket_mode,
+        capture_path=capture_path,
+        on_web_loss=config.daemon.on_web_loss,
+        on_stage_loss=config.daemon.on_stage_loss,
+    )
+
+
+def build_board_settings(config: Config) -> tuple[BoardSettings, ...]:
+    """Build the settings of the boards of all stages."""
+    if len(config.stages) < 2:
+        return (BoardSettings(build_port_settings(config), build_board_requirements(config)),)
+    settings = []
+    for stage, one in zip(config.stages, config.list_stage_configs(), strict=True):
+        requirements = build_board_requirements(one)
+        requirements = replace(requirements, limits=permit_retiming(requirements.limits))
+        settings.append(BoardSettings(build_port_settings(one), requirements, stage.name))
+    return tuple(settings)

@@ -16,7 +16,7 @@ from optodrive.physics.terms import all_terms
 from optodrive.physics.terms.thermal import compute_capacity
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels, HeatBound
 from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
-from optodrive.planning.limiter.nominal_model import (
+from optodrive.planning.limiter.panel_bound import (
     NominalPanel,
     NominalThermalModel,
     NominalTouch,

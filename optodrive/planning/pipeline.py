@@ -19,8 +19,8 @@ from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.batch_limiter import BatchLimiter
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.cap_checks import compute_usage
-from optodrive.planning.limiter.cold_start import COLD_START
 from optodrive.planning.limiter.limiter import concatenate
+from optodrive.planning.limiter.pulse_application import COLD_START
 from optodrive.planning.planned_sequence import (
     TIME_TOLERANCE_S,
     Delay,

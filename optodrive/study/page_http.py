@@ -11,8 +11,8 @@ from starlette.responses import Response
 from starlette.websockets import WebSocketDisconnect
 
 from optodrive.core.errors import InputError
+from optodrive.daemon.api.error_handlers import send_problem
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES, check_host_and_origin
-from optodrive.daemon.api.problem_response import send_problem
 from optodrive.daemon.api.request_limits import App, Receive, Scope, Send, join_headers
 from optodrive.daemon.api.static_files import MEDIA_TYPES, SECURITY_HEADERS
 

@@ -25,8 +25,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from optodrive.core.errors import InputError, OptodriveError
-from optodrive.daemon.api.host_check import LOOPBACK_NAMES
-from optodrive.daemon.api.socket_token import read_subprotocol_token, select_subprotocol
+from optodrive.daemon.api.host_check import LOOPBACK_NAMES, read_subprotocol_token, select_subprotocol
 from optodrive.daemon.server.bounded_protocols import Utf8WebSocket
 from optodrive.study.page_http import HostCheck, PageAddress, build_response, read_files
 from optodrive.study.page_messages import (

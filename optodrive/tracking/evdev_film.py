@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from optodrive.core.errors import MISSING, InputError, LinkError, Unquoted
 from optodrive.core.extras import import_extra
-from optodrive.tracking.input_events import (
+from optodrive.tracking.contacts import (
     ABS_MT_POSITION_X,
     ABS_MT_POSITION_Y,
     ABS_MT_SLOT,

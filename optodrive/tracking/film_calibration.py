@@ -18,8 +18,7 @@ from optodrive.core.files import write_text
 from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.fingers import FingerPlace
-from optodrive.tracking.contacts import Contact
-from optodrive.tracking.input_events import FilmAxes, FilmAxis
+from optodrive.tracking.contacts import Contact, FilmAxes, FilmAxis
 
 FORMAT = "optodrive-film"
 VERSION = 1

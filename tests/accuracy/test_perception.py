@@ -7,8 +7,7 @@ import pytest
 
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
-from optodrive.study.observers import Observer, Participant
-from optodrive.study.prediction import predict_accuracy, present_conditions
+from optodrive.study.observers import Observer, Participant, predict_accuracy, present_conditions
 from optodrive.study.results import Accuracy, fit_magnitudes
 from optodrive.study.study_file import load_study
 

@@ -13,9 +13,8 @@ from optodrive.link.simulator import board_core as core_module
 from optodrive.link.simulator import board_machine as machine_module
 from optodrive.link.simulator import board_process
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, tighten
 from optodrive.link.simulator.board_machine import BoardMachine
-from optodrive.link.simulator.guards import EmissionGuards
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, EmissionGuards, tighten
 
 # Each function returns a patch: (owner, attribute, replacement).
 

@@ -14,7 +14,7 @@ from wire_format import HOST
 
 from optodrive.link.session import arming, board_link
 from optodrive.link.session.arming import BITS_PER_BYTE, FRAME_BYTES
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.guards import DEFAULT_LIMITS
 
 FAULT_RATES = [(1, 0.05), (2, 0.15)]
 FAULT_RATES += [

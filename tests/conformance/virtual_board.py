@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from board_log import BoardLog
 
 from optodrive.core.clock import ManualClock
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
 
 READ_WAIT_S = 0.005
 ADVANCE_US = 5000

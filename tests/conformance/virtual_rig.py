@@ -10,7 +10,7 @@ from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.arming import BITS_PER_BYTE
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.guards import BoardSettings
 from optodrive.link.simulator.virtual_run import EXCHANGE_MIN_S, MemoryLink
 
 FAULTS_EACH = 25_000

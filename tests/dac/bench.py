@@ -11,7 +11,7 @@ from optodrive.device.config import Config
 from optodrive.device.config_file import load_config
 from optodrive.link.dac.devices.helios import Helios
 from optodrive.link.dac.encoding import PointScale, decode, encode
-from optodrive.link.dac.verification import VerifiedChunks, encode_verified
+from optodrive.link.dac.player import VerifiedChunks, encode_verified
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.heat_record import HeatRecord
 from optodrive.planning.pipeline import plan_sequence

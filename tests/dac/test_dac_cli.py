@@ -10,7 +10,7 @@ import usb.backend.libusb1
 from dac.bench import Bench, build_display, build_frame, build_train, record_cold
 from dac.emulated_helios import HostDeadError
 from optodrive.cli import dac as dac_cli
-from optodrive.cli.exit_status import DOES_NOT_FIT
+from optodrive.cli.invocation import DOES_NOT_FIT
 from optodrive.cli.main import run
 from optodrive.core.errors import LinkError
 from optodrive.device.config_file import locate_shipped

@@ -15,7 +15,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.link.dac.encoding import PointScale, decode, encode
 from optodrive.link.dac.formats.base import CHUNK_MAX_S
 from optodrive.link.dac.formats.helios import HeliosFormat
-from optodrive.link.dac.verification import verify_chunks
+from optodrive.link.dac.player import verify_chunks
 from optodrive.planning.limiter.limiter import limit
 
 

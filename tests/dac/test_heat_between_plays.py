@@ -23,7 +23,7 @@ from dac.bench import Bench, build_display, build_train, record_cold
 from dac.device_process import DeviceProcess, serve_ether_dream
 from dac.emulated_helios import CLOCK_HZ, EmulatedHelios
 from dac.judge import read_light
-from optodrive.cli.exit_status import DOES_NOT_FIT
+from optodrive.cli.invocation import DOES_NOT_FIT
 from optodrive.cli.main import run
 from optodrive.device.config_file import locate_shipped
 from optodrive.link.dac.devices.ether_dream import EtherDream

@@ -12,7 +12,7 @@ from optodrive.link.dac.devices import helios as dac_module
 from optodrive.link.dac.devices.helios import Helios
 from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.formats.helios import HeliosFormat
-from optodrive.link.transport.usb_device import find_device
+from optodrive.link.transport.usb_bulk import find_device
 
 
 def frame(points=100, rate=40_000, level=0):

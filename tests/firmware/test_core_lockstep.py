@@ -6,7 +6,7 @@ from lockstep import Lockstep, arm
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
 
 CENTRE = 32768
 PATIENT = {"lease_ms": 60_000}

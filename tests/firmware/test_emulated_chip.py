@@ -18,7 +18,7 @@ from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.session import board_link
 from optodrive.link.session.session import BoardSession
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
 
 TICK_US = 100
 WATCHDOG_US = 50_000

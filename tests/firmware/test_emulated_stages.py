@@ -7,7 +7,7 @@ from c_core import SeededCBoard
 from displays import DISPLAYS
 from link_service_rig import OPERATOR
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
-from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.link.simulator.board_core import BoardClock
 from planner_rig import build_frame
 from stage_rig import StageRig, build_stages
 

@@ -8,7 +8,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.planning.limiter.limiter import build_cold_budget_state, concatenate, limit
-from optodrive.planning.limiter.nominal_model import Uncertainty
+from optodrive.planning.limiter.panel_bound import Uncertainty
 from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.shipped_display import build_model, build_worst_factors
 from reference_models.thermal_display import TOUCHED, build_plan, build_true_display

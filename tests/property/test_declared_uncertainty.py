@@ -7,7 +7,7 @@ from optodrive.device.config_sections import DisplaySection, UncertaintySection
 from optodrive.device.panel import Neighbours
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
-from optodrive.planning.limiter.nominal_model import (
+from optodrive.planning.limiter.panel_bound import (
     NominalPanel,
     NominalThermalModel,
     NominalTouch,

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from link_service_rig import OPERATOR, REQUIREMENTS, WEB, ServiceRig
 from optodrive.link.protocol.states import LEASED_STATES
 from optodrive.link.session.session import BoardSession
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
 from tampered_link import FIELDS, TamperedLink
 from wire_points import build_points
 

@@ -17,7 +17,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.planning.feasibility import check, order_search, violation
 from optodrive.planning.feasibility.check import check_feasibility
-from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence, stretch_sequence
+from optodrive.planning.feasibility.reduction import omit_pixels, scale_sequence, stretch_sequence
 from optodrive.planning.limiter.limiter import limit
 from optodrive.planning.stimuli.train_json import check_trains
 

@@ -19,7 +19,7 @@ from optodrive.device.gate_timing import build_servo_range
 from optodrive.device.settling import SettlingTable
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.dac.encoding import PointScale, decode, encode
-from optodrive.link.dac.verification import encode_verified, verify_chunks
+from optodrive.link.dac.player import encode_verified, verify_chunks
 from optodrive.link.protocol.quantisation import CENTRE_CODE, quantise
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence

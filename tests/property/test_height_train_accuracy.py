@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from displays import DISPLAYS
-from optodrive.cli.plan_text import format_plan_summary
+from optodrive.cli.plan import format_plan_summary
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, TactileFrame
 from optodrive.device.config_file import load_config

@@ -12,7 +12,7 @@ from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
-from optodrive.planning.limiter.nominal_model import NominalPanel, Uncertainty
+from optodrive.planning.limiter.panel_bound import NominalPanel, Uncertainty
 from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import (
     NO_CAPS,

@@ -9,7 +9,7 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
 
 TURN_US = 2000
 FLIGHT_BYTES = 600

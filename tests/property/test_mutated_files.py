@@ -11,7 +11,7 @@ from optodrive.core.errors import InputError
 from optodrive.daemon.api.tokens import create_tokens, read_private_tokens
 from optodrive.device.config_file import list_shipped_configs, locate_shipped
 from optodrive.lab.calibration.pictures import read_picture_folder
-from optodrive.link.simulator.board_limits import load_settings
+from optodrive.link.simulator.guards import load_settings
 from optodrive.link.simulator.script import load_script
 from optodrive.planning.display_model import DisplayModel
 from sound_files import FieldFile, Mirrors, Parameters, Pictures, Pixels, write_toml

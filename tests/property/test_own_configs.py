@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, Phase, given, reject, settings
 from hypothesis import strategies as st
 
 from exclusive_rig import ExclusiveRig
-from optodrive.cli.exit_status import DOES_NOT_FIT
+from optodrive.cli.invocation import DOES_NOT_FIT
 from optodrive.cli.main import run
 from optodrive.device.config_file import load_config
 from optodrive.lab.commissioning.homing import Homing

@@ -13,7 +13,7 @@ from optodrive.device.panel import Neighbours
 from optodrive.planning.limiter.budget import Budget, GalvoModel, GalvoModels
 from optodrive.planning.limiter.heat_bound import panel_rise_by_others_k
 from optodrive.planning.limiter.limiter import build_cold_budget_state, concatenate, limit
-from optodrive.planning.limiter.nominal_model import NominalPanel, NominalThermalModel, NominalWalls, Uncertainty
+from optodrive.planning.limiter.panel_bound import NominalPanel, NominalThermalModel, NominalWalls, Uncertainty
 from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import NO_CAPS, build_plan, build_true_display
 

@@ -19,7 +19,7 @@ from optodrive.core.ipc import IpcError
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.control import Epoch, Pauses
 from optodrive.link.session.session import BoardSession
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
 from wire_points import build_points
 
 LEASE_S = 0.5

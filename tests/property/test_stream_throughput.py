@@ -18,7 +18,7 @@ from optodrive.daemon.engine.plan_making import make_plan
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements, build_port_settings
 from optodrive.link.session.point_stream import PointStream
-from optodrive.link.simulator.board_limits import build_settings
+from optodrive.link.simulator.guards import build_settings
 from planner_rig import PlannerRig
 
 NAME = "display-437"

@@ -5,7 +5,7 @@ from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.device.panel import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model, build_nominal_panel
-from optodrive.planning.limiter.nominal_model import Uncertainty
+from optodrive.planning.limiter.panel_bound import Uncertainty
 from reference_models.thermal_display import upper_factors
 
 

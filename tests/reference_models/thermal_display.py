@@ -14,7 +14,7 @@ from optodrive.device.config_sections import DisplaySection
 from optodrive.device.panel import Neighbours
 from optodrive.planning.limiter.budget import select_galvo
 from optodrive.planning.limiter.caps import CapValues
-from optodrive.planning.limiter.nominal_model import (
+from optodrive.planning.limiter.panel_bound import (
     NominalPanel,
     NominalThermalModel,
     NominalTouch,

@@ -12,8 +12,7 @@ from dataclasses import replace
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.ipc import IpcError, Message, MessageSocket
 from optodrive.device.config_file import load_config
-from optodrive.link.board_setup import build_scales
-from optodrive.link.service.link_settings_builder import build_link_settings
+from optodrive.link.board_setup import build_link_settings, build_scales
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.transport.base import PortSettings
 

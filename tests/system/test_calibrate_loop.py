@@ -11,7 +11,7 @@ from optodrive.device.config_file import load_config
 from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.spots import read_spots
 from optodrive.lab.commissioning.measurement_loop import build_code_grid
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.guards import DEFAULT_LIMITS
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 from rig import wait_for
 from signalled_processes import assert_dark_within_lease

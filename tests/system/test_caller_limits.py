@@ -15,8 +15,7 @@ import httpx
 import pytest
 
 from floods import BROKEN, Target, build_full_frames, build_refused_bodies, compressed_frames
-from optodrive.daemon.api.token_file import add_token
-from optodrive.daemon.api.tokens import Token
+from optodrive.daemon.api.tokens import Token, add_token
 from optodrive.daemon.preview.jobs import CALLER_WAITING_MAX
 from optodrive.daemon.preview.process import HEAVY_MAX
 from process_memory import list_processes, read_peak_mib

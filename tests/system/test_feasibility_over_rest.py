@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from forked_process import run_process
-from optodrive.cli.exit_status import DOES_NOT_FIT
+from optodrive.cli.invocation import DOES_NOT_FIT
 from rig import OPTODRIVE, TOKEN, running
 
 PIXELS = [str(pixel) for pixel in range(40)]

@@ -11,7 +11,7 @@ import pytest
 from emulated_film import FilmDevice
 from forked_process import OPTODRIVE
 from optodrive.tracking.contacts import decode_contacts
-from optodrive.tracking.film_recording import FilmRecording
+from optodrive.tracking.film import FilmRecording
 from rig import TOKEN, running, wait_for
 from test_standing_frames import LEAD, PLACES, compute_lead, send_page, show
 from touch_film import SimulatedFilm

@@ -8,7 +8,7 @@ import pytest
 
 from forked_process import FULL_INDICATOR
 from optodrive.lab.commissioning.exclusive_board import SPOT_POWER_MAX_W
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.guards import DEFAULT_LIMITS
 from rig import wait_for
 from signalled_processes import assert_dark_within_lease
 

@@ -24,7 +24,7 @@ from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState
 from optodrive.daemon.responses.telemetry import EVENTS, PulseBatch
 from optodrive.device.config_file import load_config
-from optodrive.planning.stimuli.sequence_codec import encode_sequence
+from optodrive.planning.stimuli.sequence_file import encode_sequence
 from rig import Board, config_text, wait_for
 
 

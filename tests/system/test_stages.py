@@ -13,7 +13,7 @@ from firmware_ports import build_board
 from forked_process import FULL_INDICATOR
 from optodrive.link.session.clock_sync import DRIFT_MAX
 from optodrive.link.session.host_time import SEND_AHEAD_MAX_S
-from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.link.simulator.board_core import BoardClock
 from rig import OPTODRIVE, PATIENT_LEAD_S, PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
 from signalled_processes import assert_dark_within_lease, assert_stayed_dark
 

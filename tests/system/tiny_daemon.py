@@ -23,8 +23,7 @@ from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.supervisor import supervisor
 from optodrive.daemon.supervisor.child import Child
-from optodrive.daemon.supervisor.link_view import LinkView
-from optodrive.daemon.supervisor.supervisor import Supervisor
+from optodrive.daemon.supervisor.supervisor import LinkView, Supervisor
 
 STATUS = {"connected": True, "port": "tty", "board": {"state": "DISARMED"}}
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from optodrive.link.protocol import messages as m
-from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.guards import BoardSettings
 
 INSTRUCTION_SHIFT = 5
 """An instruction takes 2**5 ns, little less than a cycle of the chip's 25 MHz."""

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.board_access import confirm_emission
 from optodrive.cli.calibrate.field import (
     FieldCalibration,
     ReportOption,
     check_calibration_outputs,
     write_calibration,
 )
+from optodrive.cli.commissioning import confirm_emission
 from optodrive.cli.options import ConfigOption, JsonOption, StageOption
 from optodrive.core.errors import MISSING, InputError
 from optodrive.core.quantity import m_to_um, um_to_m
@@ -151,7 +151,7 @@ def measure_on_board(
     The session file beside `out` receives every spot before the next one. Raises InputError for options that cannot
     be used, and LinkError, BoardFaultError or RefusedError where the measurement fails.
     """
-    from optodrive.cli.board_access import open_board
+    from optodrive.cli.commissioning import open_board
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.worker_process import WorkerProcess
     from optodrive.lab.calibration.spots import FieldPrior

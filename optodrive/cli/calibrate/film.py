@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.film_source import RecordOption, open_film
+from optodrive.cli.fingers import RecordOption, open_film
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.cli.output import list_written, print_answer
 from optodrive.core.errors import InputError, Unquoted

@@ -3,13 +3,10 @@
 import typer
 
 from optodrive.cli.calibrate.board import board
-from optodrive.cli.calibrate.camera import camera
-from optodrive.cli.calibrate.field import field
+from optodrive.cli.calibrate.field import camera, field
 from optodrive.cli.calibrate.film import film
-from optodrive.cli.calibrate.pixels import pixels
-from optodrive.cli.calibrate.servo import servo
-from optodrive.cli.calibrate.steps import steps
-from optodrive.cli.calibrate.sweep import sweep
+from optodrive.cli.calibrate.pixels import pixels, sweep
+from optodrive.cli.calibrate.servo import servo, steps
 
 GROUP = typer.Typer(help="Calibrate the scan field, the galvo servos, the pixels or a film.", no_args_is_help=True)
 for command in (field, camera, board, steps, servo, sweep, pixels, film):

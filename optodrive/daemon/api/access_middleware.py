@@ -9,8 +9,8 @@ from contextlib import contextmanager, nullcontext
 
 from starlette.requests import ClientDisconnect
 
-from optodrive.daemon.api.access_policy import AccessPolicy, RequestContext
-from optodrive.daemon.api.problem_response import send_login_page, send_problem
+from optodrive.daemon.api.access_policy import AccessPolicy, RequestContext, RequestInProgress, build_revoked_problem
+from optodrive.daemon.api.error_handlers import send_login_page, send_problem
 from optodrive.daemon.api.request_limits import (
     CALLER,
     App,
@@ -22,7 +22,6 @@ from optodrive.daemon.api.request_limits import (
     join_headers,
     receive_empty_body,
 )
-from optodrive.daemon.api.revocation import RequestInProgress, build_revoked_problem
 from optodrive.daemon.api.route_table import ARMING, STOP, RouteTable
 from optodrive.daemon.api.static_files import is_page_request
 from optodrive.daemon.responses.problem import Problem, build_problem

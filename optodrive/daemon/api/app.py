@@ -20,7 +20,7 @@ from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.client_sockets import FingersSocket, HoldSocket
 from optodrive.daemon.api.daemon_client import NO_EPOCH, DaemonClient
 from optodrive.daemon.api.error_handlers import add_error_handlers
-from optodrive.daemon.api.live_stream import LiveStream
+from optodrive.daemon.api.live_stream import LiveStream, StandingStream
 from optodrive.daemon.api.openapi import (
     ERROR_RESPONSES,
     EVENT_RESPONSES,
@@ -29,12 +29,10 @@ from optodrive.daemon.api.openapi import (
     build_request_body,
     extend_openapi,
 )
-from optodrive.daemon.api.request_limits import ARRIVED_S, CALLER
+from optodrive.daemon.api.request_limits import ARRIVED_S, CALLER, StopPriorityMiddleware
 from optodrive.daemon.api.request_models import DIM_EXAMPLE, PushOptionsQuery, parse_dim_request
 from optodrive.daemon.api.route_table import RoleRoutes, RouteTable
-from optodrive.daemon.api.standing_stream import StandingStream
 from optodrive.daemon.api.static_files import add_page_routes
-from optodrive.daemon.api.stop_priority import StopPriorityMiddleware
 from optodrive.daemon.api.telemetry_hub import DEFAULT_RATE_HZ, EventStream
 from optodrive.daemon.api.tokens import Token, is_role_sufficient
 from optodrive.daemon.engine.metrics import CONTENT_TYPE

@@ -11,8 +11,8 @@ from starlette.websockets import WebSocket
 
 from optodrive.core.errors import BusyError, InputError, OptodriveError
 from optodrive.daemon.api.daemon_client import DaemonClient, LinkClient
+from optodrive.daemon.api.host_check import select_subprotocol
 from optodrive.daemon.api.request_limits import ARRIVED_S, EARLIEST_S
-from optodrive.daemon.api.socket_token import select_subprotocol
 from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, HoldReport, validate_fingers
 from optodrive.daemon.responses.problem import build_error_problem
 from optodrive.planning.stimuli.json_values import decode_json

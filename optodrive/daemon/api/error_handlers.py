@@ -1,5 +1,6 @@
 """Problem documents for errors that routes and the framework raise."""
 
+import math
 from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
@@ -11,8 +12,46 @@ from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket
 
 from optodrive.core.errors import BusyError, InputError, OptodriveError
-from optodrive.daemon.api.request_limits import BodyTooLargeError
+from optodrive.daemon.api.request_limits import BodyTooLargeError, Send
+from optodrive.daemon.api.static_files import SECURITY_HEADERS, load_login_page
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_error_problem, build_problem
+
+
+async def send_problem(send: Send, problem: Problem, prefix: str) -> None:
+    """Send a problem document. prefix: of the messages, `http` or `websocket.http`."""
+    headers = []
+    if problem.status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
+    if problem.required_role is not None:  # RFC 6750, section 3
+        headers.append(
+            (b"www-authenticate", f'Bearer error="insufficient_scope", scope="{problem.required_role}"'.encode())
+        )
+    if problem.allow is not None:
+        headers.append((b"allow", problem.allow.encode()))
+    if problem.status == 413:
+        headers.append((b"connection", b"close"))
+    if problem.retry_after_s is not None:
+        headers.append((b"retry-after", str(math.ceil(problem.retry_after_s)).encode()))
+    await _send_response(send, prefix, problem.status, problem.to_json(), MEDIA_TYPE, headers)
+
+
+async def send_login_page(send: Send, prefix: str) -> None:
+    """Send the login page. prefix: as of send_problem."""
+    headers = [(name.lower().encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
+    headers.append((b"www-authenticate", b"Bearer"))
+    await _send_response(send, prefix, 401, load_login_page(), "text/html", headers)
+
+
+async def _send_response(
+    send: Send, prefix: str, status: int, body: bytes, content_type: str, headers: list[tuple[bytes, bytes]]
+) -> None:
+    headers = [
+        (b"content-type", content_type.encode()),
+        (b"content-length", str(len(body)).encode()),
+        *headers,
+    ]
+    await send({"type": f"{prefix}.response.start", "status": status, "headers": headers})
+    await send({"type": f"{prefix}.response.body", "body": body})
 
 
 def add_error_handlers(app: FastAPI) -> None:

@@ -1,8 +1,10 @@
 """The check of a request's Host and Origin, which keeps pages of other sites from speaking to a server here."""
 
+import base64
+import binascii
 import re
-from collections.abc import Collection, Mapping
-from typing import NamedTuple
+from collections.abc import Collection, Mapping, MutableMapping
+from typing import Any, NamedTuple
 
 from optodrive.daemon.responses.problem import Problem, build_problem
 
@@ -51,3 +53,30 @@ def _is_same_origin(origin: str, own: _Authority) -> bool:
         return False
     default = DEFAULT_PORTS[scheme]
     return authority.name == own.name and (authority.port or default) == (own.port or default)
+
+
+SUBPROTOCOL = "optodrive"
+TOKEN_PREFIX = "bearer."  # noqa: S105 - no password
+
+
+def is_websocket_request(headers: Mapping[str, str]) -> bool:
+    """Return whether a request opens a WebSocket."""
+    return headers.get("upgrade", "").lower() == "websocket"
+
+
+def read_subprotocol_token(headers: Mapping[str, str]) -> str:
+    """Return the token among the offered subprotocols, '' if there is none."""
+    for offered in headers.get("sec-websocket-protocol", "").split(","):
+        text = offered.strip()
+        if text.startswith(TOKEN_PREFIX):
+            encoded = text.removeprefix(TOKEN_PREFIX)
+            try:
+                return base64.urlsafe_b64decode(encoded + "=" * (-len(encoded) % 4)).decode()
+            except (binascii.Error, ValueError):
+                return ""
+    return ""
+
+
+def select_subprotocol(scope: MutableMapping[str, Any]) -> str | None:
+    """Return the subprotocol to accept, None if the client offers none that is known."""
+    return SUBPROTOCOL if SUBPROTOCOL in scope.get("subprotocols", ()) else None

@@ -37,7 +37,7 @@ from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.board_setup import build_scales
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.stimuli.sequence_codec import decode_sequence
+from optodrive.planning.stimuli.sequence_file import decode_sequence
 
 STATE_PERIOD_S = 0.5
 STATE_CHANGE_PERIOD_S = 0.02

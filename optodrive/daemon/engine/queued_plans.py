@@ -12,7 +12,7 @@ from optodrive.daemon.engine.progress import PlanRun, PulseAccounts
 from optodrive.daemon.engine.queue_thermal import HOLD_MAX_S, QueueThermal
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.plan import PlanStatus
-from optodrive.link.service.clients import BEAT_AGE_MAX_S
+from optodrive.link.service.control import BEAT_AGE_MAX_S
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
 

@@ -22,7 +22,7 @@ from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import build_error_problem
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.stimuli.sequence_codec import encode_sequence
+from optodrive.planning.stimuli.sequence_file import encode_sequence
 
 DRY_RUN_PLAN = "dry-run"
 """Plan id of every dry run."""

@@ -18,7 +18,7 @@ from websockets.frames import Frame
 from optodrive.daemon.api.request_limits import ARRIVED_S, CALLER, EARLIEST_S
 from optodrive.daemon.api.tokens import ANONYMOUS, Token
 from optodrive.daemon.server.connections import PhaseOfRequest
-from optodrive.daemon.server.server_state import ServerState
+from optodrive.daemon.server.stop_first_selector import ServerState
 
 HEADER_READ_BYTES, BODY_READ_BYTES = 2048, 8192
 """The size of one read: a body of chunks of one byte takes 2 µs per byte to parse, and STOP waits meanwhile."""

@@ -4,12 +4,16 @@ asyncio serves everything that is ready before it polls its sockets again. With 
 takes a tenth of a second, for which a STOP that has just arrived would wait.
 """
 
+import asyncio
 import selectors
 import socket
 import time
 from collections.abc import Callable, Iterable
 
+import uvicorn.server
+
 from optodrive.daemon.api.request_limits import STOP_PATH
+from optodrive.daemon.server.connections import Connections
 from optodrive.daemon.server.listeners import TimedSocket
 from optodrive.daemon.server.request_head import peek_head
 
@@ -76,3 +80,23 @@ class StopFirstSelector(selectors.EpollSelector):
         for fd in self._deferred:
             self._arrived_s.setdefault(fd, now_s)
         return chosen
+
+
+class ServerState(uvicorn.server.ServerState):
+    """uvicorn's state with the table of open connections."""
+
+    def __init__(self, clients: Connections, selector: StopFirstSelector) -> None:
+        super().__init__()
+        self.clients = clients
+        self.selector = selector
+
+    def pop_arrival_s(self, transport: asyncio.BaseTransport) -> float:
+        """Return the monotonic time at which the input of a connection arrived that was just read."""
+        return self.selector.pop_arrival_s(transport.get_extra_info("socket").fileno())
+
+    def forget(self, transport: asyncio.Transport) -> None:
+        """Remove a connection that is about to be closed."""
+        self.clients.remove(transport)
+        sock = transport.get_extra_info("socket")
+        if sock is not None:
+            self.selector.remove_client(sock.fileno())

@@ -17,8 +17,7 @@ from optodrive.daemon.server.connection_queue import WAIT_MAX_S, Waiting
 from optodrive.daemon.server.connections import PHASE_MAX_S, Connections
 from optodrive.daemon.server.listeners import raise_descriptor_limit
 from optodrive.daemon.server.request_head import Rank, parse_head, rank_request
-from optodrive.daemon.server.server_state import ServerState
-from optodrive.daemon.server.stop_first_selector import StopFirstSelector
+from optodrive.daemon.server.stop_first_selector import ServerState, StopFirstSelector
 
 RETRY_S = 0.02
 """Interval at which a connection is tried again for which there was no room."""

@@ -21,13 +21,11 @@ from optodrive.daemon.reload import ConfigReloader
 from optodrive.daemon.runtime_folder import SHARED_LINK_MODE, RuntimeFolder, open_runtime_folder
 from optodrive.daemon.server.listeners import BACKLOG, build_local_url, open_tcp_listener
 from optodrive.daemon.supervisor.child import Child
-from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.reload_handler import ReloadHandler
-from optodrive.daemon.supervisor.supervisor import Supervisor
+from optodrive.daemon.supervisor.supervisor import LinkView, Supervisor
 from optodrive.device.config import Config
 from optodrive.device.config_sections import DaemonSection
-from optodrive.link.board_setup import build_port_settings
-from optodrive.link.service.link_settings_builder import build_link_settings
+from optodrive.link.board_setup import build_link_settings, build_port_settings
 from optodrive.link.transport.registry import find_transport_factory
 
 if TYPE_CHECKING:

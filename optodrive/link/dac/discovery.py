@@ -55,7 +55,7 @@ def find_helios(backend: Any = None) -> list[FoundDac]:
     """Return the Helios DACs on USB, none without libusb. backend: of pyusb, None for libusb."""
     import usb.core
 
-    from optodrive.link.transport.usb_device import describe_device
+    from optodrive.link.transport.usb_bulk import describe_device
 
     try:
         devices = list(usb.core.find(True, backend, idVendor=VENDOR_ID, idProduct=PRODUCT_ID))

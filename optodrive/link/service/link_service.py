@@ -12,7 +12,7 @@ and its points are never lit in another one: the handover refuses them (gate 1, 
 those handed over before (gate 2, in the session). A successor of this process begins with a greater epoch. Its end
 sends ABORT (DISARM where that was the command), also when the board is said to be dark already: that may be false.
 
-Lease. It is renewed while the planner and a web process beat, and the planner is idle or makes progress (`clients.py`):
+Lease. It is renewed while the planner and a web process beat, and the planner is idle or makes progress (`control.py`):
 a process that could not stop the light must not keep it on. With `on_web_loss = "finish"` a running plan may outlive
 the web process, because a shell or the key can still stop it; then `UNATTENDED_MAX_S` bounds the dark rest.
 
@@ -38,8 +38,7 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.ipc import IpcError, Message
 from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES
-from optodrive.link.service.clients import Clients
-from optodrive.link.service.control import DISARM, PAUSE_MAX_S, STOP, Control, Epoch, Pauses
+from optodrive.link.service.control import DISARM, PAUSE_MAX_S, STOP, Clients, Control, Epoch, Pauses
 from optodrive.link.service.link_connection import build_result
 from optodrive.link.service.point_handover import PointHandover
 from optodrive.link.service.settings import OnWebLoss

@@ -7,7 +7,7 @@ from math import inf
 from typing import NamedTuple
 
 from optodrive.core.quantity import format_quantity
-from optodrive.link.protocol.describe import describe_reset_cause
+from optodrive.link.protocol.transcript import describe_reset_cause
 from optodrive.link.transport.port_state import PortState, describe_replug, read_port_state
 
 STALL_LEASE_FRACTION = 0.8

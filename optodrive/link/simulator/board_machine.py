@@ -18,8 +18,7 @@ from optodrive.link.protocol.states import (
     EventReason,
     find_transition,
 )
-from optodrive.link.simulator.board_limits import BoardSettings, tighten
-from optodrive.link.simulator.guards import EmissionGuards
+from optodrive.link.simulator.guards import BoardSettings, EmissionGuards, tighten
 from optodrive.link.simulator.point_queue import BoardJob, ExecutionRecord, ExecutionRecords, PointQueue, QueuedPoint
 
 INDICATOR_US = 2_000_000

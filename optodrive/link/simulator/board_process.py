@@ -15,9 +15,8 @@ from typing import NoReturn
 
 from optodrive.core.errors import InputError
 from optodrive.core.processes import LIGHT, set_realtime_priority
-from optodrive.link.simulator.board_clock import BoardClock
-from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import BoardSettings, load_settings
+from optodrive.link.simulator.board_core import BoardClock, BoardCore
+from optodrive.link.simulator.guards import BoardSettings, load_settings
 from optodrive.link.simulator.pseudo_terminal import check_link_path
 from optodrive.link.simulator.pty_board import NO_ACTIONS, BackendFactory, PtyBoard, ScriptActions
 from optodrive.link.simulator.script import load_script

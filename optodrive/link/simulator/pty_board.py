@@ -10,11 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
-from optodrive.link.simulator.board_clock import EXACT_CLOCK, BoardClock
-from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import BoardSettings
-from optodrive.link.simulator.line import READ_MAX, FaultyLink, LineRate
-from optodrive.link.simulator.pseudo_terminal import open_pty, remove_link
+from optodrive.link.simulator.board_core import EXACT_CLOCK, BoardClock, BoardCore
+from optodrive.link.simulator.guards import BoardSettings
+from optodrive.link.simulator.pseudo_terminal import READ_MAX, FaultyLink, LineRate, open_pty, remove_link
 from optodrive.link.simulator.script import SENSOR_ACTIONS, ScriptStep
 
 if TYPE_CHECKING:

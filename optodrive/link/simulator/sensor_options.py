@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from optodrive.core.errors import InputError
-from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.guards import BoardSettings
 from optodrive.link.simulator.pseudo_terminal import check_link_path
 
 if TYPE_CHECKING:

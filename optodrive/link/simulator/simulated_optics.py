@@ -13,8 +13,8 @@ import numpy as np
 
 from optodrive.core.quantity import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
-from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.galvos import SimulatedGalvos
+from optodrive.link.simulator.guards import BoardSettings
 from optodrive.link.simulator.pixel_recorder import SimulatedPixelRecorder
 from optodrive.link.simulator.pseudo_terminal import open_pty
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry

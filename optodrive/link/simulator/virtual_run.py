@@ -10,15 +10,14 @@ from optodrive.core.clock import ManualClock
 from optodrive.core.errors import BoardFaultError
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.device.config import Config
-from optodrive.link.board_setup import build_scales
+from optodrive.link.board_setup import build_board_settings, build_scales
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
-from optodrive.link.service.link_settings_builder import build_board_settings
 from optodrive.link.session.board_connector import CONNECTING
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import build_settings
+from optodrive.link.simulator.guards import build_settings
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.planned_sequence import PlannedSequence
 

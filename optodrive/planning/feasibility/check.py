@@ -13,14 +13,13 @@ from optodrive.core.types.stimuli import FrameSequence
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.order_search import ORDERS_MAX, Orders, OrderSearch, count_orders
-from optodrive.planning.feasibility.reduction import reduce_sequence
+from optodrive.planning.feasibility.reduction import omit_pixels, reduce_sequence, scale_sequence, stretch_sequence
 from optodrive.planning.feasibility.report import FeasibilityReport, NearestFeasible, Proof
 from optodrive.planning.feasibility.report_builder import (
     build_feasible_report,
     build_infeasible_report,
     build_reduction,
 )
-from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence, stretch_sequence
 from optodrive.planning.feasibility.violation import Violation, deadlines_s, find_first_violation
 from optodrive.planning.pipeline import Progress, plan_sequence
 from optodrive.planning.planned_sequence import PlannedSequence, explain_nothing_raised

@@ -19,9 +19,9 @@ from optodrive.core.types.plans import EMPTY_PLAN, BudgetState, LimitedPlan, Pul
 from optodrive.core.types.push_options import Policy
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.caps import CAPS_BY_KEY, REASONS, WRONG_ORDER
-from optodrive.planning.limiter.cold_start import COLD_START
 from optodrive.planning.limiter.galvo_load import count_galvo_feasible
 from optodrive.planning.limiter.pulse_application import (
+    COLD_START,
     COUNT_ONLY,
     STOP,
     TRIM,

@@ -1,7 +1,18 @@
 """Apply the pulses of a plan to the limiter's workspace, each as far as the caps allow. Kernels."""
 
-from optodrive.core.kernels import kernel
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numba
+
+from optodrive.core.child_process import die_with_parent
+from optodrive.core.kernels import CACHED, is_cached, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.core.types.plans import BudgetState
 from optodrive.planning.limiter.budget import TOLERANCE, Budget
 from optodrive.planning.limiter.cap_checks import PixelStartState, absorber_peak_k, max_power_w
 from optodrive.planning.limiter.caps import NO_CAP
@@ -18,7 +29,7 @@ from optodrive.planning.limiter.heat_bound import (
     warm_panel,
 )
 from optodrive.planning.limiter.slow_nodes import PulseRequest, wall_credited_peak_k
-from optodrive.planning.limiter.workspace import LimiterWorkspace, append
+from optodrive.planning.limiter.workspace import LimiterWorkspace, append, open_workspace
 
 TRIM, STOP, COUNT_ONLY = range(3)
 """Treatment of a pulse above a cap: reduce its power, stop before it, or count it regardless."""
@@ -118,3 +129,62 @@ def commit(
     history.n_valid[0] = row + 1
     append(workspace.pixel_chains, pixel, history, row)
     append(workspace.stage_chains, request.stage, history, row)
+
+
+REQUEST = PulseRequest(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+BEFORE = PixelStartState(0.0, 0.0, 0.0, 0.0)
+
+
+class ColdStart:
+    """The second process of one that plans for the first time."""
+
+    def __init__(self) -> None:
+        self._is_first = True
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def begin(self, budget: Budget, state: BudgetState) -> None:
+        """Start the second process unless the limiter is compiled already."""
+        if not self._is_first:
+            return
+        self._is_first = False
+        if CACHED and not is_cached(apply_pulses):
+            command = [sys.executable, "-P", "-m", __name__]
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
+            assert self._process.stdin is not None  # noqa: S101
+            with suppress(BrokenPipeError), self._process.stdin as pipe:
+                pipe.write(pickle.dumps(_list_types(budget, open_workspace(state, 1), REQUEST, BEFORE)))
+
+    def finish(self, budget: Budget, state: BudgetState) -> None:
+        """Compile this process's half and wait for the other."""
+        process, self._process = self._process, None
+        if process is not None:
+            workspace = open_workspace(state, 1)
+            _compile(compute_start_state, _list_types(budget, workspace, REQUEST))
+            _compile(commit, _list_types(budget, workspace, REQUEST, 0.0, BEFORE))
+            process.wait()
+
+
+COLD_START = ColdStart()
+"""That of this process."""
+
+
+_find_type: Callable[[object], Any] = numba.typeof  # numba has no types
+
+
+def _list_types(*arguments: object) -> tuple[Any, ...]:
+    """Return numba's types of a kernel's arguments. They alone tell read-only arrays from others after pickling."""
+    return tuple(map(_find_type, arguments))
+
+
+def _compile(kernel: Any, types: tuple[Any, ...]) -> None:
+    kernel.compile(types)
+
+
+def main() -> None:
+    """Compile the second half for the pickled types on standard input, which the process that plans has sent."""
+    die_with_parent()
+    _compile(max_power_w, pickle.load(sys.stdin.buffer))  # noqa: S301
+
+
+if __name__ == "__main__":
+    main()

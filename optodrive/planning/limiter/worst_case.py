@@ -37,8 +37,7 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.planning.limiter.budget import HeatBound
 from optodrive.planning.limiter.caps import CapValues
-from optodrive.planning.limiter.nominal_model import NominalThermalModel, Uncertainty
-from optodrive.planning.limiter.panel_bound import build_panel_bound, specht_ratio
+from optodrive.planning.limiter.panel_bound import NominalThermalModel, Uncertainty, build_panel_bound, specht_ratio
 
 CHORDS = 8
 STEP_FRACTION = 0.07

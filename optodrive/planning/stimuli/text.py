@@ -8,8 +8,7 @@ from optodrive.core.errors import InputError, Unquoted, build_nothing_raised_err
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
-from optodrive.planning.stimuli.braille import SPACE, Cell, encode_lines
-from optodrive.planning.stimuli.liblouis import translate_lines
+from optodrive.planning.stimuli.braille import SPACE, Cell, encode_lines, translate_lines
 from optodrive.planning.stimuli.pixel_lattice import CellSlot, Spacing, find_line_slots
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture, sequence_end_s
 from optodrive.planning.stimuli.sequence_file import FRAMES_MAX

@@ -15,9 +15,9 @@ import pytest
 from optodrive.cli import doctor_host as host
 from optodrive.cli.doctor import INTERVAL_S, watch
 from optodrive.cli.doctor_board import check_board
-from optodrive.cli.doctor_finding import report_ok
 from optodrive.cli.doctor_port import check_port
 from optodrive.cli.main import run
+from optodrive.cli.output import report_ok
 from optodrive.core.clock import ManualClock, MonotonicClock
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.config_sections import BoardSection

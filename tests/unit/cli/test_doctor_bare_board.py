@@ -11,8 +11,8 @@ from optodrive.core.clock import ManualClock
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.board_machine import BoardMachine
+from optodrive.link.simulator.guards import BoardSettings
 from optodrive.link.simulator.virtual_run import MemoryLink
 
 CHECKS = ["board", "capacities", "limits", "inputs", "clock", "link", "trigger", "lease, stop"]

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from optodrive.cli.exit_status import DOES_NOT_FIT, SUMMARY
+from optodrive.cli.invocation import DOES_NOT_FIT, SUMMARY
 from optodrive.cli.main import run
 from optodrive.device.config_file import locate_shipped
 

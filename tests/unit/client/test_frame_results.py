@@ -1,6 +1,6 @@
 """Results of a stream's frames, and the counts that lose none."""
 
-from optodrive.client.async_stream import RESULTS_MAX, FrameCounts, ResultBuffer
+from optodrive.client.stream import RESULTS_MAX, FrameCounts, ResultBuffer
 from optodrive.daemon.responses.messages import FrameResult
 
 

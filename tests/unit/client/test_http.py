@@ -13,7 +13,7 @@ import pytest
 
 from optodrive.client import api_request
 from optodrive.client.api_request import ApiRequest
-from optodrive.client.async_http import AsyncHttp
+from optodrive.client.async_display import AsyncHttp
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import (
     STOP_LOST_TIMEOUTS_S,

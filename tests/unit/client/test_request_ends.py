@@ -9,7 +9,7 @@ import pytest
 
 from optodrive.client import http
 from optodrive.client.api_request import ApiRequest
-from optodrive.client.async_http import AsyncHttp
+from optodrive.client.async_display import AsyncHttp
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import ExchangePolicy
 from optodrive.client.http import DaemonClient

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, filtfilt, lfilter
 
-from optodrive.physics.signal_filters import low_pass, low_pass_both_ways, moving_mean
 from optodrive.physics.terms import discover_terms
+from optodrive.physics.terms.sensor import low_pass, low_pass_both_ways, moving_mean
 
 T_S = np.arange(0.0, 0.5, 1e-3)
 SIGNAL = np.where(T_S > 0.1, 1.0 - np.exp(-(T_S - 0.1) / 0.03), 0.0)

@@ -15,7 +15,7 @@ from dac.bench import build_config, build_display, build_train
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState
-from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.guards import BoardSettings
 from optodrive.planning import heat_record
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.heat_record import BOARDS, LIGHTLESS, HeatRecord, build_hot_budget_state, join_uids

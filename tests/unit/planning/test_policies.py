@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
-from optodrive.cli.plan_text import format_plan_summary
+from optodrive.cli.plan import format_plan_summary
 from optodrive.core.errors import OverBudgetError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.planning.display_model import DisplayModel

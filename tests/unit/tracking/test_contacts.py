@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from optodrive.tracking import input_events
-from optodrive.tracking.contacts import Contact, decode_contacts
-from optodrive.tracking.input_events import InputEvent
+from optodrive.tracking import contacts
+from optodrive.tracking.contacts import Contact, InputEvent, decode_contacts
 from touch_film import DROPPED, SLOT, TRACKING, SimulatedFilm, X, Y
 
 
@@ -19,10 +18,10 @@ def decode_events(*events):
 
 def test_codes_are_those_of_the_kernel():
     ecodes = pytest.importorskip("evdev").ecodes
-    names = [name for name in vars(input_events) if name.startswith(("ABS_", "EV_", "SYN_"))]
+    names = [name for name in vars(contacts) if name.startswith(("ABS_", "EV_", "SYN_"))]
     assert len(names) == 8
     for name in names:
-        assert getattr(input_events, name) == getattr(ecodes, name), name
+        assert getattr(contacts, name) == getattr(ecodes, name), name
 
 
 def test_each_report_states_all_contacts_though_the_kernel_sends_changes_alone():

@@ -7,9 +7,14 @@ from optodrive.core.errors import InputError
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
 from optodrive.tracking.contacts import Contact
-from optodrive.tracking.film import choose_corner_pixels, iterate_touches, locate_contacts, replay_contacts
+from optodrive.tracking.film import (
+    FilmRecording,
+    choose_corner_pixels,
+    iterate_touches,
+    locate_contacts,
+    replay_contacts,
+)
 from optodrive.tracking.film_calibration import fit_film, load_film_calibration, normalize, write_film_calibration
-from optodrive.tracking.film_recording import FilmRecording
 from touch_film import SimulatedFilm
 
 DISPLAY = load_config().display

@@ -5,9 +5,8 @@ from itertools import pairwise
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.tracking.film import REPEAT_S, replay_contacts
-from optodrive.tracking.film_recording import FilmRecorder, FilmRecording
-from optodrive.tracking.input_events import FilmAxis
+from optodrive.tracking.contacts import FilmAxis
+from optodrive.tracking.film import REPEAT_S, FilmRecorder, FilmRecording, replay_contacts
 from touch_film import SimulatedFilm
 
 AXES = "A: 2f 0 9 0 0 0\nA: 35 0 99 0 0\nA: 36 0 99 0 0 10\n"

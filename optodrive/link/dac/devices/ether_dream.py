@@ -13,12 +13,11 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
-from optodrive.link.dac.devices.network_address import parse_address
 from optodrive.link.dac.discovery import hear_ether_dream
 from optodrive.link.dac.formats import ether_dream as wire
 from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.formats.ether_dream import Status
-from optodrive.link.dac.laser_dac import LaserDac
+from optodrive.link.dac.laser_dac import LaserDac, parse_address
 
 CONNECT_TIMEOUT_S = 2.0
 ANSWER_TIMEOUT_S = 0.5

@@ -18,7 +18,7 @@ from optodrive.link.dac.formats.base import Chunk
 from optodrive.link.dac.formats.helios import PRODUCT_ID, VENDOR_ID
 from optodrive.link.dac.laser_dac import LaserDac
 from optodrive.link.transport.base import build_lost_error, guard_opening, guard_port
-from optodrive.link.transport.usb_device import describe_device, list_devices, read_serial_number, timeout_ms
+from optodrive.link.transport.usb_bulk import describe_device, list_devices, read_serial_number, timeout_ms
 
 INTERFACE, ALTERNATE_SETTING = 0, 1
 COMMAND_ENDPOINT, ANSWER_ENDPOINT, FRAME_ENDPOINT = 0x06, 0x83, 0x02

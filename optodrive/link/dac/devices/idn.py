@@ -14,10 +14,9 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, escape_unprintable
 from optodrive.core.quantity import format_quantity
 from optodrive.device.config_sections import BoardSection
-from optodrive.link.dac.devices.network_address import parse_address
 from optodrive.link.dac.formats import idn as wire
 from optodrive.link.dac.formats.base import Chunk
-from optodrive.link.dac.laser_dac import LaserDac
+from optodrive.link.dac.laser_dac import LaserDac, parse_address
 
 ANSWER_TIMEOUT_S = 0.1
 QUERY_TRIES = 3

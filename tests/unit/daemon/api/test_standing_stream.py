@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from optodrive.core.errors import BusyError, LinkError, NotReadyError, StoppedError
-from optodrive.daemon.api import standing_stream
+from optodrive.daemon.api import live_stream
+from optodrive.daemon.api.live_stream import StandingStream
 from optodrive.daemon.api.request_limits import ARRIVED_S, EARLIEST_S
-from optodrive.daemon.api.standing_stream import StandingStream
 from optodrive.daemon.responses.messages import RefreshReport
 from optodrive.daemon.responses.problem import build_error_problem
 from planner_rig import PlannerRig, build_frame
@@ -107,7 +107,7 @@ def test_a_frame_outlives_refreshes_for_which_the_planner_was_too_busy(report):
 
 def test_without_another_try_a_busy_planner_would_end_it(report, monkeypatch):
     """Mutant."""
-    monkeypatch.setattr(standing_stream, "TRIED_AGAIN", ())
+    monkeypatch.setattr(live_stream, "TRIED_AGAIN", ())
     client, answers = stand(report, {"frame 0": [PLANNED, BUSY]})
     assert client.submitted == ["frame 0"] * 2
     assert answers == [("planned", 0), ("refused", 0)]
@@ -129,7 +129,7 @@ def test_a_new_frame_that_is_refused_leaves_the_older_one(report):
 
 
 def test_the_client_is_told_which_caps_take_light_from_a_frame_when_they_change(report, monkeypatch):
-    monkeypatch.setattr(standing_stream, "CAPS_PERIOD_S", 0.0)  # each refresh is told by itself
+    monkeypatch.setattr(live_stream, "CAPS_PERIOD_S", 0.0)  # each refresh is told by itself
     caps = [[], ["display_mean_power"], ["display_mean_power"], ["touch_temperature"], [], []]
     client, answers = stand(report, {}, end_after=8, caps=caps)
     assert answers == [("planned", 0)] * 4

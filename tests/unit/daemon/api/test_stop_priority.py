@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from optodrive.core.json_model import JsonModel, iterate_json
-from optodrive.daemon.api.stop_priority import StopPriorityMiddleware
+from optodrive.daemon.api.request_limits import StopPriorityMiddleware
 
 
 class Leaf(JsonModel):

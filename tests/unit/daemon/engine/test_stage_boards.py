@@ -11,7 +11,7 @@ from optodrive.core.errors import LinkError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.link.protocol.states import ARMED_STATES, BoardState
 from optodrive.link.session import plan_job
-from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.link.simulator.board_core import BoardClock
 from planner_rig import build_frame, build_train
 from stage_rig import CLOCKS, BreakingLink, BusyLink, StageRig, build_stages
 

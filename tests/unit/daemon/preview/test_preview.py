@@ -27,7 +27,7 @@ from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.runtime_folder import open_runtime_folder
 from optodrive.daemon.supervisor.daemon import NICE
 from optodrive.planning.pipeline import warm_up
-from optodrive.planning.stimuli.sequence_codec import decode_sequence
+from optodrive.planning.stimuli.sequence_file import decode_sequence
 
 DISPLAY = DISPLAYS["display-16"]
 FRAME = {"show_at_s": 0, "duration_s": 1, "target_um": {"5": 60}}

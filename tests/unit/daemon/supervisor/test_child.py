@@ -12,8 +12,7 @@ from optodrive.core.clock import ManualClock
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.supervisor.child import HANG_S, RESTART_DELAYS_S, START_TIMEOUT_S, STEADY_S, Child
-from optodrive.daemon.supervisor.link_view import LinkView
-from optodrive.daemon.supervisor.supervisor import STALL_S, Supervisor
+from optodrive.daemon.supervisor.supervisor import STALL_S, LinkView, Supervisor
 
 MOMENT_S, STEP_S = 0.01, 0.05
 

@@ -7,7 +7,7 @@ import pytest
 
 from displays import DISPLAYS
 from exclusive_rig import ExclusiveRig
-from optodrive.cli.calibrate.sweep import _build_displays
+from optodrive.cli.calibrate.pixels import _build_displays
 from optodrive.core.errors import BoardFaultError, InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config import build_pixel_layout

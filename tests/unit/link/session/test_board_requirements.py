@@ -7,7 +7,7 @@ from displays import DISPLAYS
 from optodrive.device.config import Config
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.plan_job import RETIMING_MAX_TICKS
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, tighten
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, tighten
 
 
 def board_us(limits, codes):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.link.session.clock_sync import ClockSync
-from optodrive.link.simulator.board_clock import BoardClock
+from optodrive.link.simulator.board_core import BoardClock
 
 CLOCKS = [BoardClock(60e-6, 0.0, 5.0), BoardClock(-40e-6, 10e-6), BoardClock()]
 

@@ -28,7 +28,7 @@ from optodrive.link.session.link_watch import (
     diagnose_port,
 )
 from optodrive.link.session.session import BoardSession
-from optodrive.link.simulator.line import FaultyLink
+from optodrive.link.simulator.pseudo_terminal import FaultyLink
 from optodrive.link.transport.port_state import PortHolder, PortState
 from optodrive.link.transport.serial_port import SerialPort
 

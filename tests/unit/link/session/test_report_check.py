@@ -11,7 +11,7 @@ from optodrive.link.session import report_check
 from optodrive.link.session.clock_sync import ClockSync
 from optodrive.link.session.point_stream import PointStream
 from optodrive.link.session.report_check import FalseReportError, ReportCheck
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.guards import DEFAULT_LIMITS
 from wire_points import build_points
 
 NOW_S = 10.0

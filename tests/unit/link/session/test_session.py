@@ -21,7 +21,7 @@ from optodrive.link.session.board_view import FAULT_HINTS, get_fault_hint
 from optodrive.link.session.clock_sync import DRIFT_MAX, ClockSync
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, BoardSettings
 from optodrive.link.simulator.virtual_run import MemoryLink
 
 CONFIG = DISPLAYS["display-16"].config

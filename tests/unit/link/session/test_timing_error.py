@@ -6,7 +6,7 @@ from hypothesis.extra.numpy import arrays
 from test_session import Rig, plan
 
 from optodrive.link.session.clock_sync import TimingTotals, compute_timing_error
-from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.guards import BoardSettings
 
 PLANNED_S = np.arange(1, 101) * 0.01
 

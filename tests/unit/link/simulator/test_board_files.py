@@ -3,8 +3,8 @@
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, SETTING_RANGES, BoardSettings, load_settings, tighten
-from optodrive.link.simulator.line import FaultyLink
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, SETTING_RANGES, BoardSettings, load_settings, tighten
+from optodrive.link.simulator.pseudo_terminal import FaultyLink
 from optodrive.link.simulator.script import ACTIONS, ScriptStep, load_script
 
 

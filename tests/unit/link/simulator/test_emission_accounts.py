@@ -6,8 +6,7 @@ from pathlib import Path
 
 from optodrive.link.simulator import board_machine as machine_module
 from optodrive.link.simulator.board_core import TICK_HZ
-from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
-from optodrive.link.simulator.guards import DUTY_FULL, WINDOW_US, EmissionGuards, energy_uj
+from optodrive.link.simulator.guards import DEFAULT_LIMITS, DUTY_FULL, WINDOW_US, EmissionGuards, energy_uj
 from optodrive.link.simulator.point_queue import RING_RECORDS
 
 

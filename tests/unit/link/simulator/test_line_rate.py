@@ -1,6 +1,6 @@
 """The byte rate of a simulated line."""
 
-from optodrive.link.simulator.line import BURST_BYTES, READ_MAX, LineRate
+from optodrive.link.simulator.pseudo_terminal import BURST_BYTES, READ_MAX, LineRate
 
 
 def test_bytes_pass_at_the_rate_of_the_line():

@@ -12,7 +12,7 @@ from optodrive.core.errors import InputError, OverBudgetError, RefusedError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.planning.feasibility import order_search
 from optodrive.planning.feasibility.check import check_feasibility
-from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence, stretch_sequence
+from optodrive.planning.feasibility.reduction import omit_pixels, scale_sequence, stretch_sequence
 from optodrive.planning.feasibility.violation import beam_lower_bound_s
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern

@@ -9,9 +9,9 @@ import pytest
 
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.limiter import cold_start
+from optodrive.planning.limiter import pulse_application
 from optodrive.planning.limiter.cap_checks import max_power_w
-from optodrive.planning.limiter.cold_start import BEFORE, REQUEST, ColdStart
+from optodrive.planning.limiter.pulse_application import BEFORE, REQUEST, ColdStart
 from optodrive.planning.limiter.workspace import open_workspace
 
 PLAN = """
@@ -44,8 +44,8 @@ def test_the_second_process_compiles_for_the_very_types(monkeypatch, display, tm
     program, sent = tmp_path / "program", tmp_path / "sent"
     program.write_text(f"#!/bin/sh\ncat > {sent}\n")
     program.chmod(0o700)
-    monkeypatch.setattr(cold_start, "is_cached", lambda kernel: False)
-    monkeypatch.setattr(cold_start.sys, "executable", str(program))
+    monkeypatch.setattr(pulse_application, "is_cached", lambda kernel: False)
+    monkeypatch.setattr(pulse_application.sys, "executable", str(program))
     start, (_, budget_state) = ColdStart(), display.build_cold_state()
     start.begin(display.budget, budget_state)
     start.finish(display.budget, budget_state)
@@ -57,8 +57,8 @@ def test_the_second_process_compiles_for_the_very_types(monkeypatch, display, tm
 
 @pytest.mark.parametrize("program", ["/bin/true", "/bin/false"])
 def test_a_second_process_that_fails_costs_nothing_but_time(monkeypatch, display, program):
-    monkeypatch.setattr(cold_start, "is_cached", lambda kernel: False)
-    monkeypatch.setattr(cold_start.sys, "executable", program)
+    monkeypatch.setattr(pulse_application, "is_cached", lambda kernel: False)
+    monkeypatch.setattr(pulse_application.sys, "executable", program)
     start = ColdStart()
     _, budget_state = display.build_cold_state()
     start.begin(display.budget, budget_state)

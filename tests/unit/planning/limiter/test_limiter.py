@@ -19,8 +19,13 @@ from optodrive.planning.limiter.limiter import (
     shift_state,
     verify,
 )
-from optodrive.planning.limiter.nominal_model import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
-from optodrive.planning.limiter.panel_bound import specht_ratio
+from optodrive.planning.limiter.panel_bound import (
+    NominalThermalModel,
+    NominalTouch,
+    NominalWalls,
+    Uncertainty,
+    specht_ratio,
+)
 from optodrive.planning.limiter.workspace import PulseHistory, WindowChains, append, max_window_power_w
 from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import NO_CAPS

@@ -5,11 +5,11 @@ import subprocess
 import numpy as np
 import pytest
 
-from optodrive.cli.pattern_parameters import parse_parameters
+from optodrive.cli.push_options import parse_parameters
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
+from optodrive.planning.stimuli.braille import TABLES
 from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII, build_braille_file
-from optodrive.planning.stimuli.liblouis import TABLES
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.pixel_lattice import Lattice, Spacing, find_line_slots
 from optodrive.planning.stimuli.text import build_text

@@ -12,8 +12,8 @@ from liblouis_judge import ALPHABETS, draw_lines, judge
 from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
-from optodrive.planning.stimuli import liblouis
-from optodrive.planning.stimuli.liblouis import LIBRARY, _find_table, list_tables, translate_lines
+from optodrive.planning.stimuli import braille
+from optodrive.planning.stimuli.braille import LIBRARY, _find_table, list_tables, translate_lines
 from optodrive.planning.stimuli.pixel_lattice import Lattice, Spacing, find_line_slots
 from optodrive.planning.stimuli.text import build_text, translate
 
@@ -117,15 +117,15 @@ def test_tables_are_listed_by_language(capsys):
 
 
 def test_without_the_library_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(liblouis, "LIBRARY", "liblouis-that-is-missing.so")
-    liblouis._load_library.cache_clear()
+    monkeypatch.setattr(braille, "LIBRARY", "liblouis-that-is-missing.so")
+    braille._load_library.cache_clear()
     try:
         with pytest.raises(InputError, match=r"t: table: .*apt-get install liblouis20 liblouis-data") as refused:
             translate_lines("a", "en-ueb-g2", "t")
         assert refused.value.code == "missing_library"
     finally:
-        liblouis._load_library.cache_clear()
+        braille._load_library.cache_clear()
 
 
 def test_the_tables_folder_is_debians():
-    assert Path("/usr/share/liblouis/tables") == liblouis.TABLES
+    assert Path("/usr/share/liblouis/tables") == braille.TABLES

@@ -5,8 +5,8 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.planning.stimuli import sequence_codec
-from optodrive.planning.stimuli.sequence_codec import decode_sequence, encode_sequence
+from optodrive.planning.stimuli import sequence_file
+from optodrive.planning.stimuli.sequence_file import decode_sequence, encode_sequence
 
 TRAINS = (PulseTrain(3, 0.0, 1.0, 0.01, 0.01, 2.0, 4), HeightTrain(5, 0.5, 1.0, 0.1, 1e-4, None, -2))
 
@@ -41,6 +41,6 @@ def test_the_largest_number_of_empty_frames_stays_small():
 
 
 def test_a_sequence_beyond_the_bound_is_refused(monkeypatch):
-    monkeypatch.setattr(sequence_codec, "ENCODED_MAX_BYTES", 100_000)
+    monkeypatch.setattr(sequence_file, "ENCODED_MAX_BYTES", 100_000)
     with pytest.raises(InputError, match="send it in parts"):
         encode_sequence(FrameSequence(tuple(build_frame(1511) for _ in range(10))))
