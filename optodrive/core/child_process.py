@@ -100,6 +100,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 def die_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
     """Let the kernel send this process a signal when its parent dies. SIGKILL ends it even while it is suspended."""
+    # The kernel does it, also after kill -9 of the parent, which no handler survives.
     _libc.prctl(PR_SET_PDEATHSIG, number, 0, 0, 0)
 
 
@@ -116,6 +117,7 @@ def fork_child(run: Callable[[], int], name: str, kept: Iterable[int]) -> int:
         with suppress(OSError):  # a full disk
             stream.flush()
     parent = os.getpid()
+    # A signal between fork and _separate would run the parent's handler in the child.
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     pid = os.fork()
     if pid != 0:
@@ -131,6 +133,7 @@ def fork_child(run: Callable[[], int], name: str, kept: Iterable[int]) -> int:
         with suppress(BaseException):
             sys.stdout.flush()
             sys.stderr.flush()
+        # No atexit and no finally of the parent's frames: those would remove its sockets and stop its children.
         os._exit(status)
 
 

@@ -185,6 +185,7 @@ class MessageSocket:
     def send_bytes(self, data: bytes) -> None:
         """Send an encoded message, or keep the bytes that the peer does not accept yet."""
         self._require_open()
+        # Lost, not waited for: a peer that does not read must not fill the memory of one in real time.
         if len(self._out) + len(data) > self._out_max_bytes:
             waiting_bytes = len(self._out)
             self.close()

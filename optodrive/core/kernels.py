@@ -95,6 +95,7 @@ def _collect_code(code: CodeType, docstring: str | None, parts: list[str], names
     for position, constant in enumerate(code.co_consts):
         if isinstance(constant, CodeType):
             _collect_code(constant, None, parts, names)
+        # The docstring is the first constant: editing it changes no machine code.
         elif position > 0 or constant != docstring:
             parts.append(repr(constant))
 
@@ -109,6 +110,7 @@ def _collect_value(value: Any, names: list[str], parts: list[str], visited: set[
     elif isinstance(value, ModuleType):
         parts.append(value.__name__)
         if value.__name__.split(".")[0] == __name__.split(".")[0]:
+            # Of a module of this package only the names that the bytecode mentions: the rest may change.
             for name in sorted(set(names) & set(vars(value))):
                 _collect_value(vars(value)[name], names, parts, visited)
     elif isinstance(value, type) and hasattr(value, "_fields"):

@@ -24,6 +24,7 @@ def set_realtime_priority(priority: int) -> None:
     Threads that it starts later inherit it; otherwise a preempted thread could hold the interpreter lock. Without the
     permission, scheduling stays as it is, and the lease tolerates less load by other programs.
     """
+    # Round robin: of several threads at one priority none waits for another to sleep.
     policy = os.SCHED_OTHER if priority == USUAL else os.SCHED_RR
     with suppress(OSError):
         os.sched_setscheduler(0, policy, os.sched_param(priority))
@@ -66,6 +67,7 @@ def settle_memory() -> None:
     """
     gc.set_threshold(*USUAL_THRESHOLDS)
     gc.collect()
+    # After the collection: what is garbage now would else be kept for good.
     gc.freeze()
 
 

@@ -46,6 +46,7 @@ class BatchLimiter:
 
         Raises OverBudgetError under policy "refuse" for a pulse above a cap, and under "delay" for one that never fits.
         """
+        # Before the limiter: it would trim a move's pulse to nothing, where a frame can be drawn more slowly.
         pause = self._find_galvo_pause(batch)
         if pause is not None:
             self._batch_pause_s, self._paused_row = self._batch_pause_s + pause.pause_us * 1e-6, pause.rows
@@ -58,8 +59,10 @@ class BatchLimiter:
                 raise
             self.delays.append(Delay(int(batch.source[0]), error.pixel, error.cap, error.fits_after_s))
             self._scheduler.delay(ceil(error.fits_after_s * 1e6))
+            # The batch comes again at a later time, when the mirrors' coils are colder: its pauses are found anew.
             self._forget_pauses()
             return None
+        # Kept with the state before it: only that tells when the batch would have fit.
         if self._first_trimmed is None and granted.trimmed_j.any():
             self._first_trimmed = batch, granted, self.state
         self.state = state
@@ -96,6 +99,7 @@ class BatchLimiter:
         stage = int(batch.stage[row])
         averaging_s = float(self._budget.galvos.averaging_s[stage])
         cold_s = COLD_AFTER_AVERAGING_TIMES * averaging_s
+        # A pause before this row was tried already: if not even cold coils admit the move, no longer pause will.
         if row == self._paused_row and galvo_feasible_prefix(batch, self.state, self._budget, row, cold_s) == row:
             return None
         pause_s = self._pause_fraction * averaging_s

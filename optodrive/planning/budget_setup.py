@@ -55,6 +55,7 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     neighbours = Neighbours.from_display(config.display)
     model = build_nominal_model(parameters, pixels, neighbours, ambient_c + ZERO_CELSIUS_K, heat_gain, panel)
     uncertainty = Uncertainty(**limits.uncertainty.model_dump())
+    # One board keeps its own order: its pulses are as far apart as planned, however wrong its clock.
     skew_s = limits.stage_skew_max_s if len(stages) > 1 else 0.0
     powers_w = (stage.laser.max_power_w for stage in stages)
     heat = build_heat_bound(model, uncertainty, caps, *powers_w, skew_s=skew_s)
@@ -62,6 +63,7 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     if not late_k < caps.absorber_k:
         expected = f"more than {base_c + late_k:.1f} °C, to which the terms of {parameters.name} may warm it"
         raise InputError("limits.absorber_max_c", limits.absorber_max_c, expected)
+    # After the bound was built: with the higher cap its chords reach further, which is no looser.
     caps = caps._replace(absorber_k=caps.absorber_k - late_k)
     galvos = [build_galvo_model(stage) for stage in stages]
     check_galvo_cap(limits.galvo_acceleration_rms_max_rad_per_s2, galvos)
@@ -107,6 +109,8 @@ def build_nominal_panel(config: Config, parameters: ParameterSet, pixels: PixelA
         walls_j_per_k = len(pixels) * compute_capacity(parameters.term_values("wall_heating"))
     if "panel_heating" in parameters.terms:
         values, where = parameters.term_values("panel_heating"), "terms.panel_heating.capacity"
+        # The bound counts absorbed light only; a term by which the panel gets more is made up for by a panel that warms
+        # as much more.
         more = max(1.0, values["share"] / float(pixels.epsilon.min()))
         resistance_k_per_w, capacity_j_per_k = values["resistance"] * more, values["capacity"] / more
     else:
@@ -162,6 +166,7 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
         * r_k_per_w
         * _compute_uncertainty_factor(config, terms, heat_gain.capacity_factor)
     )
+    # Twice: how much absorbers add to each other depends on their sum, which depends on the factors of all terms.
     uniform_rise_k = _combine_heat_gains(terms, envelope._replace(summed_absorbers_k=display_rise_k)).uniform_rise_k
     # A rise of the absorbers also warms walls and touch surfaces, with a delay; each adds a small part.
     factor = 1.0

@@ -41,12 +41,14 @@ def run_acceptor(
     folder: RuntimeFolder, beat: BeatWriter, listeners: list[socket.socket], tokens: Tokens, daemon: DaemonSection
 ) -> None:
     """Keep the acceptor until SIGTERM or the end of the supervisor. listeners: sockets that listen already."""
+    # First: it counts where the next line is not permitted.
     set_nice(NICE)
     set_realtime_priority(LIGHT)
     raise_descriptor_limit()
     acceptor = Acceptor(
         listeners, AccessPolicy(tokens, daemon), daemon, folder.acceptor_socket, folder.link_socket, beat
     )
+    # Only a flag: the loop's next beat, 50 ms at most, sees it.
     signal.signal(signal.SIGTERM, lambda number, frame: acceptor.end())
     try:
         acceptor.run()
@@ -89,6 +91,7 @@ class Acceptor:
 
     def run(self) -> None:
         """Serve until `end` or the end of the supervisor."""
+        # Before it counts as ready: a first STOP must find the link process.
         self._link.connect_if_due()
         self._beat.report_ready()
         while not self._is_ending:
@@ -107,8 +110,11 @@ class Acceptor:
     def _step(self) -> None:
         now_s = time.monotonic()
         ready = self._wait(now_s)
+        # Again: the wait is over, and what follows is dated by this turn.
         now_s = time.monotonic()
         if self._queue.fileno() in ready and self._queue.receive():
+            # Its priority is above web's: without a pause a flood of connections would leave web no processor to answer
+            # with.
             self._queue_at_s = now_s + BUSY_PAUSE_S
         if self._link.fileno() in ready:
             self._link.receive()
@@ -116,6 +122,7 @@ class Acceptor:
             self._accept_web()
         if self._web is not None and self._web.fileno() in ready:
             self._receive_confirmation(self._web)
+        # After confirmations and the queue: room and requests of this turn meet at once.
         self._hand_over()
         if now_s >= self._beat_at_s:
             self._beat_at_s = now_s + TURN_MAX_S
@@ -146,6 +153,7 @@ class Acceptor:
         """Rank a request. A permitted STOP goes to the link process before anything else happens."""
         rank = rank_request(parse_head(head), self._policy)
         if rank is Rank.STOP:
+            # Without waiting for web, which answers and audits: a web process that hangs delays only that.
             self._link.send_stop()
         return rank
 
@@ -177,6 +185,7 @@ class Acceptor:
         except OSError:  # it has left, or there is no descriptor
             time.sleep(BUSY_PAUSE_S)
             return
+        # Another web process has connected: the former's unopened connections go back to the queue, and to the new one.
         self._lose_web()
         web.setblocking(False)
         self._web = web
@@ -200,11 +209,13 @@ class Acceptor:
             return
         opened = self._unopened.pop(NUMBER.unpack(data)[0], None)
         if opened is not None:
+            # Only now: until web has confirmed it, a web process that dies may not have read its request.
             opened.sock.close()
 
     def _hand_over(self) -> None:
         """Hand over as many connections as the web process may have unopened, the highest rank first."""
         for rank, unopened_max in UNOPENED_MAX.items():
+            # By rank: callers without a token take no place from those with one.
             unopened = sum(waiting.rank is rank for waiting in self._unopened.values())
             for _ in range(min(unopened_max - unopened, self._queue.count(rank))):
                 if self._web is None or not self._send(self._web, self._queue.take(rank)):

@@ -71,6 +71,7 @@ class AcceptorClient:
     def check_beats(self) -> bool:
         """Return whether the acceptor's loop runs, so that a new caller could stop. Call it at every beat."""
         now_s = time.monotonic()
+        # This process was suspended: beats wait unread, and the acceptor is not to blame.
         if now_s - self._checked_s > STALL_S:
             self._beaten_s = now_s
         self._checked_s = now_s
@@ -88,6 +89,7 @@ class AcceptorClient:
             link.close()
             self._retry = loop.call_later(RETRY_S, self.start)
             return
+        # Connected counts as a beat, or the first check would find none.
         self._socket, self._beaten_s = link, time.monotonic()
         loop.add_reader(link, self._receive, link)
         self.on_connected()
@@ -107,6 +109,7 @@ class AcceptorClient:
         self._forget()
 
     def _receive(self, link: socket.socket) -> None:
+        # Bounded: the loop serves STOP between two turns.
         for _ in range(PACKETS_MAX):
             try:
                 packet = receive_packet(link)
@@ -125,6 +128,7 @@ class AcceptorClient:
         if self._socket is None:
             return
         self._forget()
+        # Before the retry: without an acceptor no new caller can stop, so the light ends now.
         self.on_lost()
         self._retry = asyncio.get_running_loop().call_later(RETRY_S, self.start)
 

@@ -45,11 +45,13 @@ class BoundedHttp(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse the received bytes, unless they are an endless body of a request that has been answered."""
+        # A body with a length ends by itself; a chunked one need not.
         if self.get_phase().phase == "drain" and b"transfer-encoding" in dict(self.headers):
             self._drained_bytes += len(data)
             if self._drained_bytes > DRAIN_MAX_BYTES:
                 self.transport.abort()
                 return
+        # A new dict: a request that is being answered keeps the time of its own head.
         self.app_state = {**self.app_state, ARRIVED_S: self.server_state.pop_arrival_s(self.transport)}
         super().data_received(data)
         self._set_read_size(BODY_READ_BYTES if self.get_phase().phase in ("body", "drain") else HEADER_READ_BYTES)
@@ -176,10 +178,13 @@ class BoundedWebSocket(Utf8WebSocket):
         earliest_s = arrived_s if self._unread_since_s is None else min(arrived_s, self._unread_since_s)
         self._unread_since_s = earliest_s if len(data) >= READ_BYTES else self.loop.time()
         self._read = _Arrival(arrived_s, earliest_s)
+        # A message arrives with its first byte, in whichever read that was.
         self._begun = self._begun or self._read
         if self._empty_handle is not None:
             self._empty_handle.cancel()
         self._unparsed += data
+        # Nothing more is read until this is parsed: what comes meanwhile waits in the kernel, where it costs no memory
+        # here.
         self.transport.pause_reading()
         self._pump()
 
@@ -208,6 +213,7 @@ class BoundedWebSocket(Utf8WebSocket):
             self._pump_handle.cancel()
             self._pump_handle = None
         for _ in range(SLICES_PER_TURN):
+            # A client that reads no answers gets no more of its input parsed.
             if self.read_paused or not self.writable.is_set() or self.transport.is_closing():
                 return
             if not self._unparsed:
@@ -220,6 +226,7 @@ class BoundedWebSocket(Utf8WebSocket):
             piece = bytes(self._unparsed[:SLICE_BYTES])
             del self._unparsed[:SLICE_BYTES]
             super().data_received(piece)
+        # In the next turn of the loop: a large message is parsed between others, STOP among them.
         self._pump_handle = self.loop.call_soon(self._pump)
 
     def _compute_wait_s(self) -> float:
@@ -230,6 +237,7 @@ class BoundedWebSocket(Utf8WebSocket):
 
     def handle_ping(self) -> None:
         """Answer a ping, at its pace."""
+        # Pings cost work and carry no message: unpaced, one client could keep the loop busy.
         self._allowance -= 1.0
         self._end_control_frame()
         super().handle_ping()

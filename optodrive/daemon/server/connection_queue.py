@@ -20,6 +20,7 @@ WAITING_MAX = 512
 """Connections that wait. Beyond that, the oldest of the most numerous kind gives way, one with a valid token last."""
 WAIT_MAX_S = 5.0
 """The longest time that a request waits to be served. Its head must have arrived within the time of that phase."""
+# Edge-triggered: a head that stays incomplete must not wake the loop again and again.
 INPUT = select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET
 END = select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR
 
@@ -93,6 +94,8 @@ class ConnectionQueue:
             except (BlockingIOError, ConnectionAbortedError):
                 return False
             except OSError:  # no descriptor is left
+                # The listening socket stays readable: one that waits is closed, so that the next accept has a
+                # descriptor.
                 self._make_room()
                 return True
             sock.setblocking(False)
@@ -122,6 +125,7 @@ class ConnectionQueue:
         if head and is_complete(head):
             self._forget_silent(fileno)
             self._rank(waiting._replace(since_s=self._now_s()), head)
+        # Its end counts only without a complete head: a caller may send STOP and close at once.
         elif head == b"" or has_ended:
             self._forget_silent(fileno).sock.close()
 
@@ -147,6 +151,7 @@ class ConnectionQueue:
     def put_back(self, waiting: Waiting) -> None:
         """Let a connection that was taken be the first of its rank again, unless its request has been read since."""
         head = peek_head(waiting.sock)
+        # Web has read it: what is left is no request, and to answer it would be the second answer.
         if not head or not is_complete(head):
             waiting.sock.close()
             return
@@ -163,6 +168,7 @@ class ConnectionQueue:
                 self._close_first(rank)
 
     def _make_room(self) -> None:
+        # The most numerous kind gives way: a flood of silent connections pushes out itself.
         if self._silent and len(self._silent) >= self.count(Rank.OTHER):
             self._forget_silent(next(iter(self._silent))).sock.close()
             return
@@ -172,5 +178,6 @@ class ConnectionQueue:
 
     def _close_first(self, rank: Rank) -> None:
         waiting = self.take(rank)
+        # Before it is closed: the head is still in the socket, and a STOP is audited from it.
         self.on_unserved(waiting)
         waiting.sock.close()

@@ -60,6 +60,7 @@ class Connections:
 
     def add(self, transport: asyncio.Transport, client: ClientProtocol) -> None:
         """Add a connection that has been opened, or replace its protocol."""
+        # A WebSocket replaces the HTTP protocol of the same transport, and was counted then.
         if transport not in self._entries:
             self.opening -= 1
         self._entries[transport] = _Entry(client, client.get_phase(), self._now_s())
@@ -81,6 +82,8 @@ class Connections:
         """
         while len(self) >= CONNECTIONS_MAX and self.close_longest_idle(spares_trusted=rank is Rank.OTHER):
             pass
+        # The reserve is for STOP alone: it must find a place when all others are taken by streams, which have no limit
+        # of time.
         return len(self) < CONNECTIONS_MAX + (STOP_RESERVE if rank is Rank.STOP else 0)
 
     def close_longest_idle(self, spares_trusted: bool = False) -> bool:
@@ -113,6 +116,7 @@ class Connections:
         revoked = set(tokens)
         for transport, entry in list(self._entries.items()):
             phase = entry.client.get_phase().phase
+            # An answer in progress may be that of STOP, which is never ended.
             if entry.client.get_caller() in revoked and phase != "answer" and (is_final or phase in IDLE_PHASES):
                 self.remove(transport)
                 transport.abort() if is_final else transport.close()

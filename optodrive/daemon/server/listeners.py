@@ -38,6 +38,7 @@ class TimedSocket(socket.socket):
         if flags & socket.MSG_PEEK:
             return super().recv(size_bytes, flags)
         data, ancillary, _, _ = self.recvmsg(size_bytes, _ANCILLARY_BYTES, flags)
+        # A read without a stamp, as of a Unix socket, must not keep that of the read before.
         self.received_s = None
         for level, kind, value in ancillary:
             if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS):
@@ -58,6 +59,7 @@ def open_tcp_listener(host: str, port: int) -> socket.socket:
     # With an explicit protocol, asyncio disables Nagle's algorithm, which would delay each response by 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    # On the listener: accepted sockets inherit it, so that even the first bytes have a stamp.
     enable_timestamps(listener)
     try:
         listener.bind((host, port))

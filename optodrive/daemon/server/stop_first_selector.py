@@ -55,11 +55,13 @@ class StopFirstSelector(selectors.EpollSelector):
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Return the ready keys: everything but clients, STOP first, then the clients that have waited longest."""
         ready = super().select(timeout)
+        # The usual case costs no look into any socket.
         if len(ready) <= CLIENTS_PER_TURN:
             return ready
         clients = {key.fd: (key, events) for key, events in ready if self._is_input(key.fd, events)}
         others = [(key, events) for key, events in ready if key.fd not in clients]
         chosen = self._choose(clients)
+        # Timers, signals and connections to other processes are never deferred: they carry STOP's confirmation.
         return [clients[fd] for fd in chosen] + others
 
     def _is_input(self, fileno: int, events: int) -> bool:
@@ -72,12 +74,14 @@ class StopFirstSelector(selectors.EpollSelector):
 
     def _choose(self, filenos: Iterable[int]) -> list[int]:
         ready = dict.fromkeys(filenos)
+        # Those deferred before come first, so each gets its turn.
         queue = dict.fromkeys([fd for fd in self._deferred if fd in ready]) | ready
         stops = dict.fromkeys(fd for fd in queue if self._is_stop(self._clients[fd]))
         chosen = list(stops | queue)[:CLIENTS_PER_TURN]
         self._deferred = {fd: None for fd in queue if fd not in chosen}
         now_s = time.monotonic()
         for fd in self._deferred:
+            # A deferred client keeps the first time: its latency and epoch include the wait.
             self._arrived_s.setdefault(fd, now_s)
         return chosen
 

@@ -90,6 +90,8 @@ class WebProcess:
         """Go dark, end all streams and let the server finish. Also called by a signal handler."""
         if self.server.loop is not None:
             with suppress(RuntimeError):  # after the loop's end
+                # A signal handler runs between two bytecodes of any code: the loop's own sockets are used from the loop
+                # only.
                 self.server.loop.call_soon_threadsafe(self._go_dark)
         self._client.hub.close()
         self.server.should_exit = True
@@ -120,6 +122,7 @@ class WebProcess:
         """End the process if a callback had no memory: it would be called, and fail, again, and STOP would wait."""
         if isinstance(context.get("exception"), MemoryError):
             self._beat.report_failure(OUT_OF_MEMORY)
+            # Not sys.exit, which would run callbacks and clean-up without memory.
             os._exit(1)
         loop.default_exception_handler(context)
 
@@ -135,6 +138,7 @@ class WebProcess:
             await asyncio.sleep(BEAT_INTERVAL_S)
 
     def _beat_link(self) -> None:
+        # Alive only with a living acceptor: a web process that no new caller reaches must not keep the light on.
         self._client.link.beat(alive=self._acceptor.check_beats())
 
     def _go_dark(self) -> None:
@@ -171,6 +175,7 @@ class WebProcess:
     def _revoke(self, tokens: tuple[Token, ...]) -> None:
         """End the light, then the requests and connections, of tokens that are no longer valid."""
         for token in tokens:
+            # The light first, then the requests: ended in the other order, a push in between would still be accepted.
             self._client.revoke(token.name)
         tasks = self._policy.in_progress.revoke(tokens)
         tasks.append(asyncio.create_task(self.server.close_revoked(tokens)))

@@ -54,11 +54,13 @@ class ConnectionOpener:
         """Open a connection, or hold it while there is no room. The acceptor may send another one in the next turn."""
         if self._connections.make_room(waiting.rank):
             self._open(waiting)
+        # Nobody waits longer for a place: a caller that gave up must not get one.
         elif time.monotonic() - waiting.since_s > WAIT_MAX_S:
             waiting.sock.close()
         else:
             self._hold(waiting)
             return
+        # In the next turn: the protocol reads the request first, and the acceptor keeps its copy until then.
         self._loop.call_soon(self._acceptor.confirm, waiting.number)
 
     def _hold(self, waiting: Waiting) -> None:
@@ -71,6 +73,7 @@ class ConnectionOpener:
 
     def _open(self, waiting: Waiting) -> None:
         self._selector.add_client(waiting.sock, waiting.since_s)
+        # Counted at once: asyncio opens it a turn later, and the places would be given twice.
         self._connections.opening += 1
         task: asyncio.Task[object] = self._loop.create_task(
             self._loop.connect_accepted_socket(self._create_protocol, waiting.sock)

@@ -73,8 +73,10 @@ class Child:
         self.is_ready, self.failure, self.killed_because = False, None, ""
         self._started_s = self._beaten_s = self._clock.now_s()
         with theirs:
+            # The child's end is closed here right after: only then does its death show as an end of file.
             self.pid = self._start_process(theirs, self.starts)
         self._channel = own
+        # A death wakes the loop by this descriptor, at once and not with the next missing beat.
         self._exit_descriptor = os.pidfd_open(self.pid)
 
     def send_signal(self, number: int) -> None:
@@ -117,6 +119,7 @@ class Child:
         """Descriptors that become readable at the death of the process and, until it is ready, for its messages."""
         if self._channel is None:
             return []
+        # Beats of a child that serves are read at each tick: each would otherwise wake the loop ten times per second.
         return [self._exit_descriptor] if self.is_ready else [self._exit_descriptor, self._channel.fileno()]
 
     def receive(self) -> list[dict[str, Any]]:
@@ -167,6 +170,7 @@ class Child:
 
         now_s: time before receive(). If the supervisor is suspended after it, the beats of the meantime are unread.
         """
+        # Killed already: its death is on the way.
         if not self.is_running or self.killed_because:
             return None
         if not self.is_ready:

@@ -81,11 +81,13 @@ def run(
         supervisor.start_link()  # it connects to the board while this process loads what the others need
         reloader = ConfigReloader(config, tokens, config.model_copy if read_config is None else read_config)
         starts = _build_starts(_load_display(config), folder, listeners, reloader, session_path)
+        # After all is loaded and before the first fork: forks share what is not touched later.
         _prepare_memory()
         handler = ReloadHandler(reloader, supervisor, notifier, log)
         supervisor.on_web_message = handler.on_web_message
         if notifier.is_enabled and read_config is not None:
             supervisor.on_reload = handler.request
+        # Web last: when it answers, planner, preview and acceptor are there.
         *others, web = (Child(name, start, clock) for name, start in starts.items())
         if supervisor.start_others(others, web):
             address = build_local_url(config.daemon.host, port)
@@ -144,6 +146,8 @@ def _build_starts(
     from optodrive.daemon.server.web_process import run_web
 
     memory = ThermalMemory()
+    # Only the acceptor keeps the listening sockets: with a second holder, callers would be accepted by nobody after its
+    # death.
     kept = {"acceptor": [listener.fileno() for listener in listeners]}
     targets: dict[str, Callable[[BeatWriter, int], None]] = {
         "planner": lambda beat, number: run_planner(display, folder, beat, number_path(session_path, number), memory),

@@ -187,6 +187,7 @@ class Supervisor:
         """Turn the gate off, then end the children, then kill those that do not end."""
         self._is_loading, self._is_ending = False, True
         self._notifier.send("STOPPING=1")
+        # The gate first, then the processes: link, which can close it, ends last.
         self.link_view.stop_and_wait(STOP_CONFIRMATION_S)
         self.record_audit({"event": "ended"})
         self.send_to_web({"kind": "end"})
@@ -200,6 +201,7 @@ class Supervisor:
     def _end(self, children: list[Child]) -> None:
         for child in children:
             child.send_signal(signal.SIGTERM)
+            # A suspended child would take SIGTERM only when somebody continues it.
             child.send_signal(signal.SIGCONT)
         deadline_s = self._clock.now_s() + END_GRACE_S
         while any(child.is_running for child in children):
@@ -223,6 +225,7 @@ class Supervisor:
         self._stepped_s = now_s
         with suppress(BlockingIOError):
             os.read(self._wakeup_read, 4096)
+        # Before the children are judged: a signal that ends the daemon also ends them, and they are not restarted.
         self._handle_signals()
         for child in self._children:
             for fields in child.receive():
@@ -257,6 +260,7 @@ class Supervisor:
             child.kill(f"killed: {reason}")
         ended = child.collect()
         if ended is not None:
+            # Its successor has another epoch: what this view knew of the board is void.
             if child is self._link:
                 self.link_view.close()
                 self._was_connected = False
@@ -306,6 +310,7 @@ class Supervisor:
         if text != self._status_text:
             self._status_text = text
             self._notifier.send(f"STATUS={text}")
+        # The service manager restarts the whole daemon when a process stays away: the last resort.
         if not missing:
             self._notifier.feed_watchdog()
         if self._is_serving and not self._was_announced_connected and self.link_view.status.get("connected"):

@@ -32,6 +32,7 @@ class Control(NamedTuple):
 
     def record_beat(self, at_s: float) -> "Control":
         """Return the control after a beat at a host time, s, which cannot be earlier than the beat before."""
+        # By arrival at the web server: a beat that waited in a queue proves only that the client lived then.
         return self if self.held_s is None else self._replace(held_s=max(self.held_s, at_s))
 
     def is_abandoned(self, now_s: float) -> bool:
@@ -68,6 +69,7 @@ class Epoch:
 
     def end(self, reason: str) -> None:
         """Begin the next epoch. reason: cause that ends this one, as the end of a sentence."""
+        # First the number: a request that is refused from here on is of the epoch before.
         self.number += 1
         self.reason = reason
 
@@ -120,6 +122,7 @@ class Pauses:
 
     def end(self) -> None:
         """End the pause, if there is one."""
+        # The number stays: points built before this pause are refused also after it.
         self._since_s = None
 
     def permits(self, number: int) -> bool:
@@ -140,6 +143,7 @@ PERMISSIONS = {
     "planner": {"stop", "beat", "begin", "splice", "extend", "truncate", "flush", "delay"},
     "web": {"stop", "beat", "arm", "disarm", "pause", "resume", "revoke", "hold", "release"},
     "acceptor": {"stop"},
+    # No arming: after a restart nobody may be present.
     "supervisor": {"stop", "disarm"},
     "operator": {"stop"},
 }
@@ -170,8 +174,10 @@ class Clients:
 
         Raise IpcError for a role that the client may not have.
         """
+        # Once per connection: a client that changed its role could collect the permissions of several.
         if role not in PERMISSIONS or client in self._roles or (role != "operator" and not trusted):
             raise IpcError(f"role: got {role!r}, expected one that this client may have, once")
+        # The newer one wins: after a restart the former's socket may not be noticed as closed yet.
         previous = self._find(role) if role in SINGLE_ROLES else None
         if previous is None:
             self._roles[client] = role
@@ -181,6 +187,7 @@ class Clients:
         """Remove a client. Return why its loss ends the epoch, '' if it does not."""
         role = self._roles.pop(client, "")
         self._beats.pop(role, None)
+        # Then a shell or the key must do; `_end_unattended` bounds how long.
         if role == "web" and self._on_web_loss == "finish":
             return ""
         return LOSS_REASONS.get(role, "")
@@ -201,6 +208,7 @@ class Clients:
 
     def find_stalled(self) -> str:
         """Return the role that withholds the lease, '' if it may be renewed."""
+        # Beats, not sockets: a process that hangs keeps its socket open.
         roles = ("planner",) if self._on_web_loss == "finish" else ("planner", "web")
         return next((role for role in roles if not self._is_alive(role)), "")
 

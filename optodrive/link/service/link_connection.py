@@ -167,6 +167,8 @@ class LinkConnection:
             select.select([self._socket], writable, [], max(0.0, wait_s))
             self.receive()
             if wait_s <= 0.0 and not results:
+                # Closed, not retried: link then loses its planner and goes dark, and nobody acts on a result that comes
+                # too late.
                 self.close(f"the link process did not answer {kind} within {timeout_s:g} s")
         self._on_result = None
         return results[0] if results else None
@@ -197,6 +199,7 @@ def stop_board(path: Path, timeout_s: float = STOP_TIMEOUT_S) -> dict[str, Any] 
         try:
             connection.open()
             break
+        # The listen queue is full for a moment; any other error means that nobody will answer.
         except BlockingIOError:  # others connect
             if clock.now_s() > deadline_s:
                 return None

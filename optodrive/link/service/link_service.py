@@ -120,6 +120,7 @@ class LinkService:
             self.on_client_lost(replaced)
             self._clients.add(client, role, trusted)
         if role == "planner":
+            # The planner counts its commands per connection, to know when link has carried out all of them.
             self._handover.commands = 0
         self._status.mark_due()
 
@@ -128,6 +129,7 @@ class LinkService:
 
         An arming that is not complete ends with its caller, even if a plan would continue.
         """
+        # An arming whose caller is gone would complete with nobody who knows of it.
         is_arming = self._waiters.drop_client(client)
         reason = self._clients.remove(client) or ("the client that was arming the board has left" if is_arming else "")
         if reason:
@@ -156,23 +158,30 @@ class LinkService:
     def _command(self, client: int, message: Message) -> None:
         command, request_id = message.kind, int(message.fields["id"])
         try:
+            # Before the link is required: without it the board may still emit until its lease ends, and the epoch must
+            # end now.
             if command == "stop":
                 self.go_dark(STOP)
             elif command == "disarm":
+                # No ABORT: in FAULT the command acknowledges, which ABORT does not.
                 self._end_epoch(DISARM)
             self._require_link()
             if command == "disarm":
                 self._boards.disarm()
             elif command == "arm":
+                # Arming without a renewable lease would end in fault LEASE a moment later, with a cause that nobody
+                # understands.
                 self._clients.require_lease()
                 self._require_no_control()
                 self._boards.arm()
+                # After the board took the request: a refusal must not leave a controller behind.
                 self._control = self._build_control(message.fields)
             elif command == "pause":
                 self._pause()
             elif command == "resume":
                 self._require_armed("resumed")
                 self.pauses.end()
+                # At once: nothing is awaited, the planner hands over the rest when it is ready.
                 self._reply(client, request_id, None)
                 return
         except OptodriveError as error:
@@ -184,6 +193,7 @@ class LinkService:
         """Turn the gate off, and permit no points until the light is resumed."""
         self._require_armed("paused")
         if not self.pauses.is_paused:
+            # The number rises before the queue is dropped: points on their way from the planner are then refused.
             self.pauses.begin(self._boards.board_s())
             self._handover.pause()
 
@@ -207,6 +217,7 @@ class LinkService:
 
     def _hold(self, arming: int, age_s: float) -> None:
         """Record a beat of the client that holds an arming. age_s: time since it arrived."""
+        # By number, not by caller: a beat of an earlier arming must not sustain a later one of the same token.
         if self._control is not None and self._control.arming == arming:
             self._control = self._control.record_beat(self._clock.now_s() - max(0.0, age_s))
 
@@ -239,10 +250,12 @@ class LinkService:
         self._boards.abort()
 
     def _end_epoch(self, reason: str) -> None:
+        # First of all: what follows may raise, and the epoch must have ended by then.
         self.epoch.end(reason)
         self._control = None
         self.pauses.end()
         self._boards.end_arming()
+        # It sends the reports that were collected before it forgets the jobs: the planner's heat needs them.
         self._handover.clear()
         for waiter in self._waiters.pop_ended():
             self._reply(waiter.client, waiter.request_id, NotReadyError(f"the board is not armed: {reason}"))
@@ -268,14 +281,17 @@ class LinkService:
         refusal = self._boards.pop_refusal()
         now_s = self._clock.now_s()
         failed_arming: OptodriveError | None = None
+        # After the board's messages of this step, so that no answer is older than the state it states.
         for waiter, error in self._waiters.pop_results(self._boards, refusal, self._describe_link_error(), now_s):
             self._reply(waiter.client, waiter.request_id, error)
             if error is not None and waiter.command == "arm":
                 failed_arming = error
+        # The caller was told that the board is not armed; without ABORT it might still become so.
         if failed_arming is not None and self._control is not None:
             self.go_dark(f"arming failed: {failed_arming}")
         if refusal is not None:
             self._send_to_planner(Message("refusal", {"reason": refusal}))
+        # Reports before `drained`: the planner counts what was lit before it plans the rest.
         self._handover.report_progress()
         self._handover.finish_pause()
 
@@ -284,11 +300,15 @@ class LinkService:
         try:
             self._boards.step(wait_s, renew_lease=not stalled, stalled=stalled)
             self._interrupt_if_lost()
+            # The order of these follows the causes: a lost stage is an interruption, and only what is not one ends the
+            # epoch.
             self._watch_board()
             self._end_unattended()
             self._end_abandoned()
             self._end_long_pause()
         except (LinkError, InputError):
+            # No ABORT here: the group has sent it, or the link that would carry it is gone, and the lease ends the
+            # light.
             self._end_epoch(f"the link to the board was lost: {self._describe_link_error()}")
 
     def _interrupt_if_lost(self) -> None:
@@ -303,6 +323,8 @@ class LinkService:
         It does not end what has ended; but a report that it has may be false.
         """
         seen, lost = self._seen_faults, self._boards.lost
+        # A fault that is latched since before is no news: arming and stopping would otherwise end the epoch again at
+        # each status.
         self._seen_faults = self._boards.list_faults()
         is_new_fault = any(
             fault and fault not in seen[stage : stage + 1] and (lost is None or stage != lost.stage)

@@ -93,6 +93,7 @@ class PointHandover:
 
     def pause(self) -> None:
         """Turn the gate off and drop the queue. The planner is told when all is reported that was executed."""
+        # Jobs stay: their last reports are still to come, and `finish_pause` forgets them.
         self._is_draining = True
         self._boards.drain()
 
@@ -100,6 +101,7 @@ class PointHandover:
         """Tell the planner, once, that a pause has no more reports."""
         if self._is_draining and not self._boards.is_draining:
             self._is_draining = False
+            # Reports first, then `drained`: the planner takes all that was lit as known from then on.
             self._report_jobs()
             self.clear()
             self._send(Message("drained", {"pause": self._pauses.number, "board_s": self._pauses.began_s}))
@@ -121,6 +123,8 @@ class PointHandover:
         number, start_s, points = int(fields["job"]), float(fields["start_s"]), _parse_points(message)
         try:
             self._require_allowed(message)
+            # A refusal and no queue: the planner starts a job only when the former has finished, so this one crossed
+            # another.
             if self._boards.has_points:
                 raise NotReadyError("the board still executes an earlier job")
             job = self._boards.begin(points, start_s, _parse_ahead_s(fields))
@@ -158,12 +162,14 @@ class PointHandover:
     def _require_allowed(self, message: Message) -> None:
         """Raise NotReadyError for points of another epoch, of a board that is not armed, or that were damaged."""
         epoch, crc = int(message.fields["epoch"]), int(message.fields["crc"])
+        # Gate 1 of the epochs. The order of these checks is that of their reasons: the first one explains the others.
         if not self._epoch.is_current(epoch):
             raise NotReadyError(f"the plan is of epoch {epoch}, now is {self._epoch.number}: {self._epoch.reason}")
         if not self._permits(message):
             raise NotReadyError("the light is paused, or was since the plan was made")
         if not self._boards.connected or self._boards.state not in ARMED_STATES:
             raise NotReadyError(f"the board is {self._boards.state}; arm it first")
+        # Over the bytes as the limiter verified them: a fault in memory or on the way is no light.
         if crc != zlib.crc32(message.payload):
             raise NotReadyError(DAMAGED_POINTS)
 
@@ -208,12 +214,14 @@ class PointHandover:
         """Send the progress that has changed since the last report if one is due, and forget finished jobs."""
         now_s = self._clock.now_s()
         is_finished = any(job.is_finished for job in self._jobs.values())
+        # The end of a job is news at once: the next one waits for it.
         if not is_finished and now_s - self._reported_s < REPORT_INTERVAL_S:
             return
         self._report_jobs()
 
     def _report_jobs(self) -> None:
         self._reported_s = self._clock.now_s()
+        # Before the progress: a job whose end is known has all its reports.
         self._send_executed()
         for number, job in list(self._jobs.items()):
             sent_points = [part.next_to_send - part.first_index for part in job.parts]

@@ -63,6 +63,7 @@ class ClientSockets:
     def process(self, ready: set[int]) -> None:
         """Serve the clients whose descriptors are ready, the planner with its long messages last."""
         ready_numbers = [number for number, client in self._sockets.items() if client.fileno() in ready]
+        # A full frame is many kilobytes: STOP of another client must not wait for its parsing.
         for number in sorted(ready_numbers, key=lambda number: number == self._service.planner):
             self._serve(number)
         if self._listener.fileno() in ready:
@@ -88,9 +89,11 @@ class ClientSockets:
             return False
         if len(self._sockets) >= CLIENTS_MAX:
             self._drop_oldest_operator()
+        # Numbers are never reused: a late message for a client that left reaches nobody.
         number, is_trusted = next(self._numbers), _read_user(connection) == os.geteuid()
         if is_trusted:
             self._trusted.add(number)
+        # Every user in the group may open this socket to stop; none may fill this process's memory.
         max_bytes = MESSAGE_MAX_BYTES if is_trusted else OPERATOR_MESSAGE_MAX_BYTES
         self._sockets[number] = MessageSocket(connection, max_bytes, OUT_MAX_BYTES)
         return True
@@ -190,6 +193,7 @@ class LinkProcess:
         """Let SIGUSR1 stop and SIGTERM end. Ignore the terminal's signals, which the supervisor handles."""
         self._wakeup.setblocking(False)
         self._wakeup_write.setblocking(False)
+        # A signal that arrives between the flag's test and poll() would otherwise wait for the next descriptor.
         signal.set_wakeup_fd(self._wakeup_write.fileno(), warn_on_full_buffer=False)
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGUSR1, self._on_signal)
@@ -221,12 +225,15 @@ class LinkProcess:
         if self._wakeup.fileno() in ready:
             with suppress(BlockingIOError):
                 self._wakeup.recv(4096)
+        # Before the clients: a push in this turn's messages is then of an epoch that has ended.
         if self._stop_requested:
             self._stop_requested = False
             self._service.go_dark("ended by SIGUSR1")
+        # Then their commands, then the board: a command leaves in the write of the same turn.
         self._clients.process(ready)
         self._service.step()
         self._clients.deliver()
+        # Last: a beat says that a whole turn was done.
         self._supervisor.beat()
         if self._supervisor.fileno() in ready:
             self._supervisor.receive()
@@ -300,8 +307,10 @@ def main(arguments: list[str] | None = None) -> int:
         except OSError as error:  # of its socket, or of the folder of a simulated board
             supervisor.report_failure(f"the link process cannot start: {error}")
             return 1
+        # On every way out: ABORT to the boards, then the ports are closed.
         exit_stack.callback(process.close)
         process.install_signals()
+        # Before real time: page faults and garbage of the start must not fall into a lease.
         settle_memory()
         set_realtime_priority(LIGHT)
         try:

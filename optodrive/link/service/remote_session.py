@@ -110,6 +110,7 @@ class RemoteSession(LinkStatus):
         fields = message.fields
         if message.kind == "status":
             if fields["epoch"] != self.epoch:
+                # Another epoch: link has forgotten all jobs, and none of their reports will come.
                 self._jobs.clear()
                 self._drained_number, self._drained_s = fields["pause"]["number"], None
             self._take_status(fields)
@@ -142,6 +143,7 @@ class RemoteSession(LinkStatus):
 
     def _on_drained(self, number: int, board_s: float) -> None:
         self._jobs.clear()
+        # The latest only: points carry it, and link refuses those that know an older pause.
         self._drained_number = number
         if self._drained_s is None:
             self._drained_s = board_s
@@ -151,6 +153,7 @@ class RemoteSession(LinkStatus):
     @property
     def is_ready(self) -> bool:
         """Whether a job may start now. False until the link process has carried out all commands sent."""
+        # A status from before the last command may still say ready.
         all_seen = self._commands_seen == self._commands_sent
         return self.connected and self._reported_ready and all_seen and not self.is_held
 
@@ -227,6 +230,7 @@ class RemoteSession(LinkStatus):
             if crc is not None and crc != zlib.crc32(points.encode_payload()):
                 self._keep_refusal(DAMAGED_POINTS)
                 return None
+            # The verified bytes change by these pauses, so they are checked here, and the sum is formed anew.
             points, crc = points.add_pauses([zero_tick - tick for tick in start_ticks]), None
         payload = points.encode_payload()
         self._job_number += 1
@@ -238,6 +242,7 @@ class RemoteSession(LinkStatus):
 
         def add_job(result: dict[str, Any]) -> None:
             if result["start_tick"] is not None:
+                # Within the result's handler: reports of the truncated job may follow in the same read.
                 last.truncate(kept_points)
                 if len(self.scales) > 1:
                     job = RemoteJob(number, points, zero_tick, self._send_delay, start_ticks)
@@ -253,6 +258,7 @@ class RemoteSession(LinkStatus):
     def extend(self, job: StagedJob, points: StagePoints, epoch: int, crc: int) -> bool:
         """Append points to the last job without a pause. Arguments and result as for `begin` and `truncate`."""
         last = self._find_last_job()
+        # A newer frame has replaced the plan: its rest is of no use any more.
         if last is None or last is not job:
             return False
         fields = {

@@ -62,6 +62,7 @@ class StateWaiters:
 
 
 def _is_fulfilled(waiter: Waiter, boards: BoardGroup) -> bool:
+    # STOP does not wait for the next session's HELLO: the EVENT of the ending one says that the gate is off.
     has_confirmed = boards.is_acknowledged or (waiter.command == "stop" and boards.abort_confirmed)
     if waiter.command in ("stop", "disarm") and not boards.has_lost_ended:
         return False

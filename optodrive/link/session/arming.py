@@ -44,6 +44,7 @@ class Arming:
 
     def confirm(self, challenge: m.ArmChallenge) -> m.ArmConfirm | None:
         """Return the confirmation of the board's challenge, None if it does not answer this arming's request."""
+        # A challenge that answers an earlier request may still be on the line; confirmed, it would arm for nobody.
         if self._nonce is None or challenge.host_nonce != self._nonce:
             return None
         self._nonce = None
@@ -54,6 +55,7 @@ class Arming:
         if not self.is_present:
             return
         progress = _PROGRESS.get(state, 0)
+        # Backwards only: ARMED and RUNNING alternate within one arming, and reports of both may cross.
         if progress < self._progress:
             self.end()
             self.is_lost = True
@@ -105,6 +107,7 @@ class BoardRequirements:
     @property
     def max_in_flight_bytes(self) -> int:
         """Maximum number of unacknowledged bytes on the link."""
+        # At least two frames, or a slow line would wait for each acknowledgement.
         return max(2 * FRAME_BYTES, int(self.baud / BITS_PER_BYTE * MAX_IN_FLIGHT_S))
 
     @property
@@ -151,6 +154,8 @@ class BoardRequirements:
                 "the driver's input at full level, then set both to what is measured, and neither lower"
             )
             raise InputError("laser.max_power_w", values.max_power_w, expected, "board")
+        # Compared with the configured value, not with the requested one, which is 5 % larger (`CAP_MARGIN`): that much
+        # the board may lack.
         if limits.spot_uj < values.pulse_energy_max_j * 1e6:
             max_j = limits.spot_uj * 1e-6
             raise InputError(
@@ -169,6 +174,7 @@ class BoardRequirements:
             distance = f"{self.cell_max_codes}, the distance of neighbouring pixels"
             expected = f"a board whose cell_codes are at most {distance}; this one's are {peer.cell_codes}"
             raise InputError("display.pitch_m", values.pitch_m, expected, "board")
+        # Else a frame within all caps ends in fault CELLS, when the table is full.
         if peer.cells < self.pixels:
             expected = f"at most {peer.cells}, the spots that this board can guard"
             raise InputError("display pixels", self.pixels, expected, "board")
@@ -211,6 +217,7 @@ class LeaseRenewal:
         self._sent_s = now_s
         if self._active:
             self.ages.add(age_s)
+            # Only between two renewals of one arming: the time before the first is no age.
             self.slack_s = min(self._lease_s if self.slack_s is None else self.slack_s, self._lease_s - age_s)
         self._active = True
         return m.Lease(ms=round(self._lease_s * 1e3))

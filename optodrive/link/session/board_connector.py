@@ -36,6 +36,7 @@ class BoardConnector:
         """Keep the connection, or go on with the next step to it. A failure becomes `error`."""
         try:
             if self._session.connected:
+                # Connected while another board is not: its link is kept, and its light is not.
                 self._session.step(0.0, renew_lease=False)
             elif self._steps is not None or self._clock.now_s() >= self._retry_at_s:
                 self._steps = self._steps or self._connect()
@@ -62,6 +63,7 @@ class BoardConnector:
             message = self._session.on_lost(error)
             error = LinkError(message) if isinstance(error, LinkError) else error
         self._steps, self.error = None, error
+        # A port that was unplugged comes back in seconds; each opening resets some boards.
         self._retry_at_s = self._clock.now_s() + RETRY_INTERVAL_S
 
     def compute_wait_s(self) -> float:

@@ -69,6 +69,8 @@ class BoardGroup(GroupState):
             session.on_executed = partial(self._forward_executed, stage)
 
     def _forward_executed(self, stage: int, message: m.Executed) -> None:
+        # Reports of a lost board come too late for a plan: what it may have emitted was counted in full when it was
+        # lost.
         if self.sessions[stage] not in self._present:
             return
         if self._host_time is not None:
@@ -94,18 +96,23 @@ class BoardGroup(GroupState):
 
         A board whose link fails is lost alone, or the others, whose links stay open, get ABORT and the error is raised.
         """
+        # First: a board that has come back takes part from this turn on, or the next arming would miss it.
         self._readmit_lost()
+        # Before the sessions send: a point that is late on one board must not leave on another.
         self._drop_late_points()
         if self._host_time is not None:
             self._host_time.seek(self._present, self._are_boards_ready)
+        # One wait per turn, or the leases of several boards would be renewed a wait apart.
         waiting = self._present[0]
         for session, connector in zip(self.sessions, self._connectors, strict=True):
+            # Also of a lost board: its link is kept, so that it can be disarmed and armed again with the others.
             if session not in self._present or not session.connected:
                 connector.step()
                 continue
             try:
                 session.step(wait_s if session is waiting else 0.0, renew_lease, stalled)
             except (LinkError, InputError) as error:
+                # It sends this board's ABORT; the lines below decide about the others.
                 connector.lose(error)
                 if not self._lose_alone(session, str(connector.error)):
                     self.abort()
@@ -113,6 +120,7 @@ class BoardGroup(GroupState):
             else:
                 if self._were_armed and not session.has_arming:
                     self._lose_alone(session, f"the board {describe_end(session)}{session.describe_port_fault('; ')}")
+        # Only once all were armed may one be lost alone: a loss while boards arm ends all.
         self._were_armed |= self.has_arming and all(one.board.state in ARMED_STATES for one in self._present)
 
     # --- loss of one --------------------------------------------------------------------------------------------
@@ -122,9 +130,11 @@ class BoardGroup(GroupState):
         can_go_on = self._on_stage_loss == "that_stage" and self._were_armed and self.lost is None
         if not can_go_on:
             return False
+        # Before its ABORT: neither lease nor points even if the ABORT fails and it answers again.
         session.end_arming()
         if session.connected:
             session.abort()
+        # By its lease alone: what a board that has failed says about itself proves nothing.
         dark_s = self._clock.now_s() + session.lease_s + LEASE_TRANSIT_MAX_S
         self.lost = LostStage(self.sessions.index(session), reason, dark_s)
         self._present = tuple(one for one in self.sessions if one is not session)
@@ -138,6 +148,7 @@ class BoardGroup(GroupState):
 
     def _readmit_lost(self) -> None:
         """Count the lost board again once all others are disarmed, and it too, as far as its link is up."""
+        # Acknowledged: an idle state may be from before a command that is on its way.
         are_idle = all(session.board.state in IDLE_STATES and session.is_acknowledged for session in self._present)
         if self.lost is not None and not self.has_arming and are_idle and self.has_lost_ended:
             self.lost, self._present = None, self.sessions
@@ -163,6 +174,7 @@ class BoardGroup(GroupState):
             if refused is not None:
                 refusal = refusal or f"{self._name(session)}{refused}"
                 if self.has_several and session.board.state in ARMED_STATES:
+                    # One board refused its points: the others must not draw their part of the plan alone.
                     self.flush()
         return refusal
 
@@ -173,6 +185,7 @@ class BoardGroup(GroupState):
         if self.lost is not None:
             raise NotReadyError(f"stage {self.names[self.lost.stage]!r} was lost; disarm all boards first")
         self._were_armed = False
+        # All are asked first: armed one by one, a refusal by the second would leave the first armed.
         for session in self.sessions:
             session.require_disarmed(self._name(session))
         for session in self.sessions:
@@ -192,6 +205,7 @@ class BoardGroup(GroupState):
 
     def end_arming(self) -> None:
         """End the arming of all boards: neither lease nor confirmation, nor points handed over so far."""
+        # A loss that nobody has read yet is of the arming that ends here.
         self._were_armed = self._is_loss_new = False
         for session in self.sessions:
             session.end_arming()
@@ -222,6 +236,7 @@ class BoardGroup(GroupState):
         zero_tick, ahead_s, parts = round(start_s / self.tick_s), min(send_ahead_s, SEND_AHEAD_MAX_S), []
         for session, one in zip(self.sessions, points.stages, strict=True):
             if session not in self._present:
+                # An empty job keeps the lost stage's place: rows and reports are found by stage number.
                 parts.append(PlanJob(0, one, 0, 0))
                 continue
             timing = self._host_time.build_timing(session, zero_tick)
@@ -244,6 +259,7 @@ class BoardGroup(GroupState):
         """
         self._require_nothing_lost(points)
         triples = list(zip(self.sessions, points.stages, kept_points, strict=True))
+        # All or none, decided before anything changes.
         if not all(session.can_splice(kept) for session, _, kept in triples if session in self._present):
             return None
         parts = []
@@ -257,6 +273,7 @@ class BoardGroup(GroupState):
             ahead_s = min(send_ahead_s, SEND_AHEAD_MAX_S) if timing else send_ahead_s
             part = session.splice(one, kept, ahead_s, timing, holds_first)
             if part is None:
+                # It said that it could, in the same turn. Should it happen, the link's end makes all dark.
                 raise LinkError("a board could not be spliced although the others were")
             parts.append(part)
         return StagedJob(parts, parts[0].start_tick)
@@ -269,6 +286,7 @@ class BoardGroup(GroupState):
         session = self.sessions[0]
         if self.has_several or not session.can_extend(job.parts[0]):
             return False
+        # The job first: follow_extended reads its new end.
         job.extend(points)
         session.follow_extended()
         return True

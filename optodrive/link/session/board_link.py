@@ -155,15 +155,18 @@ class BoardLink:
 
         block: whether a step waits for bytes itself. Raise errors as `connect` does.
         """
+        # Restored on failure: heat and budget are dated by this clock, and cool on while the board is away.
         previous_sync = self._clock_sync
         try:
             for wait_s in self._handshake(BOOT_MAX_S if block else REOPEN_S):
+                # The link process polls its ports itself: a wait here would delay the lease of the other boards.
                 self._exchange(wait_s if block else 0.0)
                 yield wait_s
         except (LinkError, InputError):
             self._clock_sync = previous_sync
             self.on_connect_failed()
             raise
+        # Only now can a restart be told from a deaf board: by its clock and its counters.
         self._watch.on_reconnected(self._clock.now_s(), self._reset_code, self.board_s(), self._count_errors())
         self.connected = True
 
@@ -180,6 +183,8 @@ class BoardLink:
         self._reset()
         self._send_hello()
         began_s = self._clock.now_s()
+        # HELLO is repeated with a new nonce: a pty or USB port may lose the first, and only the echo tells which one is
+        # answered.
         while self._connection.peer is None:
             self._retry_hello()
             yield HANDSHAKE_INTERVAL_S
@@ -198,6 +203,7 @@ class BoardLink:
             yield HANDSHAKE_INTERVAL_S
             if self._clock.now_s() > deadline_s:
                 raise LinkError(f"{self.port}: the board answers HELLO but nothing else; {self._describe_errors()}")
+        # The narrowest of several exchanges bounds the offset: the first one alone includes the port's first delays.
         for _ in range(CLOCK_INITIAL_SAMPLES):
             self._request_clock()
             yield 0.005
@@ -215,13 +221,16 @@ class BoardLink:
         interval_s = HELLO_SLOW_S if self.is_silent else HELLO_RETRY_S
         if self._connection.peer is None and self._clock.now_s() - self._hello_sent_s > interval_s:
             if self.is_silent and (fault := self._transport.describe_fault()):
+                # Silence of an open port is patience; one that is evidently gone would be waited for in vain.
                 raise LinkError(fault)
             self._send_hello()
 
     def _on_hello_reply(self, peer: m.HelloReply, now_s: float) -> None:
+        # Refused here, before any command: a board of another laser or servo never sees points of this configuration.
         self._requirements.check_board(peer)
         self.board.uid, self.board.firmware = peer.uid.hex(), peer.firmware
         self._queue_points, self._reset_code = peer.queue_points, peer.reset_cause
+        # The board counts points from 0 in each session.
         self._points.reset_indices()
         # before commands already queued for this session
         self._connection.send(self._requirements.limits, at_front=True)
@@ -229,6 +238,8 @@ class BoardLink:
 
     def _reset(self) -> None:
         """Forget the board that an earlier connection has reported."""
+        # Each handshake builds another: sequence numbers and queued frames of the session before must not leave in the
+        # next.
         self._connection = HostConnection(self._requirements.rto_s)
         self._clock_sync = self._build_clock_sync()
         self._report_check = self._build_report_check()
@@ -271,6 +282,7 @@ class BoardLink:
         if self.connected:
             self._send_abort()
         self.connected = False
+        # Permanently: a transport with a thread or process of its own ends it here.
         self._transport.release()
 
     def _send_abort(self) -> None:
@@ -296,11 +308,14 @@ class BoardLink:
         if self._connection.futile_transmissions > FUTILE_TRANSMISSIONS_MAX:
             raise LinkError(f"{self.port}: the board acknowledges nothing; {self._describe_errors()}")
         silence_max_s = self._silence_max_s
+        # Against the time before this step's read: a host that was suspended reads what waits before it blames the
+        # board.
         if now_s - self._last_received_s > silence_max_s:
             raise LinkError(f"{self.port}: the board sent nothing for {silence_max_s:g} s; {self._describe_errors()}")
 
     @property
     def _silence_max_s(self) -> float:
+        # The others may emit only in an order that this one keeps: its silence for a lease means that it does not.
         is_short = self._is_one_of_several and self.board.state in LEASED_STATES
         return self._requirements.lease_s if is_short else SILENCE_TIMEOUT_S
 
@@ -313,7 +328,9 @@ class BoardLink:
         if data:
             now_s = self._clock.now_s()
             for message in self._connection.receive_bytes(data, now_s):
+                # Any valid frame proves that the board lives, also one whose content is refused as old.
                 self._last_received_s = now_s
+                # The only door for reports: no handler repeats the check.
                 if self._report_check.accept(message, now_s):
                     handler = self._handlers.get(type(message))
                     if handler is not None:
@@ -355,6 +372,7 @@ class BoardLink:
         """React to a report of the board's state."""
 
     def _count_fault(self, fault: str) -> None:
+        # STATUS repeats a latched fault several times per second; it counts once.
         if fault and fault != self.board.fault:
             self.faults[fault] += 1
 

@@ -90,8 +90,10 @@ class ClockSync:
 
     def start_exchange(self, request_s: float) -> int:
         """Record a request sent at request_s and return its random stamp."""
+        # Replies were lost: their stamps would pile up, and all are older than any reply that may come.
         if len(self._request_s) > PENDING_MAX:
             self._request_s.clear()
+        # Random: a counter would repeat in the next session, whose board may still answer a request of this one.
         stamp = secrets.randbits(32)
         self._request_s[stamp] = request_s
         return stamp
@@ -105,6 +107,7 @@ class ClockSync:
         if request_s is None:
             return None
         sample, samples = (reply_s - request_s, (request_s + reply_s) / 2, board_s), self._samples
+        # One sample per interval, the narrowest: frequent exchanges must not push out the time over which drift shows.
         if not samples or self._number_interval(samples[-1]) != self._number_interval(sample):
             self._samples = (*samples[1 - self._samples_max :], sample)
         elif sample[0] < samples[-1][0]:
@@ -120,6 +123,7 @@ class ClockSync:
             return 0.0
         width_s, midpoint_s, last_board_s = self._samples[-1]
         elapsed_s = (request_s + reply_s) / 2 - midpoint_s
+        # Each exchange brackets the tick, so both may be off by half their widths at once.
         permitted_s = 0.5 * (width_s + reply_s - request_s) + RATE_ERROR_MAX * abs(elapsed_s)
         return max(0.0, abs(board_s - last_board_s - elapsed_s) - permitted_s)
 
@@ -173,7 +177,9 @@ def _fit_line(samples: tuple[tuple[float, float, float], ...]) -> _FittedLine:
     for w, (_, midpoint_s, _), each in zip(weights, samples, ahead_s, strict=True):
         spread += w * (midpoint_s - mean_s) ** 2
         covariance += w * (midpoint_s - mean_s) * (each - mean_ahead_s)
+    # A ridge: with few exchanges the rate stays near 1 instead of following their errors.
     rate = 1.0 + covariance / (spread + 1.0 / DRIFT_MAX**2)
+    # The line is stated at its last exchange, where little has to be extrapolated.
     at_s = samples[-1][1]
     drift = _bound_drift(samples)
     width_s, midpoint_s, _ = min(samples, key=lambda sample: sample[0] / 2 - drift * sample[1])
@@ -188,6 +194,7 @@ def _bound_drift(samples: Sequence[tuple[float, float, float]]) -> float:
         return DRIFT_MAX
     first, last = (min(each, key=lambda sample: sample[0]) for each in (samples[:half], samples[half:]))
     span_s = max(last[1] - first[1], WIDTH_MIN_S)
+    # Never better than the wander: a line through old exchanges does not show what the crystal does now.
     return min(DRIFT_MAX, 0.5 * (first[0] + last[0]) / span_s + WANDER_MAX)
 
 

@@ -115,6 +115,7 @@ class GroupState:
             return boards[0]
         faulty = next((board for board in boards if board.fault), boards[0])
         values = vars(faulty) | {name: sum(getattr(board, name) for board in boards) for name in SUMS}
+        # The board with the least room holds up the plan.
         values["free_points"] = min(board.free_points for board in boards)
         values["temperature_c"] = max((b.temperature_c for b in boards if b.temperature_c is not None), default=None)
         values["state"] = self.state
@@ -155,6 +156,8 @@ class GroupState:
     def is_ready(self) -> bool:
         """Whether a job may start now, or is refused because the time of a board has not become known in seconds."""
         time = self._host_time
+        # Ready also when patience is over: the start is then refused by name, where the plan would else wait without a
+        # word.
         return self._are_boards_ready and (time is None or time.are_known(self._present) or time.is_patience_over)
 
     @property
@@ -174,6 +177,7 @@ class GroupState:
     @property
     def is_draining(self) -> bool:
         """Whether reports of points that were sent before drain() may still arrive, or a lost board may still emit."""
+        # Draining covers both waits, for reports and for certain darkness: what is left is planned after the later one.
         may_emit = self.lost is not None and self._clock.now_s() < self.lost.dark_s
         return may_emit or any(session.is_draining for session in self._present)
 
@@ -184,6 +188,7 @@ class GroupState:
             return True
         session = self.sessions[self.lost.stage]
         has_confirmed = session.is_acknowledged or session.abort_confirmed
+        # Without its link nothing can be confirmed; its lease has ended by then or will.
         return not session.connected or (session.board.state in IDLE_STATES and has_confirmed)
 
     @property

@@ -65,7 +65,9 @@ class HostTime:
         are_ready: whether the boards wait for nothing else
         """
         for session in sessions:
+            # Before the limit is reached: one narrow exchange takes many tries on a busy computer.
             session.seeks_clock = self._find_error_s(session) > CLOCK_SEEK_SHARE * self._skew_max_s
+        # The wait counts only while the clocks are all that is missing.
         if not are_ready or self.are_known(sessions):
             self._awaited_s = self._clock.now_s()
 
@@ -79,6 +81,8 @@ class HostTime:
                     f"is known to {1e6 * fit.uncertainty_s:.0f} µs, "
                     f"limits.stage_skew_max_s permits {1e6 * self._skew_max_s:.0f} µs"
                 )
+            # Points are shifted by at most that rate (`RETIMING_RATE_MAX`): a faster drift would be followed too
+            # slowly.
             if abs(fit.rate - 1.0) > DRIFT_MAX:
                 raise NotReadyError(
                     f"{self._get_prefix(session)}its clock drifts by {1e6 * (fit.rate - 1.0):+.0f} ppm, "
@@ -93,6 +97,7 @@ class HostTime:
 
     def build_timing(self, session: BoardSession, zero_tick: int) -> PointTiming:
         """Return the timing of points whose zero is a tick of the host's time."""
+        # A function and no number: each point is converted when it leaves, by what is known of the clock then.
         return PointTiming(zero_tick, partial(self._to_board_tick, session))
 
     def _to_board_tick(self, session: BoardSession, host_tick: int) -> float:

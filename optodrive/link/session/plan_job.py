@@ -81,10 +81,12 @@ class PlanJob:
         self.first_sent_tick: float | None = None
         self._send_ahead_ticks = send_ahead_ticks
         self._holds_first = holds_first
+        # A copy in the board's byte order: retiming changes it, and payloads are slices of it.
         self._table = points.table.astype("<u2")
         self._count = len(points)
         self._timing = timing
         self._planned_end_tick = points.compute_end_ticks()
+        # Two columns: the plan's ends stay, these move with drift and delay.
         self._end_tick = start_tick + self._planned_end_tick
         self._delayed_ticks = 0
         self._row = points.row
@@ -127,10 +129,12 @@ class PlanJob:
     def count_sendable(self, now_tick: float) -> int:
         """Return the number of points that may be sent now."""
         position = self.next_to_send - self.first_index
+        # A plan without a lead leaves as fast as the board has room.
         if self._send_ahead_ticks == inf:
             return self._count - position
         # A point starts at the end of its predecessor. With a float, numpy would convert all ticks at every call.
         due_tick = floor(now_tick + self._send_ahead_ticks)
+        # Else the first point leaves at once, and START with it: a plan that has begun cannot be withdrawn.
         if self._holds_first and due_tick < self.start_tick:
             return 0
         due_count = int(np.searchsorted(self._end_tick[: self._count], due_tick, side="right")) + 1
@@ -160,8 +164,11 @@ class PlanJob:
         off_ticks, on_ticks = (int(value) for value in self._table[position, 2:4])
         planned_tick = timing.start_tick + int(self._planned_end_tick[position]) - on_ticks
         error = timing.to_board_tick(planned_tick) - float(self._end_tick[position] - on_ticks)
+        # Only dark time is changed, and no more of it than two crystals can drift apart since the point before: pulses
+        # keep their width.
         limit = min(RETIMING_MAX_TICKS, ceil(RETIMING_RATE_MAX * (off_ticks + on_ticks)), off_ticks)
         shift = round(max(-limit, min(limit, error)))
+        # The dark time is a field of 16 bits; a shift that does not fit waits for the next point.
         if off_ticks + shift <= TICKS_MAX:
             self._table[position, 2] = off_ticks + shift
             self._end_tick[position:] += shift
@@ -175,6 +182,7 @@ class PlanJob:
 
     def can_truncate(self, kept_points: int) -> bool:
         """Return whether no more than `kept_points` points were sent."""
+        # What was sent is final: the board's queue is never edited.
         return self.first_index + kept_points >= self.next_to_send
 
     def truncate(self, kept_points: int) -> bool:
@@ -193,9 +201,11 @@ class PlanJob:
         on_tick, on_ticks, duty = np.array(message.records[begin:end], dtype=np.int64).T
         sent = slice(first + begin, first + end)
         sent_on_ticks, sent_duty = self._table[sent, 3].astype(np.int64), self._table[sent, 4]
+        # Without the delays: the host may have assumed one that the board did not have.
         earliest_tick = self._end_tick[sent] - self._delayed_ticks - sent_on_ticks - EARLY_MAX_TICKS
         is_early = on_tick < earliest_tick
         is_long = on_ticks > sent_on_ticks + LATE_OFF_MAX_TICKS
+        # A dark point has no duty to report.
         is_other = (duty != sent_duty) & (on_ticks > 0)
         if not np.any(is_early | is_long | is_other):
             return ""
@@ -236,8 +246,10 @@ class PlanJob:
             ("_duty", fill),
             ("_row", points.row),
         ):
+            # New arrays, not appended in place: a reader in another thread keeps the old ones whole.
             setattr(self, name, np.concatenate([getattr(self, name), added]))
         self._pulse_points = np.flatnonzero(self._row >= 0)
+        # Last: a reader that sees the new count finds all columns as long.
         self._count += len(points)
 
     @property

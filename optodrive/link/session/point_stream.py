@@ -59,6 +59,7 @@ class PointDrain:
         """Record the end of an exchange. bad_frames: damaged frames so far."""
         if stamp == self._stamp:
             self._stamp = None
+            # A damaged frame may have been the report that was asked for.
             is_quiet = not self._has_report and bad_frames == self._bad_frames
             self._quiet_exchanges = self._quiet_exchanges + 1 if is_quiet else 0
 
@@ -103,6 +104,7 @@ class PointStream:
         send_ahead_ticks: maximum time from sending a point to its start; timing: as for `PlanJob`
         """
         self._number += 1
+        # START leaves with the first DATA, not here: it names a point that the board must have.
         self._started = self._end_was_moved = False
         self._end_indices.clear()
         return self._append(points, start_tick, send_ahead_ticks, timing, holds_first=False)
@@ -133,8 +135,10 @@ class PointStream:
         """
         if not self._started or not self.can_truncate(kept_points):
             return False
+        # The END of one board cannot be moved without those of the others, which may have ended already.
         if self._end_indices and self._jobs[-1].follows_host:
             return False
+        # Later than now by SPLICE_LEAD_S, or the board could run empty before the first new point arrives.
         return self._jobs[-1].end_tick_after(kept_points) >= min_end_tick
 
     def splice(
@@ -184,12 +188,14 @@ class PointStream:
 
     def clear(self) -> None:
         """Drop all points not yet sent, and all jobs. The job objects keep their reports."""
+        # Indices of points that never left are used again: the board expects them without a gap.
         self._next_index = self._sent_index
         self._jobs.clear()
 
     def drop_unsent(self) -> None:
         """Drop all points not yet sent. The jobs stay, for the reports of those that were sent."""
         for job in self._jobs:
+            # Never shorter than what was sent: those points may have been lit.
             job.truncate(job.next_to_send - job.first_index)
         self._next_index = self._sent_index
 
@@ -211,8 +217,10 @@ class PointStream:
     def restart_if_ended(self, link: HostConnection, done_index: int) -> None:
         """Start the job again if the armed board has ended it before it got the END that moved the end."""
         is_left = bool(self._jobs) and done_index < self._jobs[-1].end_index
+        # All of it acknowledged and the board idle exactly at an END: else the moved END may still be on its way.
         if not self._end_was_moved or link.outstanding or not is_left or done_index not in self._end_indices:
             return
+        # Tick 0, at once: the light is late already.
         link.send(m.Start(self._number, done_index, 0, min(WATERMARK_POINTS, max(1, self._sent_index - done_index))))
         self._end_indices.clear()
 
@@ -220,11 +228,13 @@ class PointStream:
         """Send the points that are due and that the board has room for, START and END."""
         for job in self._jobs:
             while link.outstanding < link.window:
+                # What was sent and not yet done occupies the queue, wherever it is on the line.
                 free_points = queue_points - (job.next_to_send - max(self._jobs[0].first_index, done_index))
                 count = min(m.POINTS_MAX, free_points, job.count_sendable(now_tick))
                 if count <= 0:
                     break
                 self._send_points(link, job, count, now_tick)
+            # In order: no point of a later job before the last one of this.
             if not job.is_fully_sent:
                 return
         if self._jobs and not self._end_indices and link.outstanding < link.window:
@@ -250,6 +260,7 @@ class PointStream:
         link.send(m.Data(job.next_to_send, job.take_payload(count, now_tick)))
         self._sent_index = job.next_to_send
         if not self._started:
+            # After the first DATA, so that START finds a point; the watermark never exceeds what is about to leave.
             link.send(m.Start(self._number, job.first_index, job.start_tick, watermark))
             self._started = True
         elif self._end_indices:
@@ -266,5 +277,6 @@ class PointStream:
 
     def drop_finished(self, armed: bool) -> None:
         """Drop completely reported jobs, the last one only after the board has ended it."""
+        # The last job stays until the board is ARMED again: a newer plan may still be spliced behind it.
         while self._jobs and self._jobs[0].is_finished and (len(self._jobs) > 1 or (self._end_indices and armed)):
             self._jobs.popleft()

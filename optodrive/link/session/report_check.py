@@ -39,8 +39,10 @@ class ReportCheck:
 
         Raise FalseReportError with the first value that cannot be.
         """
+        # Before the order: an old report that cannot be is no less false.
         self._require_possible(message, now_s)
         if isinstance(message, m.Status | m.Event):
+            # A repeated frame of an earlier state would end an arming.
             if message.tick < self._newest_tick:
                 return False
             self._newest_tick = message.tick
@@ -66,6 +68,7 @@ class ReportCheck:
         for name in ("session", "queue_points", "rx_window", "cell_codes", "cells", "window_pulses"):
             value = getattr(reply, name)
             _require(reply, name, value, value > 0, "at least 1")
+        # The board may have restarted, so that its ticks begin anew.
         self.queue_points, self._newest_tick = reply.queue_points, 0
 
     def _check_clock_reply(self, reply: m.ClockReply, now_s: float) -> None:
@@ -80,6 +83,7 @@ class ReportCheck:
         _require(message, "done_index", done_index, done_index <= sent_index, f"at most {sent_index}, the points sent")
 
     def _check_state(self, message: m.Status | m.Event, now_s: float) -> None:
+        # Also the newest so far: a tick from the future would make all later reports look old.
         self._check_tick(message, max(message.tick, self._newest_tick), now_s)
         state, fault = m.STATES[message.state], m.FAULTS[message.fault]
         is_consistent = (state == BoardState.FAULT) == bool(fault)
@@ -100,6 +104,7 @@ class ReportCheck:
         off_tick = 0
         for on_tick, on_ticks, _ in message.records:
             _require(message, "tick", on_tick, on_tick >= off_tick, f"at least {off_tick}, the end of the one before")
+            # Pulses of one beam cannot overlap, nor come back in time.
             off_tick = on_tick + on_ticks
         self._check_tick(message, off_tick, now_s)
         contradiction = self._points.find_contradiction(message)

@@ -99,14 +99,19 @@ class BoardSession(BoardLink):
         Raise LinkError if the link failed or the board does not answer.
         """
         now_s = self._clock.now_s()
+        # First: a stall of this loop is measured from its last call, before this step's own work.
         self._watch.on_loop(now_s, "" if renew_lease else stalled, self._count_errors())
+        # The lease leaves before points: what follows in this step may fill the line for 10 ms.
         if not self._may_have_lease:
             self.lease.pause()
         elif renew_lease:
             self._send_lease(now_s)
         self._request_due(now_s)
+        # Points before the exchange, so that they leave in the same write as the lease.
         self._stream_points()
         self._exchange(wait_s)
+        # After the reports of this step. The report of a loss may be false, so the end is sent in any case: dark boards
+        # ignore it.
         if self._arming.is_lost or self._is_armed_by_itself:
             self.abort()
         self._require_answers(now_s)
@@ -118,6 +123,7 @@ class BoardSession(BoardLink):
     @property
     def _is_armed_by_itself(self) -> bool:
         """Whether the board needs a lease although nobody has armed it, or its arming has ended."""
+        # Acknowledged: before that, the state may be from before the DISARM that is on its way.
         return not self.has_arming and self.is_acknowledged and self.board.state in LEASED_STATES
 
     def _send_lease(self, now_s: float) -> None:
@@ -134,6 +140,7 @@ class BoardSession(BoardLink):
 
     def _on_event(self, message: m.Event, now_s: float) -> None:
         super()._on_event(message, now_s)
+        # Peer None: HELLO is out and not answered, so this EVENT is of the session that ABORT ends, and no later one.
         self.abort_confirmed |= self._connection.peer is None and self.last_event_reason == "abort"
 
     def _follow_state(self) -> None:
@@ -165,6 +172,7 @@ class BoardSession(BoardLink):
         """Request arming. The board shows its indicator and is ARMED two seconds after the confirmation."""
         self.require_disarmed()
         self._refusal = None
+        # Gate 2 of the epochs: points that were handed over for an earlier arming must not be lit in this one.
         self._drop_held_points()
         self._connection.send(self._arming.begin())
 
@@ -182,6 +190,7 @@ class BoardSession(BoardLink):
         """Disarm the board, or acknowledge its fault in FAULT."""
         self._refusal = None
         self.end_arming()
+        # One verb for both: the caller wants DISARMED, and the board refuses while a fault's cause persists.
         self._connection.send(m.ClearFault() if self.board.state == BoardState.FAULT else m.Disarm())
 
     def abort(self) -> None:
@@ -189,6 +198,7 @@ class BoardSession(BoardLink):
         self._refusal = None
         self.end_arming()
         self.abort_confirmed = False
+        # ABORT, then HELLO: both stand outside the sequence and overtake it. HELLO makes all that is in flight void.
         self._connection.abort()
         self._send_hello()
 
@@ -207,6 +217,7 @@ class BoardSession(BoardLink):
 
     def drain(self) -> None:
         """Turn the gate off, drop the queue and collect the last reports. The board stays armed."""
+        # Jobs stay, unlike in flush(): their last reports tell the planner what was lit.
         self._points.drop_unsent()
         self._connection.send(m.Flush())
         self._drain = PointDrain()
@@ -217,9 +228,11 @@ class BoardSession(BoardLink):
         return self._drain is not None
 
     def _step_drain(self, drain: PointDrain) -> None:
+        # FLUSH must have arrived: reports before it would say nothing about the end.
         if not self.is_acknowledged:
             return
         missing, now_s = self._points.first_unreported, self._clock.now_s()
+        # The board may never report some points, those that FLUSH dropped: then only quiet exchanges tell the end.
         if missing is None or drain.is_complete:
             self._points.clear()
             self._drain = None
@@ -294,10 +307,12 @@ class BoardSession(BoardLink):
         if self._drain is not None:
             self._step_drain(self._drain)
             return
+        # An ended arming keeps its points until the next one drops them, so that their reports still find their job.
         if not self._points or not self.has_arming:
             return
         if self.board.state in ARMED_STATES:  # else the board has ended the job: only collect its reports
             now_tick = self.board_s() / self.scale.tick_s
+            # Only an armed board can have ended the job early; a running one obeys the moved END.
             if self.board.state == BoardState.ARMED:
                 self._points.restart_if_ended(self._connection, self.board.done_index)
             self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
@@ -311,10 +326,12 @@ class BoardSession(BoardLink):
 
     def compute_wait_s(self) -> float:
         """Return the longest time for which the next step may wait if no bytes arrive, s."""
+        # ABORT or HELLO: no wait at all.
         if self._connection.has_unsequenced:
             return 0.0
         wait_s = WAIT_MAX_S
         if self.board.state in LEASED_STATES:
+            # Half an interval, so that a renewal is late by half at most.
             wait_s = min(wait_s, 0.5 * RENEWAL_FRACTION * self._requirements.lease_s)
         if self._connection.outstanding or self.is_draining:
             wait_s = min(wait_s, RETRANSMISSION_WAIT_S)

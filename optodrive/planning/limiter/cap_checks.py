@@ -60,23 +60,33 @@ def max_power_w(
     """
     caps, width_s = budget.caps, request.width_s
     begins_s = max(workspace.budgets.begun_s[0], workspace.budgets.end_s[request.stage])
+    # Refusals before trims: these hold under every policy, and no power would mend them.
     if request.start_s < max(begins_s, workspace.nodes.last_pulse_end_s[request.pixel]) - TOLERANCE:
         return -1.0, WRONG_ORDER
     if width_s > caps.pulse_width_s * (1 + TOLERANCE):
         return -1.0, PULSE_WIDTH
     rise_k, lower_bound_k, bucket_j, merged_width_s = before
     if merged_width_s + width_s > caps.pulse_width_s + TOLERANCE:
+        # Pulses without a gap count as one, as in the board's guard B4. Without light the rule holds, so the pulse is
+        # trimmed and not refused.
         return 0.0, PULSE_WIDTH
+    # The mirrors heat by the way, not by the light: a pulse that needs no move costs nothing, and one that needs one is
+    # all or nothing.
     if is_move(workspace.budgets, request):
         galvo_state = galvo_after_move(budget, workspace.budgets, request)
         galvo = select_galvo(budget.galvos, request.stage)
+        # Until the pulse's end: from there on the bound always leaves room for the largest next move, so mirrors can
+        # always leave.
         mean_square = mean_square_bound(galvo, galvo_state, request.start_s + width_s)
         if mean_square > caps.galvo_rad2_per_s4 * (1 + TOLERANCE):
             return 0.0, GALVO_ACCELERATION
+    # Cheap caps first: the last ones bisect, from what is left of the power by then.
     max_w, binding = caps.pulse_energy_j / width_s, PULSE_ENERGY
     dimmed_w = caps.power_share * budget.heat.power_max_w[request.stage]
     if caps.power_share < 1.0 and dimmed_w < max_w:
         max_w, binding = dimmed_w, DIM
+    # The board's guard B6 keeps this bucket per cell. It leaks at the pixel's mean power, between pulses and within
+    # them alike.
     spot_w = (caps.pulse_energy_j - bucket_j) / width_s
     if spot_w < max_w:
         max_w, binding = spot_w, SPOT_ENERGY
@@ -104,12 +114,15 @@ def max_power_w(
         max_w, binding = stage_w, DISPLAY_MEAN_POWER
     wall_w, touch_w = slow_node_limits_w(budget, workspace.nodes, request, lower_bound_k)
     if wall_w < max_w:
+        # A wall is held at the lower of both caps, and the answer names that one.
         max_w, binding = wall_w, WALL_TEMPERATURE if caps.wall_k < caps.touch_k else TOUCH_TEMPERATURE
     if touch_w < max_w:
         max_w, binding = touch_w, TOUCH_TEMPERATURE
+    # Last, as it costs 32 evaluations where it binds, and none where a cheaper cap has trimmed enough.
     absorber_w = _max_absorber_power_w(budget, workspace, request, rise_k, min(max_w, request.power_w))
     if absorber_w < min(max_w, request.power_w):
         max_w, binding = absorber_w, ABSORBER_TEMPERATURE
+    # An overdrawn bucket or window is negative; a negative power would mean a refusal.
     return max(0.0, max_w), binding
 
 
@@ -118,6 +131,7 @@ def absorber_peak_k(
     budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, rise_k: float, power_w: float
 ) -> float:
     """Return the peak bound on the absorber's rise above ambient during a pulse."""
+    # Monotone within a pulse: hottest at one of its ends.
     own_k = max(rise_k, absorber_after_k(budget.heat, request.pixel, rise_k, power_w, request.width_s))
     wall_k = wall_peak_k(budget, workspace.nodes, request, power_w)
     return own_k + budget.heat.absorber_wall_factor * wall_k + budget.heat.absorber_per_panel * request.panel_k
@@ -155,6 +169,7 @@ def compute_levels(state: BudgetState, budget: Budget, at_s: float) -> FloatArra
     levels[PIXEL_MEAN_POWER] = pixel_j / caps.pixel_window_s
     stage_j = np.bincount(state.recent_stage, _compute_window_energy_j(state, at_s, caps.display_window_s), 1)
     levels[DISPLAY_MEAN_POWER] = float(stage_j.max()) / caps.display_window_s
+    # Ringing is left out: this is a gauge for people, the check of a move is not.
     decay = np.exp(-np.maximum(0.0, at_s - state.mirror_at_s) / budget.galvos.averaging_s)
     levels[GALVO_ACCELERATION] = float((state.galvo_mean_square.max(axis=1) * decay).max())
     return levels

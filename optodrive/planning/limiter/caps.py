@@ -98,6 +98,7 @@ CAPS = (
         is_gauged=False,
     ),
     Cap(
+        # Same setting as pulse_energy: the bucket holds one pulse of the largest energy, and leaks.
         key="spot_energy",
         label="energy in one pixel",
         message="cap on the energy bucket of a pixel",
@@ -108,6 +109,7 @@ CAPS = (
     Cap(
         key="pulse_width",
         label="width of a pulse",
+        # Pulses with gaps below pulse_gap_min_s count as one, since otherwise 50 ms pulses in a row would be unlimited.
         message="width cap of pulses without a gap between them",
         unit="s",
         setting="pulse_width_max_s",
@@ -142,6 +144,8 @@ CAPS = (
         is_per_pixel=False,
     ),
     Cap(
+        # A cap and not a factor on targets: trimmed, refused and proven on the bytes by the code of every other cap
+        # (decision 36).
         key="dim",
         label="dimmed power",
         message="dim cap",

@@ -53,6 +53,7 @@ def ringing_envelope_factor(galvo: GalvoModel, elapsed_s: float) -> float:
     """
     damping = galvo.damping
     amplitude_ratio = sqrt((1.0 + damping) / (1.0 - damping))
+    # The envelope exceeds 1 just after the move; a free oscillation never has more than it began with.
     return min(1.0, amplitude_ratio * exp(-damping * galvo.omega_rad_per_s * elapsed_s))
 
 
@@ -72,10 +73,12 @@ def apply_move(
     galvo: GalvoModel, state: GalvoState, dx_rad: float, dy_rad: float, previous_end_s: float, start_s: float
 ) -> GalvoState:
     """Return the state after a move to a pulse at `start_s`. The previous pulse ends at `previous_end_s`."""
+    # Each end of a move may be rounded by half a code, in the direction that makes it longer.
     dx_rad, dy_rad = abs(dx_rad) + galvo.rad_per_code, abs(dy_rad) + galvo.rad_per_code
     # The mirrors leave when a pulse ends; for the first pulse of a plan, at the start of its lead-in at the latest.
     at_s = max(previous_end_s, start_s - galvo.lead_in_s) + max(dx_rad, dy_rad) / galvo.slew_rad_per_s
     envelope = ringing_envelope_factor(galvo, previous_end_s - galvo.early_s - galvo.timing_slack_s - state.at_s)
+    # Norms add (Minkowski), not their squares: the phase of the earlier ringing is not kept, so it may be in step.
     x_ringing = sqrt(move_energy(galvo, dx_rad)) + envelope * state.x_ringing
     y_ringing = sqrt(move_energy(galvo, dy_rad)) + envelope * state.y_ringing
     # Either end of the move may be off by one converter step, and it may begin early.
@@ -101,6 +104,7 @@ def mean_square_bound(galvo: GalvoModel, state: GalvoState, end_s: float) -> flo
     elapsed_s = end_s - galvo.early_s - galvo.timing_slack_s - state.at_s
     decay = exp(-(elapsed_s - effective_delay_s(galvo)) / galvo.averaging_s)
     envelope = ringing_envelope_factor(galvo, elapsed_s)
+    # A move of any length: the energy saturates at the first minimum of the autocorrelation.
     max_move_root = sqrt(move_energy(galvo, 1e9))
     x_mean_square = state.x_mean_square * decay + (max_move_root + envelope * state.x_ringing) ** 2 / galvo.averaging_s
     y_mean_square = state.y_mean_square * decay + (max_move_root + envelope * state.y_ringing) ** 2 / galvo.averaging_s
@@ -156,5 +160,6 @@ def count_galvo_feasible(
             if mean_square > budget.caps.galvo_rad2_per_s4 * (1 + TOLERANCE):
                 return row
             store_move(budgets, request, galvo_state)
+        # Also without a move: the next move begins when this pulse ends.
         budgets.end_s[request.stage] = request.start_s + request.width_s
     return len(start_s)

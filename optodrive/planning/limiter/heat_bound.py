@@ -85,8 +85,11 @@ def absorber_after_k(heat: HeatBound, pixel: int, rise_k: float, power_w: float,
         slope = (heat.loss_k[chord + 1] - heat.loss_k[chord]) / (high_k - low_k) / r_k_per_w
         steady_k = low_k + (drive_w - heat.loss_k[chord] / r_k_per_w) / slope
         warms = steady_k > rise_k
+        # The worse end for each direction: neither has to be the true capacity.
         rate = slope / (heat.c_low_j_per_k[pixel] if warms else heat.c_high_j_per_k[pixel])
         end_k = steady_k + (rise_k - steady_k) * exp(-rate * remaining_s)
+        # The exponential of a chord holds up to its end: solve for the time at which it is reached, and go on with the
+        # next one.
         if warms and end_k > high_k and chord < last:
             remaining_s -= log((steady_k - rise_k) / (steady_k - high_k)) / rate
             rise_k, chord = high_k, chord + 1
@@ -96,6 +99,7 @@ def absorber_after_k(heat: HeatBound, pixel: int, rise_k: float, power_w: float,
         else:
             return float(end_k)
         if remaining_s <= 0.0:
+            # Rounding at a knot may leave a negative rest: the time ends there.
             return float(rise_k)
 
 
@@ -117,6 +121,7 @@ def panel_peak_k(heat: HeatBound, panel_k: FloatArray, off_s: float, energy_j: f
     for capacity in range(2):
         before_k = panel_k[capacity] * exp(-max(0.0, off_s) / heat.panel_tau_s[capacity])
         peak_k = max(peak_k, before_k + heat.panel_k_per_j[capacity] * energy_j)
+    # All of the energy counts at the start: during the pulse and after it the panel is no warmer.
     return float(heat.panel_specht_ratio * peak_k)
 
 
@@ -127,6 +132,8 @@ def warm_panel(heat: HeatBound, nodes: ThermalNodes, start_s: float, width_s: fl
     for capacity in range(2):
         nodes.panel_k[capacity] *= exp(-off_s / heat.panel_tau_s[capacity])
         own_k = heat.panel_k_per_j[capacity] * energy_j
+        # The panel keeps its time at the pulse's start, because a pulse of another stage may begin before this one
+        # ends.
         nodes.panel_k[capacity] += own_k * exp(width_s / heat.panel_tau_s[capacity])
     nodes.panel_at_s[0] = max(start_s, nodes.panel_at_s[0])
 
@@ -135,6 +142,8 @@ def warm_panel(heat: HeatBound, nodes: ThermalNodes, start_s: float, width_s: fl
 def panel_rise_by_others_k(heat: HeatBound, stage: int, width_s: float) -> float:
     """Return by how much the pulses of other stages may warm the panel during a pulse, K."""
     all_w = heat.power_max_w.sum()
+    # The own pulse is counted by its energy; others may emit throughout it, and as early or late as their clocks are
+    # off.
     return float(heat.panel_k_per_s * (all_w - heat.power_max_w[stage]) / all_w * (width_s + heat.skew_s))
 
 
@@ -185,6 +194,7 @@ def _relax(
     steady_k = nodes.inflow_w[pixel] / heat.wall_w_per_k[pixel]
     walls_k, touch_k = nodes.wall_k[pixel], nodes.touch_k[pixel]
     before_k = max(walls_k[0], walls_k[1])
+    # Walls before touch surfaces: these are driven by the larger of a wall's values at both ends of the interval.
     walls_k[0] = steady_k + (walls_k[0] - steady_k) * wall_0
     walls_k[1] = steady_k + (walls_k[1] - steady_k) * wall_1
     # A wall is monotone between events, so its maximum lies at one end.
@@ -200,6 +210,7 @@ def _advance_all(heat: HeatBound, nodes: ThermalNodes, from_s: float, to_s: floa
     touch_0 = exp(-(to_s - from_s) / heat.touch_lag_s[0])
     touch_1 = exp(-(to_s - from_s) / heat.touch_lag_s[1])
     for pixel in range(len(nodes.nodes_at_s)):
+        # A pixel that had a pulse since the last exchange has a time of its own, and pays for its own exponentials.
         if nodes.nodes_at_s[pixel] != from_s:
             advance_pixel(heat, nodes, pixel, to_s)
             continue
@@ -218,17 +229,22 @@ def exchange_wall_heat(heat: HeatBound, nodes: ThermalNodes, to_s: float, pulse_
     if heat.exchange_step_s == inf:  # no walls
         return
     if nodes.exchanged_at_s[0] == -inf:
+        # Cold until now: one step back is as good as any time, because nothing has flowed.
         nodes.exchanged_at_s[0] = to_s - heat.exchange_step_s
     step_s = heat.exchange_step_s
     while to_s - nodes.exchanged_at_s[0] >= heat.exchange_step_s:
         now_s = nodes.exchanged_at_s[0] + step_s
+        # All pixels first, then their flows: a flow from walls of different times is the bound of none.
         _advance_all(heat, nodes, nodes.exchanged_at_s[0], now_s)
         nodes.exchanged_at_s[0] = now_s
         remaining_s = to_s - now_s
         if remaining_s >= heat.exchange_step_s:
             step_s = min(COOLING_STEP_GROWTH * step_s, remaining_s)
+            # A long dark time: steps grow, since walls that cool exchange less and less.
             _update_inflow(heat, nodes, now_s, step_s, 0.0)
         else:
+            # The flow is used until the next exchange, and a pulse that begins just before it is judged with it up to
+            # its end.
             horizon_s = heat.exchange_step_s + pulse_width_s + heat.skew_s
             max_pulse_k = heat.wall_specht_ratio * heat.wall_k_per_j[0] * heat.power_max_w.sum() * horizon_s
             _update_inflow(heat, nodes, now_s, horizon_s, max_pulse_k)
@@ -246,6 +262,7 @@ def _update_inflow(heat: HeatBound, nodes: ThermalNodes, now_s: float, horizon_s
     pixels = len(nodes.inflow_w)
     warmest_k = pulses_k
     for pixel in range(pixels):
+        # Every pulse of the step might fall on the warmest wall: which one is not known yet.
         warmest_k = max(warmest_k, _wall_since_k(heat, nodes, pixel, now_s) + pulses_k)
     for pixel in range(pixels):
         neighbour_count = 0

@@ -29,6 +29,7 @@ from optodrive.planning.limiter.pulse_application import (
 )
 from optodrive.planning.limiter.workspace import LimiterWorkspace, PixelBudgets, close_workspace, open_workspace
 
+# A compiled loop answers nobody: progress keeps the planner's beat, and without it link withholds the lease.
 CHUNK_PULSES = 20_000
 """Pulses between two progress reports, about a tenth of a second."""
 
@@ -137,6 +138,7 @@ def limit(
     Raises OverBudgetError under every policy except "trim" if a pulse would be trimmed. Raises RefusedError under every
     policy if a pulse is wider than the cap or starts before the state's time.
     """
+    # "delay" and "refuse" stop at the first pulse above a cap: trimming any is not theirs to decide.
     applied, power_w, cause, workspace = _apply_plan(
         plan.pixel, plan.stage, plan, 0.0, state, budget, TRIM if policy == "trim" else STOP
     )
@@ -149,6 +151,7 @@ def limit(
         energy_j=power_w * plan.width_s,
         trimmed_j=(plan.power_w - power_w) * plan.width_s,
         reason=np.array(REASONS)[cause],
+        # A pixel without a pulse was hottest at the start of the plan.
         headroom_k=budget.caps.absorber_k - np.maximum(workspace.budgets.peak_k, state.rise_k),
     )
     return limited, close_workspace(workspace, budget)
@@ -162,6 +165,7 @@ def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float
 
     if fits(0.0):
         return 0.0
+    # Bisection needs an end that fits; what does not fit after an hour in the dark never does.
     if not fits(MAX_WAIT_S):
         return inf
     low_s, high_s = 0.0, MAX_WAIT_S
@@ -171,6 +175,7 @@ def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float
             high_s = middle_s
         else:
             low_s = middle_s
+    # The later end: it was tested and fits.
     return high_s
 
 
@@ -217,6 +222,7 @@ def commit_until(
     on_progress: Callable[[], None] = _ignore_progress,
 ) -> BudgetState:
     """Return the state after the pulses of a plan that start before `until_s`, which count in full."""
+    # In full, also a pulse that until_s cuts: the bound may only err upwards.
     count = int(np.searchsorted(plan.start_s, until_s))
     columns = {item.name: getattr(plan, item.name)[:count] for item in fields(PulsePlan)}
     first = PulsePlan(**columns)
@@ -249,6 +255,7 @@ def verify(
     is_sent = np.zeros(len(plan), dtype=np.bool)
     is_sent[row] = True
     omitted = np.flatnonzero(~is_sent)
+    # Stable: at equal starts the sent pulse comes before the omitted one, as in the plan that was limited.
     order = np.argsort(np.concatenate([pulses.start_s, plan.start_s[omitted]]), kind="stable")
     columns = [
         np.concatenate([getattr(pulses, name), getattr(plan, name)[omitted]]) for name in _EncodedPulses._fields[:-1]
@@ -257,6 +264,7 @@ def verify(
     encoded = _EncodedPulses(*(column[order] for column in (*columns, power_w)))
     pixel, stage = (np.concatenate([column[row], column[omitted]])[order] for column in (plan.pixel, plan.stage))
     zero = np.zeros(len(budget.galvos.damping))
+    # The slack is for the rounding to come; decoded pulses are rounded already, and would pay for it twice.
     exact = budget._replace(galvos=budget.galvos._replace(rad_per_code=zero, timing_slack_s=zero))
     stop_row, allowed_w, cause, _ = _apply_plan(pixel, stage, encoded, 0.0, state, exact, STOP, on_progress)
     if stop_row < len(pixel):
@@ -277,6 +285,7 @@ def _apply_plan(
     on_progress: Callable[[], None] = _ignore_progress,
 ) -> tuple[int, FloatArray, IntArray, LimiterWorkspace]:
     """Apply pulses [n] in chunks, between which nothing but the workspace is carried over."""
+    # Before the first kernel call, which would compile what the second process compiles.
     COLD_START.finish(budget, state)
     count, applied = len(pixel), 0
     workspace = open_workspace(state, count)

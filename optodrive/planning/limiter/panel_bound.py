@@ -87,6 +87,7 @@ class NominalThermalModel:
     extra_rise_k: float = 0.0
 
 
+# Each factor 1 / (1 − τ / T) is then at most 4/3. Below that ratio the margins would take most of the caps.
 PANEL_LAG_RATIO = 4.0
 
 
@@ -135,11 +136,14 @@ def build_panel_bound(
     """
     panel, walls = model.panel, model.walls
     if panel is None:
+        # Time constants of 1 and rises of 0: the kernels need no branch for a display without a panel.
         return PanelBound(np.zeros(2), np.ones(2), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     signs, count = np.array([-1.0, 1.0]), len(model.epsilon)
     capacities = panel.c_j_per_k * (1 + signs * uncertainty.panel_capacity)
     wall_lag_s = 0.0
     if walls is not None:
+        # Walls warm with the panel, and on average more: without their capacity a panel with a narrow rim seems to warm
+        # several times too fast.
         capacities += count * walls.c_j_per_k * (1 + signs * uncertainty.wall_capacity)
         wall_lag_s = walls.r_k_per_w * (1 + uncertainty.wall_resistance) * wall_max_j_per_k
     tau_s = panel.r_k_per_w * (1 + uncertainty.panel_resistance) * capacities
@@ -162,6 +166,7 @@ def build_panel_bound(
     k_per_j = epsilon * per_absorber / capacities
     k_per_s = ratio * float(k_per_j[0]) * all_power_w
     shares = 0.0 if model.touch is None else model.touch.gas_share + model.touch.wall_share
+    # At least 1: a membrane whose shares are below 1 is still surrounded by the panel, which a finger touches as well.
     per_panel = max(1.0, shares * (1 + uncertainty.touch_share))
     return PanelBound(
         k_per_j=k_per_j,

@@ -58,12 +58,15 @@ def apply_pulses(
     """
     for row in range(len(pixel)):
         panel_off_s = start_s[row] - workspace.nodes.panel_at_s[0]
+        # With the requested energy: the panel hardly changes by one pulse, and the caps of the others need it before
+        # the power is known.
         panel_k = panel_peak_k(budget.heat, workspace.nodes.panel_k, panel_off_s, power_w[row] * width_s[row])
         panel_k += panel_rise_by_others_k(budget.heat, stage[row], width_s[row])
         request = PulseRequest(
             pixel[row], stage[row], start_s[row], width_s[row], x_rad[row], y_rad[row], power_w[row], panel_k
         )
         granted_w[row], cause[row] = request.power_w, NO_CAP
+        # Also for a pulse without power: verify() must evaluate the exchange at the same times (see limiter.verify).
         before = compute_start_state(budget, workspace, request)
         if request.power_w < budget.caps.min_power_w or request.power_w <= 0.0:
             continue
@@ -71,9 +74,11 @@ def apply_pulses(
             max_w, binding = max_power_w(budget, workspace, request, before)
             if request.power_w > max_w * (1 + TOLERANCE):
                 granted_w[row], cause[row] = max(0.0, max_w), binding
+                # A negative power is a refusal (order, width) and holds under TRIM, too.
                 if policy == STOP or max_w < 0.0:
                     return row
                 if granted_w[row] < budget.caps.min_power_w:
+                    # Weaker than the board can emit: dark, and the reason says so.
                     granted_w[row] = 0.0
         if granted_w[row] > 0.0:
             commit(budget, workspace, request, granted_w[row], before)
@@ -102,6 +107,7 @@ def commit(
     heat, nodes, budgets, pixel = budget.heat, workspace.nodes, workspace.budgets, request.pixel
     rise_k, lower_bound_k, bucket_j, merged_width_s = before
     end_s = request.start_s + request.width_s
+    # Peaks and drives are read before the nodes advance: they need wall and lower bound at the pulse's start.
     budgets.peak_k[pixel] = max(budgets.peak_k[pixel], absorber_peak_k(budget, workspace, request, rise_k, power_w))
     nodes.absorber_k[pixel] = absorber_after_k(heat, pixel, rise_k, power_w, request.width_s)
     drive_k = heat.touch_per_wall_k * wall_credited_peak_k(budget, workspace.nodes, request, lower_bound_k, power_w)
@@ -117,9 +123,11 @@ def commit(
     for capacity in range(2):
         wall_k = wall_after_k(heat, nodes, pixel, capacity, request.width_s)
         nodes.wall_k[pixel, capacity] = wall_k + heat.wall_k_per_j[capacity] * power_w * request.width_s
+    # Wall and touch surface stand at the pulse's end now; a pulse of another stage that overlaps uses `_wall_since_k`.
     nodes.nodes_at_s[pixel] = end_s
     warm_panel(heat, nodes, request.start_s, request.width_s, power_w * request.width_s)
 
+    # It leaks during the pulse as well, as the board's does from the begin of one pulse to that of the next.
     budgets.bucket_j[pixel] = max(0.0, bucket_j + (power_w - budget.caps.pixel_mean_w) * request.width_s)
     budgets.merged_width_s[pixel] = merged_width_s + request.width_s
     history = workspace.history
@@ -147,6 +155,7 @@ class ColdStart:
         if not self._is_first:
             return
         self._is_first = False
+        # Without a cache on the disk the halves could not meet.
         if CACHED and not is_cached(apply_pulses):
             command = [sys.executable, "-P", "-m", __name__]
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)

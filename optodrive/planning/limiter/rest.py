@@ -32,6 +32,7 @@ def limit_rest(
         limited.append(chunk)
         on_progress()
     rest = concatenate(limited, state, budget)
+    # A row that was trimmed before keeps its reason: its power is still the lower one.
     reason = np.where(rest.reason != "", rest.reason, old.reason)
     return replace(rest, trimmed_j=old.trimmed_j + rest.trimmed_j, reason=reason), state
 

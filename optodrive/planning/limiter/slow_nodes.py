@@ -44,6 +44,7 @@ from optodrive.planning.limiter.heat_bound import (
     wall_bound_k,
 )
 
+# 2⁻¹⁶ of the requested power: about one step of the board's duty (1/65535).
 BISECTIONS = 16
 LOOK_AHEAD_TAUS = 2.0
 """Number of absorber time constants over which the warming of a wall is added to its touch surface's drive."""
@@ -80,10 +81,14 @@ def _wall_cap_k(budget: Budget, panel_k: float) -> float:
     panel rises within the touch surface's lag.
     """
     heat = budget.heat
+    # The lower of both: between two pixels a finger lies on a wall.
     cap_k = min(budget.caps.wall_k, budget.caps.touch_k) - heat.wall_per_panel * panel_k
     if heat.touch_per_wall_k > 0.0:
+        # A touch surface follows its wall late: until it has, the panel may rise further.
         touch_k = _touch_cap_k(budget, panel_k + heat.panel_k_per_s * heat.touch_lag_s[1])
         cap_k = min(cap_k, touch_k / (heat.touch_per_wall_k * heat.touch_specht_ratio))
+    # Below the floor a wall falls more slowly than its cap while others warm the panel: the set would no longer be
+    # invariant.
     return cap_k if cap_k >= heat.panel_floor_k else -1.0
 
 
@@ -98,11 +103,13 @@ def slow_node_limits_w(
     """
     heat, pixel, width_s = budget.heat, request.pixel, request.width_s
     wall_w = inf
+    # The cap is divided once here, so that both ends of the capacity are compared with one number.
     cap_k = _wall_cap_k(budget, request.panel_k) / heat.wall_specht_ratio
     for capacity in range(2):
         if heat.wall_k_per_j[capacity] > 0.0:
             off_k = wall_after_k(heat, nodes, pixel, capacity, width_s)
             wall_w = min(wall_w, (cap_k - off_k) / (heat.wall_k_per_j[capacity] * width_s))
+    # The touch surface is driven by the wall without this pulse; what the pulse adds to the wall is in k_per_w below.
     wall_k = wall_peak_k(budget, nodes, request, 0.0)
     touch_cap_k = _touch_cap_k(budget, request.panel_k)
     touch_w = inf if touch_cap_k >= 0.0 else 0.0
@@ -114,6 +121,7 @@ def slow_node_limits_w(
             k_per_w = heat.touch_k_per_j[lag] * width_s + heat.touch_per_wall_k * wall_k_per_w * response
             touch_w = min(touch_w, (touch_cap_k / heat.touch_specht_ratio - off_k) / k_per_w)
     if wall_w < request.power_w:
+        # The credit costs a bisection, so it is computed only where the linear answer trims.
         wall_w = _max_node_power_w(budget, nodes, request, lower_bound_k, WALL_NODE, max(0.0, wall_w))
     if touch_w < request.power_w:
         touch_w = _max_node_power_w(budget, nodes, request, lower_bound_k, TOUCH_NODE, max(0.0, touch_w))
@@ -126,6 +134,7 @@ def _max_node_power_w(
 ) -> float:
     """Bisect for the largest power, from `feasible_w` to the requested power, that keeps a node within its cap."""
     if _is_within_cap(budget, nodes, request, lower_bound_k, node, request.power_w):
+        # Most pulses that need the credit are granted whole: one evaluation in place of sixteen.
         return request.power_w
     low_w, high_w = feasible_w, request.power_w
     for _ in range(BISECTIONS):
@@ -134,6 +143,7 @@ def _max_node_power_w(
             low_w = middle_w
         else:
             high_w = middle_w
+    # The lower end: it was tested and passes, the middle of the last interval was not.
     return low_w
 
 
@@ -149,16 +159,19 @@ def _is_within_cap(
     """
     heat, pixel = budget.heat, request.pixel
     end_k = lower_bound_after_k(heat, pixel, lower_bound_k, power_w, request.width_s)
+    # The fastest that the credited heat may leave the absorber, with its smallest capacity.
     min_tau_s = 1.0 / heat.lower_bound_rate_per_s[pixel, 1]
     neighbours_w = 0.0
     for side in range(4):
         if heat.neighbours[pixel, side] >= 0:
+            # Neighbours at their cap: no pulse that is granted to them later makes them warmer.
             neighbours_w += heat.lateral_w_per_k * _wall_cap_k(budget, request.panel_k)
     wall_k = wall_peak_k(budget, nodes, request, power_w)
     if node == WALL_NODE:
         cap_k, credit = _wall_cap_k(budget, request.panel_k), heat.wall_transit_credit
         deficit_k = credit * heat.deficit_k
         peak_k, after_k = wall_credited_peak_k(budget, nodes, request, lower_bound_k, power_w), wall_k
+        # The largest capacity, index 1: the slowest fall, which is the worse one here.
         rate, drive_k = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[1], neighbours_w / heat.wall_w_per_k[pixel]
         cap_fall_k_per_s = heat.wall_per_panel * heat.panel_k_per_s
     else:
@@ -170,7 +183,9 @@ def _is_within_cap(
         drive_k = heat.touch_per_wall_k * min(_wall_cap_k(budget, request.panel_k), wall_k + wall_increase_k)
         cap_fall_k_per_s = heat.touch_per_panel * heat.panel_k_per_s
     fall_k_per_s = rate * (after_k - drive_k) - cap_fall_k_per_s
+    # No more than what arrives while y falls as fast: otherwise y − h would rise after the pulse.
     in_transit_k = min(credit * end_k - deficit_k, min_tau_s * fall_k_per_s)
+    # Negative where neighbours warm the node: then nothing is credited, and the full bound decides.
     return bool(max(peak_k, after_k - max(0.0, in_transit_k)) <= cap_k)
 
 
@@ -183,6 +198,7 @@ def wall_credited_peak_k(
     peak_k = 0.0
     for capacity in range(2):
         rate = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[capacity]
+        # The steady rise by a pulse that never ends: within the pulse y relaxes towards it.
         steady_k = nodes.inflow_w[pixel] / heat.wall_w_per_k[pixel] + heat.wall_k_per_j[capacity] * power_w / rate
         peak_k = max(
             peak_k,
@@ -197,7 +213,9 @@ def wall_credited_peak_k(
                 heat.wall_transit_credit / heat.wall_specht_ratio,
             ),
         )
+    # The deficit is added once, outside the maximum over both capacities: it does not depend on them.
     peak_k = heat.wall_specht_ratio * peak_k + heat.wall_transit_credit * heat.deficit_k
+    # A credit may only lower the bound, never raise it.
     return min(peak_k, wall_peak_k(budget, nodes, request, power_w))
 
 
@@ -251,6 +269,8 @@ def _credited_peak_k(
     peak_k = before_k - credit * lower_bound_k
     node_fall, credit_fall = rate * (before_k - steady_k), credit * lower_rate * (lower_bound_k - lower_steady_k)
     at_s = request.width_s
+    # First the end of the pulse, then the point in between if there is one: a second pass costs two exponentials and no
+    # search.
     for _ in range(2):
         y_k = steady_k + (before_k - steady_k) * exp(-rate * at_s)
         u_k = lower_steady_k + (lower_bound_k - lower_steady_k) * exp(-lower_rate * at_s)

@@ -70,6 +70,7 @@ def max_window_power_w(
     window_s, mean_w: length of the window, and the cap of the mean power over it.
     """
     row = chains.first[chain]
+    # Starts only grow, so a pulse that no window reaches any more is skipped once and never visited again.
     while row >= 0 and history.start_s[row] + history.width_s[row] <= start_s - window_s:
         row = chains.next_row[row]
     chains.first[chain] = row
@@ -185,6 +186,7 @@ def close_workspace(workspace: LimiterWorkspace, budget: Budget) -> BudgetState:
     """Return the state for the next plan, without pulses that no future window contains."""
     nodes, budgets, history = workspace.nodes, workspace.budgets, workspace.history
     at_s, count = float(budgets.end_s.max()), int(history.n_valid[0])
+    # From the last start, not the last end: a pulse of another stage may still begin before that end.
     horizon_s = float(budgets.begun_s[0]) - max(budget.caps.pixel_window_s, budget.caps.display_window_s)
     recent = np.flatnonzero(history.start_s[:count] + history.width_s[:count] > horizon_s)
     return BudgetState(

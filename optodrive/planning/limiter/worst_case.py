@@ -55,6 +55,7 @@ def build_heat_bound(
     epsilon = model.epsilon * (1 + uncertainty.absorbed_power)
     r_high = model.r_k_per_w * (1 + uncertainty.bridge_resistance)
     c_low = model.c_j_per_k * (1 - uncertainty.absorber_capacity)
+    # Only the largest capacity grows with heat: the smallest is that of the cold absorber, which warms fastest.
     c_high = model.c_j_per_k * (1 + uncertainty.absorber_capacity) * model.hot_capacity_factor
     knot_k, loss_k = _compute_loss_chords(model, uncertainty, caps)
     resistance_factor = float(knot_k[-1] / loss_k[-1])
@@ -70,6 +71,7 @@ def build_heat_bound(
     )
     lags_s = lag_max_s, float(wall.j_per_k[1]), float(touch.lag_s[1])
     panel = build_panel_bound(model, uncertainty, epsilon_max, sum(power_max_w), *lags_s)
+    # Last: its deficits need the fastest rise of the panel and the coupling of walls and touch surface.
     lower = _build_lower_bound(model, uncertainty, caps, c_low, c_high, wall, touch, panel.k_per_s)
     bound = HeatBound(
         epsilon=epsilon,
@@ -110,6 +112,7 @@ def build_heat_bound(
     )
     for column in bound:
         if isinstance(column, np.ndarray):
+            # Shared by all plans and threads; a kernel that wrote to it would loosen the bound of all later ones.
             column.setflags(write=False)
     return bound
 
@@ -121,6 +124,7 @@ def _compute_loss_chords(
 
     The loss is concave, so the chords lie below it.
     """
+    # The largest n: a hot bridge then conducts least and keeps its heat longest.
     exponent = model.exponent + uncertainty.exponent
     knot_k = np.linspace(0.0, caps.absorber_k, (CHORDS if exponent > 0 else 1) + 1)
     return knot_k, knot_k * _compute_bridge_ratio(model, caps, knot_k) ** -exponent
@@ -128,6 +132,7 @@ def _compute_loss_chords(
 
 def _compute_bridge_ratio(model: NominalThermalModel, caps: CapValues, rise_k: FloatArray) -> FloatArray:
     """Return the largest mean temperature of a bridge over ambient, for rises of an absorber over its wall."""
+    # The far end is as hot as caps permit: the mean temperature of the bridge is then the largest.
     wall_k = min(caps.wall_k, caps.touch_k) if model.walls is not None or model.panel is not None else 0.0
     far_end_k = model.extra_rise_k + (wall_k if np.isfinite(wall_k) else 0.0)
     return (model.ambient_k + far_end_k + 0.5 * rise_k) / model.ambient_k
@@ -170,6 +175,7 @@ def _build_wall_bound(
             dtype=np.float64,
         )
 
+    # A wall loses heat by the smallest conductance and gives its neighbours heat by the largest: no wall does both.
     min_w_per_k = compute_conductance(1 + uncertainty.wall_resistance, 1 + uncertainty.side_resistance)
     max_w_per_k = compute_conductance(1 - uncertainty.wall_resistance, 1 - uncertainty.side_resistance)
     c_low = walls.c_j_per_k * (1 - uncertainty.wall_capacity)
@@ -177,6 +183,8 @@ def _build_wall_bound(
     # With a factor of 1 / (1 − rate × time constant) the bound stays above the wall at all later times.
     retained_fraction = 1.0 - float(max_w_per_k.max()) / c_low * tau_max_s
     lag_retained_fraction = 1.0 - float(min_w_per_k.max()) / c_low * lag_max_s
+    # At 0.5 a pulse's heat counts twice; towards 0 it counts without limit, and would trim everything without saying
+    # why.
     if min(retained_fraction, lag_retained_fraction) < 0.5:
         raise InputError(
             "terms.wall_heating",
@@ -234,6 +242,7 @@ def _build_touch_bound(
         return _TouchBound(np.ones(2), np.zeros(2), 0.0, 1.0, 0.0)
     lags_s = touch.lag_s * np.array([1 - uncertainty.touch_lag, 1 + uncertainty.touch_lag])
     gas_share, wall_share = (
+        # Shares are relative: one of zero stays zero, however uncertain.
         touch.gas_share * (1 + uncertainty.touch_share),
         touch.wall_share * (1 + uncertainty.touch_share),
     )
@@ -281,6 +290,7 @@ def _build_lower_bound(
     cold_ratio = _compute_bridge_ratio(model, caps, np.array(caps.absorber_k)) ** min(
         0.0, model.exponent - uncertainty.exponent
     )
+    # Of a lower bound every end is the other one: little power, little resistance, heat that leaves fast.
     r_low = model.r_k_per_w * (1 - uncertainty.bridge_resistance) * cold_ratio
     coupling_factor = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
     rate_per_s = np.stack([coupling_factor / (r_low * c_high), coupling_factor / (r_low * c_low)], axis=1)
