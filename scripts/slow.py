@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,10 +39,14 @@ FOLDERS = {
 def list_pieces() -> dict[str, list[str]]:
     """Return the names of the pieces, such as `property-2`, and the files of each."""
     pieces: dict[str, list[str]] = {}
+    nightly = {name.partition("::")[0] for name in tomllib.loads((ROOT / "tests" / "nightly.toml").read_text())}
     for folder, count in FOLDERS.items():
         files = sorted((ROOT / "tests" / folder).rglob("test_*.py"))
+        names = [str(file.relative_to(ROOT)) for file in files]
         slow = [
-            str(file.relative_to(ROOT)) for file in files if "mark.slow" in file.read_text() or folder == "property"
+            name
+            for name, file in zip(names, files, strict=True)
+            if folder == "property" or name in nightly or "mark.slow" in file.read_text()
         ]
         for part in range(count):
             pieces[folder if count == 1 else f"{folder}-{part + 1}"] = slow[part::count]
