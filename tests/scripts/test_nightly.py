@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-
 ROOT = Path(__file__).parents[2]
-NIGHTLY = tomllib.loads((ROOT / "tests" / "nightly.toml").read_text())
-sys.path.append(str(ROOT / "scripts"))
+sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 
 import slow
+
+NIGHTLY = tomllib.loads((ROOT / "tests" / "nightly.toml").read_text())
 
 
 def exists(name):
@@ -30,8 +30,7 @@ def test_a_nightly_test_and_what_covers_it_exist(name):
 
 
 def test_every_slow_file_is_in_one_piece():
-    pieces = slow.list_pieces()
-    files = sum(pieces.values(), [])
+    files = [file for piece in slow.list_pieces().values() for file in piece]
     assert len(files) == len(set(files))
     assert {name.partition("::")[0] for name in NIGHTLY} <= set(files)
 
