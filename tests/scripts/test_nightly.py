@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
 sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 
 import slow
 
+ROOT = Path(__file__).parents[2]
 NIGHTLY = tomllib.loads((ROOT / "tests" / "nightly.toml").read_text())
 
 
