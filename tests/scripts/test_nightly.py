@@ -2,7 +2,6 @@
 
 import re
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 import slow
 
 ROOT = Path(__file__).parents[2]
-NIGHTLY = tomllib.loads((ROOT / "tests" / "nightly.toml").read_text())
+NIGHTLY = slow.read_nightly()
 
 
 def exists(name):
