@@ -46,6 +46,7 @@ class Extent:
 
 def evaluate_terms(extent: Extent, x_code: FloatArray, y_code: FloatArray) -> FloatArray:
     """Return every term at codes [n], [n, TERM_COUNT], each with mean square 1 over the extent."""
+    # Clipped: a polynomial of degree 6 runs away outside, where nothing was measured.
     u, v = (np.clip(axis, -1.0, 1.0) for axis in extent.normalise(x_code, y_code))
     along_x, along_y = _evaluate_legendre(u), _evaluate_legendre(v)
     out = np.empty((len(u), TERM_COUNT), order="F")
@@ -57,6 +58,7 @@ def evaluate_terms(extent: Extent, x_code: FloatArray, y_code: FloatArray) -> Fl
 def compute_prior_widths() -> FloatArray:
     """Return the prior standard deviation of each coefficient, [TERM_COUNT], for a surface of rms 1 over the extent."""
     degree = np.array([i + j for i, j in DEGREES])
+    # Shared by the degree + 1 terms of a degree: the ratio is that of whole degrees.
     variance = VARIANCE_RATIO ** (degree - 2.0) / (degree + 1.0)
     width: FloatArray = np.sqrt(variance / variance.sum())
     return width
@@ -161,6 +163,7 @@ class CalibratedField:
 
         The polynomial guess serves as the inverse's slope: each step is the guess's difference over the residual.
         """
+        # Its derivative is the field's to a thousandth, so one step from it suffices almost everywhere.
         guess = self._guess_codes(x_m, y_m)
         codes = guess
         for _ in range(MAX_ITERATIONS):
@@ -173,6 +176,7 @@ class CalibratedField:
         residual_m = np.hypot(at_x_m - x_m, at_y_m - y_m)
         max_residual_m = FOLDOVER_FACTOR * CODE_TOLERANCE * 2.0 * self.focal_length_m * self.rad_per_code
         failed = ~(np.all(np.abs(step) <= CODE_TOLERANCE, axis=1) & (residual_m <= max_residual_m))
+        # Refused and not clipped: a code near the end of the range would send the beam to a wrong place.
         codes[failed] = np.nan
         return codes[:, 0], codes[:, 1]
 
@@ -198,6 +202,7 @@ class CalibratedField:
 
 def _build_nodes() -> tuple[FloatArray, FloatArray]:
     """Return the codes at which the polynomial for the initial guess is fitted, [n] each."""
+    # Chebyshev nodes: at equal distances the polynomial would oscillate towards the ends.
     node = np.cos(np.pi * (np.arange(GUESS_NODES) + 0.5) / GUESS_NODES) * GUESS_MARGIN * (CODE_MAX - CENTRE_CODE)
     x_code, y_code = (CENTRE_CODE + axis.ravel() for axis in np.meshgrid(node, node))
     return x_code, y_code
@@ -205,6 +210,7 @@ def _build_nodes() -> tuple[FloatArray, FloatArray]:
 
 def _build_monomials(x: FloatArray, y: FloatArray) -> FloatArray:
     """Return the monomials of total degree up to GUESS_ORDER, [n, powers]."""
+    # By columns, as they are filled and multiplied.
     out = np.empty((len(x), (GUESS_ORDER + 1) * (GUESS_ORDER + 2) // 2), order="F")
     out[:, 0] = 1.0
     at = 0

@@ -81,6 +81,8 @@ class Config(Section):
         completed = []
         for stage in stages:
             sections = {
+                # Before the sections are validated: a key of the file may be right only together with that of the
+                # stage.
                 key: table[key] | stage.get(key, {})
                 for key in ("laser", "scanner", "board")
                 if isinstance(table.get(key), dict) and isinstance(stage.get(key, {}), dict)
@@ -91,6 +93,7 @@ class Config(Section):
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
         limits = self.limits
+        # A cap at ambient temperature leaves no light, and the limiter's chords no span.
         for key in ("absorber_max_c", "wall_max_c", "touch_max_c"):
             if getattr(limits, key) <= self.ambient_c:
                 raise ConflictError(f"limits.{key}", getattr(limits, key), f"more than ambient_c {self.ambient_c}")
@@ -116,6 +119,7 @@ class Config(Section):
         for number, stage in enumerate(self.stages):
             for key, ours in (("name", stage.name), ("board", stage.board.address)):
                 for other, earlier in enumerate(self.stages[:number]):
+                    # Two stages on one port: the second would open it while the first has the lease.
                     if ours and ours == (earlier.name if key == "name" else earlier.board.address):
                         value = stage.name if key == "name" else Unquoted(" ".join(map(str, ours)))
                         expected = f"another {key} than that of stages[{other}]"
@@ -173,6 +177,7 @@ class Config(Section):
 
     def _check_focus(self) -> None:
         display, laser = self.display, self.laser
+        # Rounding takes half a step of the aim and one of the move, and something must be left.
         min_rad = 2.0 * self.scanner.rad_per_code
         for side, tolerance_rad in zip(("width", "height"), self.tolerance_rad, strict=True):
             if tolerance_rad <= min_rad:
@@ -185,6 +190,7 @@ class Config(Section):
 
     def _check_damping(self) -> None:
         scanner = self.scanner
+        # At 1 the two poles coincide, and √(1 − ζ²) divides the bounds of the settling time.
         if scanner.damping * (1.0 + scanner.damping_uncertainty) > DAMPING_MAX:
             expected = f"a half-width that leaves scanner.damping {scanner.damping} at most {DAMPING_MAX}"
             raise ConflictError("scanner.damping_uncertainty", scanner.damping_uncertainty, expected)
@@ -209,6 +215,7 @@ class Config(Section):
             return (self,)
         sections = ("laser", "scanner", "board")
         return tuple(
+            # Copied without validation: the parts were validated, and the whole is checked by its owner.
             self.model_copy(update={"stages": (stage,)} | {name: getattr(stage, name) for name in sections})
             for stage in self.stages
         )

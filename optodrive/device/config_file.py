@@ -52,6 +52,7 @@ def build_config(path: Path, table: dict[str, Any]) -> Config:
     check_format(path, table, FORMAT, VERSION)
     check_table(str(path), table, collect_ranges(Config))
     for section, key in list_named_files(table):
+        # Relative to the file and not to the working directory: a service and a shell must read the same field.
         section[key] = str(path.parent / section[key])
     config = validate_table(path, table, Config).read_from(path)
     return config.list_stage_configs()[0] if len(config.stages) == 1 else config
@@ -66,6 +67,7 @@ def _apply_measured_servos(config: Config) -> Config:
     stages = tuple(
         stage.model_copy(update={"scanner": each.scanner}) for stage, each in zip(config.stages, measured, strict=True)
     )
+    # One cap for all stages: the smallest that a measured servo leaves.
     cap = min(each.limits.galvo_acceleration_rms_max_rad_per_s2 for each in measured)
     limits = config.limits.model_copy(update={"galvo_acceleration_rms_max_rad_per_s2": cap})
     return config.model_copy(update={"stages": stages, "limits": limits})
@@ -131,6 +133,7 @@ def apply_measured_servo(config: Config, path: Path) -> Config:
     measured = parse_table(path, table, MirrorsFile)
     scanner = config.scanner.model_copy(update={**measured.scanner.model_dump(), "mirrors": str(path)})
     if measured.effect is not None:
+        # An error that stays counts as aim: scheduler and limiter need no other model of the mirror.
         scanner = scanner.model_copy(update={"aim_error_m": _bound_aim_error_m(config, measured.effect, path)})
     stated = config.limits.galvo_acceleration_rms_max_rad_per_s2
     cap = {"galvo_acceleration_rms_max_rad_per_s2": stated * measured.galvo.share}

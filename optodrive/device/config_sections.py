@@ -22,6 +22,7 @@ POWER_STEPS = 65_535
 DAC_POWER_STEPS = {"helios": 255, "ether_dream": 4095, "idn": 255}
 """The same of the laser DACs, by transport."""
 NETWORK_DACS = ("ether_dream", "idn")
+# Counted by the galvo load, which must hold for the points as they are played.
 DAC_TIMING_SLACK_POINTS = {"helios": 5, "ether_dream": 5, "idn": 6}
 """On a laser DAC a pulse starts up to two points late (rounding; the end of a chunk) and ends up to three points early
 (the same, and the dark point before an immediately following pulse); on IDN one more dark point precedes a pulse."""

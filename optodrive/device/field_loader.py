@@ -68,6 +68,7 @@ def _check_scanner(field: CalibratedField, config: Config) -> None:
         ("range_rad", scanner.rad_per_code, field.rad_per_code),
         ("focal_length_m", scanner.focal_length_m, field.focal_length_m),
     ):
+        # Exactly: a field maps codes, and another range or lens gives its codes another meaning.
         if abs(configured / calibrated - 1.0) > 1e-9:
             value = getattr(scanner, name)
             expected = (
@@ -99,6 +100,7 @@ def _check_pixels(field: CalibratedField, config: Config) -> None:
             reason,
             f"every pixel of {config.name} within {_describe(field, config)}",
         )
+    # The gate's tolerance is what aim_error_m leaves: a field less certain than that would put light beside absorbers.
     required_m = COVERAGE_SIGMAS * float(sigma_m.max())
     if required_m > scanner.aim_error_m:
         expected = (

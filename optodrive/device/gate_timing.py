@@ -61,10 +61,12 @@ def ringing_s(omega: float, damping: float, slew: float, ramp_s: float, toleranc
     size_rad, start_rad = abs(amplitude), phase(amplitude)
     # Between two extrema of the ringing the error is monotone, so bisection finds the last crossing.
     outside_s, extremum_s = 0.0, ((0.5 * pi - phase(pole * amplitude)) % pi) / pole.imag
+    # From extremum to extremum: the last one beyond the tolerance has the crossing behind it.
     while size_rad * exp(pole.real * extremum_s) * abs(cos(pole.imag * extremum_s + start_rad)) > tolerance_rad:
         outside_s, extremum_s = extremum_s, extremum_s + pi / pole.imag
     inside_s = extremum_s
     if size_rad * exp(pole.real * outside_s) * abs(cos(pole.imag * outside_s + start_rad)) <= tolerance_rad:
+        # The ramp itself ends within the tolerance.
         return 0.0
     for _ in range(CROSSING_STEPS):
         middle_s = 0.5 * (outside_s + inside_s)
@@ -72,6 +74,7 @@ def ringing_s(omega: float, damping: float, slew: float, ramp_s: float, toleranc
             outside_s = middle_s
         else:
             inside_s = middle_s
+    # The end of the last interval that is inside: never too early.
     return inside_s
 
 

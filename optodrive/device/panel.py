@@ -61,6 +61,7 @@ class Neighbours:
     def from_display(cls, display: DisplaySection) -> "Neighbours":
         """Return the neighbours on a display's lattice."""
         layout = build_pixel_layout(display)
+        # A rim of −1 around the lattice: no edge is a special case below.
         index = np.full((display.rows + 2, display.columns + 2), -1, dtype=np.int64)
         index[layout.row + 1, layout.column + 1] = np.arange(len(layout))
         row, column = layout.row + 1, layout.column + 1

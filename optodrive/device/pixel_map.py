@@ -109,6 +109,8 @@ class PixelMap:
     @property
     def displacement_factor(self) -> FloatArray:
         """Factor on the model's displacement, [p]: the gain, or 0 for a dead pixel."""
+        # On the displacement alone: heights cannot tell a stiff membrane from a pale absorber, so heat stays the
+        # model's.
         return np.where(self.dead, 0.0, self.gain)
 
 
@@ -189,6 +191,7 @@ def read_change(path: Path) -> tuple[int, int]:
     return status.st_mtime_ns, status.st_size
 
 
+# By time and size of the file: layout, field and table of each stage ask for the map again.
 @lru_cache(maxsize=8)
 def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
     table = read_toml(path, BYTES_MAX)
@@ -221,6 +224,7 @@ def _build_map(path: Path, content: _PixelMapFile, config: Config) -> PixelMap:
     }
     for axis, max_m in zip("xy", max_aim_offset_m(config), strict=True):
         distance_m = np.abs(numbers[f"offset_{axis}_m"])
+        # Within the own cell: the light of one pixel must not count as another's.
         if distance_m.max() > max_m:
             at = int(distance_m.argmax())
             message = f"at most {max_m:.6g} in either direction, so that the focus stays within the pixel's own cell"

@@ -64,6 +64,7 @@ def tolerance_ratio(field: ScanField, layout: PixelLayout, config: Config) -> fl
             for sign in (1.0, -1.0)
         )
         slopes.append((high - low) / (2.0 * DERIVATIVE_STEP_M))
+    # Axes may be coupled: an error of one mirror then moves the beam along both.
     metres_per_rad = np.linalg.inv(np.stack(slopes, axis=-1).transpose(1, 0, 2))
     tolerance_rad = np.array(config.tolerance_rad)
     tolerance_m = 2.0 * config.scanner.focal_length_m * tolerance_rad

@@ -57,6 +57,7 @@ def simulate_servo(at_s: FloatArray, command_rad: FloatArray, t_s: FloatArray, s
     Before the first command the angle is that of the first one. servo: None for a mirror that follows immediately
     """
     if servo is None:
+        # Before the first command a mirror stands where that one sends it: a recording begins at rest.
         row = np.clip(np.searchsorted(at_s, t_s, side="right") - 1, 0, len(at_s) - 1)
         return np.asarray(command_rad[row], dtype=np.float64)
     out = np.zeros(len(t_s))
@@ -101,8 +102,10 @@ def _integrate_servo(
                 end_s = at_s[row + 1]
             if row < len(at_s) and at_s[row] > now_s and at_s[row] < end_s:
                 end_s = at_s[row]
+            # A settled mirror is jumped over: pauses between moves are most of a recording.
             h_s = end_s - now_s if is_settled else min(step_s, end_s - now_s)
             if not is_settled:
+                # The slew limits the target, not the mirror: behind it the two poles ring freely.
                 target += min(max(requested - target, -slew * h_s), slew * h_s)
                 acceleration = omega * omega * (target - angle) - 2.0 * damping * omega * speed
                 middle = angle + 0.5 * h_s * speed

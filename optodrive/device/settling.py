@@ -75,7 +75,9 @@ class SettlingTable:
         """
         departures_s = (bound_departure_s(moves.servos, moves.remaining_rad(axis, EARLY_SHARE)) for axis in range(2))
         point_s = config.board.point_max_s
+        # No longer than the shortest pulse: a step that precedes the light of its own pixel would move it.
         points = min(int(min(departures_s) / point_s), int(moves.min_pulse_s / point_s) - EARLY_SLACK_POINTS)
+        # The least that the points may last, against `point_max_s` above, the most: each bound at its own end.
         early_us = int(1e6 * points / config.board.points_per_s) - 1
         if points < 1:
             return self
@@ -110,6 +112,7 @@ class SettlingTable:
             for share in (LONG_DWELL_SHARE, moves.short_dwell_share)
         )
         # Only a first move, from the centre of an even lattice, spans half pitches.
+        # An even lattice has its centre between two pixels, and the mirrors begin there.
         halves = [
             1e6 * moves.settling_s(axis, 0.5 * odd, 0.5 * odd, moves.short_dwell_share)
             for axis, count in enumerate((display.columns, display.rows))
@@ -128,6 +131,7 @@ class SettlingTable:
         tables = self.after_long_dwell if dwell_us >= self.long_dwell_us else self.after_short_dwell
         x_us = tables[0][int(abs(dx_rad) / self.pitch_rad + CEIL_OFFSET)]
         y_us = tables[1][int(abs(dy_rad) / self.pitch_rad + CEIL_OFFSET)]
+        # A mirror that still rings when the step is sent would leave its tolerance sooner than computed.
         early_us = self.early_us if dwell_us >= self.early_dwell_us else 0
         return max(0, max(x_us, y_us) - early_us)
 
@@ -185,12 +189,15 @@ class _ServoMoves:
 
     def _min_pitch_settling_s(self, share: float) -> float:
         """Return a time that every planned move of a pitch takes at least: that of one slow servo, s."""
+        # Slow in frequency and slew, late, and well damped: a lower bound, as moves must not seem shorter than planned
+        # ones are.
         slow = self.servos.servo_at(-1.0, 1.0, -1.0, 1.0)
         return min(settling_s(slow, self.pitch_rad, self.remaining_rad(axis, share)) for axis in range(2))
 
     @property
     def _min_rate_per_s(self) -> float:
         """Rate at which ringing decays at least, 1/s."""
+        # Low frequency and low damping: ringing that decays most slowly.
         slow = self.servos.servo_at(-1.0, -1.0, 0.0, 0.0)
         return 2.0 * pi * slow.frequency * slow.damping
 
@@ -212,6 +219,7 @@ class _ServoMoves:
 
         def residual_share(share: float) -> float:
             factor = self._residual_factor(share)
+            # A geometric series: all earlier moves ring, each one gate longer than the next.
             return self._max_envelope_factor * factor / (1.0 - factor)
 
         return max(
@@ -238,6 +246,7 @@ def _bisect_fixed_point(function: Callable[[float], float], high_limit: float) -
             low = middle
         else:
             high = middle
+    # Just above the fixed point: a share that is too large errs towards longer moves.
     return high
 
 
@@ -247,8 +256,10 @@ def _enforce_subadditivity(times_us: list[int]) -> TimesUs:
     Subadditivity matters because a pulse between two moves may be trimmed to zero power: the mirrors then make the
     whole way in the time of both moves.
     """
+    # A longer move may settle sooner, when its ramp ends against the ringing; a table that falls would invite detours.
     times_us = list(accumulate(times_us, max))
     for total in range(len(times_us) - 1, 1, -1):
+        # The longer part is raised, from the largest total down.
         for part in range(1, total // 2 + 1):
             times_us[total - part] = max(times_us[total - part], times_us[total] - times_us[part])
     return tuple(accumulate(times_us, max))

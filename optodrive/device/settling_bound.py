@@ -40,6 +40,7 @@ def bound_settling_s(servos: ServoRange, min_move_rad: float, max_move_rad: floa
     cells = np.empty((CELLS_MAX, 2, 4))
     cells[0, 0] = 2.0 * pi * low.frequency, low.damping, low.slew, min_move_rad
     cells[0, 1] = 2.0 * pi * high.frequency, high.damping, high.slew, max_move_rad
+    # The delay only adds, so it needs no dimension of the box.
     return high.delay + _bound_s(cells, np.empty(CELLS_MAX), np.empty((CELLS_MAX, 4)), tolerance_rad)
 
 
@@ -49,6 +50,7 @@ def bound_departure_s(servos: ServoRange, tolerance_rad: float) -> float:
     While the error of a unit step falls, the fastest servo of the range leaves first: a higher frequency, a lower
     damping, and a ramp that is steeper, longer and earlier each move the mirror farther.
     """
+    # The opposite corner of the box: here the fastest servo is the worst one.
     fast = servos.servo_at(1.0, -1.0, 1.0, -1.0)
     pole, rate = pole_per_s(fast), fast.damping / sqrt(1.0 - fast.damping**2)
     low_s, high_s = 0.0, pi / pole.imag
@@ -59,6 +61,7 @@ def bound_departure_s(servos: ServoRange, tolerance_rad: float) -> float:
             high_s = middle_s
         else:
             low_s = middle_s
+    # low_s was found to be within the tolerance, so it errs towards a shorter lead.
     return max(0.0, fast.delay) + low_s
 
 
@@ -70,6 +73,7 @@ def _bound_s(cells: FloatArray, bounds_s: FloatArray, widths_s: FloatArray, tole
     widths_s: [n, 4], what each parameter adds to it
     """
     longest_s = 0.0
+    # Corners first: they are no bound, but a long settling time that is met early ends the search early.
     for corner in range(16):
         omega, damping = cells[0, corner & 1, OMEGA], cells[0, (corner >> 1) & 1, DAMPING]
         slew, move_rad = cells[0, (corner >> 2) & 1, SLEW], cells[0, corner >> 3, MOVE]
@@ -80,7 +84,9 @@ def _bound_s(cells: FloatArray, bounds_s: FloatArray, widths_s: FloatArray, tole
         largest = int(np.argmax(bounds_s[:count]))
         is_close = bounds_s[largest] <= (1.0 + PRECISION) * longest_s
         if is_close or count == len(bounds_s):
+            # Also where the cells have run out: the bound is then wider, never wrong.
             return float(max(longest_s, bounds_s[largest]))
+        # Halved where it adds most: four equal halvings would take sixteen cells per step.
         widest = int(np.argmax(widths_s[largest]))
         middle = 0.5 * (cells[largest, 0, widest] + cells[largest, 1, widest])
         for each in range(4):
@@ -111,6 +117,7 @@ def _bound_cell_s(low: FloatArray, high: FloatArray, tolerance_rad: float, width
     largest_rad = high[SLEW] / (low[OMEGA] * low[DAMPING] * beta)
     later_s = log(max(1.0, largest_rad / tolerance_rad)) / (low[DAMPING] * low[OMEGA])  # by the envelope alone
     if change_rad < tolerance_rad:
+        # If the error changes by more than the tolerance over the cell, only its envelope bounds it.
         later_s = min(later_s, ringing_s(omega, damping, slew, ramp_s, tolerance_rad - change_rad))
     return ramp_s + settled_s, high[MOVE] / low[SLEW] + later_s
 

@@ -133,9 +133,11 @@ class DiscoveredTerm(Section):
             raise ValueError(f"unit {unit}, not '{self.unit}'")
         if not self.low < self.high:
             raise ValueError(f"low less than high, not {self.low:g} and {self.high:g}")
+        # Before anything is computed from the values: inf and NaN end here.
         self._check_plausible(unit)
         if (self.memory_time_s is not None) != (self.depends_on == "memory"):
             raise ValueError("memory_time_s together with depends_on = 'memory', and only with it")
+        # `not <=` and not `>`: NaN is refused, too.
         if self.where in ADDED and not abs(self._compute_at_zero()) <= find_zero(self.where):
             expected = f"0 {unit} where {self.depends_on} is 0: a cold pixel stays cold"
             raise ConflictError("values", self._compute_at_zero(), expected)
@@ -196,6 +198,7 @@ def check_set(terms: Sequence[DiscoveredTerm], where: str, c_j_per_k: float) -> 
         if time_s not in (None, first_s):
             expected = f"{first_s:g} s as of the other terms: the pixel has one memory"
             raise InputError(f"{where}.{number}.memory_time_s", time_s, expected)
+        # The steepest part, with the smallest capacity: the fastest that the integrator may meet.
         rate_per_s = term.find_rate_per_s(c_j_per_k)
         if rate_per_s * SHORTEST_S > 1.0:
             found, expected = format_quantity(1.0 / rate_per_s, "s", 2), f"{format_quantity(SHORTEST_S, 's')} or more"
@@ -229,6 +232,7 @@ def _evaluate(v: FloatArray, slot: int, y: FloatArray, s: int, c: FloatArray) ->
     else:
         z = c[SINCE_EDGE_S]
     place = (z - v[slot + 2]) / v[slot + 3]
+    # Constant beyond the ends. `not >`: NaN takes the low end and cannot index the table.
     if not place > 0.0:
         return float(v[slot + HEAD])
     if place >= KNOTS - 1.0:
@@ -255,6 +259,7 @@ def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float)
         if v[number * SLOT] == LIGHT:
             value = _evaluate(v, number * SLOT, y, s, c)
             x = x + value if v[number * SLOT + 1] == OF_POWER else x * (1.0 + value)
+    # Darkness is the least: two factors below it would be light.
     return max(0.0, x)
 
 
@@ -328,6 +333,7 @@ class Discovered(Term):
                 fastest, slowest = fastest + highest, slowest + lowest
             elif place == HEAT_FLOW and highest > find_zero("absorber"):
                 own, memory_s = ratio * envelope.r_k_per_w, 0.0
+                # At 1 each joule brings another one: no bound exists.
                 if quantity == OF_GAS or not own < 1.0:
                     return None
                 late = own
@@ -338,6 +344,7 @@ class Discovered(Term):
                 age_s += own * (memory_s + envelope.r_k_per_w * envelope.c_max_j_per_k)
             elif place == GAS_RATE:
                 rise_k += envelope.gas_share * envelope.tau_g_s * highest
+        # None refuses the set by name; a bound that is too large would trim every plan without a word.
         if not power < inf or late_feedback > MAX_FEEDBACK or slowest < MIN_CAPACITY_SHARE:
             return None
         return HeatGainBound(

@@ -98,6 +98,7 @@ def compute_snapshot(
         copy_states(cache.states[i], work[0])
         if i < last:
             copy_rows(active.panel_rows, cache.states[last], work[0])
+        # Pixels take the panel as it is at the end: it changes over minutes, a pixel within a tenth of a second.
         c[PANEL_HELD] = 1.0 if i < last else 0.0
         advance_states(one, active, c, work, 0.0, events.off_s[i] + cache.at_s[i] - at_s[i], wait_s)
         copy_states(work[0], cache.states[i])
@@ -149,6 +150,7 @@ class ExtendedThermalState:
         twin = ExtendedThermalState.__new__(ExtendedThermalState)
         vars(twin).update(vars(self))
         twin._events = self._events.copy_shifted(offset_s)
+        # A cache is of the events that it was computed from.
         twin._snapshot_cache = None
         return twin
 
@@ -203,6 +205,7 @@ class ExtendedThermalState:
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
         """Return the largest displacement that one pulse can reach on each cold pixel, m, [p]."""
         affected = {all_terms()[key].affected_pixel(values) for key, values in self._values.items()}
+        # Equal pixels are computed once: of 1,511 only those that a term singles out differ.
         kinds = [(pixel, index if index in affected else None) for index, pixel in enumerate(self.pixels.elements)]
         width_s = drive.max_periods * drive.period_s
         by_kind: dict[tuple[Pixel, int | None], float] = {}
@@ -239,6 +242,7 @@ class ExtendedThermalState:
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """See `ThermalState.simulate_traces`. Raises ValueError if the display is not cold."""
+        # An experiment begins cold, and a state has no place in it.
         if self._events.states.any():
             raise ValueError("a display with terms is traced from the cold state only")
         # Membrane terms do not act back on the gas: without them, the displacement is proportional to the gas's rise.
@@ -281,6 +285,7 @@ class ExtendedThermalState:
         """
         if at_s < self._events.at_s[pixel] - TIME_ROUNDING_S:
             raise self._time_order_error(pixel, at_s)
+        # Copies: the display's own states stay at their events.
         context, work, shared = self._context.copy(), np.zeros((8, STATE_COUNT)), np.zeros((8, STATE_COUNT))
         illuminated = int(self._events.illuminated[0])
         set_light(

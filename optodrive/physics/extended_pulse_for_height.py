@@ -57,9 +57,11 @@ def find_shortest_pulse(
         c[POWER_W] = max_power_w
         highest_m = advance_states(pixel, active, c, work, 0.0, period * period_s, period_s)[0]
         copy_states(work[0], on_states[period + 1])
+        # Reached while the light is on: longer pulses only rise further, so the search ends here.
         if highest_m >= target_m and peak_after_s <= 0.0:
             high = max(period + 1, min_periods)
             break
+    # One period less is known to be too short, or not permitted.
     low = min_periods - 1
     while high - low > 1:
         middle = (low + high) // 2
@@ -102,12 +104,14 @@ def _solve_duty(
             return duty
         if error_m > 0.0:
             high, high_error_m = duty, error_m
+            # Illinois: the end that stays twice counts half, or false position would creep from one side.
             low_error_m *= 0.5 if retained_side > 0 else 1.0
             retained_side = 1
         else:
             low, low_error_m = duty, error_m
             high_error_m *= 0.5 if retained_side < 0 else 1.0
             retained_side = -1
+    # The end above the target: a pulse rather reaches too much than too little.
     return high
 
 

@@ -69,10 +69,12 @@ def advance_states(
     peak_k = work[0, ABSORBER]
     done_s, after_edge = 0.0, True
     while done_s < duration_s:
+        # A cold pixel stays cold in the dark: hours of it cost nothing.
         if c[POWER_W] == 0.0 and _is_cold(work[0]):
             work[0] = 0.0
             break
         h_s = next_step_s(pixel, active, since_edge_s + done_s)
+        # A rest of less than a third of a step is taken along, not left as a tiny step of its own.
         last = done_s + 1.3 * h_s >= duration_s
         if last:
             h_s = duration_s - done_s
@@ -80,6 +82,7 @@ def advance_states(
         begin_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
         end_m = output_signal(pixel, active, work[2], c, DISPLACEMENT_SIGNAL)
         interpolate_states(active.state_rows, work, 0.0, h_s, 0.5 * h_s)
+        # A peak lies between steps: the vertex of a parabola finds it, where the larger end would miss it.
         middle_m = output_signal(pixel, active, work[7], c, DISPLACEMENT_SIGNAL)
         peak_m = max(peak_m, end_m, _vertex_m(begin_m, middle_m, end_m))
         peak_k = max(peak_k, work[2, ABSORBER])
@@ -218,6 +221,7 @@ def apply_pulses(
     for row in range(begin, end):
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
+            # All pixels that the pulse heats are asked first: nothing may be half applied.
             if i >= 0 and start_s[row] - events.at_s[i] < -TIME_ROUNDING_S:
                 return row
         before = events.illuminated[0]
@@ -230,6 +234,7 @@ def apply_pulses(
                     continue
                 set_light(c, i, before)
                 _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, shared, work, i, start_s[row]))
+                # The laser's afterglow leaves with the beam.
                 copy_rows(active.laser_rows, dark, work[0])
                 wait_s = max(0.0, start_s[row] - events.at_s[i])
                 _store(events, work, i, events.at_s[i] + wait_s, events.off_s[i] + wait_s)
@@ -240,6 +245,7 @@ def apply_pulses(
             set_light(c, i, pixel[row])
             _raise_peak(peak_m, last_pulse, i, advance_to(events, active, c, shared, work, i, start_s[row]))
             copy_rows(active.laser_rows, shared[0], work[0])
+            # Absorbers only cool in the dark: a peak is at an end of the pulse.
             before_k = work[0, ABSORBER]
             c[POWER_W] = power_w[row]
             one = pixel_at(events.columns, i)
@@ -249,6 +255,7 @@ def apply_pulses(
                 peak_k[row] = max(before_k, on_peak_k)
             _raise_peak(peak_m, last_pulse, i, on_peak_m)
             _store(events, work, i, start_s[row] + width_s[row], 0.0)
+        # After all neighbours: until then the light was where it was before.
         events.illuminated[0] = pixel[row]
         copy_rows(active.laser_rows, events.states[pixel[row]], events.states[len(events.columns)])
         copy_rows(active.panel_rows, events.states[pixel[row]], events.states[len(events.columns)])
@@ -297,6 +304,7 @@ def simulate_displacement(
     work = np.zeros((8, len(state)))
     copy_states(state, work[0])
     now_s, since_edge_s, row = at_s, off_s, 0
+    # Edges alternate: dark until a pulse, then the pulse. The last one is the dark behind all.
     for edge in range(2 * len(pulses) + 1):
         pulse, gate_on, until_s = edge // 2, edge % 2 == 1, np.inf
         c[POWER_W] = 0.0

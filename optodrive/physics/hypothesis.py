@@ -58,6 +58,7 @@ class FreeParameter:
 
     def with_value(self, terms: Mapping[str, Mapping[str, float]], number: float) -> dict[str, dict[str, float]]:
         """Return the terms with another fitted number, clipped to the plausible range."""
+        # e⁷⁰⁹ overflows; the clip below then takes the range's end.
         value = exp(min(number, 700.0)) if self.logarithmic else number
         value = min(max(value, self.parameter.low), self.parameter.high)
         out = {key: dict(values) for key, values in terms.items()}

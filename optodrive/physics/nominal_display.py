@@ -50,6 +50,7 @@ def build_kernel_columns(
         raise IndexError(f"pixels {index.min()} to {index.max()} of {pixels}")
     if not len(index) == len(start_s) == len(width_s) == len(power_w):
         raise ValueError("columns of pulses differ in length")
+    # Copies of one type and layout: for another one numba would compile every kernel again.
     return index, np.array(start_s, dtype=float), np.array(width_s, dtype=float), np.array(power_w, dtype=float)
 
 
@@ -142,6 +143,7 @@ class NominalThermalState:
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
         """Return the largest displacement that one pulse can reach on each cold pixel, m, [p]."""
+        # Most displays have one kind of pixel, computed once.
         by_pixel = {pixel: max_displacement_m(pixel, drive) for pixel in set(self.pixels.elements)}
         return np.array([by_pixel[pixel] for pixel in self.pixels.elements])
 
@@ -223,11 +225,13 @@ def _apply_pulses(
             return row
         off_s = max(0.0, off_s)
         if last[i] >= 0:
+            # The membrane lags: a pulse's peak may come after its end, and counts until the pixel's next pulse.
             off_peak_k = cooling_peak(one, theta_k[i], gamma_k[i], off_s)[0]
             peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * off_peak_k)
         absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, off_s)
         peak_m[row] = one.kappa_m_per_k * gas_peak(one, absorber_k, gas_k, power_w[row], width_s[row])[0]
         theta_k[i], gamma_k[i] = advance(one, absorber_k, gas_k, power_w[row], width_s[row])
+        # Monotone within a pulse, so hottest at one of its ends.
         peak_k[row] = max(absorber_k, theta_k[i])
         at_s[i] = start_s[row] + width_s[row]
         last[i] = row
@@ -280,6 +284,7 @@ def solve_pulse_at(
     if off_s < -TIME_ROUNDING_S:
         return -1, 0.0
     absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, off_s))
+    # A dead pixel has κ = 0 and gets an infinite target: no pulse reaches it, and none is asked to.
     target_k = target_m / one.kappa_m_per_k
     return find_shortest_pulse(
         one, absorber_k, gas_k, target_k, max_power_w, period_s, min_periods, max_periods, peak_after_s

@@ -122,6 +122,7 @@ class ParameterSet(_SiUnits):
 
     def build_pixel(self, bridge_width_m: float) -> Pixel:
         """Return the pixel of a bridge width: its row of Table S3, else R = a / w and the mean C."""
+        # A width that was measured takes its own R and C, others R ∝ 1/w and the mean C.
         row = next((b for b in self.bridge if abs(b.width_m - bridge_width_m) < 1e-6), None)
         return Pixel(
             r_k_per_w=row.R.value if row else self.R_width_product.value / bridge_width_m,
@@ -233,6 +234,7 @@ def _merge_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     base_table = _merge_base(shipped[base], read_toml(shipped[base]))
     terms = table.get("terms", {})
     if isinstance(terms, dict):  # else the schema refuses it
+        # By key: a set that states one term keeps the other terms of its base, whole.
         terms = {**base_table.get("terms", {}), **terms}
     return {**base_table, **table, "terms": terms}
 
@@ -249,4 +251,5 @@ def build_display_pixels(config: Config, parameters: ParameterSet) -> PixelArray
     if pixel_map.model not in ("", parameters.name):
         expected = f"'{parameters.name}', the set that heights are planned with: calibrate again from the recordings"
         raise InputError(f"{config.display.pixel_map}: model.parameters", pixel_map.model, expected)
+    # κ alone: one factor then reaches, predicts and reports the height, and changes no heat.
     return replace(pixels, kappa_m_per_k=pixels.kappa_m_per_k * pixel_map.displacement_factor)

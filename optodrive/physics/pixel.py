@@ -43,6 +43,7 @@ def divided_difference(a: float, b: float, t_s: float) -> float:
     if b < a:
         a, b = b, a  # the expression is symmetric, and e^(+x) would overflow after seconds of gate off
     x = (b - a) * t_s
+    # Two terms of the series: the difference of nearly equal exponentials would lose all digits.
     if x < 1e-9:
         return t_s * exp(-a * t_s) * (1.0 - 0.5 * x)
     return exp(-a * t_s) * -expm1(-x) / (b - a)
@@ -83,12 +84,14 @@ def gas_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, withi
         x = (b - a) * u_s
         if abs(x) < 1e-12:
             turn_s = u_s
+        # Below −1 the logarithm has no value: the gas rises until within_s, and turns later or never.
         elif x > -1.0:
             turn_s = log1p(x) / (b - a)
     turn_s = min(max(turn_s, 0.0), within_s)
     if turn_s == 0.0:
         return gamma_k, 0.0
     peak_k = advance(pixel, theta_k, gamma_k, power_w, turn_s)[1]
+    # Rounding may put the extremum a last digit below the begin.
     return (peak_k, turn_s) if peak_k > gamma_k else (gamma_k, 0.0)
 
 

@@ -165,16 +165,20 @@ def simulate_signals(
 def evaluate_rates(pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArray, dy: FloatArray) -> None:
     """Write dy/dt [STATE_COUNT] for the context's command, light on this pixel, beside it or elsewhere."""
     on, v, is_target = active.on, active.values, c[IS_TARGET] > 0.0
+    # Two chains: a term that scales light must not create any in the dark, and afterglow has no command to scale.
     light_w = optical_power(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else decaying_power(on, v, y, c, 0.0)
     wall_k = wall_rise(on, v, y, c, y[WALL])
+    # Before the hooks below: terms read the far end and the flow of this very evaluation.
     c[FAR_END_K] = wall_k
     c[BRIDGE_FLOW_W] = (y[ABSORBER] - wall_k) / bridge_resistance(on, v, y, c, pixel.r_k_per_w)
     into_w = (pixel.epsilon * light_w if is_target else 0.0) - c[BRIDGE_FLOW_W] - heat_loss(on, v, y, c, 0.0)
     dy[ABSORBER] = into_w / heat_capacity(on, v, y, c, pixel.c_j_per_k)
     dy[GAS] = (0.5 * (y[ABSORBER] + wall_k) - y[GAS]) / pixel.tau_g_s
+    # Light elsewhere acts on the laser alone.
     is_beside = not is_target and c[ILLUMINATED_PIXEL] != ELSEWHERE
     neighbour_w = (pixel.epsilon * light_w if is_beside else 0.0) - y[NEIGHBOUR] / pixel.r_k_per_w
     dy[NEIGHBOUR] = neighbour_w / pixel.c_j_per_k
+    # Last: terms add to the rates that the pixel has by itself.
     rates(on, v, y, c, dy)
 
 
@@ -206,6 +210,7 @@ def step(
     y, y1 = work[0], work[2]
     k1, k2, k3, k4, stage = work[1], work[4], work[5], work[6], work[7]
     c[TIME_S], c[SINCE_EDGE_S] = at_s, since_edge_s
+    # Else the last step's end is this one's start, and its rates are known: one evaluation of five is saved.
     if after_edge:
         evaluate_rates(pixel, active, y, c, k1)
     rows = active.state_rows
@@ -222,9 +227,11 @@ def step(
     evaluate_rates(pixel, active, stage, c, k4)
     for row in rows:
         y1[row] = y[row] + h_s / 6.0 * (k1[row] + 2.0 * k2[row] + 2.0 * k3[row] + k4[row])
+    # For the Hermite interpolation of samples, and as k1 of the next step.
     evaluate_rates(pixel, active, y1, c, work[3])
     tau_s = sensor_lag(active.on, active.values, y, c, 0.0)
     if tau_s > 0.0:
+        # In closed form and not as a state: a thermometer's lag may be shorter than the steps.
         y1[SENSOR] = _lagged_reading_k(y[SENSOR], y[ABSORBER], k1[ABSORBER], y1[ABSORBER], tau_s, h_s)
         k1[SENSOR], work[3, SENSOR] = (y[ABSORBER] - y[SENSOR]) / tau_s, (y1[ABSORBER] - y1[SENSOR]) / tau_s
     else:
@@ -238,6 +245,7 @@ def next_step_s(pixel: Pixel, active: ActiveTerms, since_edge_s: float) -> float
     max_step = MAX_STEP_LATE if since_edge_s > LATE_AFTER * fastest_s else MAX_STEP_EARLY
     return min(
         MAX_STEP_S,
+        # Steps grow from an edge on, where everything changes fastest.
         STEP_GROWTH * since_edge_s + (FIRST_STEP_FAST_S if active.is_fast else FIRST_STEP * fastest_s),
         max_step * fastest_s,
     )
@@ -318,6 +326,7 @@ def _simulate(
     samples = np.zeros(3, dtype=np.int64)
     now_s, edge_s, row, dose = 0.0, 0.0, 0, span[0]
     gate_on, after_edge = False, True
+    # At least one step: samples may all be at 0.
     while now_s < until_s or now_s == 0.0:
         if row < len(pulses) and not gate_on and pulses[row, 0] <= now_s:
             gate_on, edge_s, after_edge = True, now_s, True
@@ -330,6 +339,7 @@ def _simulate(
             end_s = pulses[row, 0]
         since_edge_s = now_s - edge_s
         h_s = next_step_s(pixel, active, since_edge_s)
+        # Steps end at edges: a kink within one costs the method its order.
         reaches_edge = now_s + 1.3 * h_s >= end_s
         if reaches_edge:
             h_s = end_s - now_s
@@ -345,12 +355,14 @@ def _simulate(
             samples[2] = _fill_samples(
                 pixel, active, c, work, now_s, h_s, t_s[2], clock_delay_s[2], span, 2, samples[2], out[2]
             )
+            # Of the command: ageing by light that other terms change would feed on itself.
             dose += c[IS_TARGET] * c[POWER_W] * h_s * span[1]
             after_edge = False
             for state in active.state_rows:
                 work[0, state], work[1, state] = work[2, state], work[3, state]
             work[0, SENSOR], work[1, SENSOR] = work[2, SENSOR], work[3, SENSOR]
             for state in active.state_rows:
+                # `not <=`: NaN counts as out of range.
                 if not abs(work[0, state]) <= MAX_STATE:
                     return False
         now_s = end_s if reaches_edge else now_s + h_s

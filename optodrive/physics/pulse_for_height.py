@@ -17,6 +17,7 @@ class DriveRange:
     @classmethod
     def from_laser(cls, max_power_w: float, pwm_hz: float, width_max_s: float) -> "DriveRange":
         """Return the range for a laser's power, W, and PWM frequency, Hz, and the longest pulse allowed, s."""
+        # A width cap of whole periods must not lose one to rounding.
         return cls(max_power_w, 1.0 / pwm_hz, int(width_max_s * pwm_hz + 1e-9))
 
 
@@ -25,6 +26,7 @@ def pulse_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, wid
     """Return the peak gas rise, K, after the start of a pulse on a pixel with these rises, and its time, s."""
     on_k, on_s = gas_peak(pixel, theta_k, gamma_k, power_w, width_s)
     theta_end_k, gamma_end_k = advance(pixel, theta_k, gamma_k, power_w, width_s)
+    # The gas lags behind the absorber: short pulses peak after their end.
     off_k, off_s = cooling_peak(pixel, theta_end_k, gamma_end_k)
     return (on_k, on_s) if on_k > off_k else (off_k, width_s + off_s)
 
@@ -70,6 +72,7 @@ def find_shortest_pulse(
     """
     if _peak_after(pixel, theta_k, gamma_k, 0.0, 0.0, peak_after_s)[0] >= target_k:
         return 0, 0.0
+    # Bisection over whole periods at full power: a wider pulse always peaks higher.
     low, high = min_periods - 1, max_periods
     while high - low > 1:
         middle = (low + high) // 2
@@ -101,6 +104,7 @@ def _solve_duty(
     for _ in range(20):
         peak_k, at_s = _peak_after(pixel, theta_k, gamma_k, duty * max_power_w, width_s, peak_after_s)
         if at_s <= width_s:
+            # The pixel is linear in power, so the slope is the response of a cold pixel to full power.
             slope_k = advance(pixel, 0.0, 0.0, max_power_w, at_s)[1]
         else:
             slope_k = advance(pixel, full_theta_k, full_gamma_k, 0.0, at_s - width_s)[1]

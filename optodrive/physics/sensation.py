@@ -52,6 +52,7 @@ def compute_excitations(displacement_m: FloatArray, dt_s: float) -> tuple[float,
     count = len(displacement_m)
     frequency_hz = np.asarray(np.fft.rfftfreq(count, dt_s), dtype=np.float64)
     is_felt = (frequency_hz >= FELT_MIN_HZ) & (frequency_hz <= FELT_MAX_HZ)
+    # Without the mean: a membrane that stands is pressure, which these channels do not signal.
     amplitude_m = 2.0 / count * np.abs(np.fft.rfft(displacement_m - displacement_m.mean()))[is_felt]
     meissner_m, pacinian_m = compute_threshold_m(frequency_hz[is_felt])
     meissner, pacinian = (float(np.sqrt(np.sum((amplitude_m / m) ** 2))) for m in (meissner_m, pacinian_m))
@@ -65,6 +66,7 @@ def compute_pulse_excitations(heat: ThermalState, pulses: FloatArray, pixel: int
     """
     first_s, duration_s = pulses[0, 0], pulses[-1, 0] + pulses[-1, 1] + PERSISTENCE_S - pulses[0, 0]
     count = round(duration_s / TRACE_STEP_S)
+    # Whole steps over the whole duration: a cut period would leak into other frequencies.
     dt_s = duration_s / count
     return compute_excitations(heat.simulate_displacement_m(pulses, pixel, first_s + dt_s * np.arange(count)), dt_s)
 

@@ -30,6 +30,7 @@ STABLE_STEP = 2.78
 """Longest stable step of the classical Runge–Kutta method, in time constants."""
 SLOW_PIXEL = Pixel(184.0, 126e-6, 0.66, 2e-2, 4e-6, 2.3e-4)
 """A pixel whose gas is so slow that the steps become as long as they can be."""
+# Late first: steps are longest there, so most faults end the check at once.
 CHECKED_AFTER_S = (0.1, 1e-3, 0.0)
 """Times after a gate edge at which a step is checked; the first one is followed by the longest step."""
 HOT_K = 300.0
@@ -45,6 +46,7 @@ def check_time_constants(values: Mapping[str, TermValues]) -> None:
     They are the inverse eigenvalues of the Jacobian of the term's own states, on a hot pixel in the light.
     """
     for key, term_values in values.items():
+        # Terms without states of their own have nothing that could be too fast.
         if all_terms()[key].states or all_terms()[key].followers:
             requirements = {name: values.get(name, {}) for name in all_terms()[key].requires}
             every = {key: term_values, **requirements}
@@ -76,6 +78,7 @@ def _compute_jacobian(active: ActiveTerms, context: FloatArray, state: FloatArra
     evaluate_rates(SLOW_PIXEL, active, state, context, rates[0])
     for number, row in enumerate(rows, start=1):
         changed = state.copy()
+        # Finite differences: kernels may hold any expression.
         changed[row] += CHANGE
         evaluate_rates(SLOW_PIXEL, active, changed, context, rates[number])
     return np.asarray(((rates[1:] - rates[0])[:, rows] / CHANGE).T)

@@ -183,6 +183,7 @@ class Term:
     @property
     def is_instrument(self) -> bool:
         """Whether the term acts in an instrument, rather than in the pixel, its light or the mirrors."""
+        # An instrument changes what is read, and nothing in the pixel.
         kernels = self.kernels._replace(sensor_reading=None, sensor_lag=None)
         return self.in_pixel and self.subsystems != ("mirrors",) and not any(kernels)
 
@@ -202,6 +203,7 @@ class Term:
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
         """Return an upper bound on the heat that the term adds. The limiter refuses a term without a bound (None)."""
+        # None by default: a term whose author did not think of heat is refused, not waved through.
         return NO_HEAT_GAIN if self.cannot_add_heat else None
 
     def affected_pixel(self, values: TermValues) -> int | None:

@@ -69,6 +69,7 @@ def _generate_source() -> str:
                 continue
             name = f"{term.key}_{hook}"
             lines.append(f"from {function.__module__} import {function.__name__} as {name}")
+            # `rates` writes into the array that it gets; all others return a value.
             target = "" if hook == "rates" else "x = "
             calls[hook] += [f"    if on[{row}]:", f"        {target}{name}(v[{row}], y, {FOLLOWER_ROW[row]}, c, x)"]
     for hook, body in calls.items():
@@ -79,14 +80,17 @@ def _generate_source() -> str:
 def _load_generated_module() -> Any:
     source = _generate_source()
     folder = code_folder() or Path(mkdtemp())
+    # By content: processes of two checkouts share the cache folder.
     path = folder / f"{MODULE_NAME}_{sha256(source.encode()).hexdigest()[:16]}.py"
     if not path.exists():
+        # Several processes may start at once; each sees a whole file or none.
         with atomic_write(path) as temporary:
             temporary.write_text(source)
     spec = spec_from_file_location(MODULE_NAME, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be loaded")
     module = module_from_spec(spec)
+    # Before it is executed: cached machine code names the module, and its import must find this one.
     sys.modules[MODULE_NAME] = module
     spec.loader.exec_module(module)
     return module

@@ -79,6 +79,7 @@ def build_cold_state(config: Config, parameters: ParameterSet, pixels: PixelArra
         pixels = build_display_pixels(config, parameters)
     values = {key: parameters.term_values(key) for key in parameters.planner_terms}
     if not values:
+        # Without planner terms the closed form: microseconds per pulse in place of a millisecond.
         return NominalThermalState(pixels)
     # Imported late: loading the kernels of the pixel with terms takes time that nominal displays do not need.
     from optodrive.physics.extended_display import ExtendedThermalState

@@ -96,6 +96,7 @@ class DisplayModel:
         cold = self.build_cold_heat()
         by_stage = [cold.max_displacement_m(scan_head.drive) for scan_head in self.scan_heads]
         # A pixel may get any stage that reaches it.
+        # The smallest of the stages that reach it: which one it gets is decided later.
         reached = np.where(self.reach, np.stack(by_stage), np.inf)
         return np.asarray(reached.min(axis=0), dtype=np.float64)
 

@@ -55,11 +55,13 @@ FOLDER = Path("/var/tmp/optodrive-heat")  # noqa: S108 - shared on purpose: see 
 MAGIC = b"optodrive-heat 7\n"
 BYTES_MAX = 64_000_000
 SHARED_FOLDER, SHARED_FILE = 0o1777, 0o666
+# In a folder that all may write, a name may be a link or a pipe: the first is refused, the second does not wait.
 FILE_FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 OPEN_TRIES = 5
 LOCK_TIMEOUT_S, LOCK_POLL_S = 5.0, 0.05
 RECENT = tuple(item.name for item in fields(BudgetState) if item.name.startswith("recent_"))
 """Columns whose length is not that of the display."""
+# e⁻³: by then a hot panel has lost 95 % of its rise, and what is said of it is no news.
 COOLING_TAUS = 3.0
 BOARDS = "board"
 """Kind of a display that boards draw. Its identity is that of `join_uids`."""
@@ -140,12 +142,15 @@ class HeatRecord:
             with self._exit_stack:
                 folder = self._open_folder()
                 if self._identity is None:
+                    # Any device of its kind may be the one that it warms now.
                     self._forget_all(folder, lambda name: name.startswith(f"{self._kind}-"))
                     raise _UncountedError("the device does not say which one it is")
                 self._file = self._open_file(folder, self._name)
                 self._exit_stack.callback(os.close, self._file)
+                # Before anything is written: the file's status still tells who could have changed it.
                 self._judge(self._file)
                 if self._kind == BOARDS:
+                    # A board of this display in another record: what is drawn now is not in that one.
                     self._forget_all(folder, self._shares_board)
                 self._exit_stack = self._exit_stack.pop_all()
         except _UncountedError as error:
@@ -161,6 +166,8 @@ class HeatRecord:
 
     def _open_folder(self) -> int:
         with suppress(OSError):
+            # Closed until chmod: mkdir's mode passes through the umask, and a half-open folder would be trusted
+            # wrongly.
             FOLDER.mkdir(mode=0o700)
             FOLDER.chmod(SHARED_FOLDER)
         try:
@@ -211,6 +218,7 @@ class HeatRecord:
                 self._lock(file, FOLDER / name)
                 with suppress(FileNotFoundError):
                     named = os.stat(name, dir_fd=folder, follow_symlinks=False)
+                    # The name may be another file's by now: the lock would be on one that nobody finds.
                     if os.path.samestat(status, named):
                         exit_stack.pop_all()
                         return file
@@ -219,6 +227,7 @@ class HeatRecord:
     def _create(self, folder: int, name: str) -> None:
         try:
             with suppress(FileExistsError):
+                # Empty and private first: an empty record is hot, so a process that finds it early reads nothing false.
                 file = os.open(name, FILE_FLAGS | os.O_CREAT | os.O_EXCL, 0o600, dir_fd=folder)
                 try:
                     os.fchmod(file, SHARED_FILE)
@@ -270,6 +279,7 @@ class HeatRecord:
             self.hot_reason = "this machine had no record of its heat"
         elif not _has_mode(status, SHARED_FILE):
             self.hot_reason = "not every user could write the record of its heat"
+        # A write sets both times alike; chmod, link and restore move only the one of status.
         elif status.st_ctime_ns != status.st_mtime_ns:
             self.hot_reason = "the record of its heat was changed after it was written"
         elif self._name.endswith(f"-{PART}"):
@@ -298,6 +308,7 @@ class HeatRecord:
         hot = build_hot_budget_state(self._cold, self._budget)
         self._cooling_reason = self.hot_reason
         self._cooled_s = now_s + COOLING_TAUS * float(self._budget.heat.panel_tau_s.max())
+        # So that it cools: read again in a minute, the display counts as a minute cooler, not as hot anew.
         self.save(hot)
         return hot
 
@@ -323,8 +334,10 @@ class HeatRecord:
         if not boot or not str(arrays["boot"]):
             raise _UncountedError("this computer hides since when it runs")
         if str(arrays["boot"]) != boot:
+            # Another boot: how long the computer was off is unknown, so it has cooled since this start only.
             return shift_state(state, -max(state.at_s, 0.0) - now_s)
         zero_s = float(arrays["zero_s"])
+        # Also true for NaN, which would pass `zero_s > now_s`.
         if not zero_s <= now_s:
             raise _UncountedError("the record of its heat is of a time to come")
         return shift_state(state, zero_s - now_s)
@@ -375,10 +388,12 @@ class HeatRecord:
         payload = buffer.getvalue()
         data = MAGIC + sha256(payload).digest() + payload
         try:
+            # In place and not by rename: the lock and the status of this very file are the trust.
             os.ftruncate(self._file, len(data))
             written = 0
             while written < len(data):
                 written += os.pwrite(self._file, data[written:], written)
+            # On the disk before light: a computer that loses power then finds a display in use, which is hot.
             os.fsync(self._file)
         except OSError as error:
             raise InputError(str(self.path), error.strerror, "a file that can be written; nothing is emitted") from None
@@ -445,6 +460,7 @@ def build_hot_budget_state(cold: BudgetState, budget: Budget) -> BudgetState:
         touch_k=np.full((pixels, 2), touch_k),
         inflow_w=heat.lateral_w_per_k * heat.wall_specht_ratio * wall_k * neighbours,
         exchanged_at_s=0.0,
+        # The panel at the touch cap, and everything on it at its own: more than any light reaches.
         panel_k=np.full(2, caps.touch_k / heat.touch_per_panel),
         galvo_mean_square=np.full((stages, 2), caps.galvo_rad2_per_s4),
         recent_start_s=np.full(recent, -caps.pulse_width_s),

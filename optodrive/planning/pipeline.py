@@ -49,6 +49,7 @@ def warm_up(display: DisplayModel) -> None:
     laser, target_m = display.config.laser, np.zeros(len(display.pixels))
     pixel = int(np.argmin(display.dead))
     target_m[pixel] = 1e-6
+    # One of each kind: each has kernels of its own, and the first plan of a caller must not compile.
     trains = (
         PulseTrain(pixel, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w),
         HeightTrain(pixel, 2.0, 1e-3, 0.1, 1e-6),
@@ -113,12 +114,14 @@ class SequencePlanner:
         self._policy = policy
         self._done = 0.0
         check_targets_reachable(display, self._sequence)
+        # As early as possible: the second process compiles while this one plans up to the limiter.
         COLD_START.begin(display.budget, budget)
         self._scheduler = Scheduler(
             display.scan_heads,
             display.build_assignment(self._sequence),
             self._sequence,
             display.build_cold_heat,
+            # A delay moves a whole batch: of a train only the pulse that is above a cap.
             train_batch=1 if policy == "delay" else TRAIN_BATCH,
             on_progress=self._report_progress,
             initial_pixels=initial_pixels,
@@ -126,6 +129,7 @@ class SequencePlanner:
         )
         frame_count = len(self._sequence.frames)
         self._limiter = BatchLimiter(self._scheduler, display.budget, budget, frame_count, policy)
+        # A generator: plan_until stops between two batches and goes on later, with scheduler and limiter as they stand.
         self._batches = self._scheduler.run(heat.copy(), self._limiter.grant)
         self._limited: list[LimitedPlan] = []
         self._recent: list[LimitedPlan] = []
@@ -155,6 +159,8 @@ class SequencePlanner:
 
     def _build_planned(self, plan: LimitedPlan) -> PlannedSequence:
         self._report_progress()
+        # Predicted anew from before the plan: the scheduler's heat applied batches, this one applies the plan as a
+        # whole.
         heat, lead_in_s = self._heat.copy(), self._scheduler.lead_in_us * 1e-6
         peaks = heat.apply_pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, self._report_progress)
         return PlannedSequence(
@@ -248,6 +254,7 @@ def _compute_train_peaks(
     )
     edge_pixel = np.repeat([train.pixel for train in trains.values()], [len(each) for each in edges_s.values()])
     pixel, dark = np.append(edge_pixel, plan.pixel), np.zeros(len(edge_s))
+    # Edges first: with the stable sort a dark pulse at a pulse's start comes before it and ends the former cycle.
     start_s = np.append(edge_s, plan.start_s)
     order = np.argsort(start_s, kind="stable")
     pixel, start_s = pixel[order], start_s[order]

@@ -133,6 +133,7 @@ def explain_nothing_raised(planned: PlannedSequence) -> str:
     """Say why a plan raises no pixel, or return an empty text if it raises one or the heat left in one does."""
     plan = planned.plan
     emitting = int(np.count_nonzero((plan.power_w > 0.0) & (plan.width_s > 0.0)))
+    # A skipped pixel is up already, by the heat that is left: that is what was requested.
     if planned.skipped or emitting > planned.below_threshold:
         return ""
     if emitting:

@@ -159,6 +159,7 @@ def check_feasibility(
 
 def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSequence, FeasibilityReport]:
     """Plan the query's sequence and report. Plan a variant if the plan violates a limit."""
+    # "as_is" lets the planner refuse it by name; best effort may still draw the rest.
     unreachable = None if query.fit == "as_is" else first_unreachable(query.display, query.sequence)
     if unreachable is not None:
         return _plan_alternative(query, None, Violation("unreachable", unreachable[0], unreachable[1]), policy)
@@ -179,6 +180,7 @@ def _plan_alternative(
         ordered = query.plan(orders=orders)
         ordered_report = build_feasible_report(ordered, proof, query.fit)
         return ordered, replace(ordered_report, plans_tried=search.plans_tried, plans_tried_max=search.plans_max)
+    # A search of its own per kind: an exhausted one must not take plans from the kind that the caller requested.
     searches = [query.new_search(query.compute_plans_max(query.fit == fit)) for fit in ("priority", "even", None)]
     reduced, scaled, stretched = (
         reduce_sequence(searches[0], query.sequence),
@@ -197,6 +199,7 @@ def _plan_alternative(
         plans_tried_max=sum(each.plans_max for each in (search, *searches)),
         fit=query.fit,
     )
+    # Played late or trimmed, as the policy says: the report tells what would have fit.
     if query.fit == "as_is":
         return _apply_policy(query, plan, report, policy), report
     if query.fit == "even" and scaled is not None:

@@ -118,6 +118,7 @@ class OrderSearch:
         if self.plans_tried >= self.plans_max:
             self.is_exhausted = True
             return None
+        # Plans and not seconds are counted: the same question gets the same answer on every computer.
         self.plans_tried += 1
         try:
             return plan_sequence(
@@ -190,6 +191,7 @@ class OrderSearch:
             violation = self._try_orders(sequence, orders)
             if violation is None:
                 return orders
+            # The prefix up to the violation fails with any rest: all orders that share it are skipped at once.
             if is_order_independent(violation, sequence) or not _advance_orders(
                 ranks, *_locate_violation(violation, orders, ranks)
             ):
@@ -201,6 +203,7 @@ def count_orders(sequence: FrameSequence, stage_count: int) -> int:
 
     ORDERS_MAX + 1 with simultaneous frames or several stages.
     """
+    # Orders of several stages or rounds interact: no product of factorials counts them.
     if stage_count > 1 or any(frame.simultaneous for frame in sequence.frames):
         return ORDERS_MAX + 1
     return prod(factorial(int(np.count_nonzero(frame.target_m > 0))) for frame in sequence.frames)
@@ -231,6 +234,7 @@ def _advance_orders(ranks: list[list[int]], source: int, place: int) -> bool:
 
 def _advance_permutation(rank: list[int], place: int) -> bool:
     """Advance in place to the next permutation that differs up to a place. Return False if there is none."""
+    # The last permutation with this prefix: the step below then changes the prefix.
     rank[place + 1 :] = sorted(rank[place + 1 :], reverse=True)
     for k in range(len(rank) - 2, -1, -1):
         if rank[k] < rank[k + 1]:

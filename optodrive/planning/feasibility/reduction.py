@@ -104,6 +104,7 @@ def _find_excess_pixels(prepared: PlannedSequence, on_progress: Callable[[], Non
     for timing in prepared.frames:
         on_progress()
         rows = np.flatnonzero(plan.source == timing.source)
+        # Trimmed pixels go first: without them no cap reduces anything.
         omitted = [int(pixel) for pixel in plan.pixel[rows[plan.reason[rows] != ""]]]
         overrun_s = timing.end_s - max(timing.show_at_s, previous_end_s) - (timing.deadline_s - timing.show_at_s)
         previous_end_s = timing.end_s
@@ -126,6 +127,7 @@ def _restore_pixels(
 ) -> tuple[OmittedPixels, Orders]:
     """Restore omitted pixels that fit after all, the lowest target first, until the search is exhausted."""
     for source, pixels in list(omitted.items()):
+        # The lowest target was omitted last, and comes back first: it needs the least.
         for pixel in reversed(pixels):
             if search.is_exhausted:
                 return omitted, best
@@ -152,6 +154,7 @@ def reduce_sequence(search: OrderSearch, sequence: FrameSequence) -> tuple[Omitt
     """
     sources = len(sequence.frames) + len(sequence.trains)
     priorities = {frame.priority for frame in sequence.frames} | {train.priority for train in sequence.trains}
+    # Bulk knows no priorities, and frame by frame would need more plans than are left.
     if len(priorities) == 1 and search.plans_max < PLANS_PER_SOURCE * sources:
         reduced = reduce_in_bulk(search, sequence)
         if reduced is not None:

@@ -47,6 +47,7 @@ def find_first_violation(plan: PulsePlan, deadline_s: FloatArray) -> Violation |
     is_frame = plan.source < len(deadline_s) - 1
     end_s = plan.start_s + plan.width_s
     is_frame_late = end_s > deadline_s[np.minimum(plan.source, len(deadline_s) - 1)] + TIME_TOLERANCE_S
+    # One move is no order's fault: pulses that abut cannot avoid it. More than one adds up from pulse to pulse.
     is_train_late = ~is_frame & (plan.start_s > plan.requested_start_s + plan.settling_s + TIME_TOLERANCE_S)
     is_late = is_frame_late | is_train_late
     is_trimmed = plan.reason != "" if isinstance(plan, LimitedPlan) else np.zeros(len(plan), dtype=bool)
@@ -135,5 +136,7 @@ def _min_settling_s(scan_head: ScanHead, pixels: IntArray, origins: IntArray) ->
         others = origins[origins != pixel]
         if len(others):
             settling_us = scan_head.settling.min_settling_us(x_rad[others] - x_rad[pixel], y_rad[others] - y_rad[pixel])
+            # The nearest of all pixels from which the beam may come: no order has a shorter move.
             settling_s.append(settling_us * 1e-6)
+    # All but one: the beam may already stand on the pixel that is farthest from the others.
     return sum(settling_s) - max(settling_s, default=0.0)

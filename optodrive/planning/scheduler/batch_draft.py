@@ -104,6 +104,7 @@ class BatchDraft:
         """Return the earliest start of a stage's pulse on `pixel` that is requested for `requested_us`."""
         state, beam = self.state, self.state.beams[stage]
         settling_us = self.paths[stage].compute_settling_us(beam.pixel, pixel, beam.dwell_us)
+        # begun_us: not before the last pulse of any stage, because the limiter takes pulses in order of their starts.
         start_us = max(requested_us + state.delay_us, beam.free_us + settling_us, state.begun_us)
         return PulseStart(start_us, settling_us)
 
@@ -121,6 +122,7 @@ class BatchDraft:
         """Append a pulse at its earliest start, as `compute_start` returned it for the present state of the beam."""
         beam, (start_us, settling_us) = self.state.beams[stage], start
         if pixel != beam.pixel:
+            # Only with a move: pulses that follow on one pixel make one long dwell, after which mirrors have settled.
             beam.arrival_us = start_us
         beam.free_us, beam.pixel = start_us + width_us, pixel
         beam.dwell_us = beam.free_us - beam.arrival_us
@@ -134,6 +136,7 @@ class BatchDraft:
 
     def sort_rows(self, first: int) -> None:
         """Put the rows from `first` on in order of their starts."""
+        # Stages were drafted one after the other; the limiter needs their pulses in order.
         self.rows[first:] = sorted(self.rows[first:], key=lambda row: row.start_us)
         if self.rows:
             self.state.begun_us = max(self.state.begun_us, self.rows[-1].start_us)

@@ -122,6 +122,7 @@ class BatchPlanner:
                 if len(due) == 1
                 else min(due, key=lambda number: self._start_train_pulse(draft, number).start_us)
             )
+            # The batch ends here: this pulse's shape depends on what the limiter grants the batch.
             if not self._is_heat_known(draft, stage):
                 break
             self._draft_train_pulse(draft, stage, heat)
@@ -140,11 +141,13 @@ class BatchPlanner:
         until_us: behind the first of them, append none to a beam whose last pulse ends then or later
         """
         have_trains = any(self._next_train_pulse(draft, stage) for stage in range(len(self._stages)))
+        # The usual case of a stream, in one kernel without the interpreter: other threads run meanwhile.
         if isinstance(heat, NominalThermalState) and each.periods is None and not have_trains:
             max_count = None if max_rows is None else max_rows - len(draft.rows)
             self._extend_nominal_round(draft, each, heat, max_count, until_us)
             return
         rows_max, first, pulses = inf if max_rows is None else max_rows, len(draft.rows), dict[int, _FramePulse]()
+        # At least one pulse: a part of a plan without any would never get on.
         while len(draft.rows) < rows_max and (len(draft.rows) == first or draft.find_end_us() < until_us):
             for stage in range(len(self._stages)):
                 pulse = None if stage in pulses else self._solve_next_pulse(draft, stage, each, heat)
@@ -152,6 +155,7 @@ class BatchPlanner:
                     pulses[stage] = pulse
             if not pulses:
                 return
+            # sorted: of equal starts the lower stage, in every run.
             stage = min(sorted(pulses), key=lambda number: pulses[number].start.start_us)
             train_stage = self._find_due_train(draft, pulses, stage)
             if train_stage is not None:
@@ -160,6 +164,7 @@ class BatchPlanner:
                 self._draft_train_pulse(draft, train_stage, heat)
                 if draft.rows:
                     return
+                # The train's pulse moved a beam, so candidates of its stage begin elsewhere.
                 pulses.clear()
                 continue
             pulse = pulses.pop(stage)
@@ -182,12 +187,14 @@ class BatchPlanner:
         """Append up to max_count pulses of a round without train pulses, each stage's in one kernel."""
         counts: list[int | None] = [max_count] * len(self._stages)
         if len(self._stages) > 1 and max_count is not None:
+            # How many of each stage are among the first max_count is known only when all are in order.
             trial, first = draft.copy(), len(draft.rows)
             self._extend_nominal_round(trial, each, heat, None, inf)
             stages = [row.stage for row in trial.rows[first : first + max_count]]
             counts = [stages.count(stage) for stage in range(len(self._stages))]
         frame, first, begun_us = self._sequence.frames[each.source], len(draft.rows), draft.state.begun_us
         requested_us = self.compute_requested_us(frame.show_at_s)
+        # begun_us of before this call: stages are planned one after the other here, and must not wait for each other.
         earliest_us = max(requested_us + draft.state.delay_us, begun_us)
         for stage, tools in enumerate(self._stages):
             self._on_progress()
@@ -214,6 +221,7 @@ class BatchPlanner:
             if pulse is not None:
                 width_us = round(pulse[0] * drive.period_s * 1e6)
                 return _FramePulse(pixel, start, width_us, pulse[1] * drive.max_power_w, target_m)
+            # The heat that is left holds the pixel above its target; a pulse of no energy would only cost a move.
             draft.skip(each.source, pixel, target_m)
             beam.position += 1
         return None
@@ -233,6 +241,7 @@ class BatchPlanner:
         if not due:
             return None
         start_us, stage = min(due)
+        # Of another stage, only if it starts first: order over all stages.
         return stage if stage == first or start_us <= pulses[first].start.start_us else None
 
     def _next_train_pulse(self, draft: BatchDraft, stage: int) -> TrainPulse | None:
@@ -255,6 +264,7 @@ class BatchPlanner:
             shape, target_m = (pulse.width_us, pulse.power_w), float("nan")
             draft.add(stage, pulse.pixel, start, *shape, requested_us, target_m, pulse.source)
             return
+        # Without the plan's own delay: a delayed train is not late, and keeps its pulses' room.
         late_us = start.start_us - requested_us - draft.state.delay_us
         height_shape = trains.plan_pulse(index, heat, start.start_us, late_us)
         target_m = trains.get_target_m(pulse.source)
@@ -275,4 +285,5 @@ class BatchPlanner:
             return False
         path, end_us = self._paths[stage], frame_pulse.start.start_us + frame_pulse.width_us
         deadline_us = path.lead_in_us + pulse.requested_start_us + draft.state.delay_us
+        # The frame's width as dwell: the beam will have stood there for that time when it leaves.
         return deadline_us < end_us + path.compute_settling_us(frame_pulse.pixel, pulse.pixel, frame_pulse.width_us)

@@ -55,6 +55,7 @@ def split_pulses(single_pulses: Mapping[int, tuple[int, float]], rounds: int) ->
 
     single_pulses: by pixel, width in PWM periods and duty of the single pulse that reaches the target
     """
+    # Rounded down: the last round brings the rest, and must not find the pixel above its target.
     periods_by_pixel = {pixel: int(periods * duty / rounds) for pixel, (periods, duty) in single_pulses.items()}
     return periods_by_pixel if rounds == 1 or all(periods_by_pixel.values()) else None
 
@@ -68,6 +69,7 @@ def select_schedule(candidates: list[CandidateSchedule], deadline_s: float) -> C
 
     Returns the first candidate if none meets the deadline.
     """
+    # Without gaps, sub-pulses count as one pulse in the width cap, of limiter and board.
     feasible = [item for item in candidates if item.end_s <= deadline_s + 1e-9 and item.has_min_gaps]
     max_simultaneity = max((item.simultaneity for item in feasible), default=0.0)
     return next(
@@ -89,6 +91,7 @@ def compute_simultaneity(
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])
     end_s = plan.end_s
     after_s = PEAK_WINDOW_TAU_G * float(heat.pixels.tau_g_s.max())
+    # Two densities: peaks lie behind the last pulse, and the rounds before it may take longer than all of that.
     t_s = np.union1d(
         np.linspace(last_round_start_s, end_s, SAMPLES), np.linspace(float(plan.start_s[-1]), end_s + after_s, SAMPLES)
     )

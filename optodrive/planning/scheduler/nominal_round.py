@@ -142,7 +142,9 @@ def _solve_round(
         pulses.start_us[row], pulses.settling_us[row] = start_us, settling_us
         pulses.periods[row], pulses.duty[row] = periods, duty
         if periods < 0:
+            # A kernel raises no error with numbers in it; the caller does.
             return -1 - row, free_us, origin, arrival_us, dwell_us
+        # A skipped pixel is not visited: the beam goes on from where it stands.
         if periods:
             if i != origin:
                 arrival_us = start_us
@@ -158,9 +160,12 @@ def _compute_settling_us(moves: MoveTimes, origin: int, pixel: int, dwell_us: in
     """Return the settling time of a move as `SettlingTable.settling_us` does, from NO_PIXEL too."""
     if origin == NO_PIXEL:
         return moves.lead_in_us
+    # Rounded up to whole pitches, as in the table: of a distance between two the longer time holds.
     x = int(abs(moves.x_rad[pixel] - moves.x_rad[origin]) / moves.pitch_rad + CEIL_OFFSET)
     y = int(abs(moves.y_rad[pixel] - moves.y_rad[origin]) / moves.pitch_rad + CEIL_OFFSET)
     early_us = moves.early_us if dwell_us >= moves.early_dwell_us else 0
     if dwell_us >= moves.long_dwell_us:
+        # Both axes move at once, so the slower decides. Only after a long dwell has the mirror come to rest, so that a
+        # step may be sent early.
         return max(0, int(max(moves.long_x_us[x], moves.long_y_us[y])) - early_us)
     return int(max(moves.short_x_us[x], moves.short_y_us[y]))

@@ -104,6 +104,7 @@ def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: Drive
     first = cold_heat.solve_pulse(train.pixel, 0.0, train.target_m, drive, min_periods)
     steady_state = solve_steady_state(train, cold_heat, drive, periods, lead_ratio)
     lead_period_w = steady_state.lead_duty * drive.max_power_w
+    # A peak within the cycle: the usual way, planned for the peak itself.
     if first is None or _find_first_peak_s(train, cold_heat, drive, *first) <= EARLY_PEAK_FRACTION * train.period_s:
         return PulseRecipe(train.target_m, min_periods, lead_period_w=lead_period_w)
     return PulseRecipe(steady_state.reference_m, min_periods, steady_state.reference_s, lead_period_w)
@@ -122,6 +123,8 @@ def compute_next_pulse(
         return shapes[0]
     deviations = [_foresee_deviation(train, recipe, heat, start_s, drive, each, FORESEEN_CYCLES) for each in shapes]
     best = int(np.argmin(deviations))
+    # The steady cycle's pulse unless another is clearly better: small changes at each pulse would make a cycle of their
+    # own.
     return shapes[best] if deviations[best] < MIN_IMPROVEMENT * deviations[0] else shapes[0]
 
 
@@ -154,6 +157,7 @@ def _solve_pulse(
     if train.peak_to_peak_m is None or pulse is None or pulse[0] <= recipe.min_periods:
         return pulse
     lower_pulse = heat.solve_pulse(train.pixel, start_s, WIDENING_THRESHOLD * recipe.target_m, *shape)
+    # Up to 1 % short at full power is not widened: the next pulse would be narrower, and the train alternate.
     return pulse if lower_pulse is not None and lower_pulse[0] > recipe.min_periods else (recipe.min_periods, 1.0)
 
 
@@ -198,6 +202,7 @@ def compute_steady_state(
     lead_duty: duty of the lead period, 0 for none
     """
     pixel = cold_heat.pixels.elements[train.pixel]
+    # Simulated and not solved in closed form: with terms there is none, and both models take the same way.
     count = 2 + ceil(SETTLING_TAUS * (pixel.tau_s + pixel.tau_g_s) / train.period_s)
     lead_s = drive.period_s if lead_duty else 0.0
     shapes = [(lead_s, periods * drive.period_s, duty)] + ([(0.0, lead_s, lead_duty)] if lead_duty else [])
@@ -212,6 +217,8 @@ def compute_steady_state(
     t_s = last[0, 0] + train.period_s * np.linspace(0.0, 2.0, 2 * SAMPLES + 1)  # after the cycle, no further pulse
     height_m = heat.simulate_displacement_m(last, train.pixel, t_s)
     cycle_m = height_m[: SAMPLES + 1]
+    # Fixed width: from the peak on. Free width: at the next pulse, because planned for an earlier height, wide and
+    # narrow pulses alternate.
     reference = int(cycle_m.argmax()) if train.peak_to_peak_m is not None else SAMPLES
     reference_s = max(MIN_REFERENCE_S, float(t_s[reference] - t_s[0]) - lead_s)
     reference_m = float(height_m[reference:].max())
@@ -232,6 +239,7 @@ def solve_steady_state(
         if abs(steady_state.peak_m / train.target_m - 1.0) < PEAK_TOLERANCE:
             break
         # Displacement is nearly proportional to power.
+        # Nearly proportional, so a few steps suffice.
         duty = min(1.0, steady_state.duty * train.target_m / steady_state.peak_m)
         if duty == steady_state.duty:
             break
@@ -293,6 +301,7 @@ def _find_peak_to_peak_shape(
         else:
             high = middle
     nearest = min((low, high), key=lambda n: abs(peak_to_peak_m[n] - target_m))
+    # A lead period costs a pulse per cycle, and is left out where a whole period is near enough.
     if abs(peak_to_peak_m[nearest] - target_m) <= PEAK_TO_PEAK_TOLERANCE * target_m:
         return nearest, 0.0
     low_ratio, high_ratio = 0.0, 1.0

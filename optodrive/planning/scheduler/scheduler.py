@@ -102,6 +102,7 @@ class Scheduler:
         self._on_progress = on_progress
         self._visiting_orders = visiting_orders or {}
         lead_ins_us = [scan_head.settling.lead_in_us for scan_head in scan_heads]
+        # The longest of all stages: the plan has one zero.
         self.lead_in_us = max(lead_ins_us) if initial_pixels is None else 0
         self.until_us = inf
         self.skipped: list[SkippedPulse] = []
@@ -142,6 +143,7 @@ class Scheduler:
             if granted is not None:
                 self.accept()
                 yield granted
+                # After the yield: the caller may stop in between, and this heat is only for the next batch.
                 heat.apply_pulses(granted.pixel, granted.start_s, granted.width_s, granted.power_w, self._on_progress)
 
     def next_batch(self, heat: ThermalState) -> PulsePlan | None:
@@ -159,6 +161,7 @@ class Scheduler:
             if draft.rows:
                 self._draft = draft
                 return draft.to_plan()
+            # An empty draft may still have skipped pulses, which belong to the plan.
             self._commit(draft)
             self._kept = None
             self._state.begin_order()
@@ -170,6 +173,7 @@ class Scheduler:
         kept = self._kept or self._planner.begin(self._state)
         if self._pending_pause is not None:
             self._planner.extend_round(kept, step, heat, self._pending_pause.rows)
+            # A pause is beam time in which nothing happens: the pulses behind it are planned from the heat of then.
             kept.state.beams[self._pending_pause.stage].free_us += self._pending_pause.pause_us
             self._kept, self._pending_pause = kept, None
         draft = kept.copy()
@@ -186,6 +190,7 @@ class Scheduler:
         self._take_draft()
         self._kept = None
         for beam in self._state.beams:
+            # All beams, or the order of stages would change by the delay.
             beam.free_us += delay_us
         self._state.delay_us += delay_us
 
@@ -217,6 +222,7 @@ class Scheduler:
                 if not self._can_repeat_order(source, stage, stretch.tolist()):
                     self._orders[stage] = tools.path.orient(stretch, beam.pixel)
             orders = tuple(self._orders[stage] for stage in range(len(self._tools)))
+        # One pixel has nothing to be simultaneous with.
         if not frame.simultaneous or sum(map(len, orders)) < 2:
             return [Round(source, orders)]
         begin_us = max(free_us)
@@ -225,6 +231,7 @@ class Scheduler:
             for pixel in order:
                 pulse = heat.solve_pulse(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), tools.drive)
                 if pulse is not None:
+                    # The single pulse at the frame's begin is what the rounds split: it is the most that a pixel needs.
                     single_pulses[pixel] = pulse
         if not single_pulses:
             return [Round(source, orders)]
@@ -252,6 +259,8 @@ class Scheduler:
             return given
         frame, beam = self._sequence.frames[source], self._state.beams[stage]
         active = np.flatnonzero((frame.target_m > 0) & (stage_of == stage))
+        # Same pixels: the same order, while the mirrors are back in time. Reversed, the pixels at the ends would get
+        # two pulses in a row.
         if self._can_repeat_order(source, stage, active.tolist()):
             return self._orders[stage]
         self._orders[stage] = self._tools[stage].path.compute_order(active, beam.pixel)
@@ -287,6 +296,7 @@ class Scheduler:
 
     def _fork(self, rounds: list[Round]) -> "Scheduler":
         """Return a scheduler that plans only `rounds` from the present state and leaves this one unchanged."""
+        # A copy of references: state and steps are replaced below, a trial only reads the rest.
         fork = copy(self)
         fork._state = self._state.copy()
         fork._state.begin_order()

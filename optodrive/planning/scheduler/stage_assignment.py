@@ -44,6 +44,7 @@ class PulseWidthEstimate(NamedTuple):
     @classmethod
     def from_cold(cls, cold: ThermalState, max_m: FloatArray, drive: DriveRange) -> "PulseWidthEstimate":
         """Tabulate the tallest pixel. Others are alike at equal shares of their largest displacement."""
+        # One pixel stands for all: widths are alike at equal shares of the largest displacement, and only compared.
         pixel = int(np.argmax(max_m))
         widths_s = [0.0]
         for share in SHARES[1:]:
@@ -118,6 +119,7 @@ class StageAssignment:
 
     def _assign_recurring(self, pulse_widths: PulseWidthEstimate) -> None:
         """Assign the pixels that several frames light over the whole plan, if it is then drawn in clearly less time."""
+        # Bounded work; pixels of later frames recur in these, or are assigned when the plan reaches them.
         frames = self._sequence.frames[: max(2, BALANCED_MAX // len(self.stage_of))]
         target_m = np.array([frame.target_m for frame in frames]).reshape(len(frames), len(self.stage_of))
         is_drawn, is_free, stages = target_m > 0, self.stage_of == NOBODY, len(self._reach)
@@ -131,15 +133,18 @@ class StageAssignment:
         loads = FrameLoads(np.zeros((len(frames), stages)), np.zeros(len(frames)), show_at_s, overlap_s)
         self._assign_by_frame(loads, cost_s, is_carried=True)
         by_frame_s = find_drawing_s(loads)
+        # Already near the best that any share can do: light divided by the stages.
         if by_frame_s <= (1.0 + GAIN_ENOUGH) * loads.loads_s.sum() / drawing:
             return
         stage = self._assign_by_frame(loads, cost_s, is_carried=False)
+        # Pixels that occur once level what the recurring ones leave uneven, so they stay free.
         is_free[recurring] = False
         for frame, each_s in enumerate(np.where(is_free, cost_s, 0.0)):
             loads.loads_s[frame] -= np.bincount(stage, each_s, stages)
             loads.shared_s[frame] = each_s.sum()
         share = stage[recurring]
         balance(loads, cost_s[:, recurring], share, self._reach[:, recurring])
+        # The model knows neither paths nor pauses: below 1 % its choice was worse than none, measured with random dots.
         if by_frame_s > (1.0 + GAIN_ENOUGH) * find_drawing_s(loads):
             self.stage_of[recurring] = share
 
@@ -181,6 +186,8 @@ class StageAssignment:
         busy_s += np.bincount(self.stage_of[active[known]], cost_s[known], len(free_s))
         path = self._order_path(active[~known])
         stages = self.stage_of[path] = _cut(cost_s[np.searchsorted(active, path)], busy_s, self._reach[:, path])
+        # Stretches of one path only where all pixels are new: with assigned ones between, each stage finds its own
+        # path.
         return None if known.any() else tuple(path[stages == stage] for stage in range(len(free_s)))
 
 
@@ -192,6 +199,7 @@ def _cut(cost_s: FloatArray, free_s: FloatArray, reach: BoolArray) -> IntArray:
     if not len(cost_s):
         return np.zeros(0, dtype=np.int64)
     drawing = np.flatnonzero(reach.any(axis=1))
+    # How much each stage gets, by longest time first; which pixels, by the path, so that moves stay short.
     bounds_s = np.cumsum(_share(cost_s, free_s[drawing]))
     nearest = drawing[np.minimum(np.searchsorted(bounds_s, np.cumsum(cost_s) - 0.5 * cost_s), len(drawing) - 1)]
     distance = np.abs(np.arange(len(free_s))[:, None] - nearest[None, :])

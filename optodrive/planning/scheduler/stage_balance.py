@@ -75,6 +75,7 @@ def _find_end_s(
                 free_s[k] = max(free_s[k], level_s)
             end_s = max(end_s, free_s[k])
         ends_s[frame] = end_s
+        # Ends alone leave most moves without an effect; the wait of the other stages shows which way leads on.
         total += end_s + LEVEL_WEIGHT * max(0.0, end_s - level_s)
     return float(total / len(loads_s) + end_s)
 
@@ -113,6 +114,7 @@ def _search(
                 if end_s < best_s - GAIN_MIN:
                     best_s, stage[a], has_changed = end_s, k, True
                 else:
+                    # Undone in place: a copy of all loads per trial would be most of the work.
                     _move(loads_s, cost_s[a], k, before)
             for b in range(a):
                 first, second = stage[a], stage[b]
@@ -127,6 +129,7 @@ def _search(
                 else:
                     _move(loads_s, cost_s[a], second, first)
                     _move(loads_s, cost_s[b], first, second)
+                # Counted and not timed: equal sequences get equal plans on every computer.
                 if work > WORK_MAX:
                     return
         if not has_changed:

@@ -55,6 +55,7 @@ def list_train_pulses(
     if not trains:
         return []
     start_us, number = np.concatenate(starts_us), np.repeat(np.arange(len(trains)), [len(each) for each in starts_us])
+    # Stable: at equal times in the order of the trains.
     order = np.argsort(start_us, kind="stable")
     pulses: list[TrainPulse] = []
     for first in range(0, len(order), PROGRESS_PULSES):
@@ -71,8 +72,10 @@ def compute_free_us(pulses: list[TrainPulse], index: int, gap_us: int, settling_
     gap_us: gate-off time before the next pulse on the same pixel. Practically unlimited for the last pulse.
     """
     if index + 1 >= len(pulses):
+        # Twelve days: no next pulse limits the last one.
         return 2**40
     pulse, following = pulses[index], pulses[index + 1]
+    # On the same pixel no move, but a gap, or both pulses would count as one in the width cap.
     between_us = gap_us if following.pixel == pulse.pixel else settling_us(pulse.pixel, following.pixel)
     return following.requested_start_us - pulse.requested_start_us - between_us
 
@@ -165,6 +168,7 @@ class TrainPulses:
         """
         pulse = self._pulses[index]
         train, recipe = self._trains[pulse.source], self._recipes[pulse.source]
+        # The lead period takes its time from the same cycle.
         max_width_us = self._compute_max_width_us(train) - (self._period_us if recipe.lead_period_w else 0)
         room_us = min(compute_free_us(self._pulses, index, self._gap_us, self._settling_us) - late_us, max_width_us)
         shape = compute_next_pulse(train, recipe, heat, start_us * 1e-6, limit_pulse_width(self._drive, room_us))
@@ -186,6 +190,7 @@ class TrainPulses:
     def _build_recipe(
         self, train: HeightTrain, cold_heat: ThermalState, min_free_us: int, median_free_us: int, where: str
     ) -> PulseRecipe:
+        # The median: a few tight cycles are planned narrower one by one, and must not make all of them narrow.
         room_us = min(median_free_us, self._compute_max_width_us(train))
         if min(min_free_us, room_us) < self._drive.period_s * 1e6:
             expected = (

@@ -58,11 +58,13 @@ def compute_visiting_order(
         return active
     begin = -1 if origin is None else origin
     tours = [compute_serpentine_order(active, row, column), compute_serpentine_order(active, column, row)]
+    # Reversed: the beam may stand nearer to the other end.
     tours += [tour[::-1] for tour in tours]
     lengths_rad = [path_rad(tour, x_rad, y_rad, begin) for tour in tours]
     best = int(np.argmin(lengths_rad))
     tour = np.ascontiguousarray(tours[best], dtype=np.int64)
     steps_rad = np.maximum(np.abs(np.diff(x_rad[tour])), np.abs(np.diff(y_rad[tour])))
+    # Full lattices stop here: no path is shorter than as many of the shortest steps.
     if lengths_rad[best] > GOOD_ENOUGH_RATIO * len(steps_rad) * steps_rad.min():
         _improve(tour, _find_neighbours(tour, x_rad, y_rad, min(NEIGHBOUR_COUNT, len(steps_rad))), x_rad, y_rad, begin)
     return tour
@@ -172,6 +174,8 @@ def _try_reversal(
             if other < 0:
                 break
             gained_rad = edge_rad - _move_rad(x_rad, y_rad, pixel, other)
+            # Neighbours are in order of distance: none of the others gains either. At the open end the edge costs
+            # nothing, so all are tried.
             if ahead >= 0 and gained_rad <= 0.0:
                 break
             m = place[other]
@@ -183,6 +187,7 @@ def _try_reversal(
             _reverse_segment(tour, place, first, last)
             for changed in (pixel, other, ahead, beyond):
                 if changed >= 0:
+                    # Only what is next to a change can have a new improvement.
                     pending[changed] = 1
             return True
     return False
