@@ -36,11 +36,14 @@ def judge_candidates(selection: Selection, gains: dict[str, float]) -> tuple[Can
             judgement = "identified" if selection.claim.verdict == "cause" else "indistinguishable"
         elif item.key in selection.claim.causes:
             judgement = "indistinguishable" if selection.claim.verdict == "ambiguous" else "alternative form"
+        # Before "possible": what the base parameters imitate is not seen in any recording like this one.
         elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
             judgement = "not observable"
+        # A prior alone rules nothing out: a candidate whose χ² the noise does not separate stays possible.
         elif probability > MAX_RULED_OUT or item.label in near:
             judgement = "possible"
         else:
+            # A small score excludes nothing but a large effect; "ruled out" needs an effect that would have been seen.
             judgement = "not detected" if score.ratio < DETECTABLE_RATIO else "ruled out"
         out.append(
             CandidateCause(
@@ -83,6 +86,7 @@ def _describe_detection_limit(score: Score) -> str:
     stated_limit = discover_terms()[score.hypothesis.key].detection_limit
     if stated_limit:
         return stated_limit
+    # The start ratio is that of the last column of a score.
     free = score.hypothesis.free[-1 if score.hypothesis.is_linear else 0]
     start = score.start.get(free.names[0], 0.0) or 1.0
     if score.start_ratio <= 0.0 or score.independent_fraction < MIN_INDEPENDENT_FRACTION:

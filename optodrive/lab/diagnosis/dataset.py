@@ -141,7 +141,9 @@ def build_dataset(measurement: Measurement) -> Dataset:
     """Convert a recording to vector form. Raise InputError if it has no finite sample."""
     runs = measurement.runs
     stated_s = read_start_times(runs).seconds
+    # Equal start times say nothing, and would make every drift infinitely fast.
     is_stated = stated_s is not None and len(runs) > 1 and bool(np.ptp(stated_s))
+    # The order of the runs is at least known, and serves for ageing.
     start_times_s = stated_s if stated_s is not None and is_stated else np.arange(float(len(runs)))
     order = np.argsort(start_times_s, kind="stable")
     session_span_s = max(float(start_times_s.max() - start_times_s.min()), 1e-9)
@@ -163,6 +165,7 @@ def build_dataset(measurement: Measurement) -> Dataset:
                 dose_before=doses_before_j[number].get(pixel, 0.0) / max_total_j,
                 dose_per_j=1.0 / max_total_j,
                 session_time=float(2.0 * (start_times_s[number] - start_times_s.min()) / session_span_s - 1.0),
+                # Without real times nothing drifts within a run.
                 session_time_per_s=2.0 / session_span_s if is_stated else 0.0,
                 full_w=full_power_w,
             )
@@ -177,6 +180,7 @@ def _select_samples(number: int, run: Run, name: str) -> Samples:
     signal, kind = run.signals[name], SIGNALS.index(name)
     is_used = np.isfinite(signal.value)
     if kind == 0:
+        # Displacement and force have no kink there: the gas smooths it.
         is_used &= _is_off_edges(signal.t_s, run.pulses)
     value = signal.value[is_used] - (run.ambient_k if kind == 0 else 0.0)
     return Samples(number, kind, signal.pixel, signal.t_s[is_used], value)
@@ -210,6 +214,7 @@ def _group_by_drive(experiments: list[tuple[PixelExperiment, tuple[int, int, int
         by_drive.setdefault((experiment.pulses.tobytes(), experiment.pixel), []).append((experiment, numbers))
     groups = []
     for members in by_drive.values():
+        # Repeats of one drive are integrated once, at all their times.
         times = [np.unique(np.concatenate([experiment.t_s[kind] for experiment, _ in members])) for kind in PIXEL_KINDS]
         rows = tuple(
             (kind, numbers[kind], np.searchsorted(times[kind], experiment.t_s[kind]))
@@ -234,6 +239,7 @@ def _build_run_infos(runs: tuple[Run, ...]) -> tuple[RunInfo, ...]:
     for run in runs:
         pixels = tuple(sorted((name, signal.pixel) for name, signal in run.signals.items()))
         commands = None if run.commands is None else np.round(run.commands, COMMAND_DIGITS).tobytes()
+        # The measured pixels belong to it: one drive, measured at two pixels, is no repeat.
         key = (_round_pulses(run.pulses).tobytes(), commands, pixels)
         stated = run.attributes.get("group")
         group = first.setdefault(key, run.name) if stated is None else str(stated)
@@ -243,6 +249,7 @@ def _build_run_infos(runs: tuple[Run, ...]) -> tuple[RunInfo, ...]:
 
 def _round_pulses(pulses: FloatArray) -> FloatArray:
     """Return pulses rounded to 1 µs and 0.1 mW, within which they are equal, in order of time."""
+    # + 0.0 turns −0.0 into 0.0, whose bytes differ.
     rounded = np.round(pulses * [1e6, 1e6, 1e4, 1.0]) + 0.0
     return np.asarray(rounded[np.argsort(rounded[:, 0], kind="stable")])
 
@@ -261,6 +268,7 @@ def _compute_doses_j(runs: tuple[Run, ...], order: IntArray) -> tuple[dict[int, 
 def build_hypotheses(data: Dataset) -> list[Hypothesis]:
     """Return every hypothesis that this recording can show."""
     scope = _describe_scope(data)
+    # A term without a signature is no possible cause of a discrepancy.
     terms = (term for term in discover_terms().values() if term.signature and scope.subsystem in term.subsystems)
     return [hypothesis for term in terms for hypothesis in term.build_hypotheses(scope)]
 

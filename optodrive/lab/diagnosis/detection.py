@@ -81,6 +81,8 @@ def simulate_effects(
 
     A hypothesis of which one start diverges is left out, here and later, and noted in the log.
     """
+    # Jitters act along the derivatives of this fit, for all candidates alike: their scores are comparable, refits have
+    # their own.
     sensitivity = compute_jitter_sensitivity(problem.data, base.point, problem.epsilon, base.prediction)
     fitted_columns = compute_jacobian(problem, base.point, base.free, base.prediction)
     starts: list[tuple[Hypothesis, dict[str, float]]] = []
@@ -92,6 +94,7 @@ def simulate_effects(
             ParameterPoint(base.point.base, {**base.point.terms, item.key: start}) for start in _select_starts(item)
         ]
         try:
+            # A finite size: at size zero a time constant or a shape has no derivative.
             changes = [predict(problem.data, point, problem.epsilon) - base.prediction for point in points]
         except UNCOMPUTABLE as error:
             log.add_failure(item.label, error)
@@ -121,15 +124,18 @@ def score_effects(
     form_count = 0 if forms is None else forms.shape[1]
     if forms is not None:
         fitted_columns = np.column_stack([fitted_columns, forms])
+    # Effects differ by orders of magnitude, and the Gram matrix squares that.
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
     columns = np.column_stack([fitted_columns, candidates / scale, residual])
     total = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total
     width = fitted_columns.shape[1]
+    # The base parameters have a prior: an effect that they imitate only far from it counts as an effect.
     total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] += 1.0 / np.square(problem.prior.sigma)
     form_evidence = 0.0
     if form_count:
         parameters = list(range(width - form_count))
+        # The forms' own evidence is beside the fitted parameters alone, before any candidate.
         beside = project_out(total, parameters, [*range(width - form_count, width), len(total) - 1])
         form_evidence = compute_form_evidence(beside[:-1, :-1], beside[:-1, -1])
     projected = project_out(total, list(range(width)), list(range(width, len(total))))
@@ -144,6 +150,7 @@ def score_effects(
 
 
 def _select_starts(item: Hypothesis) -> tuple[dict[str, float], ...]:
+    # Each start of such a hypothesis needs a fit of its own, so one stands for all here.
     return item.starts[:1] if item.fit_every_start else item.starts
 
 
@@ -160,6 +167,7 @@ def compute_scores(
     column_sets: list[tuple[Hypothesis, dict[str, float], tuple[int, ...]]] = []
     joint: dict[str, list[int]] = {}
     for column, (item, start) in enumerate(trials):
+        # Sizes that act together are scored together, each at its own amplitude.
         if item.is_linear and item.degrees > 1:
             joint.setdefault(item.label, []).append(column)
             if len(joint[item.label]) == len(item.starts):
@@ -186,6 +194,7 @@ def _compute_likelihood_ratio(
 ) -> tuple[float, FloatArray]:
     inner = gram[np.ix_(indices, indices)]
     amplitude = solve(inner, right[indices])
+    # A size that cannot be negative gains nothing where the data want it negative.
     if not either_sign and amplitude[0] <= 0.0:
         return 0.0, np.zeros(len(indices))
     return float(right[indices] @ amplitude), amplitude

@@ -132,13 +132,16 @@ def diagnose(
     inspection = inspect_recording(measurement, use)
     inspection.check()
     measurement = inspection.measurement
+    # Before the test of units, in which numbers out of range would overflow.
     check_numeric_limits(measurement)
     check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel(epsilon))
     check_copied_runs(measurement)
     subsystems: list[_SubsystemFit] = []
     for part in build_dataset(measurement).split_subsystems():
+        # Pixels come first: their edges measure the timing jitter, which a mirror's repeats at rest do not show.
         timing_s = max((item.problem.noise.timing_sigma_s for item in subsystems), default=0.0)
         candidates = build_hypotheses(part)
+        # A recording that states how it was coupled needs no test of its zeros.
         if all(run.attributes.get("coupling") == "DC" for run in measurement.runs):
             candidates = [item for item in candidates if not discover_terms()[item.key].removes_zero]
         if subsystems:
@@ -157,6 +160,7 @@ def diagnose(
         log.omissions.update(subsystem.log.omissions)
     disturbances = tuple(item for subsystem in subsystems for item in subsystem.disturbances)
     claimed = combine_claims([subsystem.selection.claim for subsystem in subsystems], log.failures, bool(disturbances))
+    # The pixels where there are any; the mirrors alone else.
     main = subsystems[0]
     parameters: dict[str, Estimate] = {}
     terms: dict[str, dict[str, float]] = {}
@@ -214,6 +218,7 @@ def diagnose(
         ),
         rivals=tuple(rival for subsystem in subsystems for rival in subsystem.rivals),
         remarks=(*inspection.remarks, *_build_remarks(subsystems)),
+        # The worse of both subsystems, so that the answer promises no more than each of them holds.
         explained_fraction=min(explained_fractions, default=0.0),
         doubts=doubts,
         failures=log.failures,
@@ -251,12 +256,15 @@ def _diagnose_subsystem(
     log.on_progress("noise and nominal model")
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, shared)
     nothing: tuple[tuple[InstrumentDisturbance, ...], FloatArray] = ((), np.zeros(len(data.value)))
+    # Sought in all runs, held-out ones too: they are subtracted from the data, and no model gains by them.
     disturbances, added = log.attempt("disturbances of instruments", _find_disturbances, nothing, data, problem, base)
+    # The noise was estimated with the disturbance in it, so everything begins again without.
     if disturbances:
         log.on_progress("nominal model without the instruments' disturbances")
         data = remove_disturbances(data, added)
         fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
         problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, shared)
+    # An AC coupling leaves no zero that differs from run to run; where one does, that explanation is out.
     residual = problem.data.value - base.prediction
     coupled = log.attempt("zeros of the runs", find_dc_coupled, frozenset[str](), problem.data, residual, problem.noise)
     hypotheses = [
@@ -270,10 +278,13 @@ def _diagnose_subsystem(
     selection = compare_explanations(problem, base, hypotheses, log)
     # Twins stay twins with more runs, so what they leave open is no reason to give up the held-out ones.
     first = claim(replace(selection.collect_evidence(), twins={}))
+    # The noise stays that of the fitted runs, so that the two comparisons differ by the data alone.
     all_data = FitProblem(data, problem.noise, prior, epsilon)
     if first.verdict in ("none", "undecided", "ambiguous") and held_out_runs:
         # The held-out, hottest runs may show an effect, or which one: compare the explanations with all runs.
         log.on_progress("fitting all runs")
+        # Without a name the verdict decides whether all runs say more; with one of several names, all runs always
+        # decide.
         chosen = replace(selection, claim=first).chosen
         all_base = fit(all_data, base.point, base.free)
         wider = compare_explanations(all_data, all_base, hypotheses, log)
@@ -281,6 +292,8 @@ def _diagnose_subsystem(
             claim(replace(wider.collect_evidence(), twins={})).verdict not in ("none", first.verdict)
             or chosen is not None
         ):
+            # Nothing is held out any more, so no gain can be claimed: the report says so instead of a number from
+            # fitted runs.
             problem, base, held_out, selection = all_data, all_base, data.select([]), wider
     unchanged = tuple[HeldOutChange, ...]()
     changes = {
@@ -289,6 +302,8 @@ def _diagnose_subsystem(
         )
         for item in selection.candidates
     }
+    # Judged twice: the sizes' intervals, which may raise a doubt, cost a fit to all runs and are computed for the
+    # chosen one only.
     selection = replace(selection, claim=claim(selection.collect_evidence(changes)))
     chosen = selection.chosen
     final, estimates = _fit_all(all_data, base, chosen, hypotheses, log)
@@ -339,6 +354,7 @@ def _fit_all(
     """Return the chosen model fitted to all runs, the nominal one if there is none, and its parameters."""
     log.on_progress("fitting all runs")
     start = base if chosen is None else chosen.fit
+    # It starts at the optimum of most runs, so few steps suffice.
     final = fit(problem, start.point, start.free, iterations=6)
     if all(kind in MIRROR_KINDS for kind in problem.data.kinds):  # judge each point by its own jitter sensitivities
         points = (start.point, final.point)
@@ -368,11 +384,15 @@ def _revise_noise(
     if best is None:
         return problem, base
     other = update_noise(problem, best.fit, min_timing_sigma_s)
+    # Again beside the effect, which by itself may look like power that fluctuates.
     excess = compute_intra_pulse_power_excess(other, best.fit)
     other = replace(other, noise=replace(other.noise, intra_pulse_power_excess=excess))
     is_quieter = other.noise.power_sigma < QUIETER * problem.noise.power_sigma
+    # Noise beside an effect counts only where it explains the repeats; else the strongest candidate would choose the
+    # noise that favours it.
     if has_replicate_excess(other) or not (is_quieter or has_replicate_excess(problem)):
         return problem, base
+    # The base fit is the nominal one still, and nothing is decided yet.
     return other, fit(other, base.point)
 
 
@@ -401,6 +421,7 @@ def _find_shared_terms(subsystems: list[_SubsystemFit]) -> dict[str, TermValues]
         for key, values in subsystem.final.point.terms.items()
         if key in subsystem.selection.claim.causes
         and values.get("mirrors")
+        # Only the clock is common to pixels and mirrors; any other cause of a pixel says nothing about a mirror.
         and len(discover_terms()[key].subsystems) > 1
     }
 

@@ -58,6 +58,7 @@ def compute_discrepancy_basis(
         effect = fitted.prediction - predict(data, ParameterPoint(fitted.point.base, others), problem.epsilon)
         columns += _separate_signals(data, effect)
         term = discover_terms()[item.key]
+        # As a clock: it has no other form than its share in each signal.
         if term.is_exact:
             continue
         if any(term.kernels):  # a record's filter does not know power, dose or heat
@@ -71,6 +72,7 @@ def compute_discrepancy_basis(
         alternatives: list[ParameterPoint] = []
         for other in all_hypotheses:
             if other.key == item.key and other.label != item.label:
+                # Beside the fitted values: the other hypothesis adds its numbers, and takes none away.
                 sizes = {free.names[0]: other.starts[0][free.names[0]] for free in other.free}
                 alternatives.append(
                     ParameterPoint(fitted.point.base, {**terms, item.key: {**terms[item.key], **sizes}})
@@ -136,6 +138,8 @@ def _marginalise(gram: FloatArray, right: FloatArray, prior_sigma: Sequence[floa
         both = solve(gram + np.diag(weights), right)
         sigma = np.maximum(DISCREPANCY_SIGMA, np.abs(both[count:]))
     weights[count:] = 1.0 / np.square(sigma)
+    # After the loop: the last sizes have not been used yet.
     covariance = solve(gram + np.diag(weights), np.eye(len(gram)))[:count, :count]
     change = solve(gram + np.diag(weights), right)[:count] - alone
+    # A parameter that moves when other forms are allowed depends on the form, though its curvature may be large.
     return np.asarray(covariance + np.outer(change, change))

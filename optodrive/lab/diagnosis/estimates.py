@@ -29,16 +29,19 @@ def compute_estimates(data: Dataset, final: ModelFit, covariance: FloatArray) ->
     """
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     out: dict[str, Estimate] = {}
+    # Student's: the noise is known by as many values as there are repeats.
     t_quantile = float(stdtrit(count_noise_degrees(data), 0.975))
     if any(kind < 3 for kind in data.kinds):
         for row, name in enumerate(BASE_PARAMETERS):
             log_value, width = final.point.base[row], t_quantile * float(sigma[row])
             out[name] = Estimate(exp(log_value), BASE_UNITS[name], exp(log_value - width), exp(log_value + width))
     for row, free in enumerate(final.free, start=len(BASE_PARAMETERS)):
+        # A logarithm that the data leave open would overflow its exponential.
         number, width = free.read_value(final.point.terms), t_quantile * float(min(sigma[row], 50.0))
         ends = (number - width, number + width)
         value, low, high = (exp(min(x, 300.0)) if free.logarithmic else x for x in (number, *ends))
         at_limit = is_at_limit(final, free)
+        # At a limit the interval is not cut, or it would have no width and pass for exact.
         if not at_limit:
             low, high = max(low, free.parameter.low), min(high, free.parameter.high)
         for name in free.names:
@@ -58,6 +61,7 @@ def limit_sizes(
     for item in hypotheses:
         for free in _list_sizes(item):
             name = f"{free.key}.{free.names[0]}"
+            # The profile costs fits, and is needed only where the curvature doubts a size.
             if _describe_doubt(free, estimates[name]):
                 low, high = estimates[name].low, estimates[name].high
                 nearest = _find_size_bound(problem, final, free, limit)
@@ -74,6 +78,7 @@ def _find_size_bound(problem: FitProblem, final: ModelFit, free: FreeParameter, 
     value, absent = free.read_value(final.point.terms), free.limits[0] if free.logarithmic else 0.0
     excluded, kept = 0.0, 1.0
     for _ in range(PROFILE_STEPS):
+        # What is returned is excluded by a fit: the bound errs towards no effect, by a step at most.
         share = 0.5 * (excluded + kept)
         terms = free.with_value(final.point.terms, absent + share * (value - absent))
         if fit(problem, replace(final.point, terms=terms), others, PROFILE_ITERATIONS).chi2 > limit:
@@ -100,6 +105,7 @@ def describe_doubts(hypotheses: Iterable[Hypothesis], estimates: dict[str, Estim
     doubts = {}
     for item in hypotheses:
         clauses = [_describe_doubt(free, estimates[f"{free.key}.{free.names[0]}"]) for free in _list_sizes(item)]
+        # One size that is established establishes the cause.
         if all(clauses):
             doubts[item.key] = " and ".join(clauses)
     return doubts
@@ -123,6 +129,7 @@ def _list_sizes(item: Hypothesis) -> tuple[FreeParameter, ...]:
 def _ends_at_limit(free: FreeParameter, estimate: Estimate) -> bool:
     """Return whether a number lies at a limit: a size at any, a shape at its largest value, unless that is a share."""
     high = free.parameter.high
+    # A time constant at its largest value means a longer one; a share of 1 is a whole.
     is_largest = free.parameter.is_shape and high != 1.0 and abs(estimate.value - high) <= LIMIT_SHARE * abs(high)
     return estimate.at_limit or is_largest
 

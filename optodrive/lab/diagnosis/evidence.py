@@ -80,17 +80,22 @@ class Explanation:
 def compute_log_evidence(problem: FitProblem, fitted: ModelFit, chi2: float) -> float:
     """Return the logarithm of the marginal likelihood of a fit with this χ², up to a constant of the data."""
     count = len(problem.prior.sigma) + len(fitted.free)
+    # Without the last column, the residual's.
     hessian = fitted.gram.sum(axis=0)[:count, :count]
     precision = [1.0 / sigma**2 for sigma in problem.prior.sigma]
     scale = np.ones(count)
     for row, free in enumerate(fitted.free, start=len(precision)):
         if is_size(free):
+            # The derivative by the logarithm is the derivative times the size: at no effect it is zero, and Occam's
+            # factor 1.
             scale[row] = free.read_value(fitted.point.terms)
             precision.append(1.0 / (UNIFORM_VARIANCE * SIZE_LOG_SPAN**2))
         else:
             low, high = free.limits
+            # A uniform prior as the normal one of equal variance, for which Laplace's integral is closed.
             precision.append(1.0 / (UNIFORM_VARIANCE * (high - low) ** 2))
     root = np.sqrt(precision)
+    # Relative to the prior: a number that the data leave open costs nothing.
     relative = np.eye(count) + hessian * np.outer(scale / root, scale / root)
     return -0.5 * (chi2 + float(np.linalg.slogdet(relative)[1]))
 
@@ -110,6 +115,7 @@ def compute_hidden_share(ratio: float) -> float:
 
     The logarithm of its size is uniform a priori, as in `compute_log_evidence`.
     """
+    # The likelihood of a size s, in σ, where the best one is √ratio: exp(s √ratio − s²/2).
     logs = SIGMAS * max(ratio, 0.0) ** 0.5 - 0.5 * SIGMAS**2
     weights = np.exp(logs - logs.max())
     return float(weights[SIGMAS < HIDDEN_SIGMA].sum() / weights.sum())
@@ -121,6 +127,7 @@ def compute_form_evidence(gram: FloatArray, right: FloatArray) -> float:
     gram: [k, k] of the whitened columns, fitted parameters projected out; right: [k] with the residual
     """
     values, vectors = np.linalg.eigh(gram)
+    # Rounding makes the smallest eigenvalues negative.
     values, projected = np.maximum(values, 0.0), vectors.T @ right
     gains = []
     for sigma in FORM_SIGMAS:
@@ -146,6 +153,7 @@ class BinEvidence:
 
     def compute_own_share(self, reduction: float) -> float:
         """Return the probability that the rest in the bins belongs to a cause that reduced χ² by this amount."""
+        # The size of the bins' means that the data prefer says whether the rest is small beside the cause.
         weights = np.exp(self.gains - np.logaddexp.reduce(self.gains))
         shares = self.rests / np.maximum(max(reduction, 0.0) + self.rests, 1e-9)
         own = [compute_own_share(share, BINS_REST) for share in shares.tolist()]
@@ -159,16 +167,21 @@ def compute_bin_evidence(gram: FloatArray, right: FloatArray, noise_chi2: float,
     the differences between repeats, which estimate the scale of the noise
     """
     values, vectors = np.linalg.eigh(gram)
+    # Bins that the fitted parameters determine hold nothing, and their quotient would be rounding errors.
     kept = values > 1e-6 * values.max(initial=1.0)
     values, squares = values[kept], (vectors.T @ right)[kept] ** 2 / values[kept]
     degrees = max(noise_degrees, 1)
+    # Repeats that differ less than the noise model says do not lower the noise: the scale is one at least. Without
+    # repeats it is taken as known.
     noise = max(degrees, noise_chi2) if noise_degrees else 1e9
     degrees = degrees if noise_degrees else 10**9
     half = 0.5 * (degrees + len(values))
     gains, rests = [], []
     for variance in BIN_VARIANCES:
         inflation = 1.0 + variance * values
+        # Student's likelihood, since the scale is an estimate: one outlying bin counts less than under known noise.
         likelihood = half * (log1p(float(squares.sum()) / noise) - log1p(float((squares / inflation).sum()) / noise))
+        # Occam's factor of the free means.
         gains.append(likelihood - 0.5 * float(np.log(inflation).sum()))
         shrinkage = 1.0 - 1.0 / inflation
         rests.append(float((shrinkage**2 * squares + shrinkage).sum()))
@@ -187,22 +200,26 @@ def compute_own_share(rest: float, middle: float) -> float:
 
 def temper(difference: float, degrees: float) -> float:
     """Return the logarithm of the odds for a difference of log evidence, with the noise known to some degrees."""
+    # It grows with the logarithm of a large difference: few repeats cannot give arbitrary certainty.
     return 0.5 * (degrees + 1) * log1p(2.0 * difference / degrees)
 
 
 def compute_probabilities(explanations: Iterable[Explanation]) -> Probabilities:
     """Return the probabilities of all explanations, which sum to 1."""
     items = list(explanations)
+    # Tempering is not additive: the differences must be to one explanation, and the best is the one that matters.
     best = max(item.log_evidence for item in items)
     logs = np.array([item.log_prior - temper(best - item.log_evidence, item.degrees) for item in items])
     weights = np.exp(logs - np.logaddexp.reduce(logs))
     no_effect = none_of_these = 0.0
     causes: dict[tuple[str, ...], float] = {}
     for item, weight in zip(items, weights.tolist(), strict=True):
+        # What a cause leaves to something else is not its own, however good the fit.
         none_of_these += weight * (1.0 - item.own_share)
         if item.causes:
             key = tuple(sorted(item.causes))
             causes[key] = causes.get(key, 0.0) + weight * item.own_share * (1.0 - item.hidden)
+            # Else no recording could reach a large probability of no effect: weak effects are always possible.
             no_effect += weight * item.own_share * item.hidden
         else:
             no_effect += weight * item.own_share

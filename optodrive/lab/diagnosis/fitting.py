@@ -60,11 +60,14 @@ def compute_normal_equations(
         jitters = np.zeros((part.stop - part.start, size))
         jitters[:, 0] = noise.power_sigma * power[part]
         jitters[:, 1] = noise.timing_sigma_s * timing[part]
+        # Each signal has its own zero in each run; power and time are common to all signals of the run.
         jitters[:, 2 + index] = noise.baseline_sigma[block.kind]
         whitened, _ = whiten(block.t_s, np.hstack([columns[part], jitters]), noise.coloured[block.kind])
         grams[block.run] += whitened.T @ whitened
     out = np.empty((len(data.runs), count, count))
     for run, gram in enumerate(grams):
+        # The jitters have unit variance after their scaling: their prior is the identity, and they drop out in closed
+        # form.
         inner = gram[count:, count:] + np.eye(size)
         out[run] = gram[:count, :count] - gram[:count, count:] @ np.linalg.solve(inner, gram[count:, :count])
     return NormalEquations(out)
@@ -75,6 +78,7 @@ def solve(gram: FloatArray, right: FloatArray) -> FloatArray:
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     correlation = gram / scale / scale[:, None]
     values, vectors = np.linalg.eigh(correlation)
+    # Of the correlations, not of the matrix: units would decide else which direction is well conditioned.
     kept = values > 1e-9
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     return np.asarray(
@@ -92,10 +96,12 @@ def solve_within(
     """
     is_movable = upper > lower
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))[is_movable]
+    # The ridge lets two parameters that do the same share the step, instead of a failed factorisation.
     correlation = gram[np.ix_(is_movable, is_movable)] / scale / scale[:, None] + (1e-9 + damping) * np.eye(len(scale))
     root = np.linalg.cholesky(correlation)
     target = np.linalg.solve(root, right[is_movable] / scale)
     scaled = np.linalg.solve(root.T, target)
+    # The bounded problem takes far longer, and most steps are inside.
     limits = (lower[is_movable] * scale, upper[is_movable] * scale)
     if ((scaled < limits[0]) | (scaled > limits[1])).any():
         scaled = lsq_linear(root.T, target, limits, method="bvls").x
@@ -157,6 +163,7 @@ def compute_jitter_sensitivity(
     """Compute the sensitivities to power and timing by finite differences."""
     more_power = predict(data, point, epsilon, power_factor=1.0 + POWER_STEP)
     later = predict(data, point, epsilon, delay_s=DELAY_STEP_S)
+    # Central, as a sample may lie at an edge, where both sides differ.
     earlier = predict(data, point, epsilon, delay_s=-DELAY_STEP_S)
     return JitterSensitivity((more_power - prediction) / np.log1p(POWER_STEP), 0.5 * (later - earlier) / DELAY_STEP_S)
 
@@ -175,12 +182,14 @@ def compute_step_limits(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the limits of one step in base and free parameters: their ranges, and the range of a linear model."""
     to_centre = np.subtract(problem.prior.mean, point.base)
+    # A longer step leaves the range where the linear model holds.
     lower, upper = np.maximum(-0.5, to_centre - BASE_LOG_SPAN), np.minimum(0.5, to_centre + BASE_LOG_SPAN)
     for item in free:
         number, (low, high) = item.read_value(point.terms), item.limits
         max_change = 1.0 if item.logarithmic else 0.5 * (high - low)
         lower = np.append(lower, max(-max_change, low - number))
         upper = np.append(upper, min(max_change, high - number))
+    # A point outside its range, as a start may be, is not forced inside.
     return np.minimum(lower, 0.0), np.maximum(upper, 0.0)
 
 
@@ -202,6 +211,7 @@ def compute_jacobian(
                 columns[block.part, BASE_PARAMETERS.index(name)] = difference[block.part] / BASE_LOG_STEP
     for row, item in enumerate(free):
         number = item.read_value(point.terms)
+        # At the upper limit of its range a number only moves down.
         for step in (item.step, -item.step):
             terms = item.with_value(point.terms, number + step)
             change = item.read_value(terms) - number
@@ -229,6 +239,7 @@ def fit(
     """
     data, count = problem.data, len(BASE_PARAMETERS) + len(free)
     prediction = predict(data, point, problem.epsilon)
+    # Once, at the start: with sensitivities that moved along, χ² of two steps would not be comparable.
     sensitivity = compute_jitter_sensitivity(data, point, problem.epsilon, prediction)
     precision = np.concatenate([1.0 / np.square(problem.prior.sigma), np.zeros(len(free))])
     centre = np.concatenate([problem.prior.mean, np.zeros(len(free))])
@@ -245,8 +256,10 @@ def fit(
         cost += float(precision @ deviation**2)
         if best is None and not np.isfinite(cost):
             raise DivergedError("the fit", Unquoted("a χ² that is no number"), "a finite one at its start")
+        # Written so that a cost that is no number is refused, too.
         if best is not None and not cost <= best.chi2 - 1e-9:
             damping = max(DAMPING_INCREASE * damping, MIN_DAMPING)
+            # So short a step changes no number that anyone reads.
             if float(np.abs(step).max()) < 1e-4:
                 break
         else:
@@ -264,6 +277,7 @@ def fit(
             predicted_improvement = float(2.0 * gradient @ step - step @ hessian @ step)
             if (
                 predicted_improvement < CHI2_CONVERGED
+                # A damped step is short by intention; its small gain says nothing about the minimum.
                 or (improvement < CHI2_CONVERGED and not damping)
                 or cost - max(2.0 * float(gradient @ covariance @ gradient), improvement) > chi2_abandon
             ):

@@ -34,18 +34,21 @@ def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
             kind = "neighbour"
         if any(block.kind > 2 for block in data.blocks if block.run in runs):
             kind = "mirrors"
+        # By kind and pixel, so that no kind of experiment is only held out, and none never.
         kinds.setdefault(f"{kind} {sorted(measured)}", []).append((energy_j, name))
     held_out: list[str] = []
     for members in kinds.values():
         # A drive repeated early and late shows ageing and is never held out.
         eligible = [
             (energy_j, name)
+            # The hottest first: a model must extrapolate to what it did not see.
             for energy_j, name in sorted(members, reverse=True)
             if drive_counts[data.runs[data.groups[name][0]].pulses.tobytes()] == 1
         ]
         if len(members) >= 3:
             held_out += [name for _, name in eligible[::3][: max(1, len(members) // 4)]]
     groups = data.groups
+    # Whole groups: a repeat in the fit would have shown the held-out one.
     held_out_runs = sorted(run for name in held_out for run in groups[name])
     return [run for run in range(len(data.runs)) if run not in held_out_runs], held_out_runs
 
@@ -68,6 +71,7 @@ def compute_held_out_gain(
         problem, data.value - predict(data, extended, problem.epsilon), sensitivity
     )
     excess = nominal_chi2[:, 0] - nominal_chi2[:, 1]
+    # A share of an error that is not there could be anything.
     if excess.sum() < MIN_EXCESS_SIGMA * np.sqrt(2.0 * nominal_chi2[:, 1].sum()):
         return None
     floor2 = _compute_noise_floor2(problem, extended)
@@ -141,6 +145,7 @@ def _draw_interval(chi2_pairs: FloatArray, seed: int) -> tuple[float, float] | N
     if count < 2:
         return None
     generator = np.random.default_rng(seed)
+    # Groups are drawn, not runs: repeats of one experiment share its error.
     reductions = [
         max(-1.0, _compute_reduction(chi2_pairs[:, generator.integers(0, count, count)]))
         for _ in range(BOOTSTRAP_DRAWS)
@@ -152,6 +157,7 @@ def _draw_interval(chi2_pairs: FloatArray, seed: int) -> tuple[float, float] | N
 def _compute_reduction(chi2_pairs: FloatArray) -> float:
     """Return the reduction from [nominal and extended, groups, 2] χ² and degrees. The floor is χ² = degrees."""
     (nominal, degrees), (extended, _) = chi2_pairs.sum(axis=1)
+    # Below the noise no model can be better, except by chance.
     rms_nominal, rms_extended = np.sqrt(nominal / degrees), np.sqrt(max(extended, degrees) / degrees)
     return float((rms_nominal - rms_extended) / max(rms_nominal - 1.0, 1e-9))
 

@@ -44,15 +44,18 @@ def find_disturbances(
     found: list[InstrumentDisturbance] = []
     added = np.zeros(len(residual))
     for kind in (kind for kind in data.kinds if kind in PIXEL_KINDS):
+        # Each line is subtracted before the next is sought: a strong one raises its whole neighbourhood.
         for _ in range(MAX_LINES):
             line = find_line(data, residual - added, kind)
             if line is None:
                 break
             found.append(line[0])
             added += line[1]
+    # After the lines, whose slopes would look like hops, and before drifts, to which hops add up.
     hops, steps = find_hops(data, residual - added, sensitivity, noise)
     found += hops
     added += steps
+    # Not of the thermometer, whose drift is the ambient temperature, a cause with its own term.
     for kind in (kind for kind in data.kinds if kind in PIXEL_KINDS[1:]):
         drift = _find_drift(data, residual - added, kind)
         if drift is not None:
@@ -109,6 +112,7 @@ def _find_drift(data: Dataset, residual: FloatArray, kind: int) -> tuple[Instrum
     times, zeros = np.array(rows).T
     p_value, fitted = min((_fit_drift(times, zeros, degree) for degree in DRIFT_DEGREES), key=lambda item: item[0])
     span = float(np.ptp(fitted(times)))
+    # Below the resolution it moves no sample.
     if p_value > MAX_DRIFT_P or span < find_resolution(data, kind):
         return None
     added = np.zeros(len(residual))

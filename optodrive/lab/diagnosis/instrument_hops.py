@@ -40,6 +40,7 @@ def find_hops(
     hops: dict[int, list[tuple[Block, int, float, float]]] = {}
     for _ in range(MAX_HOPS):
         min_scores = {kind: MORE_HOPS if _are_certain(hops.get(kind, [])) else PAIR_HOP for kind in PIXEL_KINDS}
+        # One at a time: each is in all contrasts of its group, and would be found in its repeats again.
         hop = _find_largest_hop(data, residual - added, sensitivity, noise, min_scores)
         if hop is None:
             break
@@ -54,6 +55,7 @@ def find_hops(
             found.append(InstrumentDisturbance(SIGNALS[kind], "hops", size, None, runs))
             continue
         for block, first, size, _ in some:
+            # A single, not certain hop stays in the data: noise has the largest step somewhere.
             added[block.part.start + first : block.part.stop] -= size
     return found, added
 
@@ -98,6 +100,7 @@ def _find_largest_hop(
         and data.runs[block.run].group == group
     ]
     steps = [(*_measure_step(block, residual[block.part], time_s), block) for block in members]
+    # A contrast does not tell which of its runs hopped; the run itself does.
     first, size, block = max(steps, key=lambda step: abs(step[1]))
     return (block, first, size, score) if abs(size) > find_resolution(data, item.kind) else None
 
@@ -126,10 +129,12 @@ def _score_hops(contrasts: list[Contrast], noise: NoiseModel, resolutions: dict[
         for kind in set(kinds):
             members = [row for row, other in enumerate(kinds) if other == kind]
             spreads = [float(np.median(np.abs(changes[row]))) for row in members if len(changes[row])]
+            # The median over contrasts: one with many hops would raise its own threshold.
             spread = max(1.4826 * float(np.median(spreads or [0.0])), resolutions[kind[0]])
             for row in members:
                 rows = np.arange(width, width + len(changes[row]))
                 jitter = [_compute_changes(column, width) for column in contrasts[row].jitter.T[:2]]
+                # At a pulse's edge, what is left of a jitter is a step and no hop.
                 left = [share * change for share, change in zip(JITTER_LEFT, jitter, strict=True)]
                 ratio = np.abs(changes[row]) / np.sqrt(spread**2 + left[0] ** 2 + left[1] ** 2)
                 quick = _compute_changes(every[row], QUICK)[rows - QUICK] * np.sign(changes[row])

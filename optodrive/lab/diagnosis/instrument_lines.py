@@ -59,6 +59,7 @@ def find_line(data: Dataset, residual: FloatArray, kind: int) -> tuple[Instrumen
     if not is_possible.any():
         return None
     mean = np.where(is_possible, np.nansum(ratios, axis=0) / np.maximum(counts, 1), 0.0)
+    # The mean of few ratios is large by chance.
     excess = mean - LINE_RATIO_BY_RUN / np.maximum(counts, 1)
     for _ in range(MAX_PEAKS):
         at = int(np.argmax(excess))
@@ -68,10 +69,12 @@ def find_line(data: Dataset, residual: FloatArray, kind: int) -> tuple[Instrumen
         by_group: dict[str, list[float]] = {}
         for row, block in seen:
             by_group.setdefault(data.runs[block.run].group, []).append(float(ratios[row, at]))
+        # What rings after strong pulses only is no line of an instrument.
         if min(np.mean(values) for values in by_group.values()) >= MIN_GROUP_RATIO:
             line = _fit_line(data, residual, kind, [block for _, block in seen], float(grid_hz[at]), longest_s)
             if line is not None:
                 return line
+        # The whole width of the peak, or its flank would be tried next.
         excess[np.abs(grid_hz - grid_hz[at]) < PEAK_WIDTH / shortest_s] = -np.inf
     return None
 
@@ -91,6 +94,7 @@ def _compute_spectral_ratio(values: FloatArray, number: FloatArray, dt_s: float)
             for sign in (-1, 1)
         ]
     )
+    # The median of an exponential distribution is ln 2 of its mean.
     level = np.median(beside, axis=0) / np.log(2.0)
     return np.asarray(np.fft.rfftfreq(4 * length, dt_s)), np.asarray(spectrum / np.maximum(level, 1e-300))
 
@@ -119,6 +123,7 @@ def _fit_line(
             continue
         number = _fit_sinusoid(block.t_s, residual[block.part], best_hz)
         phase = 2.0 * np.pi * best_hz * block.t_s
+        # The common amplitude with the run's own phase: a run's own one would take a part of its noise along.
         scale = amplitude / max(abs(number), 1e-300)
         added[block.part] = scale * (number.real * np.cos(phase) + number.imag * np.sin(phase))
     return InstrumentDisturbance(SIGNALS[kind], "line", amplitude, best_hz, len(blocks)), added

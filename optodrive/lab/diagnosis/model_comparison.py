@@ -138,6 +138,7 @@ def _list_pushes(
         if height_m <= 0.0 or nominal_m.max() <= 0.0 or shape_m.argmax() == 0:  # it still falls from an earlier push
             continue
         near_m = shape_m[near]
+        # A fit of the predicted shape, since the largest of many samples is too high by their noise.
         measured_m = height_m * float(near_m @ problem.data.value[rows][near]) / float(near_m @ near_m)
         jitter_m = noise.power_sigma * float(np.abs(power[rows][near]).mean())
         white2 = coloured.compute_mean_variance(block.t_s, len(near_m))

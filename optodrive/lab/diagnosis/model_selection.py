@@ -157,6 +157,7 @@ def compare_explanations(
     """Compare all explanations of one subsystem."""
     log.on_progress("testing the nominal model")
     nominal_detection = detect(problem, base, hypotheses, log)
+    # Repeats that differ so, as by missed pulses, leave no noise by which explanations could be compared.
     if has_replicate_excess(problem):
         probabilities = Probabilities(1.0 - CERTAIN, CERTAIN, {(item.key,): 0.0 for item in hypotheses})
         return Selection(probabilities, (), {}, nominal_detection, base.chi2, True, repeats_differ=True)
@@ -179,12 +180,15 @@ def compare_from_single_causes(
     """
     examined = {} if examined is None else examined
     pairs: list[RefittedCandidate] = []
+    # The forms of a cause cost many predictions, so only the best refits get them.
     for item in select_near(base, singles)[:EXAMINED_SINGLES]:
         _examine(problem, base, hypotheses, item, examined, log)
     if singles:
         residual_detection = examined[singles[0]].detection
+        # Pairs cost the most; without a second effect in what the best single leaves, none is fitted.
         if residual_detection.scores and residual_detection.scores[0].ratio > PAIR_SCORE:
             pairs = refit_pairs(problem, hypotheses, select_near(base, singles), residual_detection, log)
+            # A single that ended in a side minimum leaves a rest, for which a pair would be named falsely.
             restarted = refit_alone(problem, base, pairs[0], singles, log) if pairs else singles
             if restarted[0].log_evidence > singles[0].log_evidence + RESTART_GAIN:
                 return compare_from_single_causes(
@@ -196,6 +200,7 @@ def compare_from_single_causes(
     probabilities = compute_probabilities(explanations)
     best: dict[tuple[str, ...], RefittedCandidate] = {}
     for item in sorted([*singles, *pairs], key=lambda candidate: -candidate.log_evidence):
+        # Several hypotheses of one cause share its probability; its best fit stands for them in numbers.
         best.setdefault(tuple(sorted(item.causes)), item)
     candidates = tuple(best[keys] for keys, _ in probabilities.ranked if keys in best)
     shares = {item: (rest.explained, rest.explained_with_forms) for item, rest in examined.items()}
@@ -217,6 +222,7 @@ def select_near(base: ModelFit, ranked: list[RefittedCandidate]) -> list[Refitte
     if not ranked:
         return []
     best = min(item.chi2 for item in ranked)
+    # A large effect leaves much in a slightly different form, so what counts as near grows with the effect.
     limit = best + max(NEAR_CHI2, FORM_REST * (base.chi2 - best))
     return [item for item in ranked if item.chi2 < limit or item is ranked[0]]
 
@@ -233,6 +239,7 @@ def _examine(
     if item in examined:
         return
     log.on_progress(f"testing the residuals of {item.label}")
+    # Its own cause is not among the rivals of a refit: another hypothesis of it is one of its forms.
     simulated = simulate_effects(
         problem, item.fit, [other for other in hypotheses if other.key not in item.causes], log
     )
@@ -249,6 +256,7 @@ def _compute_explained_fraction(detection: Detection, reduction: float) -> float
     """Return the share of the excess that a candidate explains: its decrease of χ², relative to that plus the rest."""
     score = detection.scores[0].ratio if detection.scores else 0.0
     degrees = detection.omnibus.degrees
+    # 2.5 σ in the bins and a best score of 12 count as noise; only what exceeds them is a rest.
     remaining = max(0.0, detection.omnibus.chi2 - degrees - 2.5 * np.sqrt(2.0 * degrees), score - 12.0)
     return float(reduction / max(reduction + remaining, 1e-9))
 
@@ -269,23 +277,28 @@ def _list_explanations(
     something = nothing + nominal_detection.omnibus.evidence.log_evidence
     out = [
         Explanation((), log(PRIOR_NO_EFFECT), nothing, degrees),
+        # None of these: the same nominal model, with free means in the bins.
         Explanation((), log(PRIOR_NONE_OF_THESE), something, degrees, own_share=0.0),
     ]
     priors = _Priors(hypotheses)
     refitted = {item.label for item in refits}
     for score in nominal_detection.scores:
         if score.hypothesis.label not in refitted:
+            # By its score, so that a weak candidate costs no fit and still takes its share of the probability.
             evidence = nothing + compute_score_evidence(score.ratio)
             prior, hidden = priors.compute((score.hypothesis,)), compute_hidden_share(score.ratio)
             out.append(Explanation((score.hypothesis.key,), prior, evidence, degrees, hidden=hidden))
     for item in refits:
         prior = priors.compute(item.hypotheses)
+        # A pair's effect is hidden only if both together are.
         hidden = compute_hidden_share(base.chi2 - item.chi2)
         out.append(Explanation(item.causes, prior, item.log_evidence, degrees_of[item], hidden=hidden))
         single, share = _find_sufficient_single(item, refits, examined)
+        # Signals in which the first cause does not act show the second one by itself, which then mends nothing.
         if single is not None and _is_seen_beside(problem, base, single, item, search_log):
             single, share = None, 0.0
         if single is not None:
+            # The pair's fit, counted for its first cause: the second one was one of the catalogue by chance.
             mended = priors.compute(single.hypotheses) + log(OTHER_ODDS * share / priors.catalogue)
             out.append(Explanation(single.causes, mended, item.log_evidence, degrees_of[item]))
         if item not in examined:
@@ -301,6 +314,7 @@ class _Priors:
     """Prior probabilities of causes: shared among the catalogue, and those of one cause among its hypotheses."""
 
     def __init__(self, hypotheses: list[Hypothesis]) -> None:
+        # The prior of a cause must not rise because a recording cannot show the others.
         self.catalogue = len(discover_terms())  # also of a subsystem that few of them act in
         self._forms = Counter(item.key for item in hypotheses)
 
@@ -332,6 +346,7 @@ def _count_degrees(
     """Return the degrees of freedom of the noise between the best refit and each, and the nominal fit (None)."""
     if not refits:
         return {None: count_noise_degrees(problem.data)}
+    # Differences to the best are what probabilities are made of, so the noise must be known there.
     best = max(refits, key=lambda item: item.log_evidence)
     certainty = NoiseCertainty(problem, best.fit)
     return {None: certainty.count_degrees(base)} | {item: certainty.count_degrees(item.fit) for item in refits}
@@ -376,6 +391,7 @@ def _is_seen_beside(
     acting = {
         block.kind
         for block in data.blocks
+        # Exact equality fails: a term may change the integration's steps in signals that it does not act on.
         if not np.allclose(effect[block.part], 0.0, atol=NO_EFFECT_SHARE * float(np.ptp(data.value[block.part])))
     }
     kinds = tuple(kind for kind in data.kinds if kind not in acting)

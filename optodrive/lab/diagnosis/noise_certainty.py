@@ -43,6 +43,7 @@ class NoiseCertainty:
     def __init__(self, problem: FitProblem, best: ModelFit) -> None:
         self._problem = problem
         self._min_degrees = count_noise_degrees(problem.data)
+        # Each change costs a whitening of all data; known noise needs none.
         changes = _list_changes(problem) if self._min_degrees < KNOWN_DEGREES else []
         self._noises = [problem.noise, *(noise for noise, _ in changes)]
         self._degrees = np.array([degrees for _, degrees in changes])
@@ -51,6 +52,7 @@ class NoiseCertainty:
     def count_degrees(self, other: ModelFit) -> float:
         """Return the degrees of freedom: those of the jitters at least, and where the fits do not differ."""
         differences = self._compute_chi2(other) - self._best
+        # Fits that agree have no shares; the fewest degrees are the cautious answer.
         if not len(self._degrees) or differences[0] <= 0.0:
             return self._min_degrees
         shares = np.log(np.maximum(differences[1:] / differences[0], 1e-9)) / LOG_STEP
@@ -77,6 +79,7 @@ def _list_changes(problem: FitProblem) -> list[tuple[NoiseModel, float]]:
         (replace(noise, power_sigma=factor * noise.power_sigma), jitter_degrees),
         (replace(noise, timing_sigma_s=factor * noise.timing_sigma_s), jitter_degrees),
     ]
+    # Only differences between repeats tell the noise: of two runs, one.
     share = data.contrast_count / len(data.runs)
     for kind, coloured in noise.coloured.items():
         blocks = [block for block in data.blocks if block.kind == kind]
@@ -87,6 +90,7 @@ def _list_changes(problem: FitProblem) -> list[tuple[NoiseModel, float]]:
         first, second = coloured.sigma
         changes = (
             (replace(coloured, white=factor * coloured.white), samples),
+            # Slow noise is known by as many values as correlation times fit in, not by samples.
             (replace(coloured, sigma=(factor * first, second)), duration_s / coloured.tau_s[0]),
             (replace(coloured, sigma=(first, factor * second)), duration_s / coloured.tau_s[1]),
         )

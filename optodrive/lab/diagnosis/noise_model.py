@@ -130,6 +130,7 @@ def _whiten(
     for row in range(n):
         if row > 0:
             dt = t_s[row] - t_s[row - 1]
+            # Evenly sampled signals need the exponentials once.
             if abs(dt - known_s) > 1e-9 * dt:
                 a1, a2, known_s = exp(-dt / tau_1), exp(-dt / tau_2), dt
                 co, si = a2 * cos(omega * dt), a2 * sin(omega * dt)
@@ -193,11 +194,14 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
         members = [item for item in contrasts if item.kind == kind]
         windows = find_windows(members) if kind in PIXEL_KINDS else ()
         if not members:
+            # Residuals contain the effect that is sought, so this noise is too large; the report says that it is a
+            # guess.
             members = build_residual_contrasts(data, residual, power, timing, kind)
         values, span = _collect_values(data, data.value - residual, kind)
         quanta[kind] = _find_quantum(values)
         coloured[kind] = _fit_coloured(members, estimate_resolution(values, span), windows)
     if not contrasts:
+        # Without repeats jitters cannot be estimated; these are guesses.
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
     power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(contrasts, coloured, data.kinds)
     if not repeats_differ:
@@ -220,6 +224,7 @@ def _compute_replicate_excess(contrasts: list[Contrast], model: NoiseModel) -> f
     largest = 0.0
     for kind in {item.kind for item in contrasts if item.kind in PIXEL_KINDS}:
         found = [_compute_excess(item, model) for item in contrasts if item.kind == kind]
+        # The median: one run that truly differs must not excuse itself by its own correlations.
         correlations = np.median([correlation for _, correlation in found], axis=0)
         largest = max(largest, max(excess for excess, _ in found) / sqrt(1.0 + 2.0 * float((correlations**2).sum())))
     return largest
@@ -281,9 +286,11 @@ def _fit_coloured(contrasts: list[Contrast], resolution: float, windows: Windows
     differences = np.concatenate([np.diff(item.value) for item in contrasts])
     std = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
     std = max(std, resolution)
+    # Differences of neighbours hold no slow noise, and the median no missed pulse.
     white = min(std, float(1.4826 * np.median(np.abs(differences)) / sqrt(2.0)) + 1e-3 * std)
     white = max(white, resolution)
     dt_s = float(np.median(np.concatenate([np.diff(item.t_s) for item in contrasts])))
+    # Projected out rather than with a prior: their sizes are not known before the noise is.
     stacked = [(item.t_s, np.column_stack([item.value, _normalize_columns(item.jitter)])) for item in contrasts]
 
     def decode(x: FloatArray) -> ColouredNoise:
@@ -306,14 +313,17 @@ def _fit_coloured(contrasts: list[Contrast], resolution: float, windows: Windows
             total += float(
                 (gram[:, 0, 0] - (right * np.linalg.solve(inner, right[:, :, None])[:, :, 0]).sum(axis=1)).sum()
             )
+            # The restricted likelihood: without it, noise that looks like a jitter would be estimated too small.
             total += float(np.linalg.slogdet(inner)[1].sum())
         # Weak priors regularise parameters that the data does not determine.
         return total + 0.02 * float((x[:5] ** 2).sum()) + 1e3 * float(np.maximum(0.0, np.abs(x[:5]) - 8.0).sum())
 
     smooth_start = np.array([-0.1, -0.7, -1.0, 1.0, 3.0])
     smooth = _minimize(cost, smooth_start, 0.7, 220)
+    # A frequency must start near its line: Nelder-Mead finds no narrow minimum by itself.
     oscillatory_start = np.array([-0.1, -1.5, -0.7, 2.0, 2.5, log(_find_dominant_omega(contrasts, dt_s))])
     oscillatory = _minimize(cost, oscillatory_start, 0.4, 260)
+    # It has a number more, and white noise has some largest line by chance.
     best = oscillatory if cost(oscillatory) < cost(smooth) - 6.0 else smooth
     return replace(decode(best), windows=windows)
 
@@ -333,11 +343,13 @@ def _find_dominant_omega(contrasts: list[Contrast], dt_s: float) -> float:
             power += np.abs(np.fft.rfft((segment - segment.mean()) * np.hanning(count))) ** 2
     if not power.any():
         return 0.2 * pi / dt_s
+    # Relative to its neighbourhood, else slow noise, always the largest, would win.
     smooth = np.convolve(np.log(power[2:] + EPS * power.max()), np.ones(5) / 5, mode="same")
     return float((2 + int(np.argmax(smooth[2:-2])) + 2) * 2.0 * pi / (count * dt_s))
 
 
 def _normalize_columns(jitter: FloatArray) -> FloatArray:
+    # A jitter to which a signal does not respond has no column.
     size = np.sqrt((jitter**2).sum(axis=0))
     return np.asarray(jitter[:, size > 0] / size[size > 0])
 
@@ -360,6 +372,7 @@ def _fit_jitter(
             gram[np.ix_(indices, indices)] += small[:3, :3]
             right[indices] += small[:3, 3]
         grams.append((gram, right))
+    # Also the centre of the weak prior: with one pair of repeats the estimate could be anything.
     start = np.log(np.array([0.005, 2e-5, *(coloured[kind].white for kind in kinds)]))
 
     def cost(x: FloatArray) -> float:

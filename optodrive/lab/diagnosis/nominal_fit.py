@@ -33,10 +33,12 @@ def fit_nominal(
     min_timing_sigma_s: lower limit of the timing jitter, from other signals; shared: known terms of the clock
     that all signals share
     """
+    # The noise needs the jitters' sensitivities, these a fit, and a fit some noise.
     crude_noise = _estimate_crude_noise(data)
     problem = FitProblem(data, crude_noise, prior, epsilon)
     trials = [
         fit(problem, ParameterPoint((float(np.log(r)), *prior.mean[1:]), shared or {}), iterations=3)
+        # From one start the fit may end with a wrong pair of R and C, of equal time constant.
         for r in R_STARTS_K_PER_W
     ]
     base = fit(problem, min(trials, key=lambda item: item.chi2).point, iterations=10)
@@ -66,6 +68,7 @@ def _raise_mirror_noise(data: Dataset, coloured: dict[int, ColouredNoise]) -> di
     for kind in MIRROR_KINDS:
         if kind in out:
             span = float(np.ptp(np.concatenate([data.value[b.part] for b in data.blocks if b.kind == kind])))
+            # A mirror at rest is measured so precisely that the model of its servo would have to be exact.
             out[kind] = replace(out[kind], white=float(np.hypot(out[kind].white, MIRROR_NOISE_FRACTION * span)))
     return out
 

@@ -50,6 +50,7 @@ def run_tasks(
             run = partial(_run_on_processes, workers or len(os.sched_getaffinity(0)))
         else:
             run = partial(_run_on_dask, _connect(address, stack))
+        # Alone and last: a task that costs its worker must not take the others' time or memory.
         lost = []
         for task, result, error in run(function, tasks):
             if error == LOST:
@@ -124,6 +125,7 @@ def _run_on_dask(
     """Run tasks on a cluster. Raise OptodriveError if its scheduler is lost or suspended."""
     from distributed import KilledWorker, as_completed
 
+    # pure=False: equal tasks are computed again, and no old result of this cluster is taken.
     futures = {client.submit(function, task, pure=False): task for task in tasks}
     completed, check_at_s = as_completed(list(futures), loop=client.loop), time.monotonic() + CHECK_PERIOD_S
     timeout_s = IMPORT_TIMEOUT_S
@@ -131,6 +133,7 @@ def _run_on_dask(
         while futures:
             while not completed.has_ready():
                 time.sleep(POLL_S)
+                # Futures of a suspended scheduler never end, and nothing tells so but a question.
                 if time.monotonic() > check_at_s:
                     _check_scheduler(client, timeout_s)
                     timeout_s, check_at_s = CHECK_TIMEOUT_S, time.monotonic() + CHECK_PERIOD_S
@@ -148,6 +151,7 @@ def _run_on_dask(
                 yield task, None, LOST if isinstance(error, KilledWorker) else text
     finally:
         if futures:
+            # Also after an interrupt, else the cluster computes on for nobody.
             client.cancel(list(futures), force=True)
 
 

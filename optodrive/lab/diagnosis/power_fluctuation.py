@@ -51,6 +51,7 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
             gram[np.ix_(indices, indices)] += whitened.T @ whitened
         inner = gram[count:, count:] + np.eye(size)
         projected = gram[:count, :count] - gram[:count, count:] @ np.linalg.solve(inner, gram[count:, :count])
+        # The score of a variance at zero: it needs no fit of the fluctuation, which nobody would use.
         excess += float((projected[1:, 0] ** 2).sum() - np.trace(projected[1:, 1:]))
         variance += 2.0 * float((projected[1:, 1:] ** 2).sum())
     return excess / float(np.sqrt(variance)) if variance > 0.0 else 0.0

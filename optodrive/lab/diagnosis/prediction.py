@@ -41,12 +41,15 @@ def predict(
     Raises DivergedError if a term is too fast for the integrator, a state leaves its range, or a sample is no number.
     """
     out = np.zeros(len(data.value))
+    # All heat is proportional to the absorbed share, so a power factor needs no other pulses.
     pixel = point.pixel(epsilon * power_factor)
     terms = [(all_terms()[key], values) for key, values in point.terms.items()]
     delays_s = BySignal(*(delay_s + sum(each) for each in _transpose([t.signal_delays(v) for t, v in terms])))
     rates = BySignal(*(sum(each) for each in _transpose([t.signal_rates(v) for t, v in terms])))
+    # Before the integration, which would take forever with one too short.
     check_time_constants(point.terms)
     active = ActiveTerms.from_values(point.terms)
+    # Repeats then differ, and each is integrated on its own.
     if any(term.varies_between_runs for term, _ in terms):
         for experiment, numbers in data.experiments:
             signals = simulate_signals(_time_truly(experiment, rates), pixel, active, delays_s[:3])
@@ -68,6 +71,7 @@ def predict(
             column = commands[:, 1 + MIRROR_KINDS.index(block.kind)]
             t_s = block.t_s / (1.0 + rates.mirrors) - delays_s.mirrors
             out[block.part] = simulate_servo(commands[:, 0], column, t_s, servo)
+    # One sample that is no number would make every χ² of this fit none.
     if not np.isfinite(out).all():
         raise DivergedError(", ".join(point.terms) or "the nominal model", Unquoted("no number"), "finite predictions")
     return out

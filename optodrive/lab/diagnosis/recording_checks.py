@@ -170,6 +170,7 @@ def check_recording_units(measurement: Measurement, pixel: Pixel, place: str = "
         for name in LENGTHS:
             length = run.attributes.get(name)
             if isinstance(length, int | float):
+                # Lengths first: they are stated, and no response is needed to judge them.
                 check_plausible(f"{where}: {name}", float(length), PLAUSIBLE[name])
         if len(run.pulses):
             check_plausible(f"{where}/pulses: power_W", float(run.pulses[:, 2].max()), PLAUSIBLE["pulses.power_W"])
@@ -206,6 +207,7 @@ def _check_pixel_signal(
             _refuse(f"{where}/{quantity}", "times that do not suit the response", "s", likely.unit)
         if stated > SHAPE_AGREES and ratio > MAX_RATIO:
             _refuse_size(f"{where}/{name}", f"a response {ratio:.3g} times too large", ratio, UNITS[name])
+        # The size of a response says nothing about units while its shape disagrees.
         if stated <= SHAPE_AGREES:
             ratio = None
     if name in CHANGE_SIGNALS:
@@ -221,6 +223,7 @@ def _find_time_units(
 ) -> _TimeUnits | None:
     """Return other units that explain the signal much better than the stated ones, with any clock offset, do."""
     is_long = float(pulses[:, 1].max()) > LONG_PULSE_S
+    # Ten other units and 21 offsets are the cost of this check; a match needs none of them.
     if stated >= SHAPE_CERTAIN and not is_long:
         return None
     margin = SHAPE_DISAGREES_LONG if is_long else SHAPE_DISAGREES
@@ -228,6 +231,7 @@ def _find_time_units(
     explained, likely = max(trials, key=lambda item: item[0])
     if explained <= SHAPE_AGREES or 1.0 - explained >= margin * (1.0 - stated):
         return None
+    # A late clock is a cause to diagnose, and must not be refused as a wrong unit.
     shifted = max(_compare(name, pixel, pulses, t_s - late_s, value)[0] for late_s in CLOCK_OFFSETS_S)
     return likely if 1.0 - explained < margin * (1.0 - shifted) else None
 

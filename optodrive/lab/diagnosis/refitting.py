@@ -64,6 +64,7 @@ def refit_strongest(
     scores, fits = detection.scores[:count], list[tuple[Score, ModelFit]]()
     chi2_abandon = np.inf
     for score in scores:
+        # Scores are sorted, so all others are weaker too.
         if score.ratio <= max(MIN_RATIO, 0.05 * scores[0].ratio):
             break
         log.on_progress(f"fitting {score.hypothesis.label}")
@@ -76,13 +77,16 @@ def refit_strongest(
         except UNCOMPUTABLE as error:
             log.add_failure(score.hypothesis.label, error)
             continue
+        # By its score this hypothesis reaches a lower χ²: a fit that ends above it has missed its minimum.
         tolerance = max(CHI2_UNCONVERGED, UNCONVERGED_SHARE * score.ratio)
         if _is_within_ranges(score) and result.chi2 > detection.residual_chi2 - score.ratio + tolerance:
             result = _retry(problem, base, score.hypothesis, free, result)
+        # The abandoned ones too: they count by the χ² at which they were left.
         fits.append((score, result))
         chi2_abandon = min(chi2_abandon, result.chi2 + CHI2_ABANDON)
     candidates = []
     for score, result in fits:
+        # After all fits, when the limit is known: settling costs as much as the fit.
         settled = _settle(problem, result) if result.chi2 < chi2_abandon else result
         evidence = compute_log_evidence(problem, settled, settled.chi2)
         candidates.append(RefittedCandidate((*given, score.hypothesis), settled, settled.chi2, evidence))
@@ -105,6 +109,7 @@ def _retry(
     """Return the best fit from the nearest starts of the hypothesis, each abandoned where it stays above the best."""
     if hypothesis.fit_every_start:
         return result
+    # Only a better χ² replaces the result, so a retry never makes a fit worse.
     for point in _select_nearest_starts(problem, base, hypothesis)[:MAX_RETRIES]:
         with suppress(*UNCOMPUTABLE):
             result = min(result, fit(problem, point, free, chi2_abandon=result.chi2), key=lambda item: item.chi2)
@@ -134,6 +139,7 @@ def refit_pairs(
     candidates: list[RefittedCandidate] = []
     for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
         others = [item for item in hypotheses if item.key not in first.causes]
+        # The best single was examined already.
         detection = residual_detection if row == 0 else detect(problem, first.fit, others, log)
         candidates += refit_strongest(problem, first.fit, first.hypotheses, detection, log, MAX_SECOND_CAUSES)
     unique: dict[frozenset[str], RefittedCandidate] = {}
@@ -157,6 +163,7 @@ def refit_alone(
     chi2_abandon = min(item.chi2 for item in singles) + CHI2_ABANDON
     for item in pair.hypotheses:
         log.on_progress(f"fitting {item.label} again")
+        # The base parameters of the pair too: beside them its cause lies in the right minimum.
         point = ParameterPoint(pair.fit.point.base, {**base.point.terms, item.key: pair.fit.point.terms[item.key]})
         free = (*base.free, *item.free)
         try:
@@ -181,6 +188,7 @@ def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
             values[free.names[0]] = min(max(number, free.parameter.low), free.parameter.high)
         return ParameterPoint(point.base, {**point.terms, item.key: values})
     free = item.free[0]
+    # Beyond these factors an effect is not proportional to such a number, and the start would leave its valley.
     scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], *AMPLITUDES))
     value = score.start[free.names[0]] * scale
     return ParameterPoint(point.base, free.with_value(terms, float(np.log(value)) if free.logarithmic else value))
@@ -190,6 +198,8 @@ def _refit_every_start(
     problem: FitProblem, base: ModelFit, item: Hypothesis, free: Sequence[FreeParameter]
 ) -> ModelFit:
     """Return the best fit from the nearest starts, each begun again at its end until χ² is stationary."""
+    # Jitter acts along the derivatives at the start of a fit: along wrong ones a servo's delay passes for a lower
+    # bandwidth.
     fits = (_settle(problem, fit(problem, point, free)) for point in _select_nearest_starts(problem, base, item))
     return min(fits, key=lambda item: item.chi2)
 
@@ -200,6 +210,7 @@ def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis
 
     def cost(point: ParameterPoint) -> float:
         residual = problem.data.value - predict(problem.data, point, problem.epsilon)
+        # Without jitters: their sensitivities cost three predictions for each of many starts, which only need an order.
         return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total[0, 0])
 
     points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: values}) for values in item.starts)

@@ -61,11 +61,13 @@ def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, ti
                 commands = data.runs[number].commands
                 if kind in MIRROR_KINDS and commands is not None:
                     common = _select_settled(members[0].t_s, common, commands[:, 0])
+                # Helmert's contrasts of one group are independent of each other, which plain differences are not.
                 scale = sqrt(later / (later + 1.0))
                 weights = [*([scale / later] * later), -scale]
                 rows = [member.part.start + picked for member, picked in zip(members, common, strict=True)]
                 value = sum(w * residual[r] for w, r in zip(weights, rows, strict=True))
                 last, block, t_s = rows[-1], blocks[number, kind, pixel], members[-1].t_s[common[-1]]
+                # With the mean residual, jitters act along the measured trace, also where the model misses it.
                 mean = np.mean([residual[r] for r in rows], axis=0)
                 missed = np.gradient(mean, t_s)
                 jitter = np.stack([power[last] + mean, timing[last] - missed, np.ones(len(last))], axis=1)
@@ -80,6 +82,7 @@ def _select_settled(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray
     times = t_s[common[0]]
     row = np.searchsorted(steps_s, times, side="right") - 1
     is_settled = (row < 0) | (times - steps_s[np.maximum(row, 0)] > MIRROR_SETTLED_S)
+    # A recording of moving mirrors only keeps them: a noise too large is better than none.
     return [rows[is_settled] for rows in common] if is_settled.sum() >= 16 else common
 
 
@@ -89,6 +92,7 @@ def _find_common_rows(first: FloatArray, others: list[FloatArray]) -> list[IntAr
     These are times that all axes share to 0.1 µs. Free-running instruments share none: then each sample belongs to the
     nearest one of the first axis, within half an interval. What the residuals change by in this time counts as noise.
     """
+    # Equality of floating-point times would fail in the last digit.
     keys = [np.round(times * 1e7).astype(np.int64) for times in (first, *others)]
     shared = keys[0]
     for key in keys[1:]:
@@ -135,6 +139,7 @@ def find_windows(contrasts: list[Contrast]) -> Windows:
     classes: dict[int, list[tuple[float, FloatArray]]] = {}
     for item in contrasts:
         interval_s = float(np.median(np.diff(item.t_s)))
+        # Jitters are smooth, and would pass for noise that was filtered.
         values = item.value - item.jitter @ np.linalg.lstsq(item.jitter, item.value, rcond=None)[0]
         classes.setdefault(round(4.0 * np.log2(interval_s)), []).append((interval_s, values))
     return tuple(
@@ -146,6 +151,7 @@ def find_windows(contrasts: list[Contrast]) -> Windows:
 def _count_smooth(members: list[tuple[float, FloatArray]]) -> int:
     """Return the number of samples, a power of two, at which the noise of these contrasts stops to be smooth."""
     count, longest = 1, max(len(values) for _, values in members)
+    # Longer windows would leave too few means to estimate the noise from.
     while count < min(MAX_WINDOW, longest // 8):
         steps = (count, 2 * count)
         spreads = [

@@ -256,13 +256,18 @@ UNJUDGED = Claim("unexplained")
 def claim(evidence: Evidence) -> Claim:
     """Return the strongest claim that the evidence permits."""
     probabilities = evidence.probabilities
+    # First: the probabilities then are of nothing.
     if evidence.repeats_differ:
         return Claim("unexplained", reasons=("Repeats differ by more than noise, so nothing was compared.",))
+    # Above 5 % nothing is named, however probable one cause is among the rest: between 5 and 90 % the answer is
+    # "undecided".
     if probabilities.no_effect > MAX_NO_EFFECT:
         return _claim_nothing(probabilities)
     ranked = evidence.alternatives
+    # No cause is named that is less probable than something unknown.
     if not ranked or probabilities.none_of_these > max(probabilities.causes[_sort(item.causes)] for item in ranked):
         return Claim("unexplained")
+    # Probable is not enough: a cause that fails a condition is refused here, and its reason is part of the answer.
     certain = _find_certain(evidence)
     listed = _list_ambiguous(evidence) if certain is None else [certain]
     refusals = {item.causes: _list_refusals(item) for item in listed}
@@ -291,6 +296,8 @@ def combine_claims(claims: Sequence[Claim], failures: Mapping[str, str], has_dis
     """
     verdicts = {item.verdict for item in claims}
     verdicts |= ({"incomplete"} if failures else set()) | ({"instrument"} if has_disturbances else set())
+    # A failed hypothesis turns "none" into "incomplete", and leaves a named cause: what was not computed can only add
+    # doubt.
     verdict = next(each for each in WORST_FIRST if each in verdicts)
     names = verdict in ("ambiguous", "cause")
     sets = tuple(keys for item in claims for keys in item.sets) if names else ()
@@ -298,6 +305,7 @@ def combine_claims(claims: Sequence[Claim], failures: Mapping[str, str], has_dis
 
 
 def _claim_nothing(probabilities: Probabilities) -> Claim:
+    # "None" is a claim, too, and needs its own evidence: a recording with much noise shows nothing at all.
     if probabilities.no_effect >= MIN_NO_EFFECT:
         return Claim("none")
     reason = (
@@ -313,6 +321,7 @@ def _find_certain(evidence: Evidence) -> Alternative | None:
     probabilities = evidence.probabilities
     keys = {key for item in evidence.alternatives for key in item.causes}
     named = tuple(sorted(key for key in keys if probabilities.sum_of(key) >= MIN_NAMED))
+    # Each key may be certain while the set is not: another cause, in most of the probability, is missing from it.
     if not evidence.has_repeats or probabilities.causes.get(named, 0.0) < MIN_ALONE:
         return None
     return next((item for item in evidence.alternatives if _sort(item.causes) == named), None)
@@ -324,6 +333,7 @@ def _list_ambiguous(evidence: Evidence) -> list[Alternative]:
     total = 0.0
     for item in evidence.alternatives[:MAX_AMBIGUOUS]:
         probability = evidence.probabilities.causes[_sort(item.causes)]
+        # The first is listed always, so that an ambiguity names something.
         if total >= MIN_NAMED or (listed and probability < MIN_LISTED):
             break
         total += probability
