@@ -99,7 +99,7 @@ class AsyncDisplay(DisplayOperations):
             return await super().arm()
         self._record_emission()
         held = AsyncHold(self._client.endpoint)
-        await held.open()
+        await held.__aenter__()
         self._hold = held
         return await self.state()
 

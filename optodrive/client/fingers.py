@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.problems import build_error
-from optodrive.client.sockets import LoopThread, open_connection
+from optodrive.client.sockets import BlockingConnection, open_connection
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.numeric_tables import read_columns
 from optodrive.core.toml_model import build_input_error
@@ -69,28 +69,14 @@ class AsyncFingers:
 
 
 @check_keywords
-class Fingers:
-    """A tracker's connection. `Display.fingers()` builds one: `with display.fingers() as fingers: fingers.send(…)`."""
+class Fingers(BlockingConnection[AsyncFingers]):
+    """A tracker's connection. `Display.fingers()` builds one: `with display.fingers() as fingers: fingers.send(…)`.
+
+    The daemon knows of no finger once it is closed.
+    """
 
     def __init__(self, endpoint: Endpoint) -> None:
-        self._fingers = AsyncFingers(endpoint)
-        self._loop = LoopThread("fingers")
-        try:
-            self._loop.run(self._fingers.__aenter__())
-        except BaseException:
-            self._loop.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *details: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the connection: the daemon then knows of no finger."""
-        self._loop.run(self._fingers.close())
-        self._loop.close()
+        super().__init__(AsyncFingers(endpoint), "fingers")
 
     def send(self, places: Sequence[FingerPlace], age_s: float = 0.0) -> None:
         """Report all fingertips, none if there is none. age_s: time since they were there.
@@ -98,7 +84,7 @@ class Fingers:
         Raise LinkError without a connection, and InputError for a place that the display cannot have. Raise BusyError,
         once, if places before these waited too long to count: the next ones may be sent, less often.
         """
-        self._loop.run(self._fingers.send(places, age_s))
+        self._loop.run(self._connection.send(places, age_s))
 
 
 COLUMNS = ("time_s", "number", "x_m", "y_m", "radius_m")

@@ -8,7 +8,7 @@ from websockets.exceptions import ConnectionClosed
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.problems import build_error
-from optodrive.client.sockets import LoopThread, open_connection
+from optodrive.client.sockets import BlockingConnection, open_connection
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.daemon.responses.messages import HoldReport
 
@@ -22,7 +22,7 @@ CONNECTION_LOST = "the connection to the daemon was lost"
 
 
 class AsyncHold:
-    """Arming of the board that ends, dark, with `close`, or with the process. `open` arms.
+    """Arming of the board that ends, dark, with `close`, or with the process. Entering it arms.
 
     A task sends the beats, so that a loop that is blocked for a second lets go, too.
 
@@ -37,7 +37,7 @@ class AsyncHold:
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
-    async def open(self) -> None:
+    async def __aenter__(self) -> Self:
         """Arm the board. Raise NotReadyError or BoardFaultError if that is refused."""
         self._task = asyncio.create_task(self._run())
         while not self._is_armed and self._error is None:
@@ -45,6 +45,7 @@ class AsyncHold:
         if self._error is not None:
             await self.close()
             raise self._error
+        return self
 
     async def wait(self) -> str:
         """Wait until the arming ends, and return the reason."""
@@ -98,36 +99,20 @@ class AsyncHold:
         self._changed.set()
 
 
-class Hold:
+class Hold(BlockingConnection[AsyncHold]):
     """Arming of the board that ends, dark, with this object's `close`, or with the process.
 
     Building it arms the board; raise NotReadyError or BoardFaultError if that is refused. A thread sends the beats.
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
-        self._hold, self._loop = AsyncHold(endpoint), LoopThread("hold")
-        try:
-            self._loop.run(self._hold.open())
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *details: object) -> None:
-        self.close()
+        super().__init__(AsyncHold(endpoint), "hold")
 
     @property
     def reason(self) -> str:
         """Cause of the end of the arming, '' while it lasts."""
-        return self._hold.reason
+        return self._connection.reason
 
     def wait(self) -> str:
         """Wait until the arming ends, and return the reason."""
-        return self._loop.run(self._hold.wait())
-
-    def close(self) -> None:
-        """Let go: the daemon disarms the board."""
-        self._loop.run(self._hold.close())
-        self._loop.close()
+        return self._loop.run(self._connection.wait())

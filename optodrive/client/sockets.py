@@ -12,7 +12,7 @@ from concurrent.futures import CancelledError
 from contextlib import AsyncExitStack, suppress
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
@@ -21,6 +21,7 @@ from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import run_blocking
 from optodrive.client.problems import parse_problem
 from optodrive.core.errors import OptodriveError
+from optodrive.core.types.push_options import check_keywords
 
 OPEN_TIMEOUT_S = 2.5
 CLOSE_TIMEOUT_S = 0.5
@@ -161,6 +162,42 @@ class _Call(Generic[T]):
             answer = error
         self._task = None
         self.answers.put(answer)
+
+
+class AsyncConnection(Protocol):
+    """A connection that opens when entered."""
+
+    async def __aenter__(self) -> object: ...
+
+    async def close(self) -> None:
+        """Close the connection."""
+
+
+Connection = TypeVar("Connection", bound=AsyncConnection)
+
+
+@check_keywords
+class BlockingConnection(Generic[Connection]):
+    """A connection whose loop runs in a thread of its own. Building it opens the connection."""
+
+    def __init__(self, connection: Connection, name: str) -> None:
+        self._connection, self._loop = connection, LoopThread(name)
+        try:
+            self._loop.run(connection.__aenter__())
+        except BaseException:
+            self.close()  # also after Ctrl-C while it opens: what was opened must not outlive this object
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection, and end its thread."""
+        self._loop.run(self._connection.close())
+        self._loop.close()
 
 
 async def _end_others() -> None:

@@ -17,7 +17,7 @@ from optodrive.client.exchange import RETRY_S, RETRY_TIMEOUT_MIN_S
 from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
 from optodrive.client.http import PROBE, PROBE_PERIOD_S, PROBE_TIMEOUT_S
 from optodrive.client.problems import build_error
-from optodrive.client.sockets import OPEN_TIMEOUT_S, LoopThread, open_connection
+from optodrive.client.sockets import OPEN_TIMEOUT_S, BlockingConnection, open_connection
 from optodrive.core.errors import LinkError, NotReadyError, RefusedError
 from optodrive.core.types.push_options import Policy, check_keywords
 from optodrive.daemon.responses.messages import FrameResult
@@ -242,8 +242,11 @@ class AsyncStream:
 
 
 @check_keywords
-class Stream:
-    """An open stream. `Display.stream()` builds one. A broken connection is restored at the next frame."""
+class Stream(BlockingConnection[AsyncStream]):
+    """An open stream. `Display.stream()` builds one. A broken connection is restored at the next frame.
+
+    Once it is closed, the daemon drops the pulses that are not yet committed to the board.
+    """
 
     def __init__(
         self,
@@ -257,24 +260,7 @@ class Stream:
         async def get_layout() -> PixelLayout:
             return layout
 
-        self._stream = AsyncStream(endpoint, get_layout, policy, standing, reconnect_timeout_s, on_send)
-        self._loop = LoopThread("stream")
-        try:
-            self._loop.run(self._stream.__aenter__())
-        except BaseException:
-            self._loop.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *details: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the stream. The daemon drops the pulses that are not yet committed to the board."""
-        self._loop.run(self._stream.close())
-        self._loop.close()
+        super().__init__(AsyncStream(endpoint, get_layout, policy, standing, reconnect_timeout_s, on_send), "stream")
 
     def send(self, heights_um: HeightsLike) -> int:
         """Show a frame in place of the uncommitted rest of the previous one. Return its number.
@@ -282,20 +268,20 @@ class Stream:
         LinkError if the daemon does not answer or cannot be reached again. The board of a restarted daemon is not
         armed; frames are then refused until somebody arms it. NotReadyError after `close`.
         """
-        return self._loop.run(self._stream.send(heights_um))
+        return self._loop.run(self._connection.send(heights_um))
 
     def results(self) -> list[FrameResult]:
         """Return the results since the last call, in order.
 
         Of results that nobody reads the newest 1,000 are kept, about 500 frames; `counts` counts all.
         """
-        return self._loop.run(self._stream.results())
+        return self._loop.run(self._connection.results())
 
     @property
     def counts(self) -> FrameCounts:
         """Number of frames shown and superseded so far. Every final result counts, also one that `results` drops."""
-        return self._stream.counts
+        return self._connection.counts
 
     def wait(self, frame: int | None = None, timeout_s: float = RESULT_TIMEOUT_S) -> FrameResult:
         """Wait for the final result of a frame, by default the last one sent. Raise its error if it failed."""
-        return self._loop.run(self._stream.wait(frame, timeout_s))
+        return self._loop.run(self._connection.wait(frame, timeout_s))

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from contextlib import suppress
 from ipaddress import AddressValueError, IPv6Address
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
@@ -31,6 +31,8 @@ class LaserDac(ABC):
         self.firmware = ""
         self.identity: str | None = None
         self._clock = clock
+        self._link: Any = None
+        """The open connection, of the kind that the driver uses."""
 
     def __enter__(self) -> Self:
         """Open the DAC."""
@@ -58,9 +60,21 @@ class LaserDac(ABC):
         """Return the identity of the open DAC. Wait for it where it comes by itself."""
         return self.identity
 
-    @abstractmethod
     def close(self) -> None:
         """Stop and release the DAC. Raise LinkError if it may not have received the stop. Do nothing if closed."""
+        if self._link is None:
+            return
+        try:
+            self.stop()
+        finally:
+            self._release()
+
+    def _release(self) -> None:
+        """Close the connection, if there is one."""
+        link, self._link = self._link, None
+        if link is not None:
+            with suppress(OSError):
+                link.close()
 
     @abstractmethod
     def stop(self) -> None:

@@ -48,7 +48,6 @@ class EtherDream(LaserDac):
     ) -> None:
         super().__init__(board, clock)
         self._connect, self._hear = connect, hear
-        self._stream: Any = None
         self._begun = False
         self._protocol = 0
 
@@ -60,8 +59,8 @@ class EtherDream(LaserDac):
         address = parse_address(self.board.port, wire.TCP_PORT)
         self.name = f"Ether Dream at {self.board.port}"
         try:
-            self._stream = self._connect(address, timeout=CONNECT_TIMEOUT_S)
-            self._stream.settimeout(ANSWER_TIMEOUT_S)
+            self._link = self._connect(address, timeout=CONNECT_TIMEOUT_S)
+            self._link.settimeout(ANSWER_TIMEOUT_S)
         except OSError as error:
             raise LinkError(f"no Ether Dream answers at {self.board.port}: {error.strerror or error}") from None
         try:
@@ -78,26 +77,11 @@ class EtherDream(LaserDac):
 
     def find_identity(self) -> str | None:
         """Return its hardware address, which it broadcasts once per second and never tells its client."""
-        if self.identity is None and self._stream is not None:
+        if self.identity is None and self._link is not None:
             with suppress(OSError):  # a lost link, which the next command meets
-                self.identity = self._hear(self._stream.getpeername()[0], self._clock)
+                self.identity = self._hear(self._link.getpeername()[0], self._clock)
             self.name = self.identity or self.name
         return self.identity
-
-    def close(self) -> None:
-        """Stop and release the DAC. Raise LinkError if it may not have received the stop. Do nothing if closed."""
-        if self._stream is None:
-            return
-        try:
-            self.stop()
-        finally:
-            self._release()
-
-    def _release(self) -> None:
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            with suppress(OSError):
-                stream.close()
 
     def stop(self) -> None:
         """Stop playback. Raise LinkError if the DAC may not have received the stop."""
@@ -148,10 +132,10 @@ class EtherDream(LaserDac):
 
     def _ask(self, command: bytes, body: bytes = b"") -> tuple[bytes, Status]:
         """Send a command and return the answer to it with the status."""
-        if self._stream is None:
+        if self._link is None:
             raise LinkError("the Ether Dream is not open")
         try:
-            self._stream.sendall(command + body)
+            self._link.sendall(command + body)
         except OSError as error:
             raise LinkError(f"link to the Ether Dream lost: {error.strerror or error}") from None
         return self._read_answer(command)
@@ -160,7 +144,7 @@ class EtherDream(LaserDac):
         data = b""
         while len(data) < wire.ANSWER_BYTES:
             try:
-                received = self._stream.recv(wire.ANSWER_BYTES - len(data))
+                received = self._link.recv(wire.ANSWER_BYTES - len(data))
             except OSError as error:  # also a time-out, whose late answer would be taken for the next one's
                 self._release()
                 raise LinkError(f"link to the Ether Dream lost: {error.strerror or error}") from None

@@ -53,7 +53,6 @@ class Helios(LaserDac):
     def __init__(self, board: BoardSection, clock: Clock, backend: Any = None) -> None:
         super().__init__(board, clock)
         self._backend = backend
-        self._device: Any = None
         self._answer_pending = False
 
     def open(self) -> None:
@@ -89,7 +88,7 @@ class Helios(LaserDac):
 
     def _claim(self, device: Any) -> None:
         """Claim, identify and stop a device."""
-        self._device = device
+        self._link = device
         try:
             with guard_opening("the Helios", "board"):
                 self._identify()
@@ -98,27 +97,18 @@ class Helios(LaserDac):
             raise
 
     def _identify(self) -> None:
-        usb.util.claim_interface(self._device, INTERFACE)
-        self._device.set_interface_altsetting(INTERFACE, ALTERNATE_SETTING)
+        usb.util.claim_interface(self._link, INTERFACE)
+        self._link.set_interface_altsetting(INTERFACE, ALTERNATE_SETTING)
         self._clock.sleep(ENABLE_DELAY_S)
         self._drain()
         self.firmware = str(int.from_bytes(self._query(VERSION, 4)[:4], "little"))
         self._command(HOST_VERSION, PROTOCOL_VERSION)
         self.name = escape_unprintable(self._query(NAME, 1).split(b"\0")[0].decode("ascii", "replace"))
-        self.identity = read_serial_number(self._device) or ANY
+        self.identity = read_serial_number(self._link) or ANY
         self.stop()
 
-    def close(self) -> None:
-        """Stop and release the DAC. Raise LinkError if it may not have received the stop. Do nothing if closed."""
-        if self._device is None:
-            return
-        try:
-            self.stop()
-        finally:
-            self._release()
-
     def _release(self) -> None:
-        device, self._device = self._device, None
+        device, self._link = self._link, None
         with suppress(Exception):  # the alternate setting without endpoints also stops it
             device.set_interface_altsetting(INTERFACE, 0)
         with suppress(Exception):
@@ -182,16 +172,16 @@ class Helios(LaserDac):
             raise LinkError("link to the Helios lost: it accepted half a command")
 
     def _write(self, endpoint: int, data: bytes, timeout_s: float) -> int:
-        if self._device is None:
+        if self._link is None:
             raise LinkError("the Helios is not open")
         with guard_port("the Helios"):
-            written_bytes: int = self._device.write(endpoint, data, timeout_ms(timeout_s))
+            written_bytes: int = self._link.write(endpoint, data, timeout_ms(timeout_s))
             return written_bytes
 
     def _read_answer(self, timeout_s: float = ANSWER_TIMEOUT_S) -> bytes:
         """Return one answer. Raise USBTimeoutError without an answer, LinkError if the link fails."""
         try:
-            return bytes(self._device.read(ANSWER_ENDPOINT, ANSWER_BYTES, timeout_ms(timeout_s)))
+            return bytes(self._link.read(ANSWER_ENDPOINT, ANSWER_BYTES, timeout_ms(timeout_s)))
         except usb.core.USBTimeoutError:
             raise
         except Exception as error:

@@ -7,7 +7,6 @@ it twice.
 
 import socket
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 from optodrive.core.clock import Clock
@@ -43,7 +42,6 @@ class Idn(LaserDac):
     def __init__(self, board: BoardSection, clock: Clock, connect: Callable[..., Any] = open_udp) -> None:
         super().__init__(board, clock)
         self._connect = connect
-        self._radio: Any = None
         self._sequence = 0
         self._end_s = 0.0
 
@@ -54,7 +52,7 @@ class Idn(LaserDac):
         """
         address = parse_address(self.board.port, wire.UDP_PORT)
         try:
-            self._radio = self._connect(address)
+            self._link = self._connect(address)
         except OSError as error:
             raise LinkError(f"no IDN device answers at {self.board.port}: {error.strerror or error}") from None
         try:
@@ -77,20 +75,6 @@ class Idn(LaserDac):
             raise InputError("board.uid", self.board.uid, expected, "board")
         if status & (wire.MALFUNCTION | wire.OFFLINE):
             raise LinkError(f"the IDN device is out of order or in an emergency stop (status {status:#04x})")
-
-    def close(self) -> None:
-        """Stop and release the device. Raise LinkError if it may not have received it. Do nothing if closed."""
-        if self._radio is None:
-            return
-        try:
-            self.stop()
-        finally:
-            self._release()
-
-    def _release(self) -> None:
-        radio, self._radio = self._radio, None
-        with suppress(OSError):
-            radio.close()
 
     def stop(self) -> None:
         """Close the channel and the connection. Raise LinkError if the device may not have received it."""
@@ -136,15 +120,15 @@ class Idn(LaserDac):
 
     def _exchange(self, command: int, body: bytes, expected: int) -> bytes | None:
         """Send a packet and return the body of the answer with its sequence, None without one."""
-        if self._radio is None:
+        if self._link is None:
             raise LinkError("the IDN device is not open")
         self._sequence = (self._sequence + 1) & 0xFFFF
         until_s = self._clock.now_s() + ANSWER_TIMEOUT_S
         try:
-            self._radio.send(wire.PACKET.pack(command, 0, self._sequence) + body)
+            self._link.send(wire.PACKET.pack(command, 0, self._sequence) + body)
             while (left_s := until_s - self._clock.now_s()) > 0.0:
-                self._radio.settimeout(left_s)
-                data = self._radio.recv(DATAGRAM_BYTES)
+                self._link.settimeout(left_s)
+                data = self._link.recv(DATAGRAM_BYTES)
                 if len(data) >= wire.PACKET.size:
                     answered, _, sequence = wire.PACKET.unpack_from(data)
                     if (answered, sequence) == (expected, self._sequence):
