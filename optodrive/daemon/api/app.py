@@ -18,7 +18,7 @@ from optodrive.core.types.push_options import Policy, PushOptions
 from optodrive.daemon.api.access_middleware import AUDIT_FIELDS, AccessMiddleware, read_request
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.client_sockets import FingersSocket, HoldSocket
-from optodrive.daemon.api.daemon_client import NO_EPOCH, DaemonClient
+from optodrive.daemon.api.daemon_client import DaemonClient
 from optodrive.daemon.api.error_handlers import add_error_handlers
 from optodrive.daemon.api.live_stream import LiveStream, StandingStream
 from optodrive.daemon.api.openapi import (
@@ -40,6 +40,7 @@ from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PatternList, PlanReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.state import CallerReport, HealthReport, ReloadReport, StateReport
+from optodrive.link.service.status import NO_EPOCH
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
 

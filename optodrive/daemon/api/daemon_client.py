@@ -8,6 +8,7 @@ import time
 from bisect import bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from optodrive.core.ipc import Message
@@ -21,23 +22,24 @@ from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.link.service.control import PauseStatus
 from optodrive.link.service.link_connection import NO_REQUEST, build_error
+from optodrive.link.service.status import NO_EPOCH, ServiceStatus
 from optodrive.link.session.board_connector import CONNECTING
+from optodrive.link.session.board_view import BoardView
 from optodrive.planning.display_model import DisplayModel
 
 EPOCHS_MAX = 1000
 ENDED_MAX = 1000
 STREAMED_BODY_MAX_BYTES = 32_768
 """Largest body that the planner parses: a frame of 1,511 targets has 20 kB, and no such body takes over 10 ms."""
-NO_EPOCH = 0
-"""Epoch without a link process."""
 
 
 class LinkClient:
     """The link process: its status, epochs, and commands to the board."""
 
     def __init__(self, peer: Peer) -> None:
-        self.status: dict[str, Any] | None = None
+        self.status: ServiceStatus | None = None
         self.peer = peer
         self._epochs: deque[tuple[float, int]] = deque([(0.0, NO_EPOCH)], EPOCHS_MAX)
         self._held: dict[int, asyncio.Future[str]] = {}
@@ -46,10 +48,12 @@ class LinkClient:
     def on_message(self, message: Message) -> None:
         """Take a status or a result."""
         if message.kind == "status":
-            self.status = message.fields
-            self._end_armings(message.fields["control"], message.fields["epoch_reason"])
+            self.status = ServiceStatus.from_fields(message.fields)
+            self._end_armings(self.status.control, self.status.epoch_reason)
         elif message.kind == "result" and self.status is not None and "board" in message.fields:
-            self.status = {**self.status, "board": message.fields["board"], "pause": message.fields["pause"]}
+            # A result comes before the next status, and its caller reads the state at once.
+            board, pause = BoardView.from_dict(message.fields["board"]), PauseStatus(**message.fields["pause"])
+            self.status = replace(self.status, board=board, pause=pause)
         if "epoch" in message.fields:
             self._record_epoch(message.fields["epoch"])
 
@@ -222,7 +226,7 @@ class DaemonClient:
     def knows_state(self) -> bool:
         """Whether the planner has reported its state, and the link process that the board is there or absent."""
         link = self.link.status
-        return link is not None and link.get("link_error_code") != CONNECTING and self.planner.state is not None
+        return link is not None and link.link_error_code != CONNECTING and self.planner.state is not None
 
     @property
     def is_complete(self) -> bool:

@@ -18,6 +18,7 @@ from optodrive.daemon.responses.state import (
 )
 from optodrive.device.config import Config
 from optodrive.device.config_sections import BoardSection
+from optodrive.link.service.status import ServiceStatus
 from optodrive.link.session.board_view import BoardView
 
 NO_LINK_PROCESS = "the link process does not run; it is being restarted"
@@ -39,15 +40,11 @@ NO_PLANNER = PlannerState(
     planner=PlannerReport(busy=False, alive=False),
     limits=LimitsReport(power_share=None),
 )
-UNKNOWN_BOARD: Mapping[str, Any] = {"state": "UNKNOWN", "fault": None, "hint": ""}
-"""A board without a link, or that is silent: its last state would be a claim."""
 SILENCE_MAX_S = 0.5
 """A board reports at least every 0.2 s."""
 
 
-def merge_state(
-    config: Config, pixels: int, status: Mapping[str, Any] | None, planner: PlannerState | None
-) -> StateReport:
+def merge_state(config: Config, pixels: int, status: ServiceStatus | None, planner: PlannerState | None) -> StateReport:
     """Merge the states of the processes, None for a process that does not run.
 
     config: names display, stages and ports; pixels: their number; status: of the link process
@@ -57,17 +54,18 @@ def merge_state(
         board = BoardView().to_dict()
     else:
         link = LinkReport(
-            port=status["port"],
-            state="up" if status["connected"] else "down",
-            error=status["link_error"],
-            **status["stats"],
+            port=status.port,
+            state="up" if status.connected else "down",
+            error=status.link_error,
+            **status.stats,
         )
-        is_silent = (status["stats"]["silence_s"] or 0.0) > SILENCE_MAX_S
-        board = status["board"] if status["connected"] and not is_silent else {**status["board"], **UNKNOWN_BOARD}
-    ends_in_s = status["pause"]["ends_in_s"] if status is not None and status["connected"] else None
-    control = status["control"] if status is not None and status["connected"] else None
+        is_silent = (status.stats["silence_s"] or 0.0) > SILENCE_MAX_S
+        # The last state of a board without a link, or that is silent, would be a claim.
+        board = (status.board if status.connected and not is_silent else status.board.forget_state()).to_dict()
+    ends_in_s = status.pause.ends_in_s if status is not None and status.connected else None
+    control = status.control if status is not None and status.connected else None
     planner = planner or NO_PLANNER
-    stages = _list_unknown_stages(config) if status is None else status["stages"]
+    stages = _list_unknown_stages(config) if status is None else status.stages
     return StateReport.from_object(
         planner,
         display=config.name,

@@ -183,8 +183,8 @@ def _announce_board(link_view: LinkView, address: str) -> None:
     """Print the state of the board, or that it is awaited. address: of the daemon, which the default one needs not."""
     default = DaemonSection()
     url = "" if address == f"http://{default.host}:{default.port}" else f" --url {address}"
-    port = link_view.status.get("port", "")
-    if link_view.status.get("connected"):
+    port = link_view.status.port
+    if link_view.status.connected:
         print(f"optodrive: board at {port}, {link_view.board_state}; arm with `optodrive arm{url}`", flush=True)
     else:
         print(f"optodrive: waiting for the board at {port}", flush=True)

@@ -16,16 +16,20 @@ from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.supervisor.child import Child
 from optodrive.link.service.link_connection import LinkConnection
+from optodrive.link.service.status import ServiceStatus
 from optodrive.link.session.board_connector import CONNECTING
 
 CONNECT_INTERVAL_S = 0.02
 
 
 class LinkView:
-    """Client of the link process. status: fields of the last status, empty without a connection."""
+    """Client of the link process.
+
+    status: the last one; is_known: whether one has come since the last connection
+    """
 
     def __init__(self, path: Path, clock: Clock) -> None:
-        self.status: dict[str, Any] = {}
+        self.status, self.is_known = ServiceStatus(), False
         self._connection = LinkConnection(path, "supervisor", clock, CONNECT_INTERVAL_S)
         self._connection.on_message = self._on_message
         self._connection.on_lost = self._on_lost
@@ -38,14 +42,14 @@ class LinkView:
     @property
     def board_state(self) -> str:
         """State of the board, `no link` without a link."""
-        return str(self.status["board"]["state"]) if self.status.get("connected") else "no link"
+        return self.status.board.state if self.status.connected else "no link"
 
     @property
     def link_error(self) -> str:
         """Why the board is not connected, '' while it is or nothing is known yet."""
-        if self.status.get("connected") or self.status.get("link_error_code") == CONNECTING:
+        if self.status.connected or self.status.link_error_code == CONNECTING:
             return ""
-        return str(self.status.get("link_error") or "")
+        return self.status.link_error or ""
 
     def receive(self) -> None:
         """Process the messages that have arrived, and connect if there is no connection."""
@@ -54,10 +58,10 @@ class LinkView:
 
     def _on_message(self, message: Message) -> None:
         if message.kind == "status":
-            self.status = message.fields
+            self.status, self.is_known = ServiceStatus.from_fields(message.fields), True
 
     def _on_lost(self) -> None:
-        self.status = {}
+        self.status, self.is_known = ServiceStatus(), False
 
     def stop(self) -> None:
         """Send STOP."""
@@ -171,8 +175,8 @@ class Supervisor:
 
     def _has_started(self) -> bool:
         status = self.link_view.status
-        is_answered = bool(status.get("connected") or self.link_view.link_error)
-        can_arm = not status.get("stalled")  # planner and web have reached the link process
+        is_answered = status.connected or bool(self.link_view.link_error)
+        can_arm = not status.stalled  # planner and web have reached the link process
         return is_answered and can_arm and all(child.is_ready for child in self._children)
 
     def serve(self) -> None:
@@ -303,8 +307,8 @@ class Supervisor:
         missing = [child.name for child in self._children if not child.is_ready or child.killed_because]
         if missing:
             text = f"waiting for {', '.join(missing)}"
-        elif self.link_view.status:
-            text = f"board at {self.link_view.status.get('port', '')}, {self.link_view.board_state}"
+        elif self.link_view.is_known:
+            text = f"board at {self.link_view.status.port}, {self.link_view.board_state}"
         else:
             text = "waiting for the state of the board"
         if text != self._status_text:
@@ -313,12 +317,12 @@ class Supervisor:
         # The service manager restarts the whole daemon when a process stays away: the last resort.
         if not missing:
             self._notifier.feed_watchdog()
-        if self._is_serving and not self._was_announced_connected and self.link_view.status.get("connected"):
+        if self._is_serving and not self._was_announced_connected and self.link_view.status.connected:
             self._announce_board()
         self._report_link_error()
 
     def _announce_board(self) -> None:
-        self._was_announced_connected = bool(self.link_view.status.get("connected"))
+        self._was_announced_connected = self.link_view.status.connected
         self.on_board_seen(self.link_view)
 
     def _report_link_error(self) -> None:
@@ -327,10 +331,10 @@ class Supervisor:
         The planner process reports the likely cause of a failure, if there is one.
         """
         status, error = self.link_view.status, self.link_view.link_error
-        self._was_connected |= bool(status.get("connected"))
-        if not status or error == self._reported_link_error:
+        self._was_connected |= status.connected
+        if not self.link_view.is_known or error == self._reported_link_error:
             return
         self._reported_link_error = error
-        is_unexplained = not self._was_connected and status.get("cause") is None
-        if error and (is_unexplained or status.get("link_error_code") == "board"):
-            self._log.warn(f"waiting for the board at {status.get('port', '')}: {error}")
+        is_unexplained = not self._was_connected and status.likely_cause is None
+        if error and (is_unexplained or status.link_error_code == "board"):
+            self._log.warn(f"waiting for the board at {status.port}: {error}")

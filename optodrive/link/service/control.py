@@ -82,6 +82,17 @@ PAUSE_MAX_S = 300.0
 """Longest pause; after it the board is disarmed."""
 
 
+class PauseStatus(NamedTuple):
+    """The latest pause: number, board time of its begin, s, and time until it is too long, None once it has ended."""
+
+    number: int = 0
+    began_s: float = 0.0
+    ends_in_s: float | None = None
+
+
+NO_PAUSE = PauseStatus()
+
+
 class Pauses:
     """Pauses of the light since this process started.
 
@@ -132,9 +143,9 @@ class Pauses:
         """
         return not self.is_paused and number == self.number
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields of the status."""
-        return {"number": self.number, "began_s": self.began_s, "ends_in_s": self.ends_in_s}
+    def build_status(self) -> PauseStatus:
+        """Return the number of the latest pause, its begin and its end."""
+        return PauseStatus(self.number, self.began_s, self.ends_in_s)
 
 
 BEAT_AGE_MAX_S = 1.0

@@ -241,7 +241,7 @@ class LinkService:
 
     def _reply(self, client: int, request_id: int, error: OptodriveError | None) -> None:
         fields: dict[str, Any] = {"board": self._boards.board.to_dict(), "epoch": self.epoch.number}
-        fields["pause"] = self.pauses.to_dict()
+        fields["pause"] = self.pauses.build_status()._asdict()
         self._outgoing.append(Outgoing((client,), build_result(request_id, error, fields)))
 
     def go_dark(self, reason: str) -> None:

@@ -17,7 +17,7 @@ from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.stage_points import DAMAGED_POINTS, StagePoints
 from optodrive.link.service.link_connection import LinkConnection, ResultHandler, ignore_result
-from optodrive.link.service.link_status import LinkStatus
+from optodrive.link.service.status import LinkStatus, ServiceStatus
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.staged_job import StagedJob
 
@@ -97,7 +97,7 @@ class RemoteSession(LinkStatus):
     def connect_if_due(self) -> None:
         """Connect to the link process if there is no connection and an attempt is due."""
         if self.connection.connect_if_due():
-            self._commands_sent = self._commands_seen = 0
+            self._commands_sent = self.commands = 0
             self._beaten_s = -inf  # the board cannot be armed before the first beat
 
     # --- messages of the link process -------------------------------------------------------------------------------
@@ -109,11 +109,12 @@ class RemoteSession(LinkStatus):
     def _on_message(self, message: Message) -> None:
         fields = message.fields
         if message.kind == "status":
-            if fields["epoch"] != self.epoch:
+            status = ServiceStatus.from_fields(fields)
+            if status.epoch != self.epoch:
                 # Another epoch: link has forgotten all jobs, and none of their reports will come.
                 self._jobs.clear()
-                self._drained_number, self._drained_s = fields["pause"]["number"], None
-            self._take_status(fields)
+                self._drained_number, self._drained_s = status.pause.number, None
+            self._take_status(status)
         elif message.kind == "executed":
             job = self._jobs.get(fields["job"])
             if job is not None:
@@ -154,13 +155,13 @@ class RemoteSession(LinkStatus):
     def is_ready(self) -> bool:
         """Whether a job may start now. False until the link process has carried out all commands sent."""
         # A status from before the last command may still say ready.
-        all_seen = self._commands_seen == self._commands_sent
-        return self.connected and self._reported_ready and all_seen and not self.is_held
+        all_seen = self.commands == self._commands_sent
+        return self.connected and self.is_startable and all_seen and not self.is_held
 
     @property
     def is_held(self) -> bool:
         """Whether the light is paused, or reports of pulses emitted before a pause may still arrive."""
-        return self.pause_ends_in_s is not None or self._drained_number != self._pause_number
+        return self.pause_ends_in_s is not None or self._drained_number != self.pause.number
 
     @property
     def is_interrupted(self) -> bool:

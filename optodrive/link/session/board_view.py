@@ -1,5 +1,6 @@
 """Latest state of the board as reported to the host, with each fault explained and its remedy before disarm."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -69,6 +70,12 @@ class BoardView:
     def forget_state(self) -> Self:
         """Return the view without a link: the last state would be a claim."""
         return replace(self, state="UNKNOWN", fault="")
+
+    @classmethod
+    def from_dict(cls, members: Mapping[str, Any]) -> Self:
+        """Return the view whose members `to_dict` wrote."""
+        known = {name: value for name, value in members.items() if name != "hint"}
+        return cls(**{**known, "fault": members.get("fault") or ""})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields of the REST response, with a hint on the fault's likely cause."""

@@ -38,10 +38,6 @@ class LostStage(NamedTuple):
     reason: str
     dark_s: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields of the status."""
-        return self._asdict()
-
 
 SUMS = ("done_index", "queued", "underruns", "crc_errors", "format_errors", "seq_errors", "laser_on_s")
 STATE_ORDER = (

@@ -3,6 +3,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.daemon.api.state_merge import NO_PLANNER, NO_STATS, merge_state
 from optodrive.daemon.responses.state import PlannerState, StateReport
+from optodrive.link.service.status import ServiceStatus
 from optodrive.link.session.board_view import BoardView
 from stage_rig import build_stages
 
@@ -19,7 +20,8 @@ STATUS = {
 
 
 def merge(status=STATUS, planner=NO_PLANNER, config=DISPLAYS["display-16"].config):
-    state = merge_state(config, 16, status, planner)
+    known = None if status is None else ServiceStatus.from_fields(status)
+    state = merge_state(config, 16, known, planner)
     assert StateReport.model_validate_json(state.model_dump_json()) == state
     return state
 

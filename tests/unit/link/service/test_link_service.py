@@ -40,7 +40,7 @@ def test_a_plan_is_executed_and_reported_to_the_planner(rig):
         assert set(records["on_ticks"]) == {200}
     assert sorted(set(positions)) == list(range(100))
     rig.run(0.1)
-    assert rig.of_kind(PLANNER, "status")[-1].fields["is_ready"]
+    assert rig.of_kind(PLANNER, "status")[-1].fields["is_startable"]
 
 
 def test_the_record_of_both_ends_is_the_same():
@@ -251,7 +251,7 @@ def test_without_beats_the_lease_expires_and_the_cause_is_named(rig, client, say
     rig.until(lambda: rig.core.fault == "LINK", patience_s=2.0)
     rig.run(0.1)
     status = rig.of_kind(SUPERVISOR, "status")[-1].fields
-    assert says in status["cause"][0]
+    assert says in status["likely_cause"][0]
     assert says in status["epoch_reason"]
     assert len(rig.list_emitted()) < 1500
 
@@ -618,7 +618,7 @@ def test_a_report_that_cannot_be_is_the_cause_of_the_loss_and_sends_abort(rig):
     rig.run(0.05)
     status = rig.of_kind(WEB, "status")[-1].fields
     says = "the board reports free_points 65535 in ACK, expected at most 4096, the queue's room"
-    assert status["cause"][0] == status["link_error"] == says
+    assert status["likely_cause"][0] == status["link_error"] == says
     rig.until(lambda: rig.boards.connected)
     rig.arm()
 

@@ -52,7 +52,7 @@ def test_a_pause_flushes_and_reports_all_that_was_executed(rig):
     rig.run(0.5)
     assert len(rig.list_emitted()) == emitted
     status = rig.of_kind(PLANNER, "status")[-1].fields
-    assert (status["is_ready"], status["pause"]["number"], status["epoch"]) == (False, 1, rig.epoch)
+    assert (status["is_startable"], status["pause"]["number"], status["epoch"]) == (False, 1, rig.epoch)
 
 
 def test_points_are_refused_in_a_pause_and_those_of_before_it_afterwards(rig):

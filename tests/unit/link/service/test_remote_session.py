@@ -8,8 +8,8 @@ from link_service_rig import PLANNER, SUPERVISOR
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service import link_connection
 from optodrive.link.service.control import BEAT_AGE_MAX_S
-from optodrive.link.service.link_status import NO_EPOCH
 from optodrive.link.service.remote_session import REPLY_TIMEOUT_S
+from optodrive.link.service.status import NO_EPOCH
 from planner_rig import PlannerRig, ServiceChannel, build_train
 
 POLL_S = 0.01
