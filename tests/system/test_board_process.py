@@ -11,13 +11,8 @@ from itertools import pairwise
 import pytest
 import serial
 
-from optodrive.core.clock import MonotonicClock
-from optodrive.device.config_file import load_config
-from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
-from optodrive.link.session.session import BoardSession
-from optodrive.link.transport.serial_port import SerialPort
 from rig import wait_for
 
 FIELDS = {
@@ -185,21 +180,6 @@ def test_a_descheduled_process_keeps_board_time(board, open_host):
     assert gaps_us == {3000, 6000}
 
 
-def test_the_session_works_over_the_port(board):
-    session = BoardSession(
-        SerialPort(str(board.port), 1_000_000),
-        MonotonicClock(),
-        build_board_requirements(load_config("display-16")),
-    )
-    session.connect()
-    try:
-        assert session.board.state == "DISARMED"
-        assert session.collect_link_stats()["round_trip_ms"]
-    finally:
-        session.close()
-    wait_for(lambda: board.of("port")[-1]["open"] is False, "the board to notice the closed port")
-
-
 # --- scripts, limits, exits -----------------------------------------------------------------------------------------
 
 
@@ -208,41 +188,6 @@ def while_playing():
     """Time of a step of a script during the first job, and a function that returns this time on the log's clock, µs."""
     # One microsecond less, because the log rounds both times.
     return 'from = "light"\nat_s = 0.5', lambda board: board.of("gate")[0]["t_us"] + 499_999
-
-
-@pytest.mark.parametrize(
-    ("name", "unsafe"), [("interlock", "false"), pytest.param("estop", "true", marks=pytest.mark.slow)]
-)
-def test_a_scripted_input_is_a_fault_within_a_millisecond(make_board, open_host, while_playing, name, unsafe):
-    # A long lease, so that a late iteration of this test does not end the job before the input.
-    step, find_due_us = while_playing
-    script = f'[[step]]\n{step}\nset = "{name}"\nvalue = {unsafe}\n'
-    board = make_board(script=script, limits="lease_ms = 2000\n")
-    host = open_host(board).hello().arm()
-    host.play(points(600, on_us=8000))
-    host.wait(lambda: board.of("fault"), "the fault")
-    (fault,) = board.of("fault")
-    assert fault["fault"] == name.upper()
-    (change,) = board.of("input")
-    assert 0 <= change["t_us"] - find_due_us(board) <= 1000
-    assert 0 <= fault["t_us"] - change["t_us"] <= 1000
-    assert board.of("gate")[-1]["on"] is False
-    assert board.of("gate")[-1]["t_us"] <= fault["t_us"] + 1000
-    host.wait(lambda: host.states()[-1] == "FAULT", "the event", lease=False)
-
-
-def test_a_scripted_reset_ends_the_session(make_board, open_host, while_playing):
-    board = make_board(script=f'[[step]]\n{while_playing[0]}\ndo = "reset"\n')
-    host = open_host(board).hello().arm()
-    host.play(points(600, on_us=8000))
-    host.wait(lambda: len(board.of("state")) > 4, "the job's end")
-    wait_for(lambda: board.of("state")[-1]["reason"] == "boot" and len(board.of("state")) > 1, "the reset")
-    host.heard.clear()
-    host.hello()
-    assert host.of(m.HelloReply)[-1].reset_cause == 1
-    host.say(m.Get())
-    host.wait(lambda: host.of(m.Status), "a status", lease=False)
-    assert m.STATES[host.of(m.Status)[-1].state] == "DISARMED"
 
 
 def test_limits_come_from_the_file(make_board, open_host):

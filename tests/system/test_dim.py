@@ -61,12 +61,3 @@ def test_an_operator_lowers_the_power_an_armer_raises_it_and_a_restart_keeps_it(
         assert display.dim(1.0).limits.power_share == 1.0
         assert set(display.push(FRAME).pulses.reason) == {""}
     assert find_max_share(board) > 0.2
-
-
-@pytest.mark.parametrize(
-    "body", [b"", b"{}", b"[]", b'{"share": 1.1}', b'{"share": -1}', b'{"share": "0.5"}', b'{"share": true}', b"0.5"]
-)
-def test_other_bodies_are_refused(bright, body):
-    problem = bright.call("PUT", "/v1/dim", 422, content=body)
-    assert problem["where"] in ("body", "body: share")
-    assert bright.state()["limits"]["power_share"] == 1.0

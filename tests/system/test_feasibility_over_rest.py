@@ -27,12 +27,6 @@ def run(*arguments):
     return run_process([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
 
 
-def test_a_feasible_sequence_is_reported(armed):
-    answer = armed.call("POST", "/v1/plans", json=EASY, params={"dry_run": True})
-    feasibility = answer["summary"]["feasibility"]
-    assert (feasibility["fits"], feasibility["proof"], feasibility["plans_tried"]) == (True, "planned", 0)
-
-
 def test_an_infeasible_sequence_names_the_cause_before_execution(armed):
     before = armed.state()["totals"]
     feasibility = armed.call("POST", "/v1/plans", json=LATE, params={"dry_run": True})["summary"]["feasibility"]
@@ -58,13 +52,6 @@ def test_best_effort_is_executed_in_time(armed, fit):
     assert answer["executed"] == 40 - len(omitted)
     executed = answer["executed_pulses"]
     assert executed["start_s"][-1] + executed["width_s"][-1] <= summary["lead_in_s"] + 0.1 + 1e-4
-
-
-def test_a_pattern_accepts_the_same_options(armed):
-    params = {"fit": "even", "dry_run": True}
-    answer = armed.call("POST", "/v1/patterns/dot", json={"step_s": 0.02}, params=params)
-    assert answer["summary"]["feasibility"]["fit"] == "even"
-    armed.call("POST", "/v1/patterns/dot", status=422, json={}, params={"fit": "evenly"})
 
 
 def test_wrong_input(armed, tmp_path):

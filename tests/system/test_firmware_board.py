@@ -37,12 +37,6 @@ def make_firmware_board(make_board, program):
     return lambda **options: make_board(**{"program": program, **options})
 
 
-@pytest.fixture
-def while_playing():
-    """As for the simulated board. This one counts from its start, and its indicator is on for two seconds."""
-    return "at_s = 4.0", lambda board: 4_000_000
-
-
 @pytest.mark.parametrize(
     ("option", "text", "says"),
     [

@@ -7,12 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from link_process_rig import LinkProcess
 from optodrive.core.errors import LinkError
-from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.link_connection import stop_board
 from rig import PATIENT_LEASE_S, wait_for
@@ -91,71 +89,6 @@ def test_it_imports_no_heavy_package():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
 
 
-def test_a_plan_runs_through_the_planners_view(link, board):
-    arm(link)
-    job = begin(link, build_stage_points(300, DUTY))
-    link.until(lambda: job.is_finished)
-    assert (job.sent_count, job.executed_count) == (300, 300)
-    reported = job.read_reported(0, 300, link.planner.scales)
-    full_power_w = link.planner.scales[0].full_power_w
-    assert reported.power_w == pytest.approx(np.full(300, DUTY / DUTY_MAX * full_power_w))
-    assert job.first_sent_tick < reported.on_tick[0]
-    link.until(lambda: link.planner.is_ready)
-    assert link.planner.stats["round_trip_ms"] > 0
-    assert link.planner.lease_ages.sum > 0
-
-
-def test_splice_and_truncation_through_the_planners_view(link, board):
-    arm(link)
-    first = begin(link, build_stage_points(400, DUTY), send_ahead_s=0.05)
-    link.until(lambda: first.executed_count)
-    second = link.planner.splice(build_stage_points(300, 2 * DUTY, dark_us=8000), [250], 0.0, link.planner.epoch, 0.05)
-    assert second.zero_tick == first.parts[0].end_tick_after(250)
-    link.until(lambda: first.is_finished)
-    assert link.planner.truncate([200])
-    assert not link.planner.truncate([1])
-    link.until(lambda: second.is_finished)
-    assert (first.executed_count, second.executed_count) == (250, 200)
-    assert link.planner.pop_refusal() is None
-
-
-def test_points_of_an_older_epoch_are_refused(link, board):
-    older = link.planner.epoch
-    link.await_result(link.web, "stop")
-    arm(link)
-    link.planner.begin(build_stage_points(10, DUTY), link.planner.board_s() + 0.05, older)
-    refusal = link.until(link.planner.pop_refusal)
-    assert "ended by stop" in refusal
-    assert link.planner.splice(build_stage_points(10, DUTY), [0], 0.0, older, 0.05) is None
-    assert not board.of("pulse")
-
-
-def test_flush_keeps_the_board_armed(link, board):
-    emit(link, board)
-    link.planner.flush()
-    assert not link.planner.is_ready
-    link.until(lambda: link.planner.is_ready)
-    assert link.planner.board.state == BoardState.ARMED
-
-
-@pytest.mark.parametrize("role", ["planner", "web"])
-def test_the_end_of_planner_or_web_turns_the_gate_off_at_once(link, board, role):
-    emit(link, board)
-    link.planner.connection.close() if role == "planner" else link.web.close()
-    await_dark(board)
-    assert read_state(board) == BoardState.DISARMED
-
-
-def test_an_operator_stops_without_planner_and_web_answering(link, board):
-    emit(link, board)
-    epoch = link.planner.epoch
-    result = stop_board(link.path)  # planner and web do nothing meanwhile
-    assert result["board"]["state"] == BoardState.DISARMED
-    assert result["epoch"] == epoch + 1
-    assert not board.of("gate")[-1]["on"]
-    link.until(lambda: link.planner.epoch == epoch + 1)
-
-
 def test_an_operator_is_told_when_there_is_no_board(make_link, tmp_path):
     link = make_link(tmp_path / "absent")
     with pytest.raises(LinkError, match="a serial port that exists"):
@@ -207,20 +140,6 @@ def test_the_terminals_signals_are_the_supervisors_business(link):
         link.process.send_signal(number)
     assert link.await_result(link.web, "stop")["error"] is None
     assert link.process.poll() is None
-
-
-def test_the_end_of_the_supervisor_ends_it_dark(link, board):
-    emit(link, board)
-    link.supervisor.close()
-    assert link.process.wait() == 0
-    await_dark(board)
-
-
-def test_a_killed_link_process_leaves_the_board_dark(link, board):
-    emit(link, board)
-    link.process.kill()
-    link.process.wait()
-    await_dark(board)
 
 
 def test_it_beats_while_it_waits_for_an_absent_board_and_finds_it(make_link, make_board, tmp_path):

@@ -5,7 +5,6 @@ import json
 import pytest
 
 from forked_process import run_process
-from optodrive.cli import main
 from rig import OPTODRIVE, Board, Daemon
 
 MODEL = """format = "optodrive-parameters"
@@ -80,40 +79,6 @@ def test_the_daemon_plans_with_the_model_and_reports_it(files, tmp_path):
             daemon.stop()
     finally:
         board.stop()
-
-
-WRONG = {
-    "no such file": (None, "a readable file"),
-    "another format": (MODEL.replace("optodrive-parameters", "optodrive-config"), "expected 'optodrive-parameters'"),
-    "a later version": (MODEL.replace("version = 1", "version = 2"), "version: got 2"),
-    "a misspelt term": (MODEL.replace("laser_turn_on", "laser_turnon"), "nearest is 'laser_turn_on'"),
-    "a term planned with that is not there": (
-        MODEL.replace('["laser_turn_on"]', '["radiation"]'),
-        "planner_terms: got 'radiation'",
-    ),
-    "a term no single pixel knows": (
-        MODEL.replace('["laser_turn_on"]', '["lateral_conduction"]'),
-        "a term that heights can be planned with",
-    ),
-    "beyond the plausible": (MODEL.replace("1.5e-3", "1.5"), "laser_turn_on.time.value: got 1.5"),
-    "another unit": (MODEL.replace('unit = "s"', 'unit = "ms"'), "time.unit: got 'ms', expected 's'"),
-    "not TOML": (MODEL + "=", "valid TOML"),
-}
-
-
-@pytest.mark.parametrize("what", WRONG)
-def test_a_wrong_model_is_rejected_in_one_line(what, files, capsys):
-    model, frames = files
-    text, expected = WRONG[what]
-    if text is None:
-        model.unlink()
-    else:
-        model.write_text(text)
-    assert main.run(["plan", str(frames), "--config", "display-16", "--model", str(model)]) == 2
-    said, errors = capsys.readouterr()
-    assert said == ""
-    assert expected in errors
-    assert errors.count("\n") == 1
 
 
 def test_a_model_must_be_a_toml_file(files):

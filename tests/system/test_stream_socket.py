@@ -9,7 +9,6 @@ from socket import create_connection
 
 import numpy as np
 import pytest
-from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from optodrive.daemon.responses.messages import FrameResult
@@ -131,20 +130,6 @@ def test_without_arming_a_frame_is_refused(make_board, make_daemon):
         stream.send(binary(0, [1]))
         (refused,) = until(stream, {"status": "refused"})
         assert refused["problem"]["status"] == 409
-
-
-@pytest.mark.parametrize(
-    ("headers", "status"),
-    [
-        ({"token": "wrong"}, 401),
-        ({"Origin": "http://elsewhere.example"}, 403),
-        ({"host": "elsewhere.example"}, 421),
-    ],
-)
-def test_a_stream_has_the_access_control_of_a_route(daemon, headers, status):
-    with pytest.raises(InvalidStatus) as refused:
-        socket(daemon, **headers)
-    assert refused.value.response.status_code == status
 
 
 def test_the_newest_plan_wins_over_rest(daemon):

@@ -1,16 +1,12 @@
 """Streamed frames: the newest replaces all unsent pulses, and every frame reports its result."""
 
-import time
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.engine import plan_making
-from optodrive.daemon.engine.planner import SPLICE_TRIES
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.planning_time import FACTOR
-from optodrive.planning.pipeline import SequencePlanner
 from rig import ended, wait_for
 
 RESERVED_S = 1.0
@@ -72,29 +68,6 @@ def test_the_newest_frame_wins_without_a_pause(armed, board, reserved_s):
         assert on_us - off_us < 3_000 or any(off_us <= hold_us <= on_us for hold_us in holds_us)
 
 
-def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
-    """After two late splices the running stream is truncated, so the third plan has no deadline."""
-    stream(armed, frame(range(30)))
-    first = stream(armed, frame(range(437), 200.0))  # seconds, long beside the naps
-    wait_for_pulses(armed, first, 4)
-    tries = []
-
-    def slowly(*arguments, **more):
-        """Take longer than the time reserved from the plan before."""
-        tries.append(0.05 + armed._planner._planning_time.compute_reserved_s(len(tries)))
-        time.sleep(tries[-1] if len(tries) <= SPLICE_TRIES else 0.0)
-        return SequencePlanner(*arguments, **more)
-
-    monkeypatch.setattr(plan_making, "SequencePlanner", slowly)
-    second = stream(armed, frame(range(40, 60)))
-    records = [ended(armed, answer) for answer in (first, second)]
-    assert len(tries) in (3, 4)  # once more if the running plan was late, which changed the heat
-    assert [record.status for record in records] == ["superseded", "done"]
-    for record, height_um in zip(records, (200.0, 100.0), strict=True):
-        assert record.executed + record.dropped == record.planned
-        assert np.array(record.executed_pulses.simulated_um) == pytest.approx(height_um, rel=0.01)
-
-
 def test_frames_reach_their_targets_in_sequence(armed):
     """With the same pixels in every frame, each plan accounts for the heat of the executed ones.
 
@@ -122,27 +95,6 @@ def test_an_empty_frame_ends_the_previous_one(armed, board):
     assert ended(armed, stream(armed, frame((3,)))).executed == 1
 
 
-def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
-    train = FrameSequence((), (PulseTrain(200, 0.0, 5.0, 0.01, 0.01, 1.0),))
-    running = armed.submit_sequence(train, "train").result()
-    waiting = armed.submit_sequence(frame(range(50)), "waiting").result()
-    wait_for(lambda: armed.get_plan(running.plan).executed >= 3, "a part of the train")
-    newest = ended(armed, stream(armed, frame(range(5), 200.0)))
-    assert newest.status == "done"
-    assert [armed.get_plan(answer.plan).status for answer in (running, waiting)] == ["superseded"] * 2
-    assert newest.executed_pulses.simulated_um == pytest.approx([200.0] * 5, rel=0.01)
-    assert len(board.of("pulse")) < 100
-
-
-def test_a_plan_after_a_stream_waits_for_its_end(armed):
-    first = stream(armed, frame(range(30)))
-    second = armed.submit_sequence(frame(range(30)), "second").result()
-    records = [ended(armed, answer) for answer in (first, second)]
-    assert [record.status for record in records] == ["done", "done"]
-    for record in records:
-        assert record.executed_pulses.simulated_um == pytest.approx([100.0] * 30, rel=0.01)
-
-
 def test_a_stop_ends_a_stream_and_the_heat_is_kept(armed, board):
     first = stream(armed, frame(range(60), 300.0))
     wait_for(lambda: armed.get_plan(first.plan).executed >= 5, "a part of the frame")
@@ -154,18 +106,3 @@ def test_a_stop_ends_a_stream_and_the_heat_is_kept(armed, board):
     armed.arm().result()
     assert len(board.of("pulse")) == count
     assert ended(armed, stream(armed, frame(range(60), 300.0))).status == "done"
-
-
-def test_a_refresh_cycle_reaches_every_pixel(armed):
-    """Each frame has time for a few of its hundred pixels. Together the frames draw all of them once."""
-    whole = frame(range(100), 60.0)
-    shown = []
-    for _ in range(40):
-        answer = stream(armed, whole)
-        shown.append(answer.plan)
-        wait_for(lambda: armed.get_plan(shown[-1]).executed >= 4, "a part of the frame")
-        if len(shown) > 3 and sum(armed.get_plan(plan).executed for plan in shown) >= 100:
-            break
-    ended(armed, stream(armed, frame(())))
-    pixels = [pixel for plan in shown for pixel in ended(armed, plan).executed_pulses.pixel]
-    assert len(set(pixels[:100])) >= 98  # one or two pixels repeat at the start of a new cycle

@@ -1,7 +1,7 @@
 import pytest
 
 from optodrive.link.protocol import messages as m
-from optodrive.link.protocol.connection import RTO_S, WINDOW, BoardLink, HostConnection
+from optodrive.link.protocol.connection import RTO_S, WINDOW, HostConnection
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 
 SESSION = 0x1234
@@ -269,41 +269,3 @@ def test_abort_then_hello_keep_their_order(host):
 
 
 # --- the board's end ------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def link():
-    board = BoardLink()
-    board.begin_session(SESSION)
-    return board
-
-
-def test_frames_in_order_are_accepted_once(link):
-    for seq in [*range(256), 0, 1]:
-        assert link.accept(seq) == (True, None)
-        link.mark_consumed(None)
-    assert link.expected_seq == 2
-    assert link.seq_errors == 0
-
-
-def test_duplicates_get_the_answer_of_the_last_frame(link):
-    for refusal in (None, m.NAK_REASONS.index("STATE")):
-        seq = link.expected_seq
-        link.accept(seq)
-        link.mark_consumed(refusal)
-        assert link.accept(seq) == (False, refusal)
-        assert link.accept((seq - 7) % 256) == (False, refusal)
-    assert link.seq_errors == 0
-
-
-def test_gaps_are_refused_and_counted(link):
-    for ahead in (1, 7, 127):
-        assert link.accept(ahead) == (False, m.NAK_REASONS.index("SEQUENCE"))
-    assert link.seq_errors == 3
-    assert link.accept(0) == (True, None)
-
-
-def test_a_frame_that_was_not_consumed_stays_expected(link):
-    assert link.accept(0) == (True, None)
-    assert link.accept(0) == (True, None)
-    assert link.expected_seq == 0

@@ -1,7 +1,6 @@
 """The board's state machine: what holds for the transitions of messages.toml, from which C and Python come."""
 
 import re
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -11,25 +10,9 @@ from optodrive.link.protocol import states
 from optodrive.link.protocol.states import TRANSITIONS, BoardState, EventReason, find_transition
 
 CONTRACT = Path(__file__).parents[4] / "firmware_protocol"
-TABLE = tomllib.loads((CONTRACT / "messages.toml").read_text())
 ROOT = CONTRACT.parent
 STATEMENTS = [ROOT / "optodrive/link/protocol/state_table.py", ROOT / "optodrive/daemon/page/board_states.js"]
 STATED = {key: transition.to for key, transition in TRANSITIONS.items()}
-
-
-def test_states_and_events_have_the_order_of_the_wire():
-    assert list(BoardState) == TABLE["enumerations"]["state"]
-    assert list(EventReason) == TABLE["enumerations"]["reason"]
-
-
-def test_groups_of_states_are_those_of_the_table():
-    groups = {name: list(getattr(states, f"{name.upper()}_STATES")) for name in TABLE["state_group"]}
-    assert groups == TABLE["state_group"]
-
-
-def test_transitions_are_those_of_the_table():
-    rows = {(state, entry["event"], entry["to"]) for entry in TABLE["transition"] for state in entry["from"]}
-    assert rows == {(state, event, to) for (state, event), to in STATED.items()}
 
 
 def test_whatever_ends_in_disarmed_or_fault_drops_the_queue():

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 import pytest
@@ -252,23 +251,6 @@ def test_a_search_ends_at_its_limit_and_proves_nothing(monkeypatch):
     monkeypatch.setattr(order_search, "beam_lower_bound_s", lambda *given: None)
     _, report = check(build_frame(range(4), 100, duration_s=0.02))
     assert (report.fits, report.proof) == (False, "not found")
-
-
-def test_every_order_is_visited_once():
-    ranks, seen = [[0, 1, 2], [], [0, 1]], set()
-    while True:
-        seen.add(tuple(map(tuple, ranks)))
-        if not order_search._advance_orders(ranks, 2, 1):
-            break
-    assert seen == {(first, (), last) for first in permutations(range(3)) for last in permutations(range(2))}
-
-
-def test_orders_with_the_same_prefix_are_skipped():
-    ranks = [[0, 1, 2, 3]]
-    firsts = []
-    while order_search._advance_orders(ranks, 0, 0):
-        firsts.append(ranks[0][0])
-    assert firsts == [1, 2, 3]
 
 
 def test_variants_keep_all_other_fields():

@@ -40,11 +40,6 @@ def test_text_is_written_as_in_unified_english_braille(text, braille):
     assert to_unicode_braille(text) == braille
 
 
-def test_letters_differ_from_each_other():
-    cells = encode_word("abcdefghijklmnopqrstuvwxyz")
-    assert len(set(cells)) == 26
-
-
 def test_lines_end_at_line_breaks_and_words_at_blanks():
     lines = encode_lines("a  b\tc\r\n\nd", "text")
     assert [len(words) for words in lines] == [3, 0, 1]
