@@ -13,12 +13,11 @@ from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
-from text_world import CAPS, PIXELS, TextPage, World
+from text_world import CAPS, TextPage, World
 
 STEPS = 25
 UNASKED_MIN_MS = 2900
 """Shortest time between two announcements that nobody asked for."""
-VERBS = {"queued": "waits", "running": "plays", "paused": "is paused"}
 GENERIC = "The indicator is on for two seconds before the laser can emit."
 
 
@@ -290,28 +289,6 @@ def desk(open_page):
     return Desk(open_page())
 
 
-def test_every_cap_has_a_sentence_beside_the_page_from_which_it_takes_light(desk):
-    desk.world.page = [3]
-    for cap, label in CAPS.items():
-        desk.world.caps = [cap]
-        assert desk.run()["standing"] == f"A page of 1 dot stands. The cap “{label}” takes light from it."
-
-
-def test_a_pixel_that_falls_between_its_pulses_is_told_by_its_peaks(desk):
-    desk.play()
-    desk.run()
-    world = desk.world
-    for _ in range(6):
-        world.pass_second()
-        world.state = "RUNNING"
-        world.height, world.peak = np.full(PIXELS, 3.0), np.full(PIXELS, 20.0)
-        world.height[10], world.peak[10] = 55.5, 200.0
-        shown = desk.tell()
-        assert "highest 200.0 µm at 10;" in shown["summary"]
-        assert "Pixel 10: now 55.5 µm, " in shown["picked"]
-        assert "; peak 200.0 µm, " in shown["picked"]
-
-
 def test_executed_pulses_are_in_the_text_as_soon_as_they_are_reported(desk):
     desk.play(32)
     world = desk.world
@@ -334,35 +311,10 @@ def test_a_new_reader_whose_first_pulses_are_old_is_not_told_that_they_are_new(d
     assert desk.page.read()["timeline-text"] == "No pulse in the last 4 s."
 
 
-def test_plans_from_before_the_tab_bear_their_own_times(desk):
-    for age_s in (5000.0, 300.0, 20.0):
-        plan = desk.world._add_plan(age_s)
-        plan.name, plan.status, plan.executed = "push", "done", plan.planned
-    shown = desk.run()  # the judge compares the times
-    assert len({text.split()[0] for text in shown["plans"]}) == 3
-    desk.world.state, desk.world.fault = "FAULT", "INTERLOCK"
-    assert shown["faults"] == ["None."]
-
-
 def test_a_fault_from_before_the_tab_has_no_time_of_its_own(desk):
     desk.world.state, desk.world.fault = "FAULT", "INTERLOCK"
     (first,) = desk.run()["faults"]
     assert re.match(r"before \d\d:\d\d:\d\d INTERLOCK", first)
-
-
-@pytest.mark.parametrize("loss", ["link", "silence"])
-def test_a_lost_board_runs_no_longer_and_its_figures_are_no_figures_of_now(desk, loss):
-    desk.play(1000)
-    for _ in range(3):
-        assert desk.run()["board-state"] == "RUNNING"
-    if loss == "link":
-        desk.world.link = "down"
-    else:
-        desk.world.silence_s = 0.6
-    desk.page.send(desk.world.build_events())
-    shown = desk.page.read()  # at once: the judge demands hatched panels, and no figure of the board
-    assert [*judge(shown, desk.world, desk.page)] == []
-    assert shown["board-means"] == ("no link to the board" if loss == "link" else "the board does not answer")
 
 
 def test_a_pause_and_a_board_ahead_of_the_planner_are_in_no_sentence_denied(desk):

@@ -4,7 +4,7 @@ import pytest
 from playwright.sync_api import expect
 
 from rig import wait_for
-from study_page_rig import PageStudy, open_wire
+from study_page_rig import PageStudy
 from study_rig import find_defects, read_records, write_study
 from study_visit import StudyVisit
 from window import PHONE, WIDE, list_violations
@@ -133,12 +133,3 @@ def test_a_participants_secret_opens_no_operators_page(study, browser):
     expect(visit.page.locator("#notice")).to_contain_text("not valid")
     assert visit.page.locator("#rows tr").count() == 0
     visit.context.close()
-
-
-@pytest.mark.parametrize("text", ["{}", '{"kind": "answer"}', '{"kind": "stop", "more": 1}', "[]"])
-def test_a_message_that_is_no_command_does_nothing(study, text):
-    with open_wire(study.urls["operator"], "operator") as wire:
-        wire.wait_for("start")
-        wire.socket.send(text)
-        assert wire.read_close()[0] == 1008
-    assert study.process.poll() is None

@@ -2,14 +2,13 @@
 
 import random
 import signal
-import subprocess
 
 import pytest
 
 import braille_reader
 from braille_desk import COUNT, BrailleCommand, SerialLine, draw_text, is_dark, running_desk
 from braille_reader import ROUTING_KEY
-from forked_process import OPTODRIVE
+from forked_process import OPTODRIVE, run_process
 from optodrive.client.humanware import NAMED_KEYS
 from rig import running, wait_for
 
@@ -113,14 +112,14 @@ def test_an_ended_command_leaves_no_port(tmp_path):
 def test_a_name_that_is_taken_is_one_line(tmp_path):
     taken = tmp_path / "file"
     taken.write_text("keep")
-    done = subprocess.run([OPTODRIVE, "braille", "file"], capture_output=True, text=True, cwd=tmp_path)
+    done = run_process([OPTODRIVE, "braille", "file"], capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "optodrive: PORT: got 'file', expected a name that is free, or a link\n"
     assert taken.read_text() == "keep"
 
 
 def test_without_a_daemon_one_line(tmp_path):
-    done = subprocess.run(
+    done = run_process(
         [OPTODRIVE, "braille", tmp_path / "tty", "--url", "http://127.0.0.1:9"], capture_output=True, text=True
     )
     assert done.returncode == 1

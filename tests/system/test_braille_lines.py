@@ -2,14 +2,13 @@
 
 import random
 import socket
-import subprocess
 
 import pytest
 
 import braille_reader
 from braille_desk import COUNT, ServedLines, draw_text, find_raised, is_dark, running_desk
 from braille_reader import ROUTING_KEY
-from forked_process import OPTODRIVE
+from forked_process import OPTODRIVE, run_process
 from optodrive.client.reader_port import FIRST_PORT, HOST
 from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII
 from rig import wait_for
@@ -142,5 +141,5 @@ def test_a_client_without_the_key_neither_shows_nor_ends_what_is_shown(desk):
 )
 def test_a_wrong_place_is_one_line(tmp_path, arguments, message):
     command = [OPTODRIVE, "braille", "--protocol", "brlapi", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    done = run_process(command, capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"optodrive: {message}\n")

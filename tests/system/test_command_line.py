@@ -11,7 +11,7 @@ from threading import Event, Thread
 
 import pytest
 
-from forked_process import start_process
+from forked_process import run_process, start_process
 from optodrive.cli import control
 from optodrive.client import Display
 from optodrive.core.errors import LinkError
@@ -32,7 +32,7 @@ def disarmed(rig):
 
 
 def command(daemon, *arguments):
-    return subprocess.run(
+    return run_process(
         [OPTODRIVE, *arguments],
         env=os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN},
         capture_output=True,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from emulated_film import FilmDevice
-from forked_process import OPTODRIVE
+from forked_process import OPTODRIVE, run_process
 from optodrive.tracking.contacts import decode_contacts
 from optodrive.tracking.film import FilmRecording
 from rig import TOKEN, running, wait_for
@@ -64,7 +64,7 @@ def test_touches_at_a_device_calibrate_it_and_are_recorded(device, tmp_path):
     assert list(dict.fromkeys(numbers)) == [65530, 65531, 65532, 65533]
     assert {len(report.contacts) for report in reports} == {0, 1}
     path, again = tmp_path / "touches.evemu", tmp_path / "again.toml"
-    subprocess.run([OPTODRIVE, "calibrate", "film", path, "--out", again], check=True, capture_output=True)
+    run_process([OPTODRIVE, "calibrate", "film", path, "--out", again], check=True, capture_output=True)
     first, second = ((tmp_path / name).read_text().split("x_m = ")[1] for name in ("film.toml", "again.toml"))
     values = [np.array(re.findall(r"-?\d\.\d+e[+-]\d+", text), dtype=float) for text in (first, second)]
     assert np.abs(values[0] - values[1]).max() < 2e-4

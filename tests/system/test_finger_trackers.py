@@ -3,12 +3,11 @@
 import os
 import re
 import signal
-import subprocess
 
 import numpy as np
 import pytest
 
-from forked_process import OPTODRIVE, start_process
+from forked_process import OPTODRIVE, run_process, start_process
 from optodrive.tracking.camera import BACKGROUND_PICTURES
 from rendered_hand import ABOVE, SIZE, Finger, render, write_marks, write_video
 from rig import TOKEN, running, wait_for
@@ -49,7 +48,7 @@ def calibration(tmp_path_factory):
 
 def run(*arguments, url="http://127.0.0.1:9", status=0):
     environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "OPTODRIVE_URL": url}
-    done = subprocess.run([OPTODRIVE, *map(str, arguments)], env=environment, capture_output=True, text=True)
+    done = run_process([OPTODRIVE, *map(str, arguments)], env=environment, capture_output=True, text=True)
     assert done.returncode == status, done
     return done
 

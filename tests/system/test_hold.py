@@ -13,6 +13,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from board_fixtures import board_disarmed, daemon_disarmed  # noqa: F401 - fixtures
+from forked_process import start_process
 from optodrive.client import AsyncDisplay, Display
 from optodrive.core.errors import NotReadyError
 from optodrive.daemon.api.client_sockets import CLIENT_LEFT
@@ -33,7 +34,7 @@ def start_push(daemon, folder, *options, seconds=20.0):
     """Start `optodrive push --hold` and return its process."""
     frames = folder / "frames.json"
     frames.write_text(json.dumps(long_train(seconds=seconds)))
-    return subprocess.Popen(
+    return start_process(
         [OPTODRIVE, "push", frames, "--hold", "--url", daemon.url, *options],
         env={**os.environ, "OPTODRIVE_TOKEN": TOKEN},
         stdout=subprocess.PIPE,

@@ -6,9 +6,9 @@ import signal
 
 import pytest
 
-from forked_process import FULL_INDICATOR, run_process
+from forked_process import run_process
 from optodrive.link.transport.link_capture import LinkCapture
-from rig import OPTODRIVE, PATIENT_LEASE_S, Board, long_train, wait_for
+from rig import OPTODRIVE, PATIENT_LEASE_S, long_train, wait_for
 
 
 def play(daemon, seconds=5.0):
@@ -52,30 +52,6 @@ def test_a_killed_board_process_is_missing_and_the_timing_error_was_reported(boa
     assert cause in failed["error"]
 
 
-@pytest.mark.slow
-def test_a_closed_pty_and_a_reset_board(make_board, make_daemon):
-    script = '[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "close"\n[[step]]\nfrom = "light"\nat_s = 6.0\ndo = "reset"\n'
-    board = make_board(script=script)
-    daemon = make_daemon(board)
-    plan = play(daemon, 30.0)
-    wait_for_cause(daemon, "is available again: replugged")
-    # When the plan failed, the port was either missing or available again.
-    assert f"likely cause: {board.port}" in daemon.finished(plan)["error"]
-    wait_for(lambda: daemon.state()["link"]["state"] == "up", "the link")
-    assert daemon.board_state() == "DISARMED"
-    assert "(reset)" in wait_for_cause(daemon, "the board restarted")
-
-
-@pytest.mark.slow
-def test_flipped_bits_are_named(make_board, make_daemon):
-    script = '[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "flip_bits"\nrate = 0.3\n'
-    daemon = make_daemon(make_board(script=script))
-    plan = play(daemon, 30.0)
-    cause = wait_for_cause(daemon, "damaged")
-    assert "cable" in cause
-    assert daemon.finished(plan)["status"] == "failed"
-
-
 def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tmp_path):
     capture = tmp_path / "capture"
     daemon = make_daemon(board, options=("--capture", str(capture)))
@@ -104,53 +80,6 @@ def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tm
     assert totals["ignored_bytes"] == totals["bad_bytes"] == 0
     assert totals["host_silence_s"] > 0.5 * PATIENT_LEASE_S  # the lease ended in it
     assert totals["round_trip_min_s"] > 0
-
-
-@pytest.fixture
-def seeded(tmp_path):
-    """Return a function that starts boards with repeating nonces, whose indicator is on as long as a replay's."""
-    boards = []
-
-    def make(folder):
-        folder.mkdir()
-        boards.append(Board(folder, seed=7, program=FULL_INDICATOR))
-        return boards[-1]
-
-    yield make
-    for board in boards:
-        board.stop()
-
-
-def replay(*arguments):
-    command = [OPTODRIVE, "wire", "replay", *arguments, "--json"]
-    run = run_process(command, capture_output=True, text=True)
-    assert run.returncode in (0, 1), run.stderr
-    assert run.stdout, run.stderr
-    verdict = json.loads(run.stdout)
-    assert run.returncode == (not verdict["identical"])
-    return verdict
-
-
-@pytest.mark.slow
-def test_a_captured_session_is_replayed_to_a_simulated_board_and_does_not_arm_one_on_a_port(
-    seeded, make_daemon, tmp_path
-):
-    capture = tmp_path / "capture"
-    daemon = make_daemon(seeded(tmp_path / "first"), options=("--capture", str(capture)))
-    plan = play(daemon, 0.3)
-    assert daemon.finished(plan)["status"] == "done"
-    daemon.stop()
-    own = ("--limits", tmp_path / "first" / "board--limits.toml")
-    verdict = replay(capture, "--board", "simulated", "--seed", "7", *own)
-    assert verdict["identical"], verdict
-    assert verdict["executed"]["recorded"] >= 15
-    assert not replay(capture, "--board", "simulated", *own)["identical"]
-    board = seeded(tmp_path / "second")
-    verdict = replay(capture, "--board", str(board.port))
-    assert not verdict["identical"]
-    assert verdict["executed"]["replayed"] == 0
-    assert "ARMED" not in [event["state"] for event in board.of("state")]
-    assert not board.of("gate")
 
 
 def doctor(config):

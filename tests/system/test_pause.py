@@ -4,12 +4,12 @@ import asyncio
 import json
 import os
 import signal
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 
+from forked_process import run_process
 from optodrive.client import AsyncDisplay, Display
 from optodrive.core.errors import NotReadyError
 from rig import OPTODRIVE, TOKEN, long_train, read_role_tokens, running, wait_for
@@ -145,7 +145,7 @@ def test_commands_pause_and_resume(daemon, board):
     plan = start_train(daemon, board, seconds=1.0)
     environment = os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN}
     for command, expected in (("pause", "dark until `optodrive resume`; disarms in"), ("resume", "running")):
-        ended = subprocess.run([OPTODRIVE, command], env=environment, capture_output=True, text=True)
+        ended = run_process([OPTODRIVE, command], env=environment, capture_output=True, text=True)
         assert (ended.returncode, ended.stderr) == (0, "")
         assert expected in ended.stdout
     assert daemon.finished(plan)["executed"] == 50

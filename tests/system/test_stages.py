@@ -2,12 +2,11 @@
 
 import os
 import signal
-import subprocess
 import time
 
 import pytest
 
-from forked_process import FULL_INDICATOR
+from forked_process import FULL_INDICATOR, run_process
 from optodrive.link.simulator.board_core import BoardClock
 from rig import OPTODRIVE, PATIENT_LEAD_S, PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
 from signalled_processes import assert_dark_within_lease, assert_stayed_dark
@@ -78,7 +77,7 @@ class Bench:
     def run_command(self, *arguments):
         """Run a command against the daemon and return what it prints."""
         environment = {**os.environ, "OPTODRIVE_URL": self.daemon.url, "OPTODRIVE_TOKEN": TOKEN}
-        done = subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
+        done = run_process([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
@@ -194,7 +193,7 @@ def test_status_shows_the_stages_and_the_commands_select_one(bench, tmp_path):
     environment = {**os.environ, "OPTODRIVE_URL": bench.daemon.url, "OPTODRIVE_TOKEN": TOKEN}
 
     def run(*arguments):
-        done = subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
+        done = run_process([OPTODRIVE, *arguments], capture_output=True, text=True, env=environment)
         return done.returncode, done.stdout + done.stderr
 
     wait_for(lambda: bench.daemon.board_state() == "DISARMED", "both boards")

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from dotpad_reader import BOARD, FIRMWARE, LINE, NAME, build, encode, list_held, read
-from optodrive.client.dotpad import NAMED_KEYS, CellArea, CellGrid
+from optodrive.client.dotpad import CellArea, CellGrid
 
 
 @pytest.fixture
@@ -109,10 +109,6 @@ def test_a_key_is_held_and_released(grid, name, keys):
     (held, released) = read(grid.build_key_press(name))
     assert (held[0], len(held[2]), list_held(held[2])) == (0x0312, 4, keys)
     assert released == (0x0312, 0, bytes(4))
-
-
-def test_named_keys_differ():
-    assert len({frozenset(keys) for keys in NAMED_KEYS.values()}) == len(NAMED_KEYS)
 
 
 def test_routing_keys_are_as_many_as_the_packet_has_room_for():

@@ -64,14 +64,6 @@ def test_a_packet_in_part_is_forgotten_with_its_reader():
     assert line.receive(INIT) == bytes([0x1B, 1, 3, 0, 0x10, 4])
 
 
-def test_a_key_goes_down_and_up():
-    assert CellLine(4).build_key_press("next") == bytes([0x1B, 5, 1, 20, 0x1B, 6, 1, 20])
-
-
-def test_a_routing_key_is_that_over_its_cell():
-    assert CellLine(40).build_key_press("routing", 6) == bytes([0x1B, 5, 1, 86, 0x1B, 6, 1, 86])
-
-
 def test_keys_of_a_chord_are_held_together():
     held, chord = set(), set()
     data = CellLine(4).build_key_press("cursor-up")

@@ -265,69 +265,6 @@ def test_arm_takes_the_board_s_two_seconds(rig):
         rig.session.arm()
 
 
-def test_the_board_executes_the_plan(rig):
-    rig.arm()
-    planned = plan(500)
-    job = rig.play(planned)
-    rig.until(lambda: job.is_finished)
-    done = job.build_executed(planned, 2.45, 1e-6)
-    assert done.complete
-    assert done.pixel.tolist() == planned.pixel.tolist()
-    assert np.abs(done.start_s - planned.start_s).max() < 1e-12
-    assert np.abs(done.width_s - planned.width_s).max() < 1e-12
-    assert np.abs(done.power_w - planned.power_w).max() < 2.45 / 65535
-    log = rig.pulses()
-    assert [entry["on_us"] for entry in log] == done.on_tick.tolist()
-    assert [entry["off_us"] - entry["on_us"] for entry in log] == done.width_ticks.tolist()
-    assert rig.states()[-2:] == ["RUNNING", "ARMED"]
-    assert (rig.session.board.underruns, rig.session.collect_link_stats()["retransmitted"]) == (0, 0)
-
-
-def test_more_points_than_the_queue_holds():
-    rig = Rig(BoardSettings(queue_points=60)).connect().arm()
-    planned = plan(400)
-    job = rig.play(planned)
-    rig.until(lambda: job.is_finished)
-    assert job.build_executed(planned, 2.45, 1e-6).complete
-    assert rig.session.collect_link_stats()["naks"] == 0, "flow control keeps the host within the free queue space"
-    assert rig.session.board.underruns == 0
-
-
-def test_one_job_after_another(rig):
-    rig.arm()
-    for n in (1, 30, 7):
-        rig.until(lambda: rig.session.is_ready)
-        planned = plan(n)
-        job = rig.play(planned)
-        rig.until(lambda job=job: job.is_finished)
-        assert job.build_executed(planned, 2.45, 1e-6).complete
-    assert len(rig.pulses()) == 38
-
-
-def test_lost_reports_are_requested_again(rig):
-    rig.arm()
-    lost = []
-    rig.link.drop_frame = lambda frame: frame.type == m.Executed.TYPE and len(lost) < 30 and not lost.append(frame)
-    planned = plan(200)
-    job = rig.play(planned)
-    rig.until(lambda: job.is_finished)
-    assert len(lost) == 30
-    assert job.build_executed(planned, 2.45, 1e-6).complete
-    assert job.build_executed(planned, 2.45, 1e-6).on_tick.tolist() == [entry["on_us"] for entry in rig.pulses()]
-    assert m.GetExecuted.TYPE in {frame.type for frame in rig.link.sent}
-
-
-def test_a_lossy_link_does_not_change_the_execution(rig):
-    rig.arm()
-    rng = np.random.default_rng(1)
-    rig.link.drop_frame = lambda frame: rng.random() < 0.1
-    planned = plan(300)
-    job = rig.play(planned)
-    rig.until(lambda: job.is_finished)
-    assert job.build_executed(planned, 2.45, 1e-6).complete
-    assert rig.session.collect_link_stats()["retransmitted"] > 0
-
-
 # --- lease, silence, faults -----------------------------------------------------------------------------------------
 
 
@@ -472,19 +409,6 @@ def test_an_abort_is_confirmed_before_the_next_session_and_limits_precede_arming
     sent = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
     assert sent == [m.Limits.TYPE, m.ArmReq.TYPE]
     assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj
-
-
-def test_a_flush_keeps_the_board_armed(rig):
-    rig.arm()
-    cut = rig.play(plan(500))
-    rig.run(0.3)
-    rig.session.flush()
-    rig.until(lambda: rig.session.is_ready)
-    assert not cut.is_finished
-    planned = plan(50)
-    job = rig.play(planned)
-    rig.until(lambda: job.is_finished)
-    assert job.build_executed(planned, 2.45, 1e-6).complete
 
 
 def test_a_board_that_ended_hold_can_be_armed_again(rig):

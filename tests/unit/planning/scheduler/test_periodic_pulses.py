@@ -11,13 +11,9 @@ from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain,
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
-from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.scheduler import periodic_pulses
 from optodrive.planning.scheduler.periodic_pulses import (
-    build_pulse_recipe,
-    compute_steady_state,
     limit_pulse_width,
-    solve_steady_state,
 )
 
 DISPLAY = DISPLAYS["display-437"]
@@ -46,31 +42,6 @@ def plan_refused(*trains):
     return caught.value.code, str(caught.value)
 
 
-def test_every_cycle_has_its_peak_and_its_peak_to_peak_value():
-    train = HeightTrain(17, 0.0, 1.0, 0.04, 300e-6, 120e-6)
-    result = plan_trains(train)
-    peaks_um, troughs_um = simulate_cycles(result, train)
-    assert len(result.plan) == 25
-    assert peaks_um == pytest.approx(np.full(25, 300.0), rel=0.01)
-    assert (peaks_um - troughs_um)[2:] == pytest.approx(np.full(23, 120.0), rel=0.03)
-    assert (peaks_um - troughs_um)[1] == pytest.approx(120.0, rel=0.05)  # the gas still lags in the first cycle
-    assert result.plan.target_m == pytest.approx(np.full(25, 300e-6))
-    assert result.predicted_m == pytest.approx(np.full(25, 300e-6), rel=0.01)
-
-
-def test_the_mean_level_does_not_grow():
-    """With pulses of fixed energy the level grows with 1 − exp(−t/τ). Here it is constant from the first cycle on."""
-    train = HeightTrain(17, 0.0, 0.5, 0.02, 200e-6, 40e-6)
-    _, troughs_um = simulate_cycles(plan_trains(train), train)
-    assert troughs_um[1] == pytest.approx(160.0, rel=0.03)
-    assert troughs_um[2:] == pytest.approx(np.full(23, 160.0), rel=0.02)
-    steady_j = plan_trains(train).plan.energy_j[-1]
-    fixed = PulseTrain(17, 0.0, 0.5, plan_trains(train).plan.width_s[-1], 0.0, 0.0)
-    fixed = replace(fixed, gap_s=0.02 - fixed.pulse_width_s, power_w=steady_j / fixed.pulse_width_s)
-    _, growing_um = simulate_cycles(plan_trains(fixed), train)
-    assert growing_um[1] < 120.0
-
-
 def test_without_a_peak_to_peak_value_pulses_are_as_short_as_possible():
     train = HeightTrain(17, 0.0, 1.0, 0.04, 200e-6)
     plan = plan_trains(train).plan
@@ -97,29 +68,6 @@ def test_planned_for_the_peak_such_cycles_omit_every_other_pulse(monkeypatch):
     train = HeightTrain(17, 0.0, 0.5, 0.01, 100e-6, 2e-6)
     peaks_um, troughs_um = simulate_cycles(plan_trains(train), train)
     assert (peaks_um - troughs_um)[10:].min() > 4.0
-
-
-def test_a_height_beyond_one_cycle_builds_up_over_several_cycles():
-    train = HeightTrain(17, 0.0, 0.2, 0.01, 380e-6)
-    result = plan_trains(train)
-    peaks_um, _ = simulate_cycles(result, train)
-    assert not result.plan.trimmed_j.any()
-    assert peaks_um[0] < 160.0
-    assert np.all(np.diff(peaks_um[:3]) > 60.0)
-    assert peaks_um[-10:] == pytest.approx(np.full(10, 380.0), rel=0.01)
-
-
-def test_four_interleaved_trains_keep_their_times_and_heights():
-    trains = [
-        HeightTrain(200 + 3 * k, 0.01 * k, 0.6, 0.04, (150 + 5 * k) * 1e-6, 0.675 * (150 + 5 * k) * 1e-6)
-        for k in range(4)
-    ]
-    result = plan_trains(*trains)
-    assert result.train_lateness_max_s < 1e-9
-    for train in trains:
-        peaks_um, troughs_um = simulate_cycles(result, train)
-        assert peaks_um[1:] == pytest.approx(np.full(14, train.target_m * 1e6), rel=0.02)
-        assert (peaks_um - troughs_um)[2:] == pytest.approx(np.full(13, 0.675e6 * train.target_m), rel=0.03)
 
 
 def test_a_pulse_never_exceeds_its_slot():
@@ -172,17 +120,6 @@ def test_frames_fill_the_gaps_and_share_a_pixel_with_a_train():
     assert result.predicted_m[plan.source == 1] == pytest.approx(80e-6, rel=0.01)
 
 
-def test_a_cycle_with_enough_residual_heat_is_skipped_and_named():
-    """A frame leaves the pixel above the target of the train's first cycle."""
-    target_m = np.zeros(len(DISPLAY.layout))
-    target_m[17] = 400e-6
-    train = HeightTrain(17, 0.06, 0.2, 0.04, 40e-6)
-    result = plan_trains(train, frames=[TactileFrame("f", 0.0, 0.06, target_m)])
-    assert [(item.source, item.pixel) for item in result.skipped] == [(1, 17)]
-    assert summarize_plan(result).skipped[0].frame == "train 0"
-    assert len(result.plan) == 5
-
-
 def test_an_unreachable_height_is_refused_with_the_maximum():
     code, message = plan_refused(HeightTrain(17, 0.0, 1.0, 0.04, 5e-3))
     assert code == "target_unreachable"
@@ -211,21 +148,6 @@ def test_starts_too_close_for_a_move_are_refused():
     code, message = plan_refused(*trains)
     assert code == "overlapping_trains"
     assert "trains[0].period_s: got 0.04" in message
-
-
-def test_many_cycles_converge_to_the_steady_state():
-    cold_heat, drive = DISPLAY.build_cold_heat(), limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
-    train = HeightTrain(17, 0.0, 1.0, 0.04, 250e-6, 100e-6)
-    shape = build_pulse_recipe(train, cold_heat, drive, "t")
-    assert shape.target_m == 250e-6
-    found = solve_steady_state(train, cold_heat, drive, shape.min_periods)
-    assert found.peak_m == pytest.approx(250e-6, rel=1e-3)
-    assert found.peak_to_peak_m == pytest.approx(100e-6, rel=0.02)
-    wider = solve_steady_state(train, cold_heat, drive, shape.min_periods + 20)
-    assert wider.peak_to_peak_m < found.peak_to_peak_m
-    assert compute_steady_state(train, cold_heat, drive, 10, 0.5).peak_m == pytest.approx(
-        0.5 * compute_steady_state(train, cold_heat, drive, 10, 1.0).peak_m
-    )
 
 
 MODEL = """format = "optodrive-parameters"
