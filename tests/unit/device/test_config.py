@@ -143,9 +143,3 @@ def test_a_serial_number_of_a_network_dac_is_refused_and_not_ignored(transport):
     table["board"] |= {"transport": transport, "port": "192.168.1.20", "serial_number": "A1"}
     with pytest.raises(ValueError, match="serial_number"):
         Config.model_validate(table)
-
-
-def test_a_layout_is_shown_in_one_short_line():
-    assert repr(build_pixel_layout(load_config("display-437").display)) == (
-        "<PixelLayout: 437 pixels, 21 rows × 21 columns>"
-    )

@@ -79,12 +79,6 @@ def test_a_wrong_bearer_is_not_made_good_by_a_cookie(send_request):
     assert send_request("/", authorization=f"Bearer {TOKEN}")[0] == 200
 
 
-def test_a_foreign_host_or_origin_is_refused_with_the_cookie_too(send_request):
-    cookie = f"optodrive-8450={TOKEN}"
-    assert send_request("/", cookie=cookie, host="elsewhere.example:8450")[0] == 421
-    assert send_request("/", cookie=cookie, origin="http://elsewhere.example")[0] == 403
-
-
 def test_what_asks_for_the_token_is_open_and_holds_none(send_request):
     for path in ("/page/login.js", "/page/login.css", "/page/colours.css"):
         assert send_request(path)[0] == 200

@@ -5,7 +5,6 @@ from optodrive.core.errors import InputError
 from optodrive.daemon.api.tokens import (
     ENVIRONMENT_VARIABLE,
     FILE_ENVIRONMENT_VARIABLE,
-    Tokens,
     build_tokens_path,
     create_tokens,
     load_daemon_tokens,
@@ -144,10 +143,6 @@ def test_a_caller_uses_whichever_is_there(tmp_path, monkeypatch):
     assert read_token(8450) == read_token(None) == SECRET
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, "another")
     assert read_token(8450) == "another"
-
-
-def test_no_tokens_find_nobody():
-    assert Tokens(()).find("") is None
 
 
 def test_a_given_secret_is_kept_as_it_is_or_refused_without_being_shown(tmp_path):

@@ -28,11 +28,6 @@ def test_max_abs_is_the_signed_error_of_largest_magnitude(off_s):
     assert np.abs(off_s - error.max_abs_s).min() < 1e-12
 
 
-def test_without_pulses_no_error_and_with_one_no_drift():
-    assert compute_timing_error(np.zeros(0), np.zeros(0)) is None
-    assert compute_timing_error(np.array([0.1]), np.array([0.3])).drift_ppm == 0.0
-
-
 def test_totals_keep_the_errors_of_largest_magnitude():
     totals = TimingTotals()
     assert totals.worst is None

@@ -60,13 +60,6 @@ def test_brightness_is_averaged_over_the_area_of_a_place():
     assert np.nanmax(np.abs(found - expected)) < 1e-5
 
 
-def test_area_is_preserved_when_sizes_do_not_divide():
-    one = np.zeros((50, 50))
-    one[20:30, 22:29] = 255
-    found = shown(encoded(grey(one)))
-    assert np.nansum(found) == pytest.approx(70 * (21 / 50) ** 2, rel=1e-2)
-
-
 @pytest.mark.parametrize(("size", "rows", "columns"), [((42, 14), 7, 21), ((14, 42), 21, 7), ((1, 1), 21, 21)])
 def test_the_aspect_ratio_is_preserved_and_the_image_centred(size, rows, columns):
     bright = np.nan_to_num(shown(encoded(Image.new("L", size, 255))), nan=1.0) > 0.5
@@ -122,12 +115,6 @@ def test_nearly_black_is_not_driven():
     assert build_image(CONFIG, "t", encoded(Image.new("L", (9, 9), 12)), 1.0, 0.0, False).frames[0].target_m.all()
 
 
-def test_white_is_the_target_height():
-    frame = build_image(CONFIG, "t", encoded(Image.new("L", (9, 9), 255)), 50e-6, 0.0, False).frames[0]
-    assert frame.target_m == pytest.approx(50e-6)
-    assert frame.duration_s > 437 * 3e-3
-
-
 def dots(count):
     pictures = [Image.new("L", (21, 21), 0) for _ in range(count)]
     for k, picture in enumerate(pictures):
@@ -154,11 +141,6 @@ def test_an_image_lasts_for_its_beam_time_unless_a_rate_is_given():
     assert slow[1].show_at_s == slow[0].duration_s
     fast = build_animation(CONFIG, "t", file, 50e-6, 25.0, False).frames
     assert [frame.show_at_s for frame in fast] == pytest.approx([0.0, 0.04])
-
-
-def test_build_image_uses_the_first_image_of_an_animation():
-    frame = build_image(CONFIG, "t", encoded(*dots(3), kind="GIF", duration=50), 50e-6, 0.0, False).frames[0]
-    assert np.flatnonzero(frame.target_m).tolist() == [int(LATTICE.index[10, 5])]
 
 
 def test_a_still_image_is_an_animation_of_one_frame():
@@ -210,12 +192,6 @@ def test_a_truncated_image_is_refused(kind):
         code, message = refusal(file[: int(len(file) * share)])
         assert code == "bad_picture"
         assert message.startswith("image: file: got ")
-
-
-def test_a_truncated_animation_is_refused():
-    noise = [grey(np.random.default_rng(k).integers(0, 256, (64, 64))) for k in range(4)]
-    file = encoded(*noise, kind="GIF", duration=50)
-    assert refusal(file[: len(file) // 2], build_animation)[0] == "bad_picture"
 
 
 def test_large_images_are_refused_before_decoding(monkeypatch):

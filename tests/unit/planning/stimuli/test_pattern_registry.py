@@ -88,11 +88,6 @@ def test_text_and_numbers_give_the_same_arguments():
     assert one == build_pattern("experiment-2", {"speed": 32, "direction": "ccw", "centre": 100}, CONFIG)
 
 
-def test_millimetres_become_metres():
-    sequence = build_pattern("square", {"side_mm": 43.2, "seconds": 0}, CONFIG)
-    assert np.count_nonzero(sequence.frames[0].target_m) == 48
-
-
 def test_a_file_is_bytes_or_base64():
     raw = build_pattern("image", {"file": picture()}, CONFIG)
     text = build_pattern("image", {"file": b64encode(picture()).decode()}, CONFIG)

@@ -11,7 +11,6 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import sequence_file, train_json
-from optodrive.planning.stimuli.json_values import decode_json
 from optodrive.planning.stimuli.sequence_file import (
     load_sequence,
     parse_sequence,
@@ -49,26 +48,6 @@ def test_frames_and_trains_are_read():
     (train,) = sequence.trains
     assert (train.pixel, train.duration_s, train.gap_s, train.power_w) == (17, 0.3, 0.06, 2.45)
     assert train.pulse_width_s == pytest.approx(0.020)
-
-
-def test_a_list_gives_every_pixel():
-    (frame,) = parse_sequence(body([{"target_um": [0.5 * k for k in range(437)]}]), CONFIG, "f").frames
-    assert frame.target_m == pytest.approx(0.5e-6 * np.arange(437))
-
-
-def test_either_part_may_be_absent():
-    assert len(parse_sequence({"frames": [FRAME]}, CONFIG, "f").frames) == 1
-    assert len(parse_sequence({"trains": [TRAIN]}, CONFIG, "f").trains) == 1
-
-
-def test_it_round_trips():
-    sequence = parse_sequence(
-        body([{"id": "a"}, {"show_at_s": 0.7, "target_um": {"0": 0, "436": 3.3}}], [{}]), CONFIG, "f"
-    )
-    again = sequence_to_json(parse_sequence(json.dumps(sequence_to_json(sequence)), CONFIG, "f"))
-    assert again == sequence_to_json(sequence)
-    assert again["frames"][1] == {"id": "frame-1", "show_at_s": 0.7, "duration_s": 0.5, "target_um": {"436": 3.3}}
-    assert again["trains"] == [TRAIN]
 
 
 @pytest.mark.parametrize(
@@ -263,12 +242,6 @@ def test_files_are_read(tmp_path):
     path.write_text('{"frames": [}')
     with pytest.raises(InputError, match=re.escape("frames.json: got")):
         load_sequence(path, CONFIG)
-
-
-def test_parse_json_decodes_text():
-    assert decode_json('{"a": [1, 2.5]}', "body") == {"a": [1, 2.5]}
-    with pytest.raises(InputError, match="valid JSON"):
-        decode_json(b"{'a': 1}", "body")
 
 
 def test_a_full_frame_of_the_largest_display_is_read_in_few_lines_per_pixel():

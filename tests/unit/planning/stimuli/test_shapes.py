@@ -25,7 +25,6 @@ from optodrive.planning.stimuli.shapes import (
     build_moving_edge,
     build_ring,
     build_showcase,
-    build_single_pixel,
     build_square_outline,
     concatenate_sequences,
     find_ring_pixels,
@@ -99,17 +98,6 @@ def test_steps_last_as_requested_or_as_the_beam_needs():
     assert (first.duration_s, third.duration_s) == (0.2, 0.2)
     assert second.duration_s == beam.beam_time_s(full) > 1.0
     assert third.show_at_s == pytest.approx(0.2 + second.duration_s)
-
-
-def test_all_raises_every_pixel():
-    for frame in build_all_pixels(CONFIG, "t", 50e-6, 1.0).frames:
-        assert frame.target_m == pytest.approx(50e-6)
-
-
-def test_single_raises_one():
-    assert raised(build_single_pixel(CONFIG, "t", 17, 1e-4, 0.3).frames[0]).tolist() == [17]
-    assert raised(build_single_pixel(CONFIG, "t", None, 1e-4, 0.3).frames[0]).tolist() == [218]
-    assert len(build_single_pixel(CONFIG, "t", 17, 1e-4, 0.3).frames) == 3
 
 
 def test_checker_leaves_every_neighbour_down():
