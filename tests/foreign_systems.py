@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 from optodrive.lab.discovery import OdeModel, Parameter, Record
 
@@ -341,6 +342,153 @@ def poor_excitation():
             [coupled_tanks(2, _steps(7, 14, 50, 2.0, 5.5))],
         ),
     }
+
+
+def _solve_delayed(rate, t, state, drive, delay):
+    """Return the states [m, n] of rate(time, state, u) with an input, as a function of time, that arrives late."""
+    late = drive(t - delay)
+    spline = CubicSpline(t, late)
+    return solve_ivp(lambda time, y: rate(time, y, spline(time)), (t[0], t[-1]), state, "RK45", t, rtol=1e-8).y.T
+
+
+def _excite(seed, count, dt_s, bandwidth_hz, rms, offset=0.0):
+    t = dt_s * np.arange(count)
+    drive, _ = smooth_input(np.random.default_rng(seed), t, bandwidth_hz, rms)
+    return t, (lambda time: offset + drive(time)), offset + drive(t)
+
+
+def presliding(seed, rms, friction=3.0, distance=0.15, beta=1.0, gamma=0.0, order=1.0):
+    """Return an oscillator of which a part slips, after Bouc and Wen; gamma of 0 and order of 1 is Dahl's friction."""
+    t, force, samples = _excite(seed, 1500, 0.02, 1.5, rms)
+
+    def rate(time, y):
+        x, v, h = y
+        slip = (v - beta * abs(v) * np.sign(h) * abs(h) ** order - gamma * v * abs(h) ** order) / distance
+        return [v, force(time) - 25.0 * x - 0.4 * v - friction * h, slip]
+
+    states = solve_ivp(rate, (0.0, t[-1]), [0.0] * 3, "RK45", t, rtol=1e-7, atol=1e-9, max_step=0.01).y.T
+    return measure(seed + 1, t, states[:, 0], 1e-3, samples)
+
+
+def relaxing_spring(seed, rms):
+    """Return an oscillator with a second spring whose far end creeps after it (standard linear solid)."""
+    t, force, samples = _excite(seed, 1500, 0.02, 1.5, rms)
+    states = solve_ivp(
+        lambda time, y: [y[1], force(time) - 25.0 * y[0] - 0.4 * y[1] - 15.0 * (y[0] - y[2]), (y[0] - y[2]) / 0.4],
+        (0.0, t[-1]), [0.0] * 3, "RK45", t, rtol=1e-8,
+    ).y.T  # fmt: skip
+    return measure(seed + 1, t, states[:, 0], 1e-3, samples)
+
+
+def creeping_actuator(seed, rms, hysteresis=0.0, creep=0.0):
+    """Return an actuator of first order whose position has hysteresis of its voltage, or creeps on."""
+    t, voltage, samples = _excite(seed, 1500, 0.02, 1.0, rms)
+    slope = CubicSpline(t, samples).derivative()
+
+    def rate(time, y):
+        speed = float(slope(time))
+        return [(2.0 * voltage(time) - y[0]) / 0.1, (speed - abs(speed) * y[1]) / 0.4, (y[0] - y[2]) / 3.0]
+
+    states = solve_ivp(
+        rate, (0.0, t[-1]), [2.0 * samples[0], 0.0, 2.0 * samples[0]], "RK45", t, rtol=1e-7, max_step=0.02
+    )
+    x, h, m = states.y
+    return measure(seed + 1, t, x + hysteresis * h + creep * m, 2e-3, samples)
+
+
+def two_nodes(seed, mean, rms, wall_s=40.0, conductance=0.03):
+    """Return a plate that heats a wall behind it, K above the surroundings; samples every 2 s."""
+    t, power, samples = _excite(seed, 1200, 2.0, 0.01, rms, mean)
+    states = solve_ivp(
+        lambda time, y: [
+            0.02 * power(time) - 0.01 * y[0] - conductance * (y[0] - y[1]),
+            (y[0] - y[1]) / wall_s,
+        ],
+        (0.0, t[-1]), [0.0, 0.0], "RK45", t, rtol=1e-8,
+    ).y.T  # fmt: skip
+    return measure(seed + 1, t, states[:, 0], 0.05, samples)
+
+
+def late_input(seed, rms, delay, order=2):
+    """Return an oscillator, or a plate of first order, whose drive arrives late."""
+    if order == 2:
+        t, force, samples = _excite(seed, 1500, 0.02, 1.5, rms)
+        states = _solve_delayed(lambda _, y, u: [y[1], u - 25.0 * y[0] - 0.8 * y[1]], t, [0.0, 0.0], force, delay)
+        return measure(seed + 1, t, states[:, 0], 1e-3, samples)
+    t, power, samples = _excite(seed, 1200, 2.0, 0.01, rms, 100.0)
+    states = _solve_delayed(lambda _, y, u: [0.02 * u - 0.02 * y[0]], t, [0.0], power, delay)
+    return measure(seed + 1, t, states[:, 0], 0.05, samples)
+
+
+def late_output(seed, rms, delay):
+    """Return an oscillator whose position is shown late."""
+    t, force, samples = _excite(seed, 1500, 0.02, 1.5, rms)
+    states = solve_ivp(
+        lambda time, y: [y[1], force(time) - 25.0 * y[0] - 0.8 * y[1]], (0.0, t[-1]), [0.0, 0.0], "RK45", t, rtol=1e-8
+    ).y.T
+    return measure(seed + 1, t, np.interp(t - delay, t, states[:, 0]), 1e-3, samples)
+
+
+def with_memory():
+    """Return systems that lack a term with one inner state.
+
+    By name: kind of term, place, variable, model, records, and one of another size for judging alone.
+    """
+    forced = oscillator_model()
+    plate = first_order_model("rise", "power", (0.02, 1e-3, 1.0), (0.01, 1e-4, 1.0), 0.0)
+    stage = OdeModel(
+        states=("x",),
+        inputs=("voltage",),
+        outputs=("position",),
+        parameters={"gain": Parameter(1.0, 0.1, 10.0), "tau": Parameter(0.2, 0.01, 2.0)},
+        rhs=lambda t, s, u, p: [(p["gain"] * u[0] - s[0]) / p["tau"]],
+        output=lambda s, u, p: [s[0]],
+        initial=lambda first, p: [first[0, 0]],
+    )
+    friction, spring = ("hysteresis", "dv/dt", "x"), ("second node", "dv/dt", "x")
+    sizes = (6.0, 3.0, 4.0)
+
+    def slip(seed, **numbers):
+        return [presliding(seed + 10 * k, size, **numbers) for k, size in enumerate(sizes)]
+
+    def build(make, seed, *further):
+        return [make(seed + 10 * k, size, *further) for k, size in enumerate(sizes)]
+
+    systems = {
+        "Dahl": (friction, forced, slip(1)),
+        "Dahl, short": (friction, forced, slip(2, distance=0.05, friction=2.0)),
+        "Bouc-Wen, closed": (friction, forced, slip(3, beta=0.5, gamma=0.5, distance=0.2)),
+        "Bouc-Wen, sharp": (friction, forced, slip(4, order=2.0, friction=4.0, distance=0.25)),
+        "hysteresis of a voltage": (
+            ("hysteresis", "position", "voltage"),
+            stage,
+            [creeping_actuator(5 + 10 * k, 0.3 * size, hysteresis=0.3) for k, size in enumerate(sizes)],
+        ),
+        "creep": (
+            ("creep", "position", "x"),
+            stage,
+            [creeping_actuator(6 + 10 * k, 0.3 * size, creep=0.15) for k, size in enumerate(sizes)],
+        ),
+        "relaxing spring": (spring, forced, build(relaxing_spring, 7)),
+        "wall": (
+            ("second node", "drise/dt", "rise"),
+            plate,
+            [two_nodes(8 + 10 * k, 100.0, 10.0 * size) for k, size in enumerate(sizes)],
+        ),
+        "slow wall": (
+            ("second node", "drise/dt", "rise"),
+            plate,
+            [two_nodes(9 + 10 * k, 100.0, 10.0 * size, 150.0, 0.01) for k, size in enumerate(sizes)],
+        ),
+        "late force": (("delay", "dv/dt", "force"), forced, build(late_input, 10, 0.09)),
+        "late power": (
+            ("delay", "drise/dt", "power"),
+            plate,
+            [late_input(11 + 10 * k, 10.0 * size, 13.0, 1) for k, size in enumerate(sizes)],
+        ),
+        "late position": (("delay", "position", "x"), forced, build(late_output, 12, 0.07)),
+    }
+    return {name: (*hidden, model, records[:2], records[2]) for name, (hidden, model, records) in systems.items()}
 
 
 def compute_error(model, parameters, record):

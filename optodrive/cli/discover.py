@@ -45,6 +45,7 @@ def build_document(answer: "Discovery") -> dict[str, object]:
                 "formula": each.term.chosen.formula,
                 "kind": each.term.chosen.kind,
                 **build_term_document(each.term),
+                "tested": {name: list(ends) for name, ends in each.tested.items()},
                 "curve": {name: getattr(each.curve, name).tolist() for name in ("x", "y", "low", "high")},
             }
             for each in answer.findings
@@ -66,8 +67,8 @@ def build_lines(answer: "Discovery") -> list[str]:
         return describe_no_term(answer.claim, answer.base_rmse, answer.noise, answer.judged_by)
     lines = []
     for each in answer.findings:
-        variable, x = each.term.chosen.depends_on[0], each.curve.x
-        lines += [*describe_term(each.term), f"  not tested outside of {variable} from {x[0]:.4g} to {x[-1]:.4g}"]
+        ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in each.tested.items())
+        lines += [*describe_term(each.term), f"  not tested outside of {ranges}"]
     lines.append(
         f"held-out error {answer.base_rmse:.4g} before, {answer.extended_rmse:.4g} after, in {answer.judged_by}"
     )

@@ -20,9 +20,19 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms, choose_step, estimate_noise, fit, output_sizes
 from optodrive.lab.discovery.forms import CURVE, CURVES, NAMELESS, Form
 from optodrive.lab.discovery.held_out import choose_splits, prepare_search
-from optodrive.lab.discovery.judgement import Judge, Measured, Proposal, name_form
+from optodrive.lab.discovery.judgement import UNCOMPUTABLE, WITHIN_NOISE, Judge, Measured, Proposal, name_form
+from optodrive.lab.discovery.memory import NONE
 from optodrive.lab.discovery.model import Curve, Discovery, Finding, OdeModel, Record
-from optodrive.lab.discovery.screening import Filtered, Place, Screened, list_places, rank_formulas, screen
+from optodrive.lab.discovery.screening import (
+    Filtered,
+    Place,
+    Screened,
+    list_memories,
+    list_places,
+    rank_formulas,
+    screen,
+    screen_memories,
+)
 from optodrive.lab.inference.claim import MAX_NO_EFFECT, NOTHING_SHOWN, Claim, TermClaim, combine_claims
 
 TIGHTNESS = (0.3, 0.03, 0.003)
@@ -37,13 +47,16 @@ START_UNCERTAINTY = 0.3
 RATE_MEMORY = 10.0
 """Samples over which a model error persists that the filters assume."""
 MAX_TERMS = 4
-PLACES, PLACES_FROM_REST, PLAIN_PLACES, FORMULAS = 3, 7, 2, 5
+PLACES, PLACES_FROM_REST, PLAIN_PLACES, MEMORIES, FORMULAS = 3, 7, 2, 6, 5
 """Places whose formulas are fitted, with a filter and without one, further ones without a factor, and how many of each.
 
 A large effect leads free runs away from where it acts, and the first-order comparison of places with them.
 """
 JUDGED, JUDGED_PER_PLACE = 8, 4
 """Formulas that are judged on what is held out."""
+FREE_PLACES, FREE_JUDGED = 2, 5
+"""Places of free runs, beside those of a filter, of outputs and of memories each, and formulas that are judged of all.
+"""
 REFINEMENTS = 2
 """How often formulas are ranked again along the free runs with the best one."""
 MIN_ERROR = 1e-3
@@ -55,15 +68,17 @@ MIN_FURTHER_GAIN, MIN_FURTHER_GAIN_WHITE = 0.05, 0.1
 
 Where it is known a little more than the first formula's form is seen, which is no term of its own.
 """
+MIN_REST = 0.1
+"""Share of the error beside the terms found before, by the removal of which a smaller further one is added, too."""
 MIN_GAIN_WHITE = 0.5
 """Share of the avoidable error that the first term removes at least, where noise is known: one that leaves more than it
 removes is not what is missing."""
 MIN_SQUARES = 12.0
 """Squares in units of noise that a curve removes in cross-validation, below which no formula is fitted."""
-UNCOMPUTABLE = (np.linalg.LinAlgError, ArithmeticError, ValueError)
-"""Errors of one candidate, which it alone is lost by."""
 MIN_MISSING = 1.0 - MAX_NO_EFFECT
 Progress = Callable[[str, float], None]
+Search = tuple[Point, list[Filtered], list[Screened]]
+"""Parameters, filtered records and places in order of evidence."""
 
 
 def discover(model: OdeModel, train: Sequence[Record], progress: Progress = lambda stage, fraction: None) -> Discovery:
@@ -114,6 +129,8 @@ class _Search:
         for number in range(MAX_TERMS):
             self.progress(f"term {number + 1}", 0.2 + 0.16 * number)
             if current.rmse[0, 1] < MIN_ERROR and not self.is_white:
+                break
+            if found and (current.rmse[:, 1] <= WITHIN_NOISE * self.judge.floor).all():
                 break
             left, first_left = float(current.rmse[0, 1]) - 1.0, float(base.rmse[0, 1]) - 1.0
             if found and self.is_white and left < MIN_FURTHER_GAIN_WHITE * first_left:
@@ -229,35 +246,44 @@ class _Search:
     def _extend(self, base: Measured, current: Measured) -> Found | None:
         """Return the best further term, None if there is no form of one."""
         point = current.points[0]
-        start, filtered, ranked = self._screen(point)
-        if not ranked or ranked[0].loss >= 1.0:
-            return None
+        searches = self._screen(point)
         time = len(self.model.states) + len(self.model.inputs)
-        changes = [each for each in ranked if time in (each.at.variable, each.at.factor)]
         # The curve of a term shows what its formula lacks at its own place; a curve without one lacks one.
-        found = {tuple(row[[0, 2, 3]]) for row in point.terms.table if row[1] not in CURVES}
-        ranked = [
-            each
-            for each in ranked
-            if each not in changes and (each.at.place, each.at.variable, each.at.factor) not in found
-        ]
-        places, evaluations = (PLACES_FROM_REST, 3) if self.model.from_rest else (PLACES, 5)
-        plain = [each for each in ranked[places:] if each.at.factor < 0]
-        shown = ranked[:places] + plain[:PLAIN_PLACES] + changes[:1]
-        if self.is_white:
-            shown = [each for each in shown if (1.0 - each.loss) * each.total >= MIN_SQUARES]
-        start, _ = self._fit_filtered(start, filtered, 5)
-        proposals = list[Proposal]()
-        for screened in shown:
-            proposals += self._propose(screened, start, point.terms, filtered, evaluations)
-        if self.model.from_rest:
-            for _ in range(REFINEMENTS if proposals else 0):
-                with suppress(*UNCOMPUTABLE):
-                    proposals += self._refine(point, min(proposals, key=lambda p: p.loss))
-        judged = self._measure(current, self._choose_judged(proposals, {id(screened) for screened in changes}))
+        found = {tuple(row[[0, 2, 3, 4]].tolist()) for row in point.terms.table if row[1] not in CURVES}
+        judged = list[Proposal]()
+        for number, (start, filtered, ranked) in enumerate(searches):
+            changes = [each for each in ranked if time in (each.at.variable, each.at.factor)]
+            ranked = [each for each in ranked if each not in changes and each.at.key not in found]
+            places, evaluations = (PLACES_FROM_REST, 3) if self.model.from_rest else (PLACES, 5)
+            past = [each for each in ranked if each.at.memory != NONE]
+            present = [each for each in ranked if each.at.memory == NONE]
+            plain = [each for each in present[places:] if each.at.factor < 0]
+            shown = present[:places] + plain[:PLAIN_PLACES] + past + changes[:1]
+            if number > 0:
+                # Beside a filter, free runs show what acts on outputs, or too slowly for one step.
+                outputs = [each for each in present if each.at.place >= len(self.model.states)]
+                shown = outputs[:FREE_PLACES] + past[:FREE_PLACES] + present[:1]
+            if self.is_white:
+                shown = [each for each in shown if (1.0 - each.loss) * each.total >= MIN_SQUARES]
+            start, _ = self._fit_filtered(start, filtered, 5)
+            proposals = list[Proposal]()
+            for screened in shown:
+                proposals += self._propose(screened, start, point.terms, filtered, evaluations)
+            if self.model.from_rest:
+                for _ in range(REFINEMENTS if proposals else 0):
+                    with suppress(*UNCOMPUTABLE):
+                        proposals += self._refine(point, min(proposals, key=lambda p: p.loss))
+            known = {_identify(each) for each in judged}
+            best = self._choose_judged(proposals, {id(screened) for screened in changes})
+            best = [each for each in best if _identify(each) not in known]
+            judged += best[:FREE_JUDGED] if number > 0 else best
+        judged = self._measure(base, current, judged)
         if not judged:
             return None
-        chosen, term = self.judge.judge(base, current, judged, filtered, start)
+        start, filtered, _ = searches[0]
+        start, _ = self._fit_filtered(start, filtered, 5)
+        is_further = len(point.terms) > 0
+        chosen, term = self.judge.judge(base, current, judged, filtered, start, is_further=is_further)
         return Found(chosen, term, judged, filtered)
 
     def _propose(
@@ -283,28 +309,34 @@ class _Search:
 
     @staticmethod
     def _choose_judged(proposals: Sequence[Proposal], changes: set[int]) -> list[Proposal]:
-        """Return the best formulas, few of each place, and of each one curve, and two that change with time."""
-        chosen, counts, physical = list[Proposal](), dict[tuple[Place, bool], int](), 0
+        """Return the best formulas, few of each place, and of each one curve, and two that change with time.
+
+        One with memory does at least as well as the best one without.
+        """
+        chosen, counts, physical = list[Proposal](), dict[tuple[object, ...], int](), 0
         for each in sorted(proposals, key=lambda p: p.loss):
-            is_change, is_curve = id(each.candidate.screened) in changes, each.candidate.form.kind == CURVE
-            key = (each.candidate.screened.at, is_curve and not is_change)
+            at, is_curve = each.candidate.screened.at, each.candidate.form.kind == CURVE
+            is_change, has_memory = id(each.candidate.screened) in changes, at.memory != NONE
+            key: tuple[object, ...] = (at.key, is_curve and not is_change)
             room = 2 if is_change else 1 if is_curve else JUDGED_PER_PLACE
-            if counts.get(key, 0) < room and (is_change or is_curve or physical < JUDGED):
+            if each.candidate.is_constant:
+                key, room = ("constant", at.place), 1
+            is_plain = not (is_change or is_curve or has_memory)
+            if counts.get(key, 0) < room and not (has_memory and physical) and (not is_plain or physical < JUDGED):
                 chosen.append(each)
                 counts[key] = counts.get(key, 0) + 1
-                physical += not is_change and not is_curve
+                physical += is_plain and not each.candidate.is_constant
         return chosen
 
-    def _measure(self, current: Measured, proposals: Sequence[Proposal]) -> list[Proposal]:
+    def _measure(self, base: Measured, current: Measured, proposals: Sequence[Proposal]) -> list[Proposal]:
         """Return the proposals as measured in free runs, fitted in every split from the model without their term."""
-        measured = list[Proposal]()
+        rivals = []
         for each in proposals:
-            with suppress(*UNCOMPUTABLE):
-                term = each.point.terms[-1:]
-                starts = [[point.with_terms(point.terms.extend(term))] for point in current.points]
-                starts[0].insert(0, each.point)
-                measured.append(replace(each, measured=self.judge.measure(starts)))
-        return measured
+            term = each.point.terms[-1:]
+            starts = [[point.with_terms(point.terms.extend(term))] for point in current.points]
+            starts[0].insert(0, each.point)
+            rivals.append((each, starts))
+        return self.judge.measure_rivals(base, current, rivals)
 
     def _reconsider(self, base: Measured, current: Measured, found: Sequence[Found]) -> tuple[Measured, list[Found]]:
         """Return the model and its terms, each judged again beside all others, which may have stood in for it."""
@@ -323,8 +355,8 @@ class _Search:
                 for trial in alone
             ]
             own = replace(each.proposal, point=first, measured=self.judge.measure(turned))
-            judged = [own, *self._measure(others, trials)]
-            chosen, term = self.judge.judge(base, others, judged, each.filtered, None)
+            judged = [own, *self._measure(base, others, trials)]
+            chosen, term = self.judge.judge(base, others, judged, each.filtered, None, is_further=True)
             if self._is_enough(base, others, chosen, True, is_final=True):
                 current = chosen.measured or current
                 kept.append(replace(each, proposal=chosen, term=term))
@@ -351,35 +383,47 @@ class _Search:
         minimum_gain = MIN_FURTHER_GAIN if is_further else 0.0
         if self.is_white:
             minimum_gain = MIN_FURTHER_GAIN_WHITE if is_further else MIN_GAIN_WHITE
+        # A large first term does not hide what can be predicted of the rest.
+        used = slice(None) if is_final else slice(1)
+        left = proposal.measured.rmse[used, 1] / current.rmse[used, 1]
+        is_much_of_rest = is_further and not self.is_white and float(left.max()) < 1.0 - MIN_REST
         return (
             after < before * (1.0 - minimum)
-            and min(shares, default=0.0) >= minimum_gain
+            and (min(shares, default=0.0) >= minimum_gain or is_much_of_rest)
             and min((each.held_out for each in gains), default=0.0) > 0.0
         )
 
-    def _screen(self, point: Point) -> tuple[Point, list[Filtered], list[Screened]]:
-        """Return the places in order of evidence, with the filter that shows it most clearly, and its parameters."""
-        best: tuple[Point, list[Filtered], list[Screened]] | None = None
+    def _screen(self, point: Point) -> list[Search]:
+        """Return the search with the filter that shows a term most clearly, and that along free runs beside it.
+
+        Each has its fitted parameters and the places in order of evidence, and at least one that improves anything.
+        """
+        best, free = list[Search](), list[Search]()
         for tightness in (0.0,) if self.model.from_rest else (*TIGHTNESS, 0.0):
             with suppress(*UNCOMPUTABLE):
                 refitted, _ = self._fit_filtered(point, self._filter(point, tightness), 5)
                 filtered, found = self._screen_filtered(refitted, tightness)
-                gain = -1.0 if not found else 1.0 - found[0].loss
-                if best is None or gain > (LOOSER * (1.0 - best[2][0].loss) if best[2] else -1.0):
-                    best = (refitted, filtered, found)
-        return best or (point, [], [])
+                if not found or found[0].loss >= 1.0:
+                    continue
+                if not best or 1.0 - found[0].loss > LOOSER * (1.0 - best[0][2][0].loss):
+                    best = [(refitted, filtered, found)]
+                if tightness == 0.0:
+                    free = [(refitted, filtered, found)]
+        return best if free and best[0][1] is free[0][1] else best + free
 
     def _screen_filtered(self, point: Point, tightness: float) -> tuple[list[Filtered], list[Screened]]:
         """Return the filtered records, and the places in order of evidence, none where the model diverges."""
         filtered, found = self._filter(point, tightness), list[Screened]()
         if not all(np.isfinite(each.line.predicted).all() for each in filtered):
             return filtered, []
-        for place in list_places(self.simulation, filtered, point):
-            # A term in an output also changes how strongly a filter follows the data: only free runs judge it.
-            if place.place < len(self.model.states) or tightness == 0.0:
-                with suppress(*UNCOMPUTABLE):
-                    screened = screen(filtered, place, len(self.model.states))
-                    found += [] if screened is None or not np.isfinite(screened.loss) else [screened]
+        n = len(self.model.states)
+        # A term in an output also changes how strongly a filter follows the data: only free runs judge it.
+        places = [each for each in list_places(self.simulation, filtered, point) if each.place < n or tightness == 0.0]
+        past = screen_memories(filtered, list_memories(self.simulation, filtered, places), n)
+        for place in places + past[:MEMORIES]:
+            with suppress(*UNCOMPUTABLE):
+                screened = screen(filtered, place, n)
+                found += [] if screened is None or not np.isfinite(screened.loss) else [screened]
         return filtered, sorted(found, key=lambda each: each.loss)
 
     # The answer
@@ -403,13 +447,27 @@ class _Search:
             named = name_form(self.simulation, candidate, values)
             chosen = replace(named, kind=term.chosen.kind, probability=term.chosen.probability, gain=term.chosen.gain)
             forms = tuple(chosen if form is term.chosen else form for form in term.forms)
-            findings.append(Finding(replace(term, chosen=chosen, forms=forms), curve))
+            tested = self._find_ranges(filtered, candidate.screened.at)
+            findings.append(Finding(replace(term, chosen=chosen, forms=forms), curve, tested))
         return tuple(sorted(findings, key=lambda each: -each.term.chosen.gain))
+
+    def _find_ranges(self, filtered: Sequence[Filtered], at: Place) -> dict[str, tuple[float, float]]:
+        """Return the range of the variables of a term along all records."""
+        ranges, names = {}, self.model.variable_names
+        for variable in [at.variable, at.factor] if at.factor >= 0 else [at.variable]:
+            values = np.concatenate([each.variables[:, variable] for each in filtered])
+            ranges[names[variable]] = (float(np.nanmin(values)), float(np.nanmax(values)))
+        return ranges
 
 
 def _is_refused(term: TermClaim) -> bool:
     """Return whether the judge of claims refuses the name of a term."""
     return term.claim.verdict == "unexplained" and term.chosen.kind not in NAMELESS
+
+
+def _identify(proposal: Proposal) -> tuple[object, ...]:
+    """Return the place and the form of a proposal."""
+    return proposal.candidate.screened.at.key, proposal.candidate.form.text
 
 
 def _evaluate(form: Form, values: FloatArray, z: FloatArray) -> FloatArray:

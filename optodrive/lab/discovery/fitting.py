@@ -8,8 +8,9 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.lab.discovery.integration import STEP, Kernels, allocate_work, build_kernels
+from optodrive.lab.discovery.integration import MEMORY, STEP, VARIABLE, Kernels, allocate_work, build_kernels
 from optodrive.lab.discovery.linearisation import Linearisation
+from optodrive.lab.discovery.memory import NONE, PATH
 from optodrive.lab.discovery.model import OdeModel, Record
 from optodrive.lab.inference.fit import fit_residuals
 
@@ -29,7 +30,7 @@ LONGEST_FROM_REST = 8.0
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """Terms added to a model, [r, 4] as in `integration`, with their numbers [r, 3] and which of them are fitted."""
+    """Terms added to a model, [r, 5] as in `integration`, with their numbers [r, 4] and which of them are fitted."""
 
     table: IntArray
     values: FloatArray
@@ -40,8 +41,8 @@ class Terms:
     @classmethod
     def none(cls) -> "Terms":
         """Return an empty table."""
-        empty = np.zeros((0, 3))
-        return cls(np.zeros((0, 4), dtype=np.int64), empty, np.zeros((0, 3), dtype=bool), empty, empty)
+        empty = np.zeros((0, 4))
+        return cls(np.zeros((0, 5), dtype=np.int64), empty, np.zeros((0, 4), dtype=bool), empty, empty)
 
     def extend(self, other: "Terms") -> "Terms":
         """Return both."""
@@ -50,6 +51,11 @@ class Terms:
     def freeze(self) -> "Terms":
         """Return the same terms, none of whose numbers is fitted."""
         return replace(self, free=np.zeros_like(self.free))
+
+    @property
+    def memories(self) -> IntArray:
+        """Rows with memory [k], in the order in which their inner states follow the model's."""
+        return np.flatnonzero(self.table[:, MEMORY] != NONE)
 
     def __getitem__(self, rows: slice) -> "Terms":
         return Terms(*(getattr(self, f)[rows] for f in Terms.__dataclass_fields__))
@@ -83,9 +89,8 @@ class Simulation:
         self.high = np.array([item.high for item in items])
         self.start = np.array([item.start for item in items])
         self.logarithmic = np.array([item.is_logarithmic for item in items])
-        sizes = (len(model.states), len(model.inputs), len(model.outputs), max(len(model.quantities), 1))
-        self.kernels: Kernels = build_kernels(model.rhs, model.output, model.quantity, *sizes, self.names)
-        self._work = allocate_work(*sizes)
+        self._sizes = (len(model.states), len(model.inputs), len(model.outputs), max(len(model.quantities), 1))
+        self.kernels: Kernels = build_kernels(model.rhs, model.output, model.quantity, *self._sizes, self.names)
         self._type = [(name, np.float64) for name in self.names]
 
     def pack(self, rows: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.void]]:
@@ -109,8 +114,12 @@ class Simulation:
         raise InputError("model.initial", "another result", f"a list of {len(self.model.states)} numbers")
 
     def run(self, record: Record, point: Point, gains: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return predicted outputs [m, o] and states [m, n], which follow the data if there are gains [m, n, o]."""
-        m, n, o = len(record.t_s), len(self.model.states), len(self.model.outputs)
+        """Return predicted outputs [m, o] and states [m, n], which follow the data if there are gains [m, n, o].
+
+        The states of memories follow those of the model.
+        """
+        work = self._allocate(point)
+        m, n, o = len(record.t_s), work[0].shape[1], len(self.model.outputs)
         predicted, states = np.zeros((m, o)), np.zeros((m, n))
         x0 = self.initial_state(record, point.parameters)
         self.kernels.run(
@@ -122,11 +131,14 @@ class Simulation:
             self.h_max,
             self.hold,
             np.zeros((m, n, o)) if gains is None else gains,
-            self._work,
+            work,
             predicted,
             states,
         )
         return predicted, states
+
+    def _allocate(self, point: Point) -> tuple[FloatArray, ...]:
+        return allocate_work(self._sizes[0] + len(point.terms.memories), *self._sizes[1:])
 
     def linearise(
         self,
@@ -148,14 +160,18 @@ class Simulation:
                 parameters[position] += delta
                 starts.append((self.initial_state(record, parameters) - x0) / delta)
             else:
-                row, column = divmod(position, 3)
+                row, column = divmod(position, 4)
                 delta = STEP * max(abs(numbers[row, column]), 1e-12)
                 numbers[row, column] += delta
                 starts.append(np.zeros(len(x0)))
             ps.append(parameters)
             values.append(numbers)
             deltas.append(delta)
-        out = Linearisation.allocate(len(record.t_s), len(x0), len(noise), len(columns))
+        work, rows = self._allocate(point), point.terms.table[point.terms.memories]
+        sources = np.concatenate([scales, np.abs(record.inputs).max(axis=0, initial=0.0), np.ones(1 + self._sizes[3])])
+        inner = np.array([1.0 if row[MEMORY] in PATH else sources[row[VARIABLE]] or 1.0 for row in rows])
+        silent = np.zeros(len(rows))
+        out = Linearisation.allocate(len(record.t_s), len(x0) + len(rows), len(noise), len(columns))
         self.kernels.linearise(
             (record.t_s, record.inputs, record.slopes, record.outputs),
             x0,
@@ -163,16 +179,17 @@ class Simulation:
             point.terms.table,
             np.array(values),
             np.array(deltas),
-            scales,
+            np.concatenate([scales, inner]),
             self.h_max,
             self.hold,
-            noise_rate,
+            np.concatenate([noise_rate, silent]),
             noise,
-            start_sigma**2,
-            self._work,
+            np.concatenate([start_sigma**2, silent]),
+            work,
             out,
         )
-        return out, np.array(starts).T.reshape(len(x0), len(columns))
+        first = np.array(starts).T.reshape(len(x0), len(columns))
+        return out, np.concatenate([first, np.zeros((len(rows), len(columns)))])
 
     def list_variables(self, record: Record, point: Point, states: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return all variables [m, v] at the samples, and as they are on arrival there, with the inputs held before."""
@@ -184,7 +201,8 @@ class Simulation:
             derived = np.zeros((len(states), max(len(self.model.quantities), 1)))
             packed = self.pack(point.parameters[None, :])
             self.kernels.describe(record.t_s, states, np.ascontiguousarray(inputs), packed, derived)
-            tables.append(np.column_stack([states, inputs, record.t_s, derived[:, : len(self.model.quantities)]]))
+            own = states[:, : self._sizes[0]]
+            tables.append(np.column_stack([own, inputs, record.t_s, derived[:, : len(self.model.quantities)]]))
         return tables[0], tables[1]
 
     def find_parametrised(self, record: Record, states: FloatArray, point: Point) -> list[int]:
@@ -198,7 +216,9 @@ class Simulation:
                 rows[-1][position] += 1e-3 * (self.high - self.low)[position] * (rows[-1][position] == 0.0)
             packed = self.pack(np.array(rows)).view(np.recarray)
             rates = [
-                np.array(self.model.rhs(record.t_s[k], states[k], record.inputs[k], p), dtype=np.float64)
+                np.array(
+                    self.model.rhs(record.t_s[k], states[k, : self._sizes[0]], record.inputs[k], p), dtype=np.float64
+                )
                 for p in packed
             ]
             found |= {int(s) for rate in rates[1:] for s in np.flatnonzero(rate != rates[0])}
@@ -244,13 +264,20 @@ def fit(
     weights: [m, o] per record, 0 where a sample does not count; gains: as of `Simulation.run`, None for free runs
     """
     used = [np.isfinite(r.outputs) & (w > 0.0) for r, w in zip(records, weights, strict=True)]
+    # What follows the last sample that counts need not be simulated.
+    parts_used = []
+    for k, (record, mask) in enumerate(zip(records, used, strict=True)):
+        if mask.any():
+            part = record.cut(int(np.flatnonzero(mask.any(axis=1))[-1]) + 1)
+            end = len(part.t_s)
+            parts_used.append((part, None if gains is None else gains[k], weights[k][:end], mask[:end]))
 
     def residuals(vector: FloatArray) -> FloatArray:
         trial = simulation.from_vector(vector * unit, point)
         parts = []
-        for k, record in enumerate(records):
-            predicted, _ = simulation.run(record, trial, None if gains is None else gains[k])
-            error = weigh(record, record.outputs - predicted, weights[k])[used[k]]
+        for record, gain, weight, mask in parts_used:
+            predicted, _ = simulation.run(record, trial, gain)
+            error = weigh(record, record.outputs - predicted, weight)[mask]
             parts.append(np.nan_to_num(np.clip(error, -DIVERGED, DIVERGED), nan=DIVERGED))
         return np.concatenate(parts)
 

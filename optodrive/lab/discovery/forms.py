@@ -26,7 +26,7 @@ from optodrive.core.types.arrays import FloatArray
 ) = range(14)
 CURVES = (SINE, COSINE, BUMP)
 MAX_EXPONENT = 50.0
-CURVE, CHANGE = "curve", "change with time"
+CONSTANT, CURVE, CHANGE = "constant", "curve", "change with time"
 """Kinds that are no names: what follows the data without a formula of physics, and what no state explains."""
 NAMELESS = {CURVE: "a curve without a formula", CHANGE: "changes with time: not explained"}
 MAX_SHARE_OF_FRICTION = 0.1
@@ -112,10 +112,14 @@ class Form:
         return replace(self, kind="saturation", text="tanh({z} / {a})")
 
     def describe(self, values: FloatArray, variable: str, factor: str = "") -> str:
-        """Return one term as a formula, such as -7.41e+05 x^3. values: [3] amplitude and inner numbers."""
-        amplitude, first, second = (f"{value:.4g}" for value in values)
+        """Return one term as a formula, such as -7.41e+05 x^3. values: amplitude and inner numbers."""
+        amplitude, first, second = (f"{value:.4g}" for value in values[:3])
         text = self.text.format(z=variable, a=first, b=second)
         return " ".join(part for part in (amplitude, factor, text) if part)
+
+
+LINEAR = Form(POWER, np.array([[1.0, 0.0]]), 0, "linear", "{z}")
+"""Form of a term with memory."""
 
 
 def list_forms(z: FloatArray) -> list[Form]:
@@ -125,7 +129,7 @@ def list_forms(z: FloatArray) -> list[Form]:
     def starts(first: FloatArray, second: float = 0.0) -> FloatArray:
         return np.column_stack([first, np.full(len(first), second)])
 
-    powers = {"constant": "", "linear": "{z}", "quadratic": "{z}^2", "cubic": "{z}^3", "fourth power": "{z}^4"}
+    powers = {CONSTANT: "", "linear": "{z}", "quadratic": "{z}^2", "cubic": "{z}^3", "fourth power": "{z}^4"}
     forms = [
         Form(POWER, starts(np.array([float(power)])), 0, kind, text)
         for power, (kind, text) in enumerate(powers.items())

@@ -2,9 +2,11 @@
 
 Theory of operation. Classical Runge–Kutta between samples, with inputs held or interpolated linearly, substeps of at
 most h_max. At each sample the predicted outputs are written, then the states may be corrected by a gain times the
-prediction error, for outputs that were measured. Without gains this is a free run. With the gains of an extended Kalman
-filter the states follow the data, although the model is wrong, so that a term that depends on them can be recognised;
-the gains are computed once and then kept, and the prediction errors remain smooth functions of all parameters.
+prediction error, for outputs that were measured. A term with memory has one inner state, which is carried over each
+substep in closed form and follows the model's states in the vector x. Without gains this is a free run. With the gains
+of an extended Kalman filter the states follow the data, although the model is wrong, so that a term that depends on
+them can be recognised; the gains are computed once and then kept, and the prediction errors remain smooth functions of
+all parameters.
 
 `linearise` also returns, per sample, the derivatives of the next state and of the outputs by states, by an additional
 rate in each equation, and by each parameter, from single perturbed steps (`linearisation.py`).
@@ -27,11 +29,13 @@ from optodrive.core.kernels import compile_here
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.discovery.forms import evaluate_form
 from optodrive.lab.discovery.linearisation import copy, correct, predict_covariance
+from optodrive.lab.discovery.memory import DELAY, NONE, carry, start_memory, take_value
 
-PLACE, FORM, VARIABLE, FACTOR = range(4)
-"""Columns of a table of terms: place (states' equations, then outputs), form, variable, and a variable that multiplies
-the form, or -1. Variables: states, inputs, time, quantities of the model. The table of values holds amplitude and the
-form's inner numbers."""
+PLACE, FORM, VARIABLE, FACTOR, MEMORY = range(5)
+"""Columns of a table of terms: place (states' equations, then outputs), form, variable, a variable that multiplies the
+form, or -1, and which memory of the variable the form is a function of. Variables: states, inputs, time, quantities of
+the model. The table of values holds amplitude, the form's inner numbers and the memory's scale."""
+SCALE = 3
 STEP = 1e-5
 """Relative step of derivatives."""
 MAX_STATE = 1e9
@@ -66,7 +70,7 @@ def build_kernels(
     """
     p = np.ones(1, dtype=[(name, np.float64) for name in parameters])
     t, u, y = np.array([0.0, 1e-9]), np.zeros((2, i)), np.zeros((2, o))
-    terms, values, gains = np.zeros((0, 4), dtype=np.int64), np.zeros((0, 3)), np.zeros((2, n, o))
+    terms, values, gains = np.zeros((0, 5), dtype=np.int64), np.zeros((0, 4)), np.zeros((2, n, o))
     work = allocate_work(n, i, o, c)
     for count_references in (False, True):
         kernels = _build(rhs, output, quantity, n, i, o, count_references)
@@ -79,8 +83,8 @@ def build_kernels(
 
 
 def allocate_work(n: int, i: int, o: int, c: int) -> tuple[FloatArray, ...]:
-    """Return work arrays of a run: [9, n], [i], [o], [2, n, n] and [c]."""
-    return np.zeros((9, n)), np.zeros(i), np.zeros(o), np.zeros((2, n, n)), np.zeros(c)
+    """Return work arrays of a run with n states, those of memories included: [10, n], [i], [o], [2, n, n] and [c]."""
+    return np.zeros((10, n)), np.zeros(i), np.zeros(o), np.zeros((2, n, n)), np.zeros(c)
 
 
 def _return_tuple(function: Any) -> Any:
@@ -109,7 +113,7 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         output = compile_(output if counts_references else _return_tuple(output))
         quantity = compile_(quantity if counts_references else _return_tuple(quantity))
     else:
-        state_tuple = input_tuple = np.array
+        state_tuple, input_tuple = lambda x: np.array(x[:n]), np.array
         record = lambda ps, q: ps.view(np.recarray)[q]  # noqa: E731
     if counts_references or not is_compiled:
 
@@ -135,32 +139,118 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         return float(u[which - n]) if which < n + i else t
 
     @compile_
-    def term_value(terms: Any, values: Any, row: int, t: float, x: Any, u: Any, derived: Any) -> float:
-        factor = 1.0 if terms[row, FACTOR] < 0 else variable(terms[row, FACTOR], t, x, u, derived)
-        z = variable(terms[row, VARIABLE], t, x, u, derived)
-        return float(factor * values[row, 0] * evaluate_form(terms[row, FORM], z, values[row, 1], values[row, 2]))
+    def delayed(which: int, k: int, t: float, z: float, delay: float, hold: int, samples: Any, states: Any) -> float:
+        """Return a state or an input as it was before a delay, at time t after sample k, when it is z."""
+        times, u, d, _ = samples
+        at, is_state = t - delay, which < n
+        column = which if is_state else which - n
+        past = states if is_state else u
+        if at <= times[0]:
+            return float(past[0, column])
+        last = k
+        while last > 0 and times[last] > at:
+            last -= 1
+        before, h = past[last, column], max((t if last == k else times[last + 1]) - times[last], 1e-300)
+        if hold == 0 and not is_state:
+            return float(before)
+        after, part = z if last == k else past[last + 1, column], (at - times[last]) / h
+        rise = after - before
+        low = high = rise
+        if is_state:  # its slopes from the samples beside
+            if last > 0:
+                low = h * (after - past[last - 1, column]) / (times[last] + h - times[last - 1])
+            if last + 2 <= k:
+                high = h * (past[last + 2, column] - before) / (times[last + 2] - times[last])
+        elif hold > 1:
+            low, high = h * d[last, column], h * d[min(last + 1, len(times) - 1), column]
+        back = 1.0 - part
+        return float(before + part * rise + part * back * (back * (low - rise) - part * (high - rise)))
+
+    @compile_
+    def read_variables(terms: Any, t: float, x: Any, u: Any, derived: Any, out: Any) -> None:
+        """Write the variable of each term with memory."""
+        slot = n
+        for row in range(len(terms)):
+            if terms[row, MEMORY] != NONE:
+                out[slot] = variable(terms[row, VARIABLE], t, x, u, derived)
+                slot += 1
+
+    @compile_
+    def remember(
+        k: int,
+        t: float,
+        dt: float,
+        x: Any,
+        u: Any,
+        terms: Any,
+        values: Any,
+        derived: Any,
+        z0: Any,
+        hold: int,
+        samples: Any,
+        states: Any,
+        out: Any,
+    ) -> None:
+        """Write the memories at time t after sample k, dt after they were x and their variables z0. u: [i] inputs."""
+        slot = n
+        for row in range(len(terms)):
+            kind = terms[row, MEMORY]
+            if kind != NONE:
+                z = variable(terms[row, VARIABLE], t, out, u, derived)
+                if kind == DELAY:
+                    out[slot] = delayed(terms[row, VARIABLE], k, t, z, values[row, SCALE], hold, samples, states)
+                else:
+                    out[slot] = carry(kind, x[slot], z0[slot], z, dt, values[row, SCALE])
+                slot += 1
+
+    @compile_
+    def add_terms(
+        first: int, last: int, terms: Any, values: Any, t: float, x: Any, u: Any, derived: Any, out: Any
+    ) -> None:
+        """Add the terms at places from first to last, with the memories in x."""
+        slot = n
+        for row in range(len(terms)):
+            z = variable(terms[row, VARIABLE], t, x, u, derived)
+            if terms[row, MEMORY] != NONE:
+                z = take_value(terms[row, MEMORY], x[slot], z)
+                slot += 1
+            if first <= terms[row, PLACE] < last:
+                factor = 1.0 if terms[row, FACTOR] < 0 else variable(terms[row, FACTOR], t, x, u, derived)
+                form = evaluate_form(terms[row, FORM], z, values[row, 1], values[row, 2])
+                out[terms[row, PLACE] - first] += factor * values[row, 0] * form
 
     @compile_
     def rates(
         t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, values: Any, offset: Any, derived: Any, out: Any
     ) -> None:
-        store(rhs(t, state_tuple(x), input_tuple(u), record(ps, q)), out)
+        store(rhs(t, state_tuple(x), input_tuple(u), record(ps, q)), out[:n])
         for j in range(n):
             out[j] += offset[j]
         if len(terms) > 0:
+            add_terms(0, n, terms, values, t, x, u, derived, out)
+
+    @compile_
+    def derive(t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, derived: Any) -> None:
+        if len(terms) > 0:
             store(quantity(t, state_tuple(x), input_tuple(u), record(ps, q)), derived)
-        for row in range(len(terms)):
-            if terms[row, PLACE] < n:
-                out[terms[row, PLACE]] += term_value(terms, values, row, t, x, u, derived)
 
     @compile_
     def observe(t: float, x: Any, u: Any, ps: Any, q: int, terms: Any, values: Any, derived: Any, out: Any) -> None:
         store(output(state_tuple(x), input_tuple(u), record(ps, q)), out)
         if len(terms) > 0:
-            store(quantity(t, state_tuple(x), input_tuple(u), record(ps, q)), derived)
+            derive(t, x, u, ps, q, terms, derived)
+            add_terms(n, n + o, terms, values, t, x, u, derived, out)
+
+    @compile_
+    def start(t: float, u: Any, ps: Any, terms: Any, derived: Any, x: Any) -> None:
+        """Write the memories at the start of a record."""
+        derive(t, x, u, ps, 0, terms, derived)
+        read_variables(terms, t, x, u, derived, x)
+        slot = n
         for row in range(len(terms)):
-            if terms[row, PLACE] >= n:
-                out[terms[row, PLACE] - n] += term_value(terms, values, row, t, x, u, derived)
+            if terms[row, MEMORY] != NONE:
+                x[slot] = start_memory(terms[row, MEMORY], x[slot])
+                slot += 1
 
     @compile_
     def advance(
@@ -177,15 +267,17 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         work: Any,
         held: Any,
         derived: Any,
+        states: Any,
     ) -> None:
         """Advance x in place from sample k - 1 to k.
 
-        work: [5, n]; held: [i] inputs within a step; hold: 0, 1 or 2
+        work: [10, n]; held: [i] inputs within a step; hold: 0, 1 or 2; states: [m, n] at samples before k
         """
         t, u, d, _ = samples
         t0, t1, u0, u1, d0, d1 = t[k - 1], t[k], u[k - 1], u[k], d[k - 1], d[k]
         steps = min(max(1, ceil((t1 - t0) / h_max - 1e-6)), MAX_SUBSTEPS)
         h = (t1 - t0) / steps
+        z0, has_memory = work[9], len(x) > n
         for step in range(steps):
             at = step / steps
             for stage in range(4):
@@ -200,14 +292,31 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
                 weight = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
                 for j in range(n):
                     work[4, j] = x[j] + (weight * work[stage - 1, j] if stage > 0 else 0.0)
-                rates(t0 + part * (t1 - t0), work[4], held, ps, q, terms, values, offset, derived, work[stage])
+                now = t0 + part * (t1 - t0)
+                derive(now, work[4], held, ps, q, terms, derived)
+                if has_memory:
+                    if stage == 0:
+                        if step == 0 and hold == 0 and k > 1:  # the input jumped at the sample
+                            read_variables(terms, t0, work[4], u[k - 2], derived, z0)
+                            remember(
+                                k - 1, t0, 0.0, x, held, terms, values, derived, z0, hold, samples, states, work[4]
+                            )
+                            for j in range(n, len(x)):
+                                x[j] = work[4, j]
+                        read_variables(terms, now, work[4], held, derived, z0)
+                    remember(k - 1, now, weight, x, held, terms, values, derived, z0, hold, samples, states, work[4])
+                rates(now, work[4], held, ps, q, terms, values, offset, derived, work[stage])
             for j in range(n):
-                x[j] += h / 6.0 * (work[0, j] + 2.0 * work[1, j] + 2.0 * work[2, j] + work[3, j])
+                work[4, j] = x[j] + h / 6.0 * (work[0, j] + 2.0 * work[1, j] + 2.0 * work[2, j] + work[3, j])
+            if has_memory:
+                derive(now, work[4], held, ps, q, terms, derived)
+                remember(k - 1, now, h, x, held, terms, values, derived, z0, hold, samples, states, work[4])
+            copy(work[4], x)
 
     @compile_
     def is_sound(x: Any) -> bool:
         sound = True
-        for j in range(n):
+        for j in range(len(x)):
             sound = sound and isfinite(x[j]) and abs(x[j]) <= MAX_STATE
         return sound
 
@@ -228,11 +337,13 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         t, u, _, y = samples
         work, held, _, _, derived = workspace
         x, offset = work[5], work[6]
-        copy(x0, x)
+        for s in range(n):
+            x[s] = x0[s]
         offset[:] = 0.0
+        start(t[0], u[0], ps, terms, derived, x)
         for k in range(len(t)):
             if k > 0:
-                advance(k, samples, h_max, hold, ps, 0, terms, values, offset, x, work, held, derived)
+                advance(k, samples, h_max, hold, ps, 0, terms, values, offset, x, work, held, derived, states)
             if not is_sound(x):
                 predicted[k:] = np.nan
                 states[k:] = np.nan
@@ -240,7 +351,7 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
             observe(t[k], x, u[k], ps, 0, terms, values, derived, predicted[k])
             for j in range(o):
                 if isfinite(y[k, j]):
-                    for s in range(n):
+                    for s in range(gains.shape[1]):  # a term's memory that was added later is not corrected
                         x[s] += gains[k, s, j] * (y[k, j] - predicted[k, j])
             copy(x, states[k])
 
@@ -265,35 +376,42 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         t, u, _, y = samples
         work, held, y1, half, derived = workspace
         x, offset, before, moved = work[5], work[6], work[7], work[8]
-        copy(x0, x)
+        size_n = len(x)
+        for s in range(n):
+            x[s] = x0[s]
         offset[:] = 0.0
+        start(t[0], u[0], ps, terms, derived, x)
         covariance = half[0]
         covariance[:] = 0.0
-        for s in range(n):
+        for s in range(size_n):
             covariance[s, s] = start_variance[s]
         for k in range(len(t)):
             if k > 0:
                 copy(x, before)
                 # Unperturbed, then each state, each rate and each number moved a little.
-                for case in range(1 + 2 * n + len(deltas)):
-                    q, j, size = 0, (case - 1) % n, 1.0
+                for case in range(1 + 2 * size_n + len(deltas)):
+                    q, j, size = 0, (case - 1) % size_n, 1.0
+                    if size_n < case <= 2 * size_n and j >= n:
+                        continue
                     copy(before, moved)
-                    if 1 <= case <= n:
+                    if 1 <= case <= size_n:
                         size = STEP * scales[j]
                         moved[j] += size
-                    elif n < case <= 2 * n:
+                    elif size_n < case <= 2 * size_n:
                         size = STEP * scales[j] / (t[k] - t[k - 1])
                         offset[j] = size
-                    elif case > 2 * n:
-                        q = case - 2 * n
+                    elif case > 2 * size_n:
+                        q = case - 2 * size_n
                         size = deltas[q - 1]
-                    advance(k, samples, h_max, hold, ps, q, terms, values[q], offset, moved, work, held, derived)
-                    for s in range(n):
+                    advance(
+                        k, samples, h_max, hold, ps, q, terms, values[q], offset, moved, work, held, derived, states
+                    )
+                    for s in range(size_n):
                         if case == 0:
                             x[s] = moved[s]
-                        elif case <= n:
+                        elif case <= size_n:
                             transition[k, s, j] = (moved[s] - x[s]) / size
-                        elif case <= 2 * n:
+                        elif case <= 2 * size_n:
                             response[k, s, j] = (moved[s] - x[s]) / size
                         else:
                             forcing[k, s, q - 1] = (moved[s] - x[s]) / size
@@ -303,10 +421,10 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
                 predicted[k:] = np.nan
                 states[k:] = np.nan
                 return
-            for case in range(1 + n + len(deltas)):
-                q, size = max(case - n, 0), 1.0
+            for case in range(1 + size_n + len(deltas)):
+                q, size = max(case - size_n, 0), 1.0
                 copy(x, moved)
-                if 1 <= case <= n:
+                if 1 <= case <= size_n:
                     size = STEP * scales[case - 1]
                     moved[case - 1] += size
                 elif q > 0:
@@ -315,7 +433,7 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
                 for j in range(o):
                     if case == 0:
                         predicted[k, j] = y1[j]
-                    elif case <= n:
+                    elif case <= size_n:
                         observation[k, j, case - 1] = (y1[j] - predicted[k, j]) / size
                     else:
                         direct[k, j, q - 1] = (y1[j] - predicted[k, j]) / size

@@ -6,7 +6,8 @@ between two forms; how far one is behind another is the sum of its differences i
 claim follows is decided in `lab.inference`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +15,9 @@ import numpy as np
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.discovery.fitting import Point, Simulation, fit, output_sizes, run_errors, weigh
-from optodrive.lab.discovery.forms import CHANGE, CURVE, NAMELESS, Form
+from optodrive.lab.discovery.forms import CHANGE, CURVE, LINEAR, NAMELESS, Form
 from optodrive.lab.discovery.held_out import Split, sum_parts
+from optodrive.lab.discovery.memory import NONE, TEXTS, name_memory
 from optodrive.lab.discovery.model import Record
 from optodrive.lab.discovery.screening import Candidate, Filtered, find_twin
 from optodrive.lab.inference.claim import (
@@ -42,6 +44,8 @@ SAME = 0.01
 """Squared difference of two functions, relative to the smaller one, below which they are one."""
 ALIKE_SIGMA, NEARLY = 2.0, 0.9
 """How far behind a simpler form may be, and which share of a curve's gain a formula of physics needs, to replace it."""
+UNCOMPUTABLE = (np.linalg.LinAlgError, ArithmeticError, ValueError)
+"""Errors of one candidate, which it alone is lost by."""
 NO_OFFSET = 0.1
 """Value of a term where its variable is nearest to zero, relative to its largest, below which it vanishes there."""
 PER_NUMBER, PER_CHANGE = 0.5, 0.1
@@ -77,7 +81,7 @@ class Proposal:
     def evaluate(self, z: FloatArray) -> FloatArray:
         """Return the values [n] of the proposed term at z [n]."""
         point = self.point if self.measured is None else self.measured.points[0]
-        amplitude, first, second = point.terms.values[-1].tolist()
+        amplitude, first, second, _ = point.terms.values[-1].tolist()
         return np.asarray(self.candidate.form.evaluate(z, first, second) * amplitude)
 
 
@@ -103,11 +107,16 @@ class Judge:
         """Return the errors [m, o] of free runs of all records."""
         return run_errors(self.simulation, self.records, point, self.sizes)
 
-    def measure(self, starts: Sequence[Sequence[Point]], evaluations: int = 12) -> Measured:
-        """Return a model fitted in each split from some points of it, of which the first split's answer is one more."""
+    def measure(self, starts: Sequence[Sequence[Point]], max_rmse: float = np.inf) -> Measured:
+        """Return a model fitted in each split from some points of it, of which the first split's answer is one more.
+
+        Raises ValueError where the error of what the first split holds out is above max_rmse.
+        """
         points, rmse, logs, first = list[Point](), list[list[float]](), list[FloatArray](), list[FloatArray]()
         for split, own in zip(self.splits, starts, strict=True):
-            points.append(self.fit([*own, *points[:1]], split.fitted, evaluations))
+            if rmse and rmse[0][1] > max_rmse:
+                raise ValueError(f"error {rmse[0][1]:.4g}: no rival of the best one")
+            points.append(self.fit([*own, *points[:1]], split.fitted))
             errors = self.run(points[-1])
             first = first or errors
             rmse.append([_compute_rms(errors, split.fitted), _compute_rms(errors, split.held_out)])
@@ -128,13 +137,30 @@ class Judge:
             if not quiet
         )
 
+    def measure_rivals(
+        self, base: Measured, current: Measured, rivals: Iterable[tuple[Proposal, Sequence[Sequence[Point]]]]
+    ) -> list[Proposal]:
+        """Return proposals measured from starts in every split, without those that cannot be rivals of the best."""
+        found, best = list[Proposal](), 0.0
+        before, first = min(current.rmse[0, 1], base.rmse[0, 1]), base.rmse[0, 1]
+        for each, starts in rivals:
+            with suppress(*UNCOMPUTABLE):
+                # What gains less than this share of another's gain in one split is no rival of it.
+                enough = max(before - MIN_KEPT * best * (first - self.floor), WITHIN_NOISE * self.floor)
+                measured = self.measure(starts, enough if best > 0.0 else np.inf)
+                gains = self.measure_gains(base, current, measured)
+                best = max(best, min((gain.held_out for gain in gains), default=0.0))
+                found.append(replace(each, measured=measured))
+        return found
+
     def compute_evidence(
-        self, before: Sequence[FloatArray], after: Sequence[FloatArray], masks: Sequence[BoolArray]
+        self, before: Sequence[FloatArray], after: Sequence[FloatArray], masks: Sequence[BoolArray], tries: int
     ) -> float:
         """Return the probability of no effect from errors [m, o] without and with a term in masked samples.
 
         The change of the predictions does not depend on the noise of held-out samples, so without an effect the sum of
-        its products with the errors has mean zero. Their noise is that with the errors that the term leaves.
+        its products with the errors has mean zero. Their noise is that with the errors that the term leaves. tries: how
+        many terms were compared, of which this one is the best
         """
         change = [a - b for a, b in zip(before, after, strict=True)]
         products = [
@@ -143,7 +169,7 @@ class Judge:
         ]
         improves = sum(float(np.sum(each)) for each in products) > 0.0  # the sum of squares falls
         sigma, parts = sum_in_sigma(*products)
-        return compute_no_effect(sigma if improves else 0.0, parts, tries=2)
+        return compute_no_effect(sigma if improves else 0.0, parts, tries)
 
     def judge(
         self,
@@ -152,29 +178,33 @@ class Judge:
         proposals: Sequence[Proposal],
         filtered: Sequence[Filtered],
         start: Point | None,
+        *,
+        is_further: bool,
     ) -> tuple[Proposal, TermClaim]:
         """Return the proposal to extend the model by, and the claim on its term.
 
-        filtered: the search's records; start: the model without the term there, None where it is known to be missing
+        filtered: the search's records; start: the model without the term there, None where it is known to be missing;
+        is_further: whether there are other terms, beside which a curve only follows what they leave
         """
         fitted = [(each, each.measured) for each in proposals if each.measured is not None]
         kept = list[tuple[Proposal, Measured]]()
         named = dict[str, tuple[Proposal, Measured]]()
         for each, measured in sorted(fitted, key=lambda item: -float(item[1].logs.mean())):
             named[self.name(each).name] = each, measured  # of one name the best, which is the last
-        # Curves come last: one is as good as a formula of physics nearly everywhere. Of equally simple forms one
-        # that vanishes where its variable does comes first, and then the better one: it stands for those like it.
+        # Curves come last: one is as good as a formula of physics nearly everywhere. Before them come memories, for
+        # which no function of the present may do as well. Of equally simple forms one that vanishes where its variable
+        # does comes first, and then the better one: it stands for those like it.
         for each, measured in sorted(
             named.values(),
             key=lambda item: (
                 item[0].candidate.form.kind == CURVE,
+                item[0].candidate.screened.at.memory != NONE,
                 item[0].candidate.numbers,
                 _has_offset(item[0]),
                 float(item[1].logs.mean()),
             ),
         ):
-            alike = [other for one, other in kept if _is_same(one, each) and _is_behind(other, measured) < ALIKE_SIGMA]
-            if not alike:
+            if not any(_stands_for((one, other), (each, measured), before) for one, other in kept):
                 kept.append((each, measured))
         forms = [self.name(each) for each, _ in kept]
         gains = [self.measure_gains(base, before, measured) for _, measured in kept]
@@ -203,13 +233,14 @@ class Judge:
         ]
         is_usable = [form.gain > 0.0 and len(own) > 0 for form, own in zip(forms, gains, strict=True)]
         # Time explains any slow misfit: it is what is left where no state and no input extrapolates.
-        order = sorted(range(len(kept)), key=lambda k: (not is_usable[k], forms[k].kind == CHANGE, -weights[k]))
+        last = (CHANGE, CURVE) if is_further else (CHANGE,)
+        order = sorted(range(len(kept)), key=lambda k: (not is_usable[k], forms[k].kind in last, -weights[k]))
         chosen = order[0]
-        no_effect = 0.0
+        no_effect, tries = 0.0, 2 * len(kept)  # in predictions that follow the data, and in free runs
         if start is not None:
-            no_effect = self._compute_step_evidence(filtered, start, kept[chosen][0].point)
+            no_effect = self._compute_step_evidence(filtered, start, kept[chosen][0].point, tries)
         if before.rmse[0, 1] > START_NOISE * self.floor:
-            run_evidence = self.compute_evidence(before.errors, kept[chosen][1].errors, self.splits[0].held_out)
+            run_evidence = self.compute_evidence(before.errors, kept[chosen][1].errors, self.splits[0].held_out, tries)
             no_effect = min(no_effect, run_evidence)
         names = {k: (f"{forms[k].name} ({forms[k].formula})",) for k in order}
         probabilities = Probabilities(no_effect, 0.0, {names[k]: (1.0 - no_effect) * weights[k] for k in order})
@@ -231,7 +262,7 @@ class Judge:
             found = replace(found, next_record=self._propose_record(kept, forms, chosen, rival, gains[chosen]))
         return kept[chosen][0], found
 
-    def _compute_step_evidence(self, filtered: Sequence[Filtered], start: Point, longer: Point) -> float:
+    def _compute_step_evidence(self, filtered: Sequence[Filtered], start: Point, longer: Point, tries: int) -> float:
         """Return the probability of no effect from predictions that follow the data, where held out."""
         records, gains = [each.record for each in filtered], [each.line.gains for each in filtered]
         before, after = (
@@ -243,7 +274,7 @@ class Judge:
             ]
             for point in (start, longer)
         )
-        return self.compute_evidence(before, after, [each.fold < 0 for each in filtered])
+        return self.compute_evidence(before, after, [each.fold < 0 for each in filtered], tries)
 
     def _find_twin(self, filtered: Sequence[Filtered], proposal: Proposal) -> str:
         """Return another variable of which the term is a function too, "" if there is none."""
@@ -290,13 +321,16 @@ class Judge:
 
 
 def name_form(simulation: Simulation, candidate: Candidate, values: FloatArray) -> TermForm:
-    """Return the form of a candidate with fitted numbers [3]."""
+    """Return the form of a candidate with fitted numbers [4]."""
     at, nodes, model = candidate.screened.at, candidate.screened.nodes, simulation.model
     names = model.variable_names
     involved = (names[at.variable], *((names[at.factor],) if at.factor >= 0 else ()))
     form: Form = candidate.form.settle(float(values[1]), float(np.abs(nodes).max()))
     kind = CHANGE if "t" in involved else form.kind
     formula = NAMELESS[CHANGE] if kind == CHANGE else form.describe(values, *involved)
+    if at.memory != NONE:
+        kind = name_memory(at.memory, at.place >= len(model.states), at.variable < len(model.states))
+        formula = f"{values[0]:.4g} {TEXTS[at.memory].format(z=involved[0], s=f'{values[3]:.4g}')}"
     return TermForm(model.place_names[at.place], involved, kind, NAMELESS.get(kind, formula), 0.0, 0.0)
 
 
@@ -317,10 +351,40 @@ def _has_offset(proposal: Proposal) -> bool:
     return bool(values[np.argmin(np.abs(proposal.candidate.screened.nodes))] > NO_OFFSET * values.max())
 
 
+def _stands_for(simple: tuple[Proposal, Measured], other: tuple[Proposal, Measured], before: Measured) -> bool:
+    """Return whether the simpler one of two terms is all that the data shows of the other one.
+
+    before: the model without either
+    """
+    (one, a), (two, b) = simple, other
+    at, further = one.candidate.screened.at, two.candidate.screened.at
+    if at.place != further.place:
+        return False
+    is_constant = one.candidate.is_constant
+    is_rewritten = at.variable == further.variable and one.candidate.numbers == two.candidate.numbers
+    if is_constant or is_rewritten or one.candidate.numbers < two.candidate.numbers:
+        # The same predictions, whichever variables they are functions of.
+        apart, changes = _sum_squares(a, b), (_sum_squares(a, before), _sum_squares(b, before))
+        if apart <= SAME * min(changes):
+            return True
+    is_special = (
+        # Each form of a variable becomes a constant or a line beyond the data.
+        is_constant
+        or (at == further and one.candidate.form.kind == LINEAR.kind)
+        or (further.memory != NONE and at.memory == NONE)
+        or _is_same(one, two)
+    )
+    return is_special and _is_behind(a, b) < ALIKE_SIGMA
+
+
+def _sum_squares(one: Measured, other: Measured) -> float:
+    return sum(float(np.sum((a - b) ** 2)) for a, b in zip(one.errors, other.errors, strict=True))
+
+
 def _is_same(one: Proposal, other: Proposal) -> bool:
     """Return whether two terms are one function along the data. A curve may be any."""
     screened = one.candidate.screened
-    if screened.at != other.candidate.screened.at:
+    if screened.at.key != other.candidate.screened.at.key:
         return False
     if other.candidate.form.kind == CURVE:
         return True

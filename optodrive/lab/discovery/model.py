@@ -1,7 +1,7 @@
 """A small ODE simulation, measured records of the system, and the answer of a discovery."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -118,6 +118,15 @@ class Record:
         if np.isinf(self.outputs).any():
             raise InputError("record.outputs", "inf", "numbers, or NaN where nothing was measured")
 
+    def cut(self, end: int) -> "Record":
+        """Return the first samples, two or more, or the record itself where its errors are whitened as a whole."""
+        if end == len(self.t_s) or self.whiten is not None:
+            return self
+        end = max(end, 2)
+        first = replace(self, t_s=self.t_s[:end], inputs=self.inputs[:end], outputs=self.outputs[:end])
+        first.__dict__["slopes"] = self.slopes[:end]  # of the whole record
+        return first
+
     def check(self, model: OdeModel) -> None:
         """Refuse a record whose columns are not those of the model."""
         for name, values, names in (("inputs", self.inputs, model.inputs), ("outputs", self.outputs, model.outputs)):
@@ -165,11 +174,13 @@ class Curve:
 class Finding:
     """Term that the simulation lacks.
 
-    term: the claim on it; curve: against the first of its variables, per unit of the second variable, if any
+    term: the claim on it; curve: against the first of its variables, or what it remembers of that, per unit of the
+    second variable, if any; tested: range of each variable in all records, beyond which nothing is known of the term
     """
 
     term: TermClaim
     curve: Curve
+    tested: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,15 @@ hats' columns times its values at the nodes.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from math import ceil
 
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.discovery.fitting import Point, Simulation, Terms, weigh
-from optodrive.lab.discovery.forms import CURVE, Form, list_forms
+from optodrive.lab.discovery.forms import CONSTANT, CURVE, LINEAR, Form, list_forms
 from optodrive.lab.discovery.linearisation import Linearisation
+from optodrive.lab.discovery.memory import DELAY, LAG, NONE, PATH, remember
 from optodrive.lab.discovery.model import Curve, Record
 
 EVEN_NODES = 21
@@ -34,6 +36,10 @@ TWIN_SHARE = 0.02
 """Share of a term's squares that is no function of another variable, below which the data cannot tell them apart."""
 SLOW_NODES = 6
 Evaluate = Callable[[FloatArray], FloatArray]
+MEMORY_NODES = 5
+MIN_WAY, MAX_WAY, MAX_TIME, SCALE_RATIO = 0.003, 0.5, 0.2, 2.5
+"""Distances of presliding relative to a variable's range, longest time constant relative to a record, and the ratio
+from one scale of a memory to the next."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +57,29 @@ class Filtered:
     variables: FloatArray
     arriving: FloatArray
 
+    def read(self, at: "Place") -> tuple[FloatArray, FloatArray]:
+        """Return the arguments of a term at a place, [m] at the samples and [m] on arrival there."""
+        leaving, arriving = self.variables[:, at.variable], self.arriving[:, at.variable]
+        if at.memory == NONE:
+            return leaving, arriving
+        past = remember(at.memory, at.scale, self.record.t_s, arriving)
+        return past, past
+
 
 @dataclass(frozen=True)
 class Place:
-    """Place of a term, its variable, and the variable that multiplies it (-1: none), as in `integration`."""
+    """Place of a term, its variable, the variable that multiplies it (-1: none), and memory, as in `integration`."""
 
     place: int
     variable: int
     factor: int
+    memory: int = NONE
+    scale: float = 0.0
+
+    @property
+    def key(self) -> tuple[int, ...]:
+        """The place without the scale, which is fitted."""
+        return self.place, self.variable, self.factor, self.memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,18 +129,23 @@ class Candidate:
     @property
     def numbers(self) -> int:
         """How many numbers the formula has, and one for a factor."""
-        return 1 + self.form.free + (self.screened.at.factor >= 0)
+        return 1 + self.form.free + (self.screened.at.factor >= 0) + (self.screened.at.memory != NONE)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the term depends on nothing."""
+        return self.form.kind == CONSTANT and self.screened.at.factor < 0
 
     def build_terms(self) -> Terms:
         """Return the candidate as a row of a table of terms, with limits of its numbers."""
         at, form, nodes = self.screened.at, self.form, self.screened.nodes
         span, (low, high) = float(nodes[-1] - nodes[0]), form.limit(nodes, self.first)
         return Terms(
-            np.array([[at.place, form.code, at.variable, at.factor]]),
-            np.array([[self.amplitude, self.first, self.second]]),
-            np.array([[True, form.free > 0, form.free > 1]]),
-            np.array([[-np.inf, low, 0.01 * span]]),
-            np.array([[np.inf, high, 10.0 * span]]),
+            np.array([[at.place, form.code, at.variable, at.factor, at.memory]]),
+            np.array([[self.amplitude, self.first, self.second, at.scale]]),
+            np.array([[True, form.free > 0, form.free > 1, at.memory != NONE]]),
+            np.array([[-np.inf, low, 0.01 * span, 0.05 * at.scale]]),
+            np.array([[np.inf, high, 10.0 * span, 20.0 * at.scale + 1e-300]]),
         )
 
 
@@ -148,6 +174,53 @@ def list_places(simulation: Simulation, filtered: Sequence[Filtered], point: Poi
     return places
 
 
+def list_memories(simulation: Simulation, filtered: Sequence[Filtered], places: Sequence[Place]) -> list[Place]:
+    """Return the places with a memory of each state and input, of some time constants and distances.
+
+    A model that names its places names its memories too, as states.
+    """
+    model = simulation.model
+    if model.places:
+        return []
+    times = [each.record.t_s for each in filtered]
+    step_s, long_s = float(np.median(np.diff(times[0]))), max(float(t[-1] - t[0]) for t in times)
+    found = []
+    for variable in range(len(model.states) + len(model.inputs)):
+        span = float(np.ptp(np.concatenate([each.variables[:, variable] for each in filtered])))
+        if not np.isfinite(span) or span <= 0.0:
+            continue
+        for kind in range(LAG, DELAY + 1):
+            low, high = (MIN_WAY * span, MAX_WAY * span) if kind in PATH else (2.0 * step_s, MAX_TIME * long_s)
+            count = 1 + ceil(np.log(high / low) / np.log(SCALE_RATIO))
+            found += [(variable, kind, scale) for scale in np.geomspace(low, high, count)]
+    spots = list(dict.fromkeys(at.place for at in places))
+    return [Place(spot, variable, -1, kind, float(scale)) for spot in spots for variable, kind, scale in found]
+
+
+def screen_memories(filtered: Sequence[Filtered], places: Sequence[Place], n: int) -> list[Place]:
+    """Return the places with memory in order of evidence, each with its best scale, none that a parameter imitates."""
+    q, best = filtered[0].columns.shape[2], dict[tuple[int, ...], tuple[float, Place]]()
+    for spot in dict.fromkeys(at.place for at in places):
+        own = [at for at in places if at.place == spot]
+
+        def read(each: Filtered, own: Sequence[Place] = own) -> tuple[FloatArray, FloatArray]:
+            past = np.column_stack([each.read(at)[0] for at in own])
+            return past, past
+
+        grams = _build_grams(filtered, spot, len(own), read, n)
+        total = grams.sum(axis=0)
+        for number, at in enumerate(own):
+            rows = [*range(q), q + number, -1]
+            small = [gram[np.ix_(rows, rows)] for gram in grams]
+            matrix, _, _ = _project(total[np.ix_(rows, rows)], q)
+            if not matrix[0, 0] > PARAMETER_SHARE * total[q + number, q + number]:
+                continue
+            loss = sum(_held_loss(sum(small) - fold, fold, q, 1, None) for fold in small)
+            if np.isfinite(loss) and (at.key not in best or loss < best[at.key][0]):
+                best[at.key] = loss, at
+    return [at for _, at in sorted(best.values(), key=lambda item: item[0])]
+
+
 def choose_nodes(values: FloatArray) -> FloatArray:
     """Return nodes [c] for a variable: over its range, and denser where its values are."""
     low, high = float(values.min()), float(values.max())
@@ -173,11 +246,18 @@ def hat_functions(z: FloatArray, nodes: FloatArray) -> FloatArray:
 
 def screen(filtered: Sequence[Filtered], at: Place, n: int) -> Screened | None:
     """Return the regression of a place on the fitted samples, None if the variable does not vary."""
-    values = np.concatenate([each.variables[:, at.variable] for each in filtered])
+    values = np.concatenate([each.read(at)[0] for each in filtered])
     if not np.isfinite(values).all() or np.ptp(values) <= 1e-9 * np.abs(values).max():
         return None
-    nodes = choose_nodes(values)
-    grams = _build_grams(filtered, at, nodes, n)
+    nodes = choose_nodes(values) if at.memory == NONE else np.linspace(values.min(), values.max(), MEMORY_NODES)
+
+    def read(each: Filtered) -> tuple[FloatArray, FloatArray]:
+        leaving, arriving = (hat_functions(z, nodes) for z in each.read(at))
+        if at.factor >= 0:
+            return leaving * each.variables[:, at.factor, None], arriving * each.arriving[:, at.factor, None]
+        return leaving, arriving
+
+    grams = _build_grams(filtered, at.place, len(nodes), read, n)
     if not np.isfinite(grams).all():
         return None
     q = filtered[0].columns.shape[2]
@@ -204,26 +284,32 @@ def screen(filtered: Sequence[Filtered], at: Place, n: int) -> Screened | None:
     )
 
 
-def _build_grams(filtered: Sequence[Filtered], at: Place, nodes: FloatArray, n: int) -> FloatArray:
-    """Return the products of all columns, parameters, hats and prediction errors, of each fold [f, k, k]."""
+def _build_grams(
+    filtered: Sequence[Filtered],
+    place: int,
+    count: int,
+    read: Callable[[Filtered], tuple[FloatArray, FloatArray]],
+    n: int,
+) -> FloatArray:
+    """Return the products of all columns, parameters, terms and prediction errors, of each fold [f, k, k].
+
+    read: returns the terms at one place [m, count] at the samples, and as they are on arrival there
+    """
     o = filtered[0].line.predicted.shape[1]
     direct = np.zeros(o)
-    if at.place >= n:
-        direct[at.place - n] = 1.0
-    size = filtered[0].columns.shape[2] + len(nodes) + 1
+    if place >= n:
+        direct[place - n] = 1.0
+    size = filtered[0].columns.shape[2] + count + 1
     grams = np.zeros((1 + max(int(each.fold.max()) for each in filtered), size, size))
     for each in filtered:
         if each.fold.max() < 0:
             continue
-        hats, arriving = (
-            hat_functions(values[:, at.variable], nodes) * (values[:, at.factor, None] if at.factor >= 0 else 1.0)
-            for values in (each.variables, each.arriving)
-        )
+        leaving, arriving = read(each)
         line = each.line
-        forcing = np.zeros((*line.states.shape, len(nodes)))
-        if at.place < n:
-            forcing[1:] = (0.5 * line.response[1:, :, at.place])[:, :, None] * (hats[:-1] + arriving[1:])[:, None, :]
-        change = line.propagate(forcing, direct[:, None] * hats[:, None, :], np.zeros((n, len(nodes))))
+        forcing = np.zeros((*line.states.shape, count))
+        if place < n:
+            forcing[1:] = (0.5 * line.response[1:, :, place])[:, :, None] * (leaving[:-1] + arriving[1:])[:, None, :]
+        change = line.propagate(forcing, direct[:, None] * leaving[:, None, :], np.zeros((line.states.shape[1], count)))
         error = np.nan_to_num(each.record.outputs - line.predicted)[:, :, None]
         joined = weigh(each.record, np.concatenate([each.columns, change, error], axis=2), each.weights)
         for fold in np.unique(each.fold[each.fold >= 0]):
@@ -270,17 +356,28 @@ def _project(total: FloatArray, q: int) -> tuple[FloatArray, FloatArray, float]:
     return rest[:-1, :-1], rest[:-1, -1], float(rest[-1, -1])
 
 
+def follow(filtered: Sequence[Filtered], at: Place, evaluate: Evaluate) -> FloatArray:
+    """Return the values of a term along the fitted samples of all records."""
+    values = []
+    for each in filtered:
+        own = evaluate(each.read(at)[0]) * (each.variables[:, at.factor] if at.factor >= 0 else 1.0)
+        values.append(own[each.fold >= 0])
+    return np.concatenate(values)
+
+
 def find_twin(filtered: Sequence[Filtered], at: Place, evaluate: Evaluate, names: Sequence[str], time: int) -> str:
     """Return a variable of which the term is a function too along these records, "" if there is none.
 
     names: of the variables; time: number of that which is time, of which only slow changes count
     """
     table = np.concatenate([each.variables[each.fold >= 0] for each in filtered])
-    values = evaluate(table[:, at.variable]) * (table[:, at.factor] if at.factor >= 0 else 1.0)
+    values = follow(filtered, at, evaluate)
     spread = float(np.sum((values - values.mean()) ** 2))
     for number, name in enumerate(names):
         variable = table[:, number]
-        if (number == at.variable and at.factor < 0) or np.ptp(variable) <= 1e-9 * np.abs(variable).max():
+        if (number == at.variable and at.factor < 0 and at.memory == NONE) or np.ptp(variable) <= 1e-9 * np.abs(
+            variable
+        ).max():
             continue
         nodes = np.linspace(variable.min(), variable.max(), SLOW_NODES) if number == time else choose_nodes(variable)
         hats = hat_functions(variable, nodes)
@@ -293,7 +390,7 @@ def find_twin(filtered: Sequence[Filtered], at: Place, evaluate: Evaluate, names
 def rank_formulas(found: Screened, count: int) -> list[Candidate]:
     """Return the best formulas of a place and one curve, none of which a parameter can imitate."""
     columns, owners = [], []
-    for form in list_forms(found.nodes):
+    for form in list_forms(found.nodes) if found.at.memory == NONE else [LINEAR]:
         for first, second in form.starts:
             values = form.evaluate(found.nodes, float(first), float(second))
             if not np.isfinite(values).all() or np.abs(values).max() == 0.0:
@@ -310,8 +407,10 @@ def rank_formulas(found: Screened, count: int) -> list[Candidate]:
         best.setdefault((owners[k][0].kind, owners[k][0].text), int(k))
     usable_best = [k for k in best.values() if usable[k]]
     physical = [k for k in usable_best if owners[k][0].kind != CURVE]
+    # What all forms of a variable become beyond the data is compared with them in any case.
+    constants = [k for k in physical[count:] if owners[k][0].kind == CONSTANT and found.at.factor < 0]
     curves = [k for k in usable_best if owners[k][0].kind == CURVE]
     return [
         Candidate(found, *owners[k][:3], float(vector[k] / squares[k] / owners[k][3]))
-        for k in physical[:count] + curves[:1]
+        for k in physical[:count] + constants + curves[:1]
     ]

@@ -127,10 +127,11 @@ def describe_gain(gain: HeldOutGain | None, verdict: str, runs: int) -> list[str
 def describe_term(term: TermClaim) -> list[str]:
     """Return the lines on a missing term: its form, three probabilities, gains, rivals and doubts."""
     form = term.chosen
+    kind = form.kind if form.place == form.where else f"{form.kind} in {' times '.join(form.depends_on)}"
     if term.is_sure:
-        head = f"{form.where} lacks {form.formula}: {form.kind} in {' times '.join(form.depends_on)}"
+        head = f"{form.where} lacks {form.formula}: {kind}"
     elif term.claim.verdict == "ambiguous":
-        head = f"{form.where} lacks a term, perhaps {form.formula}: {form.kind} in {' times '.join(form.depends_on)}"
+        head = f"{form.where} lacks a term, perhaps {form.formula}: {kind}"
     else:
         head = f"{form.where} lacks a function of {' times '.join(form.depends_on)}: {form.formula}"
     lines = [
