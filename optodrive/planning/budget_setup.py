@@ -43,6 +43,7 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
                 setting,
                 f"more than {base_c:.1f} °C, to which the terms of {parameters.name} may warm it",
             )
+        # By the table: a new cap needs nothing here, and a field without a setting fails at once in `CapValues`.
         values[cap.field] = cap.scale.to_value(setting, base_c)
     caps = CapValues(
         **values,

@@ -52,6 +52,7 @@ class AccessMiddleware:
         problem = self._policy.check(request, self._table)
         if problem is None and request.route is not None and request.route.key in ARMING:
             problem = await self._record_intent(request)
+            # The disk may take seconds, in which a reload may have revoked the token.
             if self._policy.is_revoked(request.token):
                 problem = build_revoked_problem(request.token)
         if problem is None:
@@ -76,6 +77,7 @@ class AccessMiddleware:
         scope[CALLER] = request.token
         is_stop = request.route is not None and request.route.key == STOP
         try:
+            # STOP goes on after its token is revoked: ending it would leave the light on.
             with nullcontext() if is_stop else self._policy.in_progress.track(in_progress, request.token):
                 await self._app(scope, body, in_progress.send)
         except ClientDisconnect:  # within its body: there is nobody to answer
@@ -88,6 +90,7 @@ class AccessMiddleware:
             self._record(request, {**audit_fields, "event": "answered", "status": in_progress.status})
 
     def _bound_receive(self, request: RequestContext, receive: Receive) -> Receive:
+        # Its body is not even read: a slow one would delay it.
         if request.route is not None and request.route.key == STOP:
             return receive_empty_body
         if request.method == "WEBSOCKET":
@@ -119,6 +122,7 @@ class CallerLoad:
     @contextmanager
     def count(self, request: RequestContext) -> Iterator[Problem | None]:
         """Count a request while it is served. Yield why it is refused. STOP is not counted."""
+        # A caller at its limit must still be able to stop.
         if request.route is None or request.route.key == STOP:
             yield None
             return

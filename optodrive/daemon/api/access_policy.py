@@ -55,6 +55,7 @@ class RequestInProgress:
 
     async def receive(self) -> Message:
         """Return the next message, the end of the connection once the token is revoked."""
+        # The test comes after the wait: most requests are revoked while they wait for input.
         message = await self._receive()
         return {"type": f"{self._kind}.disconnect"} if self.is_revoked else message
 
@@ -76,6 +77,7 @@ class RequestInProgress:
 
         A stream of events has no end of its own.
         """
+        # A response that has begun has a length that its client expects, and ends soon by itself.
         self.is_revoked = self._kind == "websocket" or self.status is None or self._is_event_stream
         return self.is_revoked
 
@@ -111,6 +113,7 @@ class RequestsInProgress:
         return [
             asyncio.create_task(request.send_end(build_revoked_problem(token)))
             for request, token in self._requests.items()
+            # By the token itself and not by its name: a new token of the same name must survive.
             if token in revoked and request.revoke()
         ]
 
@@ -135,6 +138,7 @@ class RateLimiter:
 
     def acquire(self, caller: Hashable, now_s: float) -> float:
         """Take one token: return 0 if there is one, else the time until there is, s."""
+        # Popped and inserted again, so that the oldest request is first in the dict.
         bucket = self._buckets.pop(caller, None) or _Bucket(self._burst, now_s)
         bucket.tokens = min(self._burst, bucket.tokens + (now_s - bucket.updated_s) * self._per_s)
         bucket.updated_s = now_s
@@ -200,6 +204,7 @@ class AccessPolicy:
 
     def update(self, tokens: Tokens, daemon: DaemonSection) -> tuple[Token, ...]:
         """Replace the tokens and limits. Every caller's rate limit starts anew. Return the tokens that are revoked."""
+        # In one step of the loop: no request is accepted in between with a token that is revoked.
         revoked, self.tokens = self.tokens.find_revoked(tokens), tokens
         self.body_max_bytes = daemon.body_max_bytes
         self._hosts = {*LOOPBACK_NAMES, *map(str.lower, daemon.hosts)}
@@ -212,14 +217,17 @@ class AccessPolicy:
 
     def check(self, request: RequestContext, table: RouteTable) -> Problem | None:
         """Identify token and route of a request. Return why it is refused, or None if it is accepted."""
+        # First: a page of another site, whose browser sends the cookie along, must learn nothing.
         problem = check_host_and_origin(request.headers, self._hosts)
         if problem is not None:
             return problem
         route = table.find(request.method, request.path)
         is_stop = route is not None and route.key == STOP
+        # An unknown path needs a token too, so that nobody without one can list the routes.
         if route is None or route.min_role is not None:
             token = self.find_token(request)
             if token is None:
+                # A caller without a valid token has a rate, too.
                 rate_problem = None if is_stop else self._check_rate(request)
                 return rate_problem or _build_token_problem(_read_presented_token(request))
             request.token = token
@@ -273,6 +281,7 @@ class AccessPolicy:
     def _check_size(self, request: RequestContext) -> Problem | None:
         length = request.headers.get("content-length", "0")
         limit = self.body_max_bytes
+        # Only what the request states; `BoundedBody` counts what arrives.
         if length.isdigit() and int(length) <= limit:
             return None
         detail = f"content-length: got {length[:20]}, expected at most {limit} bytes"
@@ -314,6 +323,7 @@ def check_query(query: str, known: Sequence[str]) -> None:
 
 def _read_presented_token(request: RequestContext) -> str:
     scheme, _, credentials = request.headers.get("authorization", "").partition(" ")
+    # The cookie opens the page alone: a form of another site could send it to a route that changes something.
     if not scheme and is_page_request(request.method, request.path):
         return read_cookie_token(request.headers)
     if not scheme and is_websocket_request(request.headers):

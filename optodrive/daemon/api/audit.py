@@ -86,7 +86,9 @@ class AuditLog:
                 error = None
             except OSError as caught:
                 error = caught
+            # Before the future: a caller that waits for it may record again at once.
             self._free_slots.release()
+            # False where the caller has given up after WRITE_TIMEOUT_S.
             if entry.future.set_running_or_notify_cancel():
                 entry.future.set_result(None) if error is None else entry.future.set_exception(error)
 
@@ -109,6 +111,7 @@ class AuditLog:
         if self._may_be_torn and self._path.exists() and stat.S_ISREG(self._path.stat().st_mode):
             with self._path.open("r+b", buffering=0) as file:
                 size = file.seek(0, os.SEEK_END)
+                # From the end alone: the file may have gigabytes.
                 file.seek(max(0, size - LINE_MAX_BYTES))
                 torn = file.read(LINE_MAX_BYTES).rpartition(b"\n")[2]
                 if torn:
@@ -179,10 +182,12 @@ class RefusalAudit:
         now_s = self._now_s()
         self._close_periods(now_s)
         period = self._periods.setdefault(code, _Period(now_s + PERIOD_S))
+        # By code, so that a flood of one kind of refusal does not hide the others.
         if period.entries < ENTRIES_MAX:
             period.entries += 1
             self._audit.record({**fields, "event": "refused", "code": code})
             return
+        # The count is written also if no further refusal comes.
         if not period.suppressed:
             asyncio.get_running_loop().call_later(period.end_s - now_s, self._close_ended)
         period.suppressed += 1

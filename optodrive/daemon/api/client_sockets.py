@@ -46,6 +46,7 @@ class FingersSocket:
     async def _read(self) -> None:
         while (message := await self._socket.receive())["type"] != "websocket.disconnect":
             was_late, self._is_late = self._is_late, time.monotonic() - message[EARLIEST_S] > WAITED_MAX_S
+            # One refusal for a backlog, not one for each of its messages.
             if was_late and self._is_late:
                 continue
             try:
@@ -65,6 +66,7 @@ class FingersSocket:
             assert self._newest is not None  # noqa: S101 - set before the event
             fingers, arrived_s = self._newest
             self._daemon.send_fingers(fingers.places, arrived_s - fingers.age_s, arrived_s)
+            # After sending, so that the first place after a rest is not delayed.
             await asyncio.sleep(FORWARD_PERIOD_S)
 
 
@@ -113,6 +115,7 @@ class HoldSocket:
                 await self._send_last(HoldReport(status="ended", reason=reason), POLICY_VIOLATION)
                 return
             age_s = time.monotonic() - (message.get(ARRIVED_S) or time.monotonic())
+            # With its age: a beat that waited in a loaded web process must not extend the hold.
             self._link.hold(self._arming, max(0.0, age_s))
 
     async def _keep(self) -> None:

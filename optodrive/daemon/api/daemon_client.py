@@ -71,6 +71,7 @@ class LinkClient:
         """Return the epoch at a monotonic time, or an older one. Raise LinkError while there is none."""
         if self._epochs[-1][1] == NO_EPOCH:
             raise self.peer.build_loss_error()
+        # Older than kept counts as the oldest, which link refuses: never as a newer one.
         position = bisect_right(self._epochs, arrived_s, key=lambda entry: entry[0])
         return self._epochs[max(0, position - 1)][1]
 
@@ -114,6 +115,7 @@ class LinkClient:
         """
         call = asyncio.ensure_future(self.peer.call(Message(kind, fields)))
         call.add_done_callback(lambda done: done.cancelled() or done.exception())  # retrieved if the caller has left
+        # A caller that leaves ends its wait, and not the command.
         result = await asyncio.shield(call)
         if result.fields["error"] is not None:
             raise build_error(result.fields["error"])
@@ -259,6 +261,7 @@ class DaemonClient:
 
         The planner itself parses a small streamed body, because it is there three hand-overs earlier.
         """
+        # A larger one would hold the planner's thread, and with it other streams.
         if push.streamed and len(body) <= STREAMED_BODY_MAX_BYTES:
             return await self.planner.submit_body(body, push)
         built = await self.preview.call(Message("build", {"source": source, "push": push._asdict()}, body))
@@ -307,6 +310,7 @@ class DaemonClient:
         self._publish_state()
 
     def _publish_state(self) -> None:
+        # Built when it is read next.
         self._state, self._state_json = None, b""
         if self.hub.readers[0]:
             self.hub.publish_state(self.build_state())

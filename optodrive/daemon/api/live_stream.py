@@ -62,6 +62,7 @@ class LiveStream:
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
+            # A client that has gone draws nothing any more: what it left in the queue would light for nobody.
             if self._may_emit():
                 # First, because this coroutine may be cancelled at its next await.
                 self._daemon.planner.end_stream(self._last_epoch, self._caller)
@@ -80,7 +81,9 @@ class LiveStream:
                 return
             data: str | bytes = message.get("text") or message.get("bytes") or b""
             try:
+                # By the earliest time at which it may have arrived: a doubt counts against the frame.
                 self._require_recent(message[EARLIEST_S])
+                # The epoch of the frame's arrival, not of now: a STOP that came behind it must end it.
                 epoch = self._daemon.link.require_epoch_at(message[EARLIEST_S])
                 number, sequence = parse_live_frame(data, self._next_number, self._pixels)
                 frame = Frame(number, encode_sequence(sequence), message[ARRIVED_S], epoch)
@@ -275,6 +278,7 @@ class StandingStream(LiveStream):
 
     def _refuse(self, frame: Frame, problem: Problem) -> None:
         if frame is self._shown:
+            # A page stands through a busy moment; the next refresh tries again.
             if problem.code in TRIED_AGAIN:
                 return
             self._shown = None

@@ -69,6 +69,7 @@ class Peer:
         try:
             connection.send(message)
         except IpcError as error:
+            # The request is refused, and the connection stays.
             if not connection.is_closed:  # the message is too large
                 raise LinkError(f"{self._name} process: {error}") from None
             self._lose(connection)
@@ -93,6 +94,7 @@ class Peer:
                 self.send(Message("drop", {"id": request_id}))
             raise
         finally:
+            # Its result, if it still comes, is for nobody.
             self._results.pop(request_id, None)
 
     def _receive(self, connection: MessageSocket) -> None:
@@ -122,6 +124,7 @@ class Peer:
             asyncio.get_running_loop().remove_writer(self._fileno)
 
     def _lose(self, connection: MessageSocket) -> None:
+        # A late call for a connection that was replaced.
         if connection is not self._socket:
             return
         self._forget(connection)
@@ -135,6 +138,7 @@ class Peer:
             with suppress(OSError):  # the connection has closed itself while bytes waited to be sent
                 remove(self._fileno)
         connection.close()
+        # At once: nobody waits for a process that may take seconds to restart.
         for future in self._results.values():
             if not future.done():
                 future.set_exception(self.build_loss_error())

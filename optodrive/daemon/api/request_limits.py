@@ -64,6 +64,7 @@ class BoundedBody:
             chunk = message.get("body", b"")
             self.size_bytes += len(chunk)
             if self.size_bytes > self._max_bytes:
+                # The answer must reach the client, which still writes.
                 await self._discard_rest(message)
                 raise BodyTooLargeError
             self._digest.update(chunk)
@@ -148,9 +149,11 @@ class StopPriorityMiddleware:
             await self._serve_stop(scope, receive, send)
         else:
             async with self._start_lock:
+                # One iteration of the loop, in which it polls its sockets and starts a STOP that has arrived.
                 await asyncio.sleep(0)
                 if self._stops_in_progress:
                     with suppress(TimeoutError):
+                        # Bounded: a board that does not answer STOP must not stop the API.
                         async with asyncio.timeout_at(self._hold_deadline_s):
                             await self._stop_done.wait()
             await self._app(scope, receive, send)
@@ -158,6 +161,7 @@ class StopPriorityMiddleware:
     async def _serve_stop(self, scope: Scope, receive: Receive, send: Send) -> None:
         if not self._stops_in_progress:
             self._stop_done.clear()
+            # Of the first STOP: a client that repeats it could hold all others else.
             self._hold_deadline_s = asyncio.get_running_loop().time() + HOLD_MAX_S
         self._stops_in_progress += 1
         try:

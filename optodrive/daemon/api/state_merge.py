@@ -94,6 +94,7 @@ def _merge_queue(queue: QueueReport, pause_ends_in_s: float | None) -> QueueRepo
     """Merge a pause, as the link process states it, into the planner's queue, which may not know of it yet."""
     active = queue.active
     if pause_ends_in_s is not None:
+        # The link process turns the light off by itself; its word counts before the planner's.
         paused = {"status": PlanStatus.PAUSED, "ends_in_s": None}
         active = [plan.model_copy(update=paused) if plan.status == PlanStatus.RUNNING else plan for plan in active]
     update = {"paused": pause_ends_in_s is not None, "pause_ends_in_s": pause_ends_in_s, "active": active}

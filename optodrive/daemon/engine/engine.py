@@ -136,11 +136,13 @@ class Engine:
         """Run one loop iteration, which waits at most wait_s for messages and commands."""
         self.commands.run_pending()
         self._session.connect_if_due()
+        # The rest of a streamed frame is due at a time, not at a message.
         self.message_loop.poll(min(wait_s, self._planner.growth_due_in_s))
         self._follow_link()
         self._plan_queue.update_jobs(self._session.pop_refusal())
         self._planner.follow_queue()
         self._save_thermal_state()  # before a plan starts, so that a successor of this process knows its heat
+        # A planner that does not know what an earlier one has heated plays nothing.
         if self._heat.may_emit:
             self._plan_queue.start_next()
         self._beat()
@@ -167,6 +169,7 @@ class Engine:
             self._heat.follow(self._continues)
         if not self._session.connected:
             return
+        # Building the state costs time, comparing its key does not.
         key = self._plan_queue.saved_key
         if key != self._saved_key:
             self._saved_key = key
@@ -174,6 +177,7 @@ class Engine:
 
     def _beat(self) -> None:
         """Prove to the link process and to the supervisor that the loop runs."""
+        # Without these beats the lease of the board is not renewed, and its gate goes off.
         self._session.beat(self._planner.is_alive)
         self.on_beat()
 
@@ -195,6 +199,7 @@ class Engine:
 
     def close(self) -> None:
         """End the threads and close the loop, after run()."""
+        # Without waiting: a long plan must not delay the end of the process.
         self._planning_executor.shutdown(wait=False, cancel_futures=True)
         self._simulation_executor.shutdown(wait=False, cancel_futures=True)
         self._heat.close()

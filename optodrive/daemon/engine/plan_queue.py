@@ -101,12 +101,14 @@ class PlanQueue(QueuedPlans):
                 self.pause.require_no_pause()
             self._revoked_callers.require_valid(record.caller, record.arrived_s)
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
+            # Identity, not equality: every change makes a new object, so that one comparison finds all.
             if self.thermal.estimate is not snapshot.thermal:
                 return False
             record.planned_after_s = self._session.board_s() - record.arrived_s  # link may send at once
             if snapshot.predecessor is None:
                 start_s = max(record.start_s, self._earliest_start_s(record.streamed))
                 if start_s > record.start_s:
+                    # Later is safe for the skin, but a bump from less heat is lower.
                     if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > cooling_max_m:
                         return False
                     plan.begin_from(*snapshot.thermal.shift_to_plan(start_s))
@@ -114,6 +116,7 @@ class PlanQueue(QueuedPlans):
                 self.waiting.append(plan)
             elif snapshot.cut is None or not self.stream.splice(plan, snapshot.predecessor, snapshot.cut):
                 return False
+            # Before the lock is released: the next snapshot must contain this plan's heat.
             self.thermal.append(plan)
             self.stream.record_accepted(plan)
             self.accounts.totals["planned"] += record.pulse_count
@@ -143,6 +146,7 @@ class PlanQueue(QueuedPlans):
 
         Several boards emit nothing late: a plan whose time has passed while it waited for them is proven again for now.
         """
+        # One job at a time; a stream's next plan is spliced into it, and does not pass here.
         if self.running or not self.waiting or not self._session.is_ready or self.pause.off_s is not None:
             return
         if len(self._session.scales) > 1 and self._find_start_s(self.waiting[0]) < self._session.board_s():
@@ -166,6 +170,7 @@ class PlanQueue(QueuedPlans):
 
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
+        # First: a board that is not armed executes nothing of what runs.
         if self._session.board.state in UNARMED_STATES and self.is_busy:
             self.end_all(PlanStatus.FAILED, self._describe_unarmed())
         off_s = self._session.pop_drained()
@@ -174,6 +179,7 @@ class PlanQueue(QueuedPlans):
         self.pause.end_if_idle()
         for run in self.running:
             self.accounts.count_progress(run)
+        # All of them: one report may end several short plans.
         while self.running and self.running[0].job.is_finished:
             self._finish_first()
         if self.running and refusal is not None:
@@ -195,6 +201,7 @@ class PlanQueue(QueuedPlans):
             record = run.plan.record
             is_partial = record.dropped or run.plan.growth is not None
             self.conclude(run, PlanStatus.SUPERSEDED if is_partial else PlanStatus.DONE, None)
+            # A late end delays the heat of all plans behind it.
             self.delay_all(record.delay_s)
             if run.plan.is_cut_short and not self.running:  # a pause has begun, and its last report is here first
                 self.thermal.rewind([run.plan], self.waiting)
@@ -205,6 +212,7 @@ class PlanQueue(QueuedPlans):
 
         reason: what ended it; clock_shift_s: as for end_all
         """
+        # What a person has asked for is no failure.
         status = PlanStatus.STOPPED if reason in (STOP, DISARM) else PlanStatus.FAILED
         self.stream.forget_cycle()
         self.end_all(status, reason, clock_shift_s)

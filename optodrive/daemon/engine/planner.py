@@ -99,6 +99,7 @@ class Planner:
         Cancelling the future removes a request that is not yet begun. Raise BusyError if too many wait.
         """
         with self._lock:
+            # Counted here and not by the executor, whose queue has no bound.
             if self._pending_count > REQUESTS_MAX:
                 raise BusyError(f"too many requests wait: {REQUESTS_MAX} before this one; try again later")
             if self._pending_count == 0:
@@ -126,11 +127,13 @@ class Planner:
             work = self._restart
         elif self.growth_due_in_s <= 0.0:
             work = self._grow
+        # It counts as a request, or a hanging one would not stop the beats.
         if work is not None:
             with self._lock:
                 if self._pending_count == 0:
                     self._progress_at_s = self._clock.now_s()
                 self._pending_count += 1
+            # On the one planning thread, so that it and a request never plan at once.
             self._own_work = self._executor.submit(work)
             self._own_work.add_done_callback(self._on_done)
 
@@ -167,12 +170,14 @@ class Planner:
     def _extend(self, plan: ActivePlan, check: Callable[[float], None]) -> bool:
         """Append the rest of a plan to it. Return False if it is too late, or the display was dimmed."""
         growth, display, began_s = plan.growth, self._dimmer.display, self._clock.now_s()
+        # A plan is continued only under the caps that it began with.
         if growth is None or growth.display is not display:
             return False
         grown = grow_plan(plan, growth, self._session.scales, check)
         self._growth_time.record(self._clock.now_s() - began_s)
 
         def commit() -> bool:
+            # Asked in the loop's thread, which dims: in any other a change could come in between.
             return self._dimmer.display is display and self._plan_queue.stream.extend(plan, grown)
 
         return self._run_in_loop(commit)
@@ -247,12 +252,15 @@ class Planner:
 
         def check(_fraction: float) -> None:
             self._progress_at_s = self._clock.now_s()
+            # Processor time: a request must not fail because the computer was busy with others.
             used_s = thread_time() - began_s
+            # A long computation goes on at usual priority, so that it starves no other process.
             if streamed and used_s > REALTIME_MAX_S:
                 use_usual_priority()
             if used_s > PLANNING_MAX_S:
                 expected = f"a sequence that is planned within {PLANNING_MAX_S:g} s of processor time; send it in parts"
                 raise InputError("body", "a longer computation", expected, "too_slow")
+            # At every step, so that a STOP also ends a plan that is being computed.
             self._plan_queue.require_epoch(epoch)
             if caller_left.is_set():
                 raise StoppedError("the caller has left")

@@ -54,6 +54,7 @@ class QueueStream:
     def lead_s(self) -> float:
         """Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
         lead_s = self._display.config.stream_lead_s
+        # A stall longer than the lead is an underrun, and stalls are longer without real-time priority.
         return lead_s if self._session.is_realtime else max(lead_s, SHARED_STREAM_LEAD_S)
 
     def find_running(self) -> ActivePlan | None:
@@ -84,6 +85,7 @@ class QueueStream:
 
     def splice(self, plan: ActivePlan, predecessor: ActivePlan, cut: PointCut) -> bool:
         """Continue the points of a running plan with those of a new one. Return False if the cut has been sent."""
+        # It has ended, or another has been spliced behind it, since the snapshot.
         if not self._plans.running or self._plans.running[-1].plan is not predecessor:
             return False
         zero_s, ahead_s, dropped = plan.record.start_s, self.lead_s, predecessor.record.pulse_count - cut.row
@@ -120,6 +122,7 @@ class QueueStream:
         """Supersede the waiting plans, and end a running plan that is not streamed, for a newer plan."""
         with self._plans.lock:
             if self._plans.waiting:
+                # To before the first one: what never starts leaves no heat.
                 self._plans.thermal.go_back(self._plans.waiting[0])
             while self._plans.waiting:
                 plan = self._plans.waiting.popleft()
@@ -200,6 +203,7 @@ class QueueStream:
                 return False
             if not self._plans.waiting:
                 job = self._plans.running[-1].job
+                # Link first: if it refuses, nothing here has changed.
                 if not self._session.extend(job, grown.added, plan.epoch, grown.added_crc):
                     return False
             self._plans.accounts.totals["planned"] += len(grown.planned.plan) - plan.record.pulse_count

@@ -145,6 +145,7 @@ def _build_starts(
     from optodrive.daemon.server.acceptor import run_acceptor
     from optodrive.daemon.server.web_process import run_web
 
+    # In the supervisor, which outlives its planners: a new one plans from the heat that the killed one has left.
     memory = ThermalMemory()
     # Only the acceptor keeps the listening sockets: with a second holder, callers would be accepted by nobody after its
     # death.

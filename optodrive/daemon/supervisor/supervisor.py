@@ -271,6 +271,8 @@ class Supervisor:
             if not self._is_serving:
                 raise _build_start_error(child, ended)
             self._report_end(child, ended)
+        # Link has turned the light off by itself meanwhile. The successor of a planner finds the heat in the memory
+        # that all planners share.
         if self._is_serving and child.is_due and not self._is_ending:
             child.start()
 

@@ -161,6 +161,7 @@ class PointHandover:
 
     def _require_allowed(self, message: Message) -> None:
         """Raise NotReadyError for points of another epoch, of a board that is not armed, or that were damaged."""
+        # The host's last refusal; behind it are only the session's times and the board's own guards.
         epoch, crc = int(message.fields["epoch"]), int(message.fields["crc"])
         # Gate 1 of the epochs. The order of these checks is that of their reasons: the first one explains the others.
         if not self._epoch.is_current(epoch):

@@ -106,6 +106,8 @@ class ClientSockets:
                 return
 
     def _drop(self, number: int) -> None:
+        # A killed process ends here, for the kernel closes its socket: the light goes off at once, and no beat is
+        # waited for. A process that hangs is found by its beats.
         self._sockets.pop(number).close()
         self._trusted.discard(number)
         self._service.on_client_lost(number)

@@ -160,6 +160,7 @@ CAPS = (
 CAPS_BY_KEY: Mapping[str, Cap] = {cap.key: cap for cap in CAPS}
 
 NO_CAP = 0
+# For kernels alone: plans and messages hold keys, so that a new cap may stand anywhere in the table.
 CAP_NUMBERS: Mapping[str, int] = {cap.key: number for number, cap in enumerate(CAPS, start=1)}
 """Number of each cap in kernels."""
 WRONG_ORDER = len(CAPS) + 1
