@@ -269,7 +269,8 @@ class ExtendedThermalState:
             recorded = list(simulate_signals(experiment, one, self._active, late_s))
             for key, values in self._values.items():
                 record = all_terms()[key].record
-                recorded = [record(values, name, t_s, each) for name, each in zip(names, recorded, strict=True)]
+                pairs, run = zip(names, recorded, strict=True), experiment.recorded_run
+                recorded = [record(values, name, t_s, each, run) for name, each in pairs]
             # κ = 1, because a dead pixel's κ is 0.
             gas_k = simulate_signals(experiment, one._replace(kappa_m_per_k=1.0), ActiveTerms.from_values(gas_terms))[1]
             columns.append((recorded[0], gas_k, *recorded[1:]))

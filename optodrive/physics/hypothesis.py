@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from math import exp, log
 
 
@@ -105,7 +106,8 @@ class RecordingScope:
 
     signals: "temperature", "displacement", "force", "mirrors", those measured, in this order; pixels: the pixels
     measured; illuminated: pixels that received a pulse; has_neighbour_pulses: a measured pixel has runs in which
-    another pixel is illuminated; power_levels: number of distinct pulse powers.
+    another pixel is illuminated; power_levels: number of distinct pulse powers; runs: session time, from −1 to 1, and
+    group of each run.
     """
 
     signals: tuple[str, ...]
@@ -113,11 +115,26 @@ class RecordingScope:
     illuminated: frozenset[int]
     has_neighbour_pulses: bool
     power_levels: int
+    runs: tuple[tuple[float, str], ...] = ()
 
     def list_signal_sets(self, names: tuple[str, ...]) -> list[tuple[str, ...]]:
         """Return all of these signals together and, of a recording of several, each measured one alone."""
         measured = [(name,) for name in self.signals if name in names]
         return [names, *(measured if len(self.signals) > 1 else [])]
+
+    def list_run_spans(self, *, with_steps: bool) -> list[tuple[float, float]]:
+        """Return session times of the first and the last run of every run, of repeats in a row, and of all from one on.
+
+        with_steps: whether with the latter
+        """
+        runs = sorted(self.runs)
+        rows = range(len(runs))
+        changes = [row for row in rows if row == 0 or runs[row][1] != runs[row - 1][1]]
+        spans = [(row, row) for row in rows]
+        spans += [(first, after - 1) for first, after in pairwise([*changes, len(runs)])]
+        spans += [(row, len(runs) - 1) for row in rows[1:] if with_steps]
+        whole = (0, len(runs) - 1)
+        return [(runs[first][0], runs[last][0]) for first, last in dict.fromkeys(spans) if (first, last) != whole]
 
     @property
     def subsystem(self) -> str:

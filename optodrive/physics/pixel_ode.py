@@ -35,6 +35,7 @@ from optodrive.physics.term import (
     SINCE_EDGE_S,
     TIME_S,
     WALL,
+    RecordedRun,
     TermValues,
 )
 from optodrive.physics.term_kernels import CHAINS, FOLLOWER_ROW, MAX_PARAMETERS, STATE_COUNT, TERM_ROW, TERMS
@@ -91,6 +92,11 @@ class PixelExperiment:
         # Kernels are compiled for one memory layout.
         object.__setattr__(self, "pulses", np.array(self.pulses, dtype=np.float64).reshape(-1, 4))
         object.__setattr__(self, "t_s", tuple(np.array(times, dtype=np.float64) for times in self.t_s))
+
+    @property
+    def recorded_run(self) -> RecordedRun:
+        """The run as an instrument sees it."""
+        return RecordedRun(self.session_time, float(self.pulses[:, 2].max(initial=0.0)) / self.full_w)
 
 
 class ActiveTerms(NamedTuple):

@@ -130,6 +130,13 @@ class BySignal(NamedTuple):
     mirrors: float = 0.0
 
 
+class RecordedRun(NamedTuple):
+    """The run that an instrument records: session time from −1 to 1, and its largest power relative to full power."""
+
+    session_time: float = 0.0
+    power: float = 1.0
+
+
 def build_signal_parameters(
     unit: str, default: float, low: float, high: float, source: str, names: tuple[str, ...] = BySignal._fields
 ) -> tuple[TermParameter, ...]:
@@ -147,7 +154,8 @@ class Term:
     for; couples_neighbours, whether light on one pixel heats the pixels around it; is_fast, whether it acts within a
     gas time constant; cannot_add_heat, whether it never makes anything hotter, see also `bound_heat_gain`.
     Diagnosis: signature, where the effect shows in recorded data, empty if it is no possible cause of a discrepancy;
-    subsystems, the kinds of recording that can show it; varies_between_runs, whether repeats of one drive differ by it;
+    subsystems, the kinds of recording that can show it; only_records, whether it acts by `record` alone;
+    varies_between_runs, whether repeats of one drive differ by it;
     is_exact, whether the effect has no other form than the term's, but for its share in each signal;
     starts_by_signal, of a term with one number per signal: where the search for one of all and for each begins;
     is_linear and fit_every_start as in `Hypothesis`; detection_limit, replaces the computed smallest visible effect;
@@ -170,6 +178,7 @@ class Term:
     cannot_add_heat: bool = False
     signature: str = ""
     subsystems: tuple[str, ...] = ("pixels",)
+    only_records: bool = False
     varies_between_runs: bool = False
     is_exact: bool = False
     starts_by_signal: tuple[float, ...] = ()
@@ -218,8 +227,10 @@ class Term:
         """Return the share by which the stated times of each signal run faster than true ones."""
         return BySignal()
 
-    def record(self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray) -> FloatArray:
-        """Return an instrument's record [n] of a pixel's signal, one of `BySignal`, at these times."""
+    def record(
+        self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray, run: RecordedRun
+    ) -> FloatArray:
+        """Return an instrument's record [n] of a pixel's signal, one of `BySignal`, at these times of a run."""
         return value
 
     def servo(self, values: TermValues) -> Servo | None:

@@ -154,6 +154,37 @@ def test_a_leak_is_told_from_ac_coupling_by_what_the_recording_states_or_by_its_
         assert (found.verdict, found.causes) == ("cause", ("gas_leak",))
 
 
+def scale_displacement(recording, gains):
+    """Return the recording of displacement alone, with a gain of each run."""
+    runs = []
+    for item, gain in zip(recording.runs, gains, strict=True):
+        signal = item.signals["displacement_m"]
+        runs.append(replace(item, signals={"displacement_m": replace(signal, value=gain * signal.value)}))
+    return Measurement(tuple(runs))
+
+
+POWERS = ("weak", "middle", "strong")
+
+
+def test_gains_that_follow_few_powers_are_as_likely_as_a_power_that_does_not():
+    shares = [1.0 - run.pulses[0, 2] / 2.45 for run in lab(5, {}, groups=POWERS, repeats=2).runs]
+    by_power = scale_displacement(lab(5, {}, groups=POWERS, repeats=2), [1.0 + 0.1 * share for share in shares])
+    nonlinear = lab(5, {"power_nonlinearity": {"threshold": 0.0, "curvature": 0.1}}, groups=POWERS, repeats=2)
+    for recording in (by_power, scale_displacement(nonlinear, [1.0] * 6)):
+        found = diagnose(recording)
+        assert (found.verdict, set(found.causes)) == ("ambiguous", {"run_gain", "power_nonlinearity"})
+        assert any("record one power again" in line for line in build_narrative(found))
+
+
+def test_without_gains_of_runs_a_touched_sensor_would_pass_for_an_ageing_absorber(monkeypatch):
+    touched = scale_displacement(lab(5, {}, groups=POWERS, repeats=2), [1.0, 1.0, 1.06, 1.06, 1.0, 1.0])
+    found = diagnose(touched)
+    assert (found.verdict, found.causes) == ("cause", ("run_gain",))
+    assert found.parameters["run_gain.displacement"].value == pytest.approx(0.06, abs=0.01)
+    monkeypatch.setattr(type(discover_terms()["run_gain"]), "build_hypotheses", lambda self, scope: [])
+    assert "absorber_ageing" in diagnose(touched).causes
+
+
 def test_without_repeats_nothing_is_named_for_certain():
     found = diagnose(lab(14, DROOP, repeats=1))
     assert found.verdict != "cause"

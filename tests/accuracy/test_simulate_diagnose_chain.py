@@ -52,6 +52,7 @@ NOT_SHOWN = {
     "gas_membrane": "no cause of its own: its stiffness is that of a membrane",
     "mirror_lag": "no mirror is recorded",
     "neighbour_crosstalk": "a neighbour's pulses heat by a few mK",
+    "run_gain": "one gain of all runs, as R, C and κ together",
     "panel_heating": "three seconds of light heat a panel by mK",
     "sensor_scale": "R, C and κ together",
 }

@@ -17,7 +17,10 @@ import numpy as np
 from blind_display import DISPLACEMENT, Physics, simulate_signals
 
 INSTRUMENT_TERMS = frozenset(
-    ("sensor_lag", "clock_offset", "sensor_scale", "ambient_drift", "time_rate", "smoothing", "high_pass")
+    (
+        *("sensor_lag", "clock_offset", "sensor_scale", "ambient_drift", "time_rate", "smoothing", "high_pass"),
+        "run_gain",
+    )
 )
 """Terms of the catalogue that are not in the pixel."""
 LAGS = frozenset(("sensor_lag", "clock_offset", "smoothing"))
@@ -76,7 +79,7 @@ ALLOWED: dict[str, Allowed] = {
         words=r"trigger|\blate\b|\bearly\b|clock|shift|(?:after|before) the light|left out", refusal=True
     ),
     "sign": Allowed(words=r"\bsign\b|invert|negativ|revers|turned|−1|falls while", refusal=True),
-    "gain_run": Allowed(words=r"gain|scale|power|left out"),
+    "gain_run": Allowed(_set("run_gain"), words=r"gain|scale|power|left out"),
     "gap": Allowed(_set(), _set("clock_offset")),
 }
 """Kind of fault → truthful answers, beside nothing and beside every cause."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from optodrive.core.types.measurements import Measurement, Run
 from optodrive.lab.inspection.start_times import read_start_times
 from optodrive.physics.hypothesis import Hypothesis, RecordingScope
 from optodrive.physics.pixel_ode import PixelExperiment
+from optodrive.physics.term import RecordedRun
 from optodrive.physics.terms import discover_terms
 
 SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad", "mirror_y_rad")
@@ -110,6 +112,15 @@ class Dataset:
             if runs:
                 subsystems.append(self.select(runs, kinds))
         return subsystems
+
+    @cached_property
+    def recorded_runs(self) -> tuple[RecordedRun, ...]:
+        """The run of each block, a default for those of mirrors."""
+        recorded = [RecordedRun()] * len(self.blocks)
+        for experiment, numbers in self.experiments:
+            for number in (number for number in numbers if number >= 0):
+                recorded[number] = experiment.recorded_run
+        return tuple(recorded)
 
     @property
     def groups(self) -> dict[str, list[int]]:
@@ -274,6 +285,10 @@ def build_hypotheses(data: Dataset) -> list[Hypothesis]:
 
 
 def _describe_scope(data: Dataset) -> RecordingScope:
+    groups = {
+        recorded.session_time: data.runs[block.run].group
+        for block, recorded in zip(data.blocks, data.recorded_runs, strict=True)
+    }
     return RecordingScope(
         signals=tuple(dict.fromkeys(CLOCKS[kind] for kind in data.kinds)),
         pixels=tuple(data.pixels),
@@ -282,4 +297,5 @@ def _describe_scope(data: Dataset) -> RecordingScope:
             bool((experiment.pulses[:, 3] != experiment.pixel).any()) for experiment, _ in data.experiments
         ),
         power_levels=len({round(float(power_w), 3) for run in data.runs for power_w in run.pulses[:, 2]}),
+        runs=tuple(groups.items()),
     )

@@ -22,9 +22,10 @@ from optodrive.lab.diagnosis.fitting import (
     solve,
 )
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
-from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict, record
 from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE, SearchLog
 from optodrive.physics.hypothesis import Hypothesis
+from optodrive.physics.terms import discover_terms
 
 ROUNDING_FRACTION = 1e-12
 """An effect with a smaller share orthogonal to the fitted parameters is known only by rounding errors, and unseen."""
@@ -90,12 +91,9 @@ def simulate_effects(
     for item in hypotheses:
         if item.label in log.failures:
             continue
-        points = [
-            ParameterPoint(base.point.base, {**base.point.terms, item.key: start}) for start in _select_starts(item)
-        ]
         try:
             # A finite size: at size zero a time constant or a shape has no derivative.
-            changes = [predict(problem.data, point, problem.epsilon) - base.prediction for point in points]
+            changes = [_simulate_start(problem, base, item.key, start) for start in _select_starts(item)]
         except UNCOMPUTABLE as error:
             log.add_failure(item.label, error)
             continue
@@ -103,6 +101,18 @@ def simulate_effects(
         effects += changes
     stacked = np.stack(effects, axis=1) if effects else np.zeros((len(problem.data.value), 0))
     return SimulatedEffects(tuple(starts), stacked, fitted_columns, sensitivity)
+
+
+def _simulate_start(problem: FitProblem, base: ModelFit, key: str, start: dict[str, float]) -> FloatArray:
+    """Return the change of the prediction [m] by a term beside a fit without it."""
+    term = discover_terms()[key]
+    if term.only_records and key not in base.point.terms:  # acts on what the other terms leave, which is known
+        signals = base.prediction.copy()
+        record(problem.data, term, start, signals)
+    else:
+        point = ParameterPoint(base.point.base, {**base.point.terms, key: start})
+        signals = predict(problem.data, point, problem.epsilon)
+    return signals - base.prediction
 
 
 def detect(

@@ -49,9 +49,8 @@ def compute_discrepancy_basis(
         for number in numbers:
             if number >= 0:
                 part = data.blocks[number].part
-                power[part] = experiment.pulses[:, 2].max(initial=0.0) / experiment.full_w
                 dose[part] = experiment.dose_before
-                session[part] = experiment.session_time
+                session[part], power[part] = data.recorded_runs[number]
     columns: list[FloatArray] = []
     for item in hypotheses:
         others = {key: values for key, values in terms.items() if key != item.key}

@@ -96,9 +96,7 @@ def find_dc_coupled(data: Dataset, residual: FloatArray, noise: NoiseModel) -> f
 
 def _find_drift(data: Dataset, residual: FloatArray, kind: int) -> tuple[InstrumentDisturbance, FloatArray] | None:
     """Return the drift of the zero of one kind of signal over the recording and its values [m], or None."""
-    session = {
-        number: experiment.session_time for experiment, numbers in data.experiments for number in numbers if number >= 0
-    }
+    session = [recorded.session_time for recorded in data.recorded_runs]
     rows = []
     for number, block in enumerate(data.blocks):
         if block.kind != kind:

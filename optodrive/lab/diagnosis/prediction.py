@@ -12,7 +12,7 @@ from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, PIXEL_KINDS, Dataset
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.stability import check_time_constants
-from optodrive.physics.term import BySignal, TermValues
+from optodrive.physics.term import BySignal, Term, TermValues
 from optodrive.physics.terms import all_terms
 
 BASE_PARAMETERS = ("R", "C", "tau_g", "kappa", "phi")
@@ -50,7 +50,7 @@ def predict(
     check_time_constants(point.terms)
     active = ActiveTerms.from_values(point.terms)
     # Repeats then differ, and each is integrated on its own.
-    if any(term.varies_between_runs for term, _ in terms):
+    if any(term.varies_between_runs and not term.only_records for term, _ in terms):
         for experiment, numbers in data.experiments:
             signals = simulate_signals(_time_truly(experiment, rates), pixel, active, delays_s[:3])
             for kind in PIXEL_KINDS:
@@ -62,12 +62,11 @@ def predict(
             for kind, number, rows in item.block_rows:
                 out[data.blocks[number].part] = signals[kind][rows]
     servo = next((servo for term, values in terms if (servo := term.servo(values)) is not None), None)
+    for term, values in terms:
+        record(data, term, values, out)
     for block in data.blocks:
         commands = data.runs[block.run].commands
-        if block.kind in PIXEL_KINDS:
-            for term, values in terms:
-                out[block.part] = term.record(values, BySignal._fields[block.kind], block.t_s, out[block.part])
-        elif commands is not None:
+        if block.kind in MIRROR_KINDS and commands is not None:
             column = commands[:, 1 + MIRROR_KINDS.index(block.kind)]
             t_s = block.t_s / (1.0 + rates.mirrors) - delays_s.mirrors
             out[block.part] = simulate_servo(commands[:, 0], column, t_s, servo)
@@ -75,6 +74,13 @@ def predict(
     if not np.isfinite(out).all():
         raise DivergedError(", ".join(point.terms) or "the nominal model", Unquoted("no number"), "finite predictions")
     return out
+
+
+def record(data: Dataset, term: Term, values: TermValues, signals: FloatArray) -> None:
+    """Replace the pixel's signals [m] by the record that instruments make of them under a term."""
+    for block, run in zip(data.blocks, data.recorded_runs, strict=True):
+        if block.kind in PIXEL_KINDS:
+            signals[block.part] = term.record(values, BySignal._fields[block.kind], block.t_s, signals[block.part], run)
 
 
 def _transpose(rows: list[BySignal]) -> Iterable[tuple[float, ...]]:

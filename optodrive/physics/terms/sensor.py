@@ -7,6 +7,7 @@
 - Time rate: the clock that times the samples of one instrument, or of all, is fast or slow.
 - High-pass: an instrument's input is AC coupled.
 - Smoothing: a program averages each sample of a signal with those before and after it.
+- Run gain: an instrument has another gain in some runs than in the others.
 """
 
 from math import exp, pi
@@ -23,6 +24,7 @@ from optodrive.physics.term import (
     HeatGainBound,
     Kernels,
     OperatingEnvelope,
+    RecordedRun,
     Term,
     TermValues,
     build_signal_parameters,
@@ -235,12 +237,15 @@ class HighPass(Term):
         "Hz", 0.3, 0.0, 30.0, "AC inputs of oscilloscopes and amplifiers, 0.1 to 10 Hz", HIGH_PASS_SIGNALS
     )
     cannot_add_heat = True
+    only_records = True
     signature = "a signal that falls while the drive is held, and undershoots after it"
     removes_zero = True
     twin = "gas_leak"
     remedy = "couple the input DC, state coupling = DC in the runs and record again: what remains is the pixel."
 
-    def record(self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray) -> FloatArray:
+    def record(
+        self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray, run: RecordedRun
+    ) -> FloatArray:
         """Return the signal behind the high-pass, [n]."""
         cutoff_hz = values.get(signal, 0.0)
         return value if cutoff_hz <= 0.0 else value - low_pass(t_s, value, 1.0 / (2.0 * pi * cutoff_hz))
@@ -284,11 +289,14 @@ class Smoothing(Term):
         TermParameter("by_samples", "1", 0.0, 0.0, 1.0, "0 width in time, 1 in samples", (0.0, 1.0), True),
     )
     cannot_add_heat = True
+    only_records = True
     is_fast = True
     signature = "edges that begin before the light does, or are rounded in one signal alone"
     remedy = "record again without averaging or filter."
 
-    def record(self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray) -> FloatArray:
+    def record(
+        self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray, run: RecordedRun
+    ) -> FloatArray:
         """Return the smoothed signal, [n]."""
         width_s, tails = values.get(signal, 0.0), values["tails"]
         if width_s <= 0.0 or len(t_s) < 2:
@@ -319,3 +327,67 @@ class Smoothing(Term):
             )
             for names in scope.list_signal_sets(SIGNALS[:3])
         ]
+
+
+GAIN_START = 0.05
+BESIDE_RUN = 1e-6
+"""Session time beside a run, far less than between two."""
+MAX_POWERS = 4
+"""Largest number of powers whose order gains may have by chance: that of k powers is one of k! orders."""
+
+
+class RunGain(Term):
+    """(1 + gain) · signal in runs that start from `first` to `last`, in session time from −1 to 1.
+
+    With by_power = 1 it is (1 + gain · (1 − power)) · signal, with the largest power of the run relative to full power.
+    """
+
+    key = "run_gain"
+    label = "the gain of an instrument, or the power of the laser, is another in some runs"
+    parameters = (
+        *build_signal_parameters(
+            "1", GAIN_START, -0.5, 0.5, "a range, a lens or a sensor exchanged, to 30 %", SIGNALS[:3]
+        ),
+        TermParameter(
+            "first", "1", -1.0, -1.0 - BESIDE_RUN, 1.0 + BESIDE_RUN, "session time of the first run", (), True
+        ),
+        TermParameter("last", "1", 1.0, -1.0 - BESIDE_RUN, 1.0 + BESIDE_RUN, "session time of the last run", (), True),
+        TermParameter("by_power", "1", 0.0, 0.0, 1.0, "1: the gain follows the power by chance", (), True),
+    )
+    cannot_add_heat = True
+    is_exact = True
+    only_records = True
+    varies_between_runs = True
+    signature = "one scale of a signal in some runs, and another in their repeats"
+    remedy = (
+        "with sensors and laser untouched, record one power again before, between and after the others; a gain that "
+        "changed shows in these repeats, and no power that is wrong does."
+    )
+
+    def record(
+        self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray, run: RecordedRun
+    ) -> FloatArray:
+        """Return the signal with the gain of its run, [n]."""
+        if not values["first"] <= run.session_time <= values["last"]:
+            return value
+        share = 1.0 - run.power if values["by_power"] > 0.5 else 1.0
+        return value * (1.0 + share * values.get(signal, 0.0))
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return one gain of each signal, in a run, in a group of runs, or from a run on, and of all signals likewise.
+
+        From a run on, all signals together change as the absorber does that loses some of its absorption. Where the
+        powers are few, the gains of one signal may follow them by chance.
+        """
+        none = dict.fromkeys(SIGNALS[:3], 0.0) | {item.name: item.default for item in self.parameters[3:]}
+        hypotheses = []
+        for names in scope.list_signal_sets(SIGNALS[:3]):
+            is_alone = len(names) == 1 or len(scope.signals) == 1
+            spans = scope.list_run_spans(with_steps=is_alone)
+            start, label = none | dict.fromkeys(names, GAIN_START), f"{self.key} of {describe_signals(names)}"
+            starts = tuple(start | {"first": first - BESIDE_RUN, "last": last + BESIDE_RUN} for first, last in spans)
+            hypotheses += [Hypothesis(self.key, label, starts, (self.free(*names),), True)] if starts else []
+            if is_alone and 1 < scope.power_levels <= MAX_POWERS:
+                starts = (start | {"by_power": 1.0},)
+                hypotheses.append(Hypothesis(self.key, f"{label} by power", starts, (self.free(*names),), True))
+        return hypotheses

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, filtfilt, lfilter
 
+from optodrive.physics.term import RecordedRun
 from optodrive.physics.terms import discover_terms
 from optodrive.physics.terms.sensor import low_pass, low_pass_both_ways, moving_mean
 
@@ -23,8 +24,10 @@ def test_a_high_pass_is_that_of_a_circuit():
     b, a, _ = cont2discrete(([1.0, 0.0], [1.0, 2 * np.pi * cutoff_hz]), 1e-3, "foh")
     values = dict.fromkeys(("temperature", "displacement", "force"), 0.0) | {"displacement": cutoff_hz}
     term = discover_terms()["high_pass"]
-    assert term.record(values, "displacement", T_S, SIGNAL) == pytest.approx(lfilter(b[0], a, SIGNAL), abs=1e-9)
-    assert term.record(values, "temperature", T_S, SIGNAL) is SIGNAL
+    assert term.record(values, "displacement", T_S, SIGNAL, RecordedRun()) == pytest.approx(
+        lfilter(b[0], a, SIGNAL), abs=1e-9
+    )
+    assert term.record(values, "temperature", T_S, SIGNAL, RecordedRun()) is SIGNAL
 
 
 def test_smoothing_is_a_moving_mean_or_a_filter_run_both_ways():
@@ -32,11 +35,13 @@ def test_smoothing_is_a_moving_mean_or_a_filter_run_both_ways():
     values = {"temperature": 0.0, "displacement": width_s, "force": 0.0, "tails": 0.0, "late": 0.0, "by_samples": 0.0}
     mean = np.convolve(SIGNAL, np.ones(15) / 15, "same")
     inside = slice(20, -20)
-    assert term.record(values, "displacement", T_S, SIGNAL)[inside] == pytest.approx(mean[inside], abs=4e-4)
+    assert term.record(values, "displacement", T_S, SIGNAL, RecordedRun())[inside] == pytest.approx(
+        mean[inside], abs=4e-4
+    )
     tau_s = width_s / np.sqrt(24.0)
     b, a, _ = cont2discrete(([1.0], [tau_s, 1.0]), 1e-3, "foh")
     both = filtfilt(b[0], a, SIGNAL)
-    wide = term.record(values | {"tails": 1.0}, "displacement", T_S, SIGNAL)
+    wide = term.record(values | {"tails": 1.0}, "displacement", T_S, SIGNAL, RecordedRun())
     assert wide[inside] == pytest.approx(both[inside], abs=2e-4)
     assert low_pass_both_ways(T_S, SIGNAL, 1e-7) == pytest.approx(SIGNAL, abs=1e-4)
 
@@ -49,9 +54,9 @@ def test_a_mean_of_samples_is_as_wide_as_its_samples_and_late_if_of_past_ones(in
     values = {"temperature": 0.0, "displacement": 0.015, "force": 0.0} | forms
     mean = np.convolve(signal, np.ones(15) / 15, "valid")
     term, inside = discover_terms()["smoothing"], slice(20, -20)
-    centred = term.record(values, "displacement", t_s, signal)
+    centred = term.record(values, "displacement", t_s, signal, RecordedRun())
     assert centred[inside] == pytest.approx(mean[13 : 13 + len(t_s) - 40], abs=4e-4)
-    past = term.record(values | {"late": 7.0 / 15.0}, "displacement", t_s, signal)
+    past = term.record(values | {"late": 7.0 / 15.0}, "displacement", t_s, signal, RecordedRun())
     assert past[inside] == pytest.approx(centred[13 : 13 + len(t_s) - 40], abs=4e-4)
     assert np.isfinite(past).all()
 
