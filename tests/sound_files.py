@@ -11,9 +11,9 @@ from hidden_field import CONFIG as FIELD_CONFIG
 from hidden_field import PRIOR, grid_codes, measure_spots
 from optodrive.core.errors import InputError
 from optodrive.core.plausibility import FRAMES, OTHER_UNITS, PlausibleRange, collect_ranges
+from optodrive.device.calibrated_field import _FieldFile, load_field
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import MirrorsFile, apply_measured_servo, load_config, locate_shipped
-from optodrive.device.field_file import _FieldFile, load_field
 from optodrive.device.field_geometry import FieldGeometry
 from optodrive.device.pixel_map import _PixelMapFile, load_pixel_map, replace_pixel_map
 from optodrive.lab.calibration.pictures import _PicturesFile, read_picture_folder

@@ -49,7 +49,7 @@ def field(
     if import_path is not None:
         result = _import(import_path, _require_option("--out", out), config)
     else:
-        from optodrive.device.field_file import load_field
+        from optodrive.device.calibrated_field import load_field
 
         calibrated_field = load_field(_require_option("--calibration", calibration))
         if export_path is not None:
@@ -123,8 +123,8 @@ def _export(calibrated_field: "CalibratedField", export: Path) -> dict[str, Any]
 
 def _import(grid: Path, out: Path, config: str | None) -> dict[str, Any]:
     from optodrive.core.files import write_text
+    from optodrive.device.calibrated_field import format_field, strip_toml_specials
     from optodrive.device.config_file import load_config
-    from optodrive.device.field_file import format_field, strip_toml_specials
     from optodrive.lab.calibration.field_output import fit_correction_grid
     from optodrive.lab.calibration.spots import FieldPrior
 

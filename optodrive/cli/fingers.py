@@ -109,7 +109,7 @@ def _report_film(path: Path, calibration: Path | None, record: Path | None, repe
 
 def _report_camera(source: str, marks: Path | None, repeat: bool, url: str) -> None:
     from optodrive.tracking.camera import Camera, follow_fingertips
-    from optodrive.tracking.marks import load_marks
+    from optodrive.tracking.fingertips import load_marks
 
     if marks is None:
         raise InputError("--marks", MISSING, "marks.toml, which states where the marks are")

@@ -100,7 +100,7 @@ def record_traces(
     from optodrive.core.types.measurements import Measurement
     from optodrive.device.pixel_map import load_pixel_map
     from optodrive.lab.recording import write_recording
-    from optodrive.link.simulator.pixel_recorder import measure
+    from optodrive.link.simulator.simulated_optics import measure
     from optodrive.physics.terms import all_terms
 
     coupling = "AC" if any(all_terms()[key].removes_zero for key in true_terms) else "DC"
@@ -129,7 +129,7 @@ def _label_run(run: "Run", repeat: int, instruments: InstrumentSettings, group: 
 
 
 def _describe_noise(noise: float) -> str:
-    from optodrive.link.simulator.pixel_recorder import INSTRUMENT_SIGMA
+    from optodrive.link.simulator.simulated_optics import INSTRUMENT_SIGMA
 
     if noise == 0.0:
         return "none: the recording is exact, as no instrument's is"

@@ -17,7 +17,7 @@ from optodrive.core.errors import InputError, NotReadyError, Unquoted
 if TYPE_CHECKING:
     from optodrive.core.types.arrays import FloatArray
     from optodrive.device.config import Config, PixelLayout
-    from optodrive.study.page_http import PageAddress
+    from optodrive.study.page_messages import PageAddress
     from optodrive.study.page_respondent import PageRespondent
     from optodrive.study.presenter import Presenter
     from optodrive.study.session import Respondent
@@ -214,7 +214,7 @@ def _run_person(
     from optodrive.study.daemon_presenter import DaemonPresenter
     from optodrive.study.dataset import build_log_path
     from optodrive.study.lab_streams import LabStreams, PublishingPresenter
-    from optodrive.study.page_http import parse_page_address
+    from optodrive.study.page_messages import parse_page_address
     from optodrive.study.presenter import check_stimuli
     from optodrive.study.session import build_matching_model, draw_order, run_session
     from optodrive.study.terminal import TerminalRespondent

@@ -8,7 +8,7 @@ import httpx
 
 from optodrive.client import http
 from optodrive.client.api_request import ApiRequest
-from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import Endpoint
 from optodrive.client.fingers import AsyncFingers
 from optodrive.client.hold import AsyncHold
 from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations

@@ -8,8 +8,7 @@ from typing import Any, Self, Unpack
 
 import numpy as np
 
-from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import run_blocking
+from optodrive.client.exchange import Endpoint, run_blocking
 from optodrive.client.fingers import Fingers
 from optodrive.client.heights import HeightsLike
 from optodrive.client.hold import Hold
@@ -225,7 +224,7 @@ class Display:
         return f"<Display at {self._client.endpoint.url}>"
 
     def _repr_png_(self) -> bytes | None:
-        from optodrive.client.picture import render_png
+        from optodrive.client.heights import render_png
 
         try:
             layout = self.layout

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
-from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import Endpoint
 from optodrive.client.problems import build_error
 from optodrive.client.sockets import BlockingConnection, open_connection
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError

@@ -6,7 +6,7 @@ from typing import Self
 
 from websockets.exceptions import ConnectionClosed
 
-from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import Endpoint
 from optodrive.client.problems import build_error
 from optodrive.client.sockets import BlockingConnection, open_connection
 from optodrive.core.errors import NotReadyError, OptodriveError

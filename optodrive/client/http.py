@@ -11,8 +11,7 @@ from typing import Any
 import httpx
 
 from optodrive.client.api_request import ApiRequest, Response
-from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import ExchangePolicy, run_blocking
+from optodrive.client.exchange import Endpoint, ExchangePolicy, run_blocking
 from optodrive.core.errors import NotReadyError
 
 READ_TIMEOUT_S = 2.5

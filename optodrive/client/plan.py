@@ -62,7 +62,7 @@ class Plan(PlanReport):
         heights_um = self.heights_um
         if heights_um is None or self._layout is None:
             return None
-        from optodrive.client.picture import render_png
+        from optodrive.client.heights import render_png
 
         return render_png(self._layout, heights_um)
 

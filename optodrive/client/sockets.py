@@ -17,8 +17,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
-from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import run_blocking
+from optodrive.client.exchange import Endpoint, run_blocking
 from optodrive.client.problems import parse_problem
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.push_options import check_keywords

@@ -12,8 +12,7 @@ import httpx
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
-from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import RETRY_S, RETRY_TIMEOUT_MIN_S
+from optodrive.client.exchange import RETRY_S, RETRY_TIMEOUT_MIN_S, Endpoint
 from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
 from optodrive.client.http import PROBE, PROBE_PERIOD_S, PROBE_TIMEOUT_S
 from optodrive.client.problems import build_error

@@ -6,10 +6,9 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import format_quantity
-from optodrive.device.calibrated_field import CalibratedField
+from optodrive.device.calibrated_field import CalibratedField, load_field
 from optodrive.device.config import Config
 from optodrive.device.config_sections import Wiring
-from optodrive.device.field_file import load_field
 from optodrive.device.pixel_map import build_aim_layout, load_pixel_map
 from optodrive.device.scan_field import IdealField, ScanField
 from optodrive.device.settling import SettlingTable

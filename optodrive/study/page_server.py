@@ -27,13 +27,16 @@ from starlette.websockets import WebSocket
 from optodrive.core.errors import InputError, OptodriveError
 from optodrive.daemon.api.host_check import LOOPBACK_NAMES, read_subprotocol_token, select_subprotocol
 from optodrive.daemon.server.bounded_protocols import Utf8WebSocket
-from optodrive.study.page_http import HostCheck, PageAddress, build_response, read_files
 from optodrive.study.page_messages import (
     MESSAGE_MAX_BYTES,
     OPERATOR_MESSAGES,
     PARTICIPANT_MESSAGES,
     AnswerMessage,
+    HostCheck,
+    PageAddress,
     SeenMessage,
+    build_response,
+    read_files,
 )
 from optodrive.study.page_respondent import PageRespondent
 

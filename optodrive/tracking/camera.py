@@ -15,8 +15,7 @@ import numpy as np
 from optodrive.core.errors import InputError, LinkError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.fingers import FingerPlace, FingerReport
-from optodrive.tracking.fingertips import FingertipDetector
-from optodrive.tracking.marks import MarksFile, find_view, import_opencv
+from optodrive.tracking.fingertips import FingertipDetector, MarksFile, find_view, import_opencv
 
 JUMP_MAX_M = 0.02
 """Largest way between two pictures. One that is farther from all others is a new fingertip."""

@@ -12,7 +12,7 @@ from shown_output import find_difference
 
 from hidden_field import CONFIG, PRIOR, field_errors_m, grid_codes
 from optodrive.cli.main import run
-from optodrive.device.field_file import load_field
+from optodrive.device.calibrated_field import load_field
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.spots import MeasuredSpots, read_spots
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry

@@ -7,7 +7,7 @@ from websockets.exceptions import InvalidStatus
 
 from optodrive.core.errors import InputError
 from optodrive.link.session.clock_sync import CLOCK_SPAN_S, DRIFT_MAX
-from optodrive.study.page_http import parse_page_address
+from optodrive.study.page_messages import parse_page_address
 from study_page_rig import PageStudy, open_wire
 from study_rig import find_defects, read_records, write_study
 from study_visit import StudyVisit

@@ -17,8 +17,8 @@ from optodrive.daemon.api.client_sockets import parse_fingers
 from optodrive.daemon.api.openapi import SEQUENCE_EXAMPLE
 from optodrive.device.config_file import load_config
 from optodrive.physics.parameters import load_parameters
+from optodrive.planning.stimuli.frame_json import parse_live_frame
 from optodrive.planning.stimuli.sequence_file import parse_sequence
-from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 from optodrive.study.study_file import EXPERIMENTS, list_shipped_studies, load_study
 from sound_files import write_toml
 

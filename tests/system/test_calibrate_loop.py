@@ -7,8 +7,8 @@ import signal
 import numpy as np
 import pytest
 
+from optodrive.device.calibrated_field import load_field
 from optodrive.device.config_file import load_config
-from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.spots import read_spots
 from optodrive.lab.commissioning.measurement_loop import build_code_grid
 from optodrive.link.simulator.guards import DEFAULT_LIMITS

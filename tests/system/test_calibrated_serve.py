@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hidden_field import CONFIG, LAYOUT, calibrate_hidden_field
-from optodrive.device.field_file import load_field
+from optodrive.device.calibrated_field import load_field
 from optodrive.device.pixel_map import DEAD, MEASURED, PixelMap, write_pixel_map
 from rig import Board, Daemon
 

@@ -18,7 +18,7 @@ import pytest
 from optodrive.core.processes import LIGHT, PLANNING
 from optodrive.daemon.server import acceptor
 from optodrive.daemon.server.acceptor import UNOPENED_MAX
-from optodrive.daemon.server.request_head import Rank
+from optodrive.daemon.server.connections import Rank
 from optodrive.daemon.supervisor.child import HANG_S
 from optodrive.daemon.supervisor.daemon import NICE
 from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, is_alive, long_train, read_proc, wait_for

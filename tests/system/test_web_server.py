@@ -18,8 +18,8 @@ from optodrive.daemon.api.tokens import ANONYMOUS, Token, Tokens
 from optodrive.daemon.server import bounded_protocols, connections
 from optodrive.daemon.server.acceptor import Acceptor
 from optodrive.daemon.server.acceptor_client import AcceptorClient
+from optodrive.daemon.server.connections import peek_head
 from optodrive.daemon.server.listeners import open_tcp_listener
-from optodrive.daemon.server.request_head import peek_head
 from optodrive.daemon.server.web_server import Server
 from optodrive.device.config_sections import DaemonSection
 from rig import wait_for

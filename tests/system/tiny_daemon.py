@@ -19,8 +19,7 @@ from optodrive.core.child_process import BeatWriter, fork_with_beat
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
 from optodrive.core.ipc import IpcError, Message, MessageSocket
-from optodrive.daemon.log import DaemonLog
-from optodrive.daemon.notify import Notifier
+from optodrive.daemon.log import DaemonLog, Notifier
 from optodrive.daemon.supervisor import supervisor
 from optodrive.daemon.supervisor.child import Child
 from optodrive.daemon.supervisor.supervisor import LinkView, Supervisor

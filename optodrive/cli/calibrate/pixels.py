@@ -212,7 +212,7 @@ def fit_pixel_map(recordings: list[Path], out: Path | None, config: str | None, 
     from optodrive.core.files import check_output
 
     import_extra("scipy")
-    from optodrive.device.field_file import strip_toml_specials
+    from optodrive.device.calibrated_field import strip_toml_specials
     from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
     from optodrive.lab.calibration.pixel_map_fit import PixelMapFitter, compute_stats
     from optodrive.lab.diagnosis.recording_checks import check_recording_units

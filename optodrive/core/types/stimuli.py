@@ -1,5 +1,6 @@
 """Requested stimuli: tactile frames and pulse trains."""
 
+import struct
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,3 +85,10 @@ class FrameSequence:
 
     frames: tuple[TactileFrame, ...] = ()
     trains: tuple[Train, ...] = ()
+
+
+MAGIC = b"ODF1"
+HEADER = struct.Struct("<4sI")
+HEIGHT_UNIT_M = 1e-7
+"""Unit of binary heights, m."""
+FRAME_NUMBER_MAX = 0xFFFF_FFFF

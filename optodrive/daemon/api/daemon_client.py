@@ -25,8 +25,8 @@ from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.service.control import PauseStatus
 from optodrive.link.service.link_connection import NO_REQUEST, build_error
 from optodrive.link.service.status import NO_EPOCH, ServiceStatus
-from optodrive.link.session.board_connector import CONNECTING
 from optodrive.link.session.board_view import BoardView
+from optodrive.link.session.group_state import CONNECTING
 from optodrive.planning.display_model import DisplayModel
 
 EPOCHS_MAX = 1000

@@ -16,8 +16,8 @@ from optodrive.daemon.push import Push
 from optodrive.daemon.responses.messages import FrameResult, RefreshReport
 from optodrive.daemon.responses.plan import PlanReport, PlanStatus
 from optodrive.daemon.responses.problem import Problem, build_error_problem
+from optodrive.planning.stimuli.frame_json import parse_live_frame
 from optodrive.planning.stimuli.sequence_file import encode_sequence
-from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 OUTBOX_MAX = 1000
 """A client with this number of unread results is disconnected."""

@@ -6,12 +6,12 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from optodrive.core.json_model import JsonModel
+from optodrive.core.types.stimuli import FRAME_NUMBER_MAX
 from optodrive.daemon.api.request_models import DIM_SCHEMA
 from optodrive.daemon.api.route_table import RouteTable
 from optodrive.daemon.responses.messages import FingersMessage, FingersRefusal, FrameResult, HoldReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.telemetry import EVENTS
-from optodrive.planning.stimuli.binary_frame import FRAME_NUMBER_MAX
 from optodrive.planning.stimuli.frame_json import ID_MAX, TARGET_KEYS
 from optodrive.planning.stimuli.json_values import KEY_MAX, LABELS_MAX, NUMBER_MAX, PRIORITY_MAX, TEXT_MAX, TIME_MAX_S
 from optodrive.planning.stimuli.pattern_registry import PATTERNS

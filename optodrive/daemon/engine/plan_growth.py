@@ -23,7 +23,7 @@ from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.planned_sequence import PlannedSequence
-from optodrive.planning.stimuli.streamed_frame import FRAME_DURATION_S, can_split
+from optodrive.planning.stimuli.frame_json import FRAME_DURATION_S, can_split
 
 
 class ExtendedPlan(NamedTuple):

@@ -22,8 +22,8 @@ from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.pulse_table import PulseTable
+from optodrive.planning.stimuli.frame_json import can_split, delay_frames, stale_pixels_first
 from optodrive.planning.stimuli.standing_page import Refresh
-from optodrive.planning.stimuli.streamed_frame import can_split, delay_frames, stale_pixels_first
 
 NEVER = threading.Event()
 """Event of a caller that does not leave."""

@@ -22,8 +22,8 @@ from optodrive.daemon.api.tokens import Tokens
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.server.acceptor_client import BEAT, NUMBER, send_connection
 from optodrive.daemon.server.connection_queue import ConnectionQueue, Waiting
+from optodrive.daemon.server.connections import Rank, parse_head, peek_head, rank_request
 from optodrive.daemon.server.listeners import raise_descriptor_limit
-from optodrive.daemon.server.request_head import Rank, parse_head, peek_head, rank_request
 from optodrive.device.config_sections import DaemonSection
 from optodrive.link.service.link_connection import LinkConnection
 

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from optodrive.daemon.server.connection_queue import Waiting
+from optodrive.daemon.server.connections import Rank
 from optodrive.daemon.server.listeners import TimedSocket
-from optodrive.daemon.server.request_head import Rank
 
 BEAT = b"beat"
 _CONNECTION_RECORD = struct.Struct("<QBd")

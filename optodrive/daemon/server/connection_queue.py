@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
-from optodrive.daemon.server.connections import PHASE_MAX_S
-from optodrive.daemon.server.request_head import Rank, is_complete, peek_head
+from optodrive.daemon.server.connections import PHASE_MAX_S, Rank, is_complete, peek_head
 
 ACCEPTS_MAX, EVENTS_MAX = 64, 64
 """Connections that are accepted, and sockets that are looked at, before others get a turn."""

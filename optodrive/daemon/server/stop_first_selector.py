@@ -13,9 +13,8 @@ from collections.abc import Callable, Iterable
 import uvicorn.server
 
 from optodrive.daemon.api.request_limits import STOP_PATH
-from optodrive.daemon.server.connections import Connections
+from optodrive.daemon.server.connections import Connections, peek_head
 from optodrive.daemon.server.listeners import TimedSocket
-from optodrive.daemon.server.request_head import peek_head
 
 CLIENTS_PER_TURN = 6
 STOP = STOP_PATH.encode()

@@ -14,9 +14,8 @@ from optodrive.daemon.api.tokens import Token
 from optodrive.daemon.server.acceptor_client import AcceptorClient
 from optodrive.daemon.server.bounded_protocols import MESSAGE_MAX_BYTES, BoundedHttp, BoundedWebSocket
 from optodrive.daemon.server.connection_queue import WAIT_MAX_S, Waiting
-from optodrive.daemon.server.connections import PHASE_MAX_S, Connections
+from optodrive.daemon.server.connections import PHASE_MAX_S, Connections, Rank, parse_head, rank_request
 from optodrive.daemon.server.listeners import raise_descriptor_limit
-from optodrive.daemon.server.request_head import Rank, parse_head, rank_request
 from optodrive.daemon.server.stop_first_selector import ServerState, StopFirstSelector
 
 RETRY_S = 0.02

@@ -12,12 +12,11 @@ from typing import Any
 from optodrive.core.clock import Clock
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message
-from optodrive.daemon.log import DaemonLog
-from optodrive.daemon.notify import Notifier
+from optodrive.daemon.log import DaemonLog, Notifier
 from optodrive.daemon.supervisor.child import Child
 from optodrive.link.service.link_connection import LinkConnection
 from optodrive.link.service.status import ServiceStatus
-from optodrive.link.session.board_connector import CONNECTING
+from optodrive.link.session.group_state import CONNECTING
 
 CONNECT_INTERVAL_S = 0.02
 

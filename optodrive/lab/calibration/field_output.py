@@ -17,8 +17,7 @@ import numpy as np
 from optodrive.core.errors import InputError
 from optodrive.core.files import atomic_write, write_text
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.calibrated_field import CalibratedField
-from optodrive.device.field_file import format_field, strip_toml_specials
+from optodrive.device.calibrated_field import CalibratedField, format_field, strip_toml_specials
 from optodrive.device.field_geometry import CENTRE_CODE
 from optodrive.lab.calibration.field_fit import FieldFit, fit_field
 from optodrive.lab.calibration.spots import FieldPrior, MeasuredSpots

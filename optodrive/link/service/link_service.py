@@ -24,7 +24,7 @@ loss of a stage, where the others go on, is an interruption of the same kind tha
 
 Order of one `step`: bytes of the board first, then what follows from them (ends of epochs), then status, then the
 answers to commands: a caller that learns from an answer that the board is armed may push at once, and the planner must
-know it by then. Results wait until the board has confirmed (`waiters.py`); a caller never learns of a state before it
+know it by then. Results wait until the board has confirmed (`control.py`); a caller never learns of a state before it
 is true.
 
 No method blocks and no client is waited for: the process has the highest priority of the daemon, its loop is bounded by
@@ -38,12 +38,11 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.ipc import IpcError, Message
 from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES
-from optodrive.link.service.control import DISARM, PAUSE_MAX_S, STOP, Clients, Control, Epoch, Pauses
+from optodrive.link.service.control import DISARM, PAUSE_MAX_S, STOP, Clients, Control, Epoch, Pauses, StateWaiters
 from optodrive.link.service.link_connection import build_result
 from optodrive.link.service.point_handover import PointHandover
 from optodrive.link.service.settings import OnWebLoss
 from optodrive.link.service.status import StatusPublisher
-from optodrive.link.service.waiters import StateWaiters
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.link.session.board_view import get_fault_hint
 

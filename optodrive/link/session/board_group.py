@@ -18,7 +18,7 @@ for it while its link is up. The owner pauses them until it is dark for certain 
 the light of all. It counts as lost until all are disarmed.
 
 Time. One board keeps its own: `board_s` is its clock, its points follow each other by durations, and what is late is
-executed late and reported. Several keep the host's (`host_time.py`): `board_s` is the host's clock.
+executed late and reported. Several keep the host's (`staged_job.py`): `board_s` is the host's clock.
 
 Late light is not emitted. If one board would execute its next point late, all drop their points and stay armed
 (`_drop_late_points`), and the plan has failed: light out of order is not covered by any proof.
@@ -39,10 +39,9 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES
 from optodrive.link.session.group_state import LEASE_TRANSIT_MAX_S, GroupState, LostStage, OnStageLoss, describe_end
-from optodrive.link.session.host_time import SEND_AHEAD_MAX_S
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
-from optodrive.link.session.staged_job import StagedJob
+from optodrive.link.session.staged_job import SEND_AHEAD_MAX_S, StagedJob
 
 
 class BoardGroup(GroupState):

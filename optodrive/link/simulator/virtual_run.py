@@ -13,8 +13,8 @@ from optodrive.device.config import Config
 from optodrive.link.board_setup import build_board_settings, build_scales
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
-from optodrive.link.session.board_connector import CONNECTING
 from optodrive.link.session.board_group import BoardGroup
+from optodrive.link.session.group_state import CONNECTING
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.guards import build_settings

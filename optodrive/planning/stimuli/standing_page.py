@@ -20,7 +20,7 @@ from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import PixelLayout
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
-from optodrive.planning.stimuli.streamed_frame import FRAME_DURATION_S
+from optodrive.planning.stimuli.frame_json import FRAME_DURATION_S
 
 REFRESH_PERIOD_S = 0.04
 """Time from one pulse of a pixel to its next turn. Touch tells less than 20 per second from a standing dot."""

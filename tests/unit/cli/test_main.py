@@ -9,7 +9,7 @@ import typer
 
 from optodrive.cli import commands
 from optodrive.cli.main import run
-from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import Endpoint
 from optodrive.core.daemon_url import read_default_url
 from optodrive.core.errors import InputError, LinkError
 

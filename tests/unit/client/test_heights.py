@@ -6,12 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from displays import DISPLAYS
-from optodrive.client.heights import convert_to_pixels, encode_frame, encode_json, encode_target
-from optodrive.client.picture import interpolate_colour, render_png
+from optodrive.client.heights import (
+    convert_to_pixels,
+    encode_frame,
+    encode_json,
+    encode_target,
+    interpolate_colour,
+    render_png,
+)
 from optodrive.core.errors import InputError
 from optodrive.device.config import build_pixel_layout
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
-from optodrive.planning.stimuli.streamed_frame import parse_live_frame
+from optodrive.planning.stimuli.frame_json import parse_live_frame
 
 LAYOUT = DISPLAYS["display-437"].layout
 

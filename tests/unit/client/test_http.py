@@ -14,9 +14,9 @@ import pytest
 from optodrive.client import api_request
 from optodrive.client.api_request import ApiRequest
 from optodrive.client.async_display import AsyncHttp
-from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import (
     STOP_LOST_TIMEOUTS_S,
+    Endpoint,
     ExchangePolicy,
     parse_response,
     run_blocking,
@@ -183,7 +183,7 @@ def test_a_request_with_an_effect_is_repeated_only_if_it_was_not_sent(call):
 
 def test_a_refused_token_is_read_again_once(call, monkeypatch):
     tokens = iter(["second", "second"])
-    monkeypatch.setattr("optodrive.client.endpoint.read_token", lambda port: next(tokens))
+    monkeypatch.setattr("optodrive.client.exchange.read_token", lambda port: next(tokens))
     monkeypatch.setattr(Endpoint, "__init__", explicit_first_token(Endpoint.__init__))
     _, requests = call([REFUSED_TOKEN, HEALTHY], send(HEALTH))
     assert [authorization for _, _, authorization in requests] == ["Bearer token", "Bearer second"]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from websockets.asyncio.server import serve
 
-from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import Endpoint
 from optodrive.client.sockets import LoopThread
 from optodrive.client.stream import Stream
 from optodrive.core.errors import LinkError, NotReadyError

@@ -10,8 +10,7 @@ import pytest
 from optodrive.client import http
 from optodrive.client.api_request import ApiRequest
 from optodrive.client.async_display import AsyncHttp
-from optodrive.client.endpoint import Endpoint
-from optodrive.client.exchange import ExchangePolicy
+from optodrive.client.exchange import Endpoint, ExchangePolicy
 from optodrive.client.http import DaemonClient
 from optodrive.client.requests import parse_as
 from optodrive.core.errors import LinkError

@@ -17,9 +17,9 @@ from optodrive.core.plausibility import (
     check_table,
     collect_ranges,
 )
+from optodrive.device.calibrated_field import _FieldFile
 from optodrive.device.config import Config
 from optodrive.device.config_file import MirrorsFile
-from optodrive.device.field_file import _FieldFile
 from optodrive.device.field_geometry import GEOMETRY_RANGES, FieldGeometry
 from optodrive.device.pixel_map import _PixelMapFile
 from optodrive.lab.calibration.pictures import _PicturesFile

@@ -4,7 +4,7 @@ import socket
 import pytest
 
 from optodrive.core.clock import ManualClock
-from optodrive.daemon.notify import Notifier
+from optodrive.daemon.log import Notifier
 
 
 @pytest.fixture

@@ -6,15 +6,14 @@ import pytest
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, NotReadyError
 from optodrive.daemon.api.tokens import Token, Tokens
-from optodrive.daemon.log import DaemonLog
-from optodrive.daemon.notify import Notifier
+from optodrive.daemon.log import DaemonLog, Notifier
 from optodrive.daemon.reload import (
     ConfigReloader,
     describe_reload,
     merge_reloadable,
     split_changed_keys,
 )
-from optodrive.daemon.supervisor.reload_handler import ReloadHandler
+from optodrive.daemon.supervisor.daemon import ReloadHandler
 from optodrive.device.config_file import load_config
 from optodrive.link.protocol.states import LEASED_STATES
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from hidden_field import CODE_M, CONFIG, PRIOR, grid_codes, measure_spots
 from optodrive.core.errors import InputError
-from optodrive.device.field_file import load_field
+from optodrive.device.calibrated_field import load_field
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.field_output import write_field
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry

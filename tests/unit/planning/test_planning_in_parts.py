@@ -9,7 +9,7 @@ from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.planning.limiter.limiter import commit_until, shift_state
 from optodrive.planning.pipeline import SequencePlanner, plan_sequence
-from optodrive.planning.stimuli.streamed_frame import stale_pixels_first
+from optodrive.planning.stimuli.frame_json import stale_pixels_first
 
 FRAMES = 40
 

@@ -14,7 +14,7 @@ from optodrive.tracking.camera import (
     FingerNumbers,
     follow_fingertips,
 )
-from optodrive.tracking.marks import load_marks
+from optodrive.tracking.fingertips import load_marks
 from rendered_hand import ABOVE, PITCH_M, SIZE, Finger, render, write_marks, write_video
 
 RATE_HZ = 30.0

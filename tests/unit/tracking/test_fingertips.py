@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from optodrive.tracking.fingertips import FingertipDetector
-from optodrive.tracking.marks import find_view, load_marks
+from optodrive.tracking.fingertips import FingertipDetector, find_view, load_marks
 from rendered_hand import ABOVE, BELOW, PITCH_M, SIZE, random_hand, render, take_picture, write_marks
 
 BACKGROUNDS, PICTURES = 5, 60

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.tracking.marks import find_view, load_marks, project
+from optodrive.tracking.fingertips import find_view, load_marks, project
 from rendered_hand import ABOVE, BELOW, MARKS, SIDE_M, SIZE, render, write_marks
 
 GRID = np.array([[x, y] for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])

@@ -7,7 +7,7 @@ import pytest
 
 from hidden_field import CONFIG, HALF_M, grid_codes, measure_spots
 from optodrive.cli.main import run
-from optodrive.device.field_file import load_field
+from optodrive.device.calibrated_field import load_field
 from optodrive.lab.calibration.field_output import (
     NODE_SPACING_CODES,
     NODES_PER_SIDE,

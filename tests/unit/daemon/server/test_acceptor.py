@@ -16,8 +16,8 @@ from optodrive.daemon.api.tokens import Token, Tokens
 from optodrive.daemon.server import acceptor_client, connection_queue
 from optodrive.daemon.server.acceptor import UNOPENED_MAX, Acceptor
 from optodrive.daemon.server.acceptor_client import AcceptorClient
+from optodrive.daemon.server.connections import Rank, parse_head
 from optodrive.daemon.server.listeners import open_tcp_listener
-from optodrive.daemon.server.request_head import Rank, parse_head
 from optodrive.device.config_sections import DaemonSection
 
 SECRET = "a-valid-secret-of-a-viewer"

@@ -7,8 +7,8 @@ import pytest
 
 from optodrive.daemon.server import connection_queue
 from optodrive.daemon.server.connection_queue import PHASE_MAX_S, WAIT_MAX_S, WAITING_MAX, ConnectionQueue
+from optodrive.daemon.server.connections import Rank
 from optodrive.daemon.server.listeners import open_tcp_listener
-from optodrive.daemon.server.request_head import Rank
 
 RANKS = {b"S": Rank.STOP, b"T": Rank.TOKEN, b"O": Rank.OTHER}
 END = b"\r\n\r\n"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from optodrive.daemon.api.access_policy import AccessPolicy
 from optodrive.daemon.api.request_limits import join_headers, normalise_path
 from optodrive.daemon.api.tokens import Token, Tokens
-from optodrive.daemon.server.request_head import HEAD_MAX_BYTES, Rank, is_complete, parse_head, peek_head, rank_request
+from optodrive.daemon.server.connections import HEAD_MAX_BYTES, Rank, is_complete, parse_head, peek_head, rank_request
 from optodrive.device.config_sections import DaemonSection
 
 SECRET = "a-valid-secret-of-a-viewer"

@@ -9,8 +9,7 @@ import pytest
 
 from optodrive.core.child_process import BEAT, READY
 from optodrive.core.clock import ManualClock
-from optodrive.daemon.log import DaemonLog
-from optodrive.daemon.notify import Notifier
+from optodrive.daemon.log import DaemonLog, Notifier
 from optodrive.daemon.supervisor.child import HANG_S, RESTART_DELAYS_S, START_TIMEOUT_S, STEADY_S, Child
 from optodrive.daemon.supervisor.supervisor import STALL_S, LinkView, Supervisor
 

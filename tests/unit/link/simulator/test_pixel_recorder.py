@@ -5,7 +5,12 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
-from optodrive.link.simulator.pixel_recorder import PRE_LIGHT_US, SAMPLES_MAX, SAMPLES_PER_LINE, SimulatedPixelRecorder
+from optodrive.link.simulator.simulated_optics import (
+    PRE_LIGHT_US,
+    SAMPLES_MAX,
+    SAMPLES_PER_LINE,
+    SimulatedPixelRecorder,
+)
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 DISPLAY = DISPLAYS["display-437"]

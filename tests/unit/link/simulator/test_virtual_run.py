@@ -4,7 +4,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
-from optodrive.link.simulator.pixel_recorder import INSTRUMENT_SIGMA, measure
+from optodrive.link.simulator.simulated_optics import INSTRUMENT_SIGMA, measure
 from optodrive.link.simulator.true_display import compute_traces
 from optodrive.link.simulator.virtual_run import execute
 from optodrive.planning.display_model import DisplayModel

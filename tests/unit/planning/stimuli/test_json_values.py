@@ -3,9 +3,9 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.planning.stimuli import json_values
+from optodrive.planning.stimuli.frame_json import parse_live_frame
 from optodrive.planning.stimuli.json_values import decode_json
 from optodrive.planning.stimuli.sequence_file import parse_sequence
-from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 CONFIG = DISPLAYS["display-16"].config
 PARSERS = {

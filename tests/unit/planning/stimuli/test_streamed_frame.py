@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.planning.stimuli.streamed_frame import parse_live_frame, stale_pixels_first
+from optodrive.planning.stimuli.frame_json import parse_live_frame, stale_pixels_first
 
 
 def binary(heights, number=7, magic=b"ODF1"):
