@@ -19,43 +19,27 @@ TABLE = ROOT / "tests" / "slow.csv"
 COLUMNS = ("piece", "commit", "date", "passed", "failed", "seconds", "ended")
 PIECE_MAX_S = 1200.0
 FOLDERS = {
-    "accuracy": 3,
-    "blind": 2,
-    "browser": 1,
-    "conformance": 3,
-    "dac": 2,
+    "accuracy": 6,
+    "blind": 4,
+    "browser": 3,
+    "conformance": 6,
+    "dac": 8,
     "docs": 1,
-    "firmware": 2,
+    "firmware": 4,
     "independent": 1,
-    "property": 4,
-    "scripts": 1,
-    "system": 4,
-    "unit": 1,
+    "property": 8,
+    "scripts": 2,
+    "system": 8,
+    "unit": 2,
 }
-"""Folders of tests → the number of pieces that their files are dealt out to."""
+"""Folders of tests → the number of pieces that their slow tests are dealt out to."""
+PIECES = {f"{folder}-{k}": (folder, f"{k}/{count}") for folder, count in FOLDERS.items() for k in range(1, count + 1)}
 
 
 def read_nightly() -> dict[str, str]:
     """Return the beginnings of the names of tests that went to the nightly run, and what covers each in the gate."""
     with (ROOT / "tests" / "nightly.csv").open(newline="") as file:
         return {row["name"]: row["covered_by"] for row in csv.DictReader(file)}
-
-
-def list_pieces() -> dict[str, list[str]]:
-    """Return the names of the pieces, such as `property-2`, and the files of each."""
-    pieces: dict[str, list[str]] = {}
-    nightly = {name.partition("::")[0] for name in read_nightly()}
-    for folder, count in FOLDERS.items():
-        files = sorted((ROOT / "tests" / folder).rglob("test_*.py"))
-        names = [str(file.relative_to(ROOT)) for file in files]
-        slow = [
-            name
-            for name, file in zip(names, files, strict=True)
-            if folder == "property" or name in nightly or "mark.slow" in file.read_text()
-        ]
-        for part in range(count):
-            pieces[folder if count == 1 else f"{folder}-{part + 1}"] = slow[part::count]
-    return pieces
 
 
 def read_rows() -> list[dict[str, str]]:
@@ -72,10 +56,12 @@ def choose_piece(names: list[str], rows: list[dict[str, str]]) -> str:
     return min(names, key=lambda name: last.get(name, -1))
 
 
-def run_piece(name: str, files: list[str]) -> dict[str, str]:
-    """Run the slow tests of files, and those of properties with all examples. Return the table's row."""
-    select = [] if name.startswith("property") else ["-m", "slow"]
-    command = [sys.executable, "-m", "pytest", "-v", *files, *select, "--numprocesses", "2", "--dist", "loadfile"]
+def run_piece(name: str) -> dict[str, str]:
+    """Run the slow tests of a piece, and those of properties with all examples. Return the table's row."""
+    folder, part = PIECES[name]
+    select = ["--piece", part] if folder == "property" else ["--piece", part, "-m", "slow"]
+    command = [sys.executable, "-m", "pytest", "-v", f"tests/{folder}", *select, "--numprocesses", "2"]
+    command += ["--dist", "loadfile"]
     began_s, found, ended = time.monotonic(), Counter[str](), "yes"
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -100,13 +86,13 @@ def run_piece(name: str, files: list[str]) -> dict[str, str]:
 
 def main(arguments: list[str]) -> int:
     """Run the pieces that are named, or the one that is due."""
-    pieces, rows = list_pieces(), read_rows()
-    if unknown := [name for name in arguments if name not in pieces]:
-        print(f"scripts/test --slow: piece: got {unknown[0]!r}, expected one of {', '.join(pieces)}", file=sys.stderr)
+    rows = read_rows()
+    if unknown := [name for name in arguments if name not in PIECES]:
+        print(f"scripts/test --slow: piece: got {unknown[0]!r}, expected one of {', '.join(PIECES)}", file=sys.stderr)
         return 2
     status = 0
-    for name in arguments or [choose_piece(list(pieces), rows)]:
-        row = run_piece(name, pieces[name])
+    for name in arguments or [choose_piece(list(PIECES), rows)]:
+        row = run_piece(name)
         is_new = not TABLE.exists()
         with TABLE.open("a", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

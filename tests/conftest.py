@@ -59,6 +59,7 @@ def pytest_sessionfinish():
 
 def pytest_addoption(parser):
     parser.addoption("--board", default=None, metavar="PORT", help="run the hardware tests on the board at PORT")
+    parser.addoption("--piece", default="1/1", metavar="K/N", help="run the K-th of N pieces of the selected tests")
 
 
 SLOW = (
@@ -76,7 +77,7 @@ NIGHTLY = tuple(line.partition(",")[0] for line in (Path(__file__).parent / "nig
 """Beginnings of the names of tests that are slow; the table names the test of the gate that covers their faults."""
 
 
-@pytest.hookimpl(tryfirst=True)  # before `-m` selects
+@pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_collection_modifyitems(config, items):
     for item in items:
         if item.nodeid.startswith(NIGHTLY):
@@ -88,6 +89,9 @@ def pytest_collection_modifyitems(config, items):
         for item in items:
             if "hardware" in item.keywords:
                 item.add_marker(skip)
+    yield  # `-m` selects
+    number, count = map(int, config.getoption("--piece").split("/"))
+    items[:] = items[len(items) * (number - 1) // count : len(items) * number // count]
 
 
 @pytest.fixture(params=sorted(DISPLAYS))
