@@ -160,15 +160,17 @@ def test_decoupled_axes_of_an_npz_are_judged_one_by_one(tmp_path, capsys):
     assert second["linear"] > 0.95
 
 
-@pytest.mark.skipif("OPTODRIVE_STEERING_MIRROR" not in os.environ, reason="OPTODRIVE_STEERING_MIRROR names no data")
-def test_a_measured_piezo_mirror_has_hysteresis_and_one_model_halves_the_error(capsys):
-    path = os.environ["OPTODRIVE_STEERING_MIRROR"]
+@pytest.mark.skipif("STEERING_MIRROR_NPZ" not in os.environ, reason="STEERING_MIRROR_NPZ does not name the data")
+def test_one_model_of_a_measured_piezo_mirror_predicts_an_amplitude_left_out(capsys):
+    path = os.environ["STEERING_MIRROR_NPZ"]
     assert run(["calibrate", "servo", path, "--sample-rate", "6400", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["probability"]["hysteresis"] > 0.95
-    # Half of 0.37, 0.25 and 0.31 µm, the errors of one linear response; at the last one 0.155 µm is not reached by 1 %.
-    errors = list(report["error"]["model"].values())
-    assert errors == pytest.approx([0.068, 0.116, 0.157], rel=0.02)
+    assert report["number_count"] <= 40
+    # One response per amplitude leaves 0.064, 0.106 and 0.146 µm; one linear response, without 0.2 V, 0.238 µm there.
+    within = 1.2 * np.array([0.064, 0.106, 0.146])
+    assert np.all(np.array(list(report["error"]["model"].values())) <= within)
+    assert list(report["error"]["fitted_without"].values())[1] <= 0.15
 
 
 @pytest.mark.parametrize(
