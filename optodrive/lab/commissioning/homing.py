@@ -119,6 +119,7 @@ class Homing:
     def check_indicator(self) -> Outcome:
         """Arm the board and check that its indicator is on for two seconds before ARMED."""
         indicator_s = self._board.arm()
+        # A shorter warning is a failure, though the board is ARMED.
         is_met, expected = indicator_s >= INDICATOR_S * (1.0 - CLOCK_TOLERANCE), f"at least {INDICATOR_S:g} s"
         self._require(is_met, "time from the request to ARMED", f"{indicator_s:.2f} s", expected)
         return f"indicator on for {indicator_s:.2f} s, ARMED", {"indicator_s": round(indicator_s, 3)}
@@ -138,8 +139,10 @@ class Homing:
         self._ends[axis] = high, low
         commanded_rad = high.commanded_rad[axis] - low.commanded_rad[axis]
         if high.output_rad is not None:
+            # Here only whether it moves; axis, sign and scale are the next step's, which can compare both axes.
             self._require_motion(axis, _difference(high.output_rad, low.output_rad, axis), commanded_rad, "rad")
         if high.spot_m is not None:
+            # A mirror turns the beam by twice its own angle.
             commanded_m = 2.0 * self._board.config.scanner.focal_length_m * commanded_rad
             own_m, other_m = (_difference(high.spot_m, low.spot_m, each) for each in (axis, 1 - axis))
             self._require_motion(axis, own_m, commanded_m, "m")
@@ -185,6 +188,7 @@ class Homing:
     def _measure_at(self, x_code: int, y_code: int) -> HomingPosition:
         self._board.move_to(x_code, y_code)
         commanded_rad = (x_code - CENTRE_CODE) * self._code_rad, (y_code - CENTRE_CODE) * self._code_rad
+        # Nobody measures, but a person may look at the spot.
         if self._sensor_reader is None:
             if self._power_w:
                 self._board.fire_spot(x_code, y_code, self._power_w)
@@ -262,6 +266,7 @@ STEPS: tuple[Step, ...] = (
 
 def default_power_w(config: Config) -> float:
     """Return the lowest power that is emitted and that the reference board's readback detects, at most a spot's, W."""
+    # Below its threshold a laser emits nothing, and a step would pass that has shown nothing.
     lowest_w = max(DUTY_SHARE * config.laser.max_power_w, config.laser.threshold_w)
     return min(lowest_w, max_spot_power_w(config))
 
@@ -276,6 +281,7 @@ def emit_first_light(
     """
     if not 1 <= pulses <= PULSES_MAX:
         raise InputError("--pulses", pulses, f"1 to {PULSES_MAX}")
+    # Not the steps that move the mirrors over the display: the first light is to be where a person expects it.
     Homing(board, None, 0.0, acknowledge).run(on_step, DARK_STEPS)
     board.move_to(CENTRE_CODE, CENTRE_CODE)
     for number in range(1, pulses + 1):

@@ -185,6 +185,7 @@ class MeasurementResult:
 def fit_and_warm_up(spots: MeasuredSpots, prior: FieldPrior) -> FieldFit:
     """Fit the field and build its inverse now, which would later delay the lease."""
     fit = fit_field(spots, prior)
+    # Its result is kept in the field and not needed here.
     fit.field.codes(np.zeros(1), np.zeros(1))
     return fit
 
@@ -212,6 +213,7 @@ class MeasurementLoop:
 
         Continue an interrupted session only if its first spot is still at the same position, else raise RefusedError.
         """
+        # Before anything new is measured: spots of two positions of the display would fit one wrong field.
         if self._session.rows:
             self._check_unchanged()
         while True:
@@ -219,6 +221,7 @@ class MeasurementLoop:
             predicted_error_m: float = self._run_keeping_lease(predicted_rms_m, fit, self._board.config)
             count, error_bound_m = len(self._session.rows), CONFIDENCE_FACTOR * predicted_error_m
             on_progress(MeasurementProgress(count, predicted_error_m, error_bound_m, int(fit.outlier.sum())))
+            # Corners, edges and centre first: the error bound of a fit that lacks one of them means nothing there.
             if not self._remaining_initial_places():
                 self._run_keeping_lease(
                     check_spots, f"calibrate: {self._locator.name}", self._session.spots, self._prior
@@ -246,6 +249,7 @@ class MeasurementLoop:
         """Measure the first valid spot again, and the second if the first one has moved: it may be an outlier."""
         spots = self._session.spots
         fit: FieldFit = self._run_keeping_lease(fit_and_warm_up, spots, self._prior)
+        # √2: the difference of two measurements has the noise of both.
         places, max_shift_m = self._locator.match_places(spots), RECHECK_SIGMAS * 2.0**0.5 * fit.noise_m
         code_m = 2.0 * self._prior.focal_length_m * self._prior.rad_per_code
         shifts = []
@@ -255,6 +259,7 @@ class MeasurementLoop:
             if current is None:
                 shifts.append("nowhere")
                 continue
+            # A person may move the spot to other codes than before; only what these do not explain is a shift.
             x_m = current.x_m - previous.x_m - code_m * (current.x_code - previous.x_code)
             y_m = current.y_m - previous.y_m - code_m * (current.y_code - previous.y_code)
             if np.hypot(x_m, y_m) <= max_shift_m:
@@ -276,8 +281,11 @@ class MeasurementLoop:
             row = self._locator.measure(place, int(codes[place, 0]), int(codes[place, 1]))
             if row is not None:
                 self._session.rows.append(row)
+                # After each spot and flushed: each costs light and a person's time. In the worker, because a flush may
+                # take longer than the lease.
                 self._run_keeping_lease(save_text, self._session.path, self._session.to_json())
                 return
+            # Of this run alone: a cover may be gone at the next one.
             self._unseen_places.add(place)
             misses += 1
             if misses == CONSECUTIVE_MISSES_MAX:
@@ -296,6 +304,7 @@ class MeasurementLoop:
         initial = self._remaining_initial_places()
         if initial:
             return initial[0]
+        # An outlier, as by a reflection, may be measured again.
         done = {*self._locator.match_places(fit.spots)[~fit.outlier].tolist(), *self._unseen_places}
         remaining = [place for place in range(len(codes)) if place not in done]
         if not remaining:

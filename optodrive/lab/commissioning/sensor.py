@@ -75,6 +75,7 @@ class SpotSensorClient:
         self._buffer += self._read()
         line, end, _ = self._buffer.partition(b"\n")
         if not end:
+            # A port with another device may send without end.
             if len(self._buffer) > LINE_MAX:
                 raise self._build_answer_error(self._buffer.decode("ascii", "replace"), "a line")
             return None

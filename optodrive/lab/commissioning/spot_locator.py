@@ -116,6 +116,7 @@ class ManualLocator:
                 for code, offset_um in zip((x_code, y_code), nudge_um, strict=True)
             )
             try:
+                # Before the light: the spot stays where it was, and the person is told why.
                 self._board.check_range(new_x_code, new_y_code)
             except InputError as error:
                 self._show(str(error))

@@ -33,10 +33,12 @@ def plan_aims(displays: list[tuple[Aim, DisplayModel]], journal: SweepJournal) -
     plans = []
     for aim, display in displays:
         missing = is_reachable(display.config, display.scan_head.field, aim)
+        # What an interrupted sweep has played is not lit again.
         missing[list(journal.list_done(aim.name))] = False
         trains = build_sweep(display.config, aim, missing)
         if trains:
             sequence = FrameSequence((), trains)
+            # Never trimmed: a pulse of another energy would be another measurement.
             plan = plan_sequence(display, sequence, *display.build_cold_state(), policy="delay").plan
             plans.append(AimPlan(aim, plan))
     return plans
@@ -56,11 +58,13 @@ def play_aims(
     """
     for number, item in enumerate(plans):
         if number:
+            # Each aim is planned for a cold display.
             board.wait(rest_s)
         recorder = _JournalRecorder(item, board, journal, on_progress)
         for first in range(0, len(item.plan), PULSES_PER_JOB):
             recorder.first = recorder.count = first
             board.play(_cut_plan(item.plan, first), recorder.record)
+        # After a job and not within: a full disk must not end the light in the middle of a pulse's record.
         journal.raise_if_failed()
         if recorder.count != len(item.plan):
             raise RefusedError(f"sweep: aim {item.aim.name}: {recorder.count} of {len(item.plan)} pulses were reported")
@@ -95,6 +99,7 @@ class _JournalRecorder:
         scale, plan = self.board.session.scale, self.item.plan
         done = job.executed_count
         reported = job.read_reported(self.count - self.first, done)
+        # At each report, so that the drift of the board's clock does not add up over a sweep.
         unix_minus_board_s = time.time() - self.board.session.board_s()
         self.journal.append(
             [

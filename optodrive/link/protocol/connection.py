@@ -115,6 +115,7 @@ class HostConnection:
         effect of ABORT.
         """
         self._aborted_session = self.session or self._aborted_session
+        # Nothing that waited may follow it.
         self._control = [encode_frame(Frame(Abort.TYPE, 0, self.session, b""))]
         self.peer = self._nonce = None
         self._reset()
@@ -148,6 +149,7 @@ class HostConnection:
     def _collect_sequenced(self, now_s: float, max_in_flight_bytes: int) -> bytes:
         out = b""
         if self._unacked and (self._retransmit_pending or now_s - self._timer_start_s > self._rto_s):
+            # All of them: go-back-N, since a board keeps no frame behind a gap.
             out += b"".join(self._unacked)
             self._retransmit_count += len(self._unacked)
             self.futile_transmissions += 1
@@ -157,6 +159,7 @@ class HostConnection:
         while self._queued and len(self._unacked) < WINDOW:
             message = self._queued[0]
             frame = encode_frame(Frame(message.TYPE, self._next_seq, self.session, message.encode_body()))
+            # One frame always goes, else a small limit would stop the link.
             if self._unacked and in_flight + len(frame) > max_in_flight_bytes:
                 break
             if not self._unacked:
@@ -184,6 +187,7 @@ class HostConnection:
                 self._decoder.counters.format_errors += 1  # an echo of the host's own message
                 continue
             if isinstance(message, HelloReply):
+                # A late answer to an earlier HELLO would name a session that the board has left.
                 if message.host_nonce != self._nonce or self.peer is not None:
                     continue
                 self.peer, self._aborted_session = message, 0
@@ -194,6 +198,7 @@ class HostConnection:
                     or not isinstance(message, Event)
                 ):
                     continue
+            # Reports of an earlier session have other indices of points.
             elif frame.session != self.session:
                 continue
             if isinstance(message, Ack):
@@ -213,6 +218,7 @@ class HostConnection:
     def _advance_window(self, next_seq: int, now_s: float) -> bool:
         """Forget the acknowledged frames. Return False for an acknowledgement that is older than one before."""
         count = (next_seq - self._base_seq) % SEQ_MODULUS
+        # More than is under way: sequence numbers wrap, so an old acknowledgement looks like one far ahead.
         if count > len(self._unacked):
             return False
         for _ in range(count):
@@ -254,6 +260,7 @@ class BoardLink:
         ahead = (seq - self._expected_seq) % SEQ_MODULUS
         if ahead == 0:
             return True, None
+        # Behind what is expected: a duplicate, whose first answer was lost.
         if ahead >= SEQ_MODULUS // 2:
             return False, self._last_refusal
         self.seq_errors += 1

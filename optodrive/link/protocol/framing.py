@@ -76,12 +76,14 @@ class FrameDecoder:
         *complete, rest = (self._pending + data).split(b"\0")
         self._pending = rest
         for encoded in complete:
+            # The end of a frame whose beginning was thrown away: without its head it would be read as another one.
             if self._overlong:
                 self._overlong = False
             elif encoded:
                 frame = self._decode_frame(encoded)
                 if frame is not None:
                     yield frame
+        # Bounded: a port without delimiters, as of another device, must not fill the memory.
         if len(self._pending) > ENCODED_MAX:
             if not self._overlong:
                 self.counters.format_errors += 1
@@ -94,6 +96,7 @@ class FrameDecoder:
             self.counters.format_errors += 1
             return None
         content, (crc,) = raw[: -CRC.size], CRC.unpack(raw[-CRC.size :])
+        # Silently: an answer to a damaged frame could be damaged itself, and the time-out repeats what matters.
         if crc32(content) != crc:
             self.counters.crc_errors += 1
             return None

@@ -168,6 +168,7 @@ def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
     rows = np.flatnonzero(plan.stage == stage)
     start = np.rint(plan.start_s[rows] / scale.tick_s).astype(np.int64)
     width = np.rint(plan.width_s[rows] / scale.tick_s).astype(np.int64)
+    # Down, so that no point has more light than was limited; the 1e-12 keeps whole duties whole against rounding.
     duty = np.floor(plan.power_w[rows] / scale.full_power_w * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
     misfits = np.flatnonzero((width > TICKS_MAX) | (width < 1) | (duty > DUTY_MAX) | (duty < 0))
     if len(misfits):
@@ -180,6 +181,7 @@ def quantise(plan: LimitedPlan, scale: WireScale, stage: int = 0) -> WirePoints:
     if len(rows) and (start - np.concatenate([[0], (start + width)[:-1]])).min() < 0:
         raise LocalProtocolError("pulses overlap, or the first begins before the plan")
     end = np.where(next_gate_on > np.arange(len(rows)), start[next_gate_on], start + width)
+    # The guards count gate-on time, also at duty 0.
     on_ticks = np.where(duty == 0, 0, width)
     off_ticks = end - on_ticks - np.concatenate([[0], end[:-1]])
     pauses = np.maximum(0, -(-(off_ticks - TICKS_MAX) // GATE_OFF_STEP_TICKS))  # points inserted before each pulse
@@ -211,6 +213,7 @@ def decode(payload: bytes, scale: WireScale) -> DecodedPulses:
     x_output, y_output, off, on, duty = table.T
     x, y = scale.to_axes(x_output, y_output)
     end = np.cumsum(off + on)
+    # From the bytes alone, and not from the plan that was encoded.
     gate_on = np.flatnonzero(on > 0)
     return DecodedPulses(
         index=gate_on,

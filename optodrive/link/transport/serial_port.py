@@ -44,6 +44,7 @@ class SerialPort:
             if not Path(self.name).exists():
                 present = ", ".join(port.device for port in list_ports.comports()) or "none found"
                 raise InputError(self._config_key, self.name, f"a serial port that exists ({present})", "no_port")
+            # Exclusive: a second program at the port would take a part of the board's answers.
             self._serial = serial.Serial(
                 self.name, self._baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
             )
@@ -103,6 +104,7 @@ class SerialPort:
                 node = Path(self.name).stat()
             except FileNotFoundError:
                 return f"{self.name} is missing: unplugged, or its power is off"
+            # The name is there again, but it is another device: this descriptor belongs to the one that was unplugged.
             if (node.st_dev, node.st_ino) != (self._node.st_dev, self._node.st_ino):
                 return describe_replug(self.name)
             changed = self._describe_changed_settings(termios.tcgetattr(self._serial.fileno()))
