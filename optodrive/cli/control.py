@@ -67,12 +67,17 @@ def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption
         raise NotReadyError(f"the board was disarmed: {held.wait()}")
 
 
-def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Disarm the board. This also acknowledges a fault whose cause is gone."""
-    from optodrive.client.api_request import DISARM
+def _send(request: str, url: str, as_json: bool) -> None:
+    """Send a request of `client.api_request`, and print the state that it answers."""
+    from optodrive.client import api_request
     from optodrive.client.http import DaemonClient
 
-    _print_state(DaemonClient(url).call(DISARM), json)
+    _print_state(DaemonClient(url).call(getattr(api_request, request)), as_json)
+
+
+def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
+    """Disarm the board. This also acknowledges a fault whose cause is gone."""
+    _send("DISARM", url, json)
 
 
 def dim(
@@ -90,18 +95,12 @@ def dim(
 
 def pause(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Switch the gate off. The board stays armed and plans wait, for five minutes at most."""
-    from optodrive.client.api_request import PAUSE
-    from optodrive.client.http import DaemonClient
-
-    _print_state(DaemonClient(url).call(PAUSE), json)
+    _send("PAUSE", url, json)
 
 
 def resume(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Play the rest of the paused plan, and the waiting plans."""
-    from optodrive.client.api_request import RESUME
-    from optodrive.client.http import DaemonClient
-
-    _print_state(DaemonClient(url).call(RESUME), json)
+    _send("RESUME", url, json)
 
 
 def reload(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:

@@ -234,12 +234,6 @@ class Study(Section):
         return len(self.conditions) * self.repetitions
 
     @property
-    def varied(self) -> tuple[str, ...]:
-        """Names of the stimulus' parameters that vary between trials."""
-        matched = () if self.matching is None else MATCHED_PARAMETERS
-        return (*self.factors, *(() if self.procedure is None else (self.procedure.parameter,)), *matched)
-
-    @property
     def task(self) -> str:
         """Name of the task in a dataset, which has letters and digits only."""
         return self.name.replace("-", "")

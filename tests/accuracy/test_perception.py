@@ -1,21 +1,63 @@
 """The model of a participant against the paper's accuracies, and the table of docs/explanation/perception.md."""
 
+from collections.abc import Sequence
 from math import log
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
-from optodrive.study.observers import Observer, Participant, predict_accuracy, present_conditions
+from optodrive.study.observers import Observer, Participant
+from optodrive.study.presenter import Presentation, VirtualPresenter
 from optodrive.study.results import Accuracy, fit_magnitudes
-from optodrive.study.study_file import load_study
+from optodrive.study.study_file import Condition, Study, load_study
 
 PREDICTED = {1: 0.979, 2: 0.930, 3: 0.793, 5: 0.889, 6: 0.979}
 """As the page states them."""
 MISSED = {1}
 DRAWS = {1: 2000, 2: 2000, 3: 2000, 5: 300, 6: 2}
 STANDARD_ERRORS_MAX = 5.0
+
+
+class PredictedAccuracy(NamedTuple):
+    """Share of correct answers, and its standard error by the finite number of draws."""
+
+    share: float
+    standard_error: float
+
+
+def present_conditions(study: Study, display: DisplayModel) -> list[tuple[Condition, Presentation]]:
+    """Return every condition of a study as simulated boards execute it."""
+    presenter = VirtualPresenter(display)
+    shown: list[tuple[Condition, Presentation]] = []
+    for condition in study.conditions:
+        shown.append((condition, presenter.present(study.stimulus.pattern, {**study.stimulus.parameters, **condition})))
+        presenter.wait(study.pause_s)
+    presenter.close()
+    return shown
+
+
+def predict_accuracy(
+    study: Study,
+    display: DisplayModel,
+    participant: Participant,
+    shown: Sequence[tuple[Condition, Presentation]],
+    draws: int,
+    seed: int = 0,
+) -> PredictedAccuracy:
+    """Predict the share of correct answers of a study with a correct answer, from a number of draws per condition."""
+    observer = Observer(study, display, Participant(participant.localisation_sd_m, lapse=0.0))
+    rng = np.random.default_rng(seed)
+    correct = [
+        [observer.answer(presentation, rng) == study.find_correct_answer(condition) for _ in range(draws)]
+        for condition, presentation in shown
+    ]
+    attentive, chance = float(np.mean(correct)), 1.0 / len(study.response.answers)
+    share = (1.0 - participant.lapse) * attentive + participant.lapse * chance
+    error = (1.0 - participant.lapse) * np.sqrt(attentive * (1.0 - attentive) / (draws * len(shown)))
+    return PredictedAccuracy(share, float(error))
 
 
 @pytest.fixture(scope="module")

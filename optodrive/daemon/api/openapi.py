@@ -39,29 +39,19 @@ _PRIORITY_SCHEMA: Schema = {
     "maximum": PRIORITY_MAX,
     "description": "what fit=priority omits last is the highest; by default 0",
 }
-_TARGETS_SCHEMA: Schema = {
-    "oneOf": [
-        {
-            "type": "object",
-            "additionalProperties": _HEIGHT_SCHEMA,
-            "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"},
-        },
-        {"type": "array", "items": _HEIGHT_SCHEMA},
-    ],
-    "description": "heights by pixel, or one height per pixel",
-}
-_INTENSITY_SCHEMA: Schema = {"type": "number", "minimum": 0, "description": "in thresholds"}
-_INTENSITIES_SCHEMA: Schema = {
-    "oneOf": [
-        {
-            "type": "object",
-            "additionalProperties": _INTENSITY_SCHEMA,
-            "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"},
-        },
-        {"type": "array", "items": _INTENSITY_SCHEMA},
-    ],
-    "description": "perceived intensities by pixel, or one per pixel, in place of target_um",
-}
+
+
+def _by_pixel_schema(value: Schema, text: str) -> Schema:
+    """Return the schema of values by pixel, or of one per pixel."""
+    by_pixel = {"type": "object", "additionalProperties": value, "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"}}
+    return {"oneOf": [by_pixel, {"type": "array", "items": value}], "description": text}
+
+
+_TARGETS_SCHEMA = _by_pixel_schema(_HEIGHT_SCHEMA, "heights by pixel, or one height per pixel")
+_INTENSITIES_SCHEMA = _by_pixel_schema(
+    {"type": "number", "minimum": 0, "description": "in thresholds"},
+    "perceived intensities by pixel, or one per pixel, in place of target_um",
+)
 
 
 def _described(schema: Schema, text: str) -> Schema:

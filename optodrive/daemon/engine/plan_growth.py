@@ -8,18 +8,16 @@ planned as a whole, limited from the budget after the first part and proven as b
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.push import Push
-from optodrive.link.protocol.quantisation import DecodedPulses, WireScale
-from optodrive.link.protocol.stage_points import StagePoints, decode_stages
-from optodrive.planning.limiter.limiter import verify
+from optodrive.link.protocol.quantisation import WireScale
+from optodrive.link.protocol.stage_points import StagePoints
+from optodrive.link.proven_points import prove
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.planned_sequence import PlannedSequence
@@ -62,18 +60,13 @@ def grow_plan(
     planned = growth.plan_until()
     points = StagePoints.from_plan(planned.plan, scales, display.draws)
     added = points.split_behind(plan.points)
-    payload = points.encode_payload()
-    row, decoded = decode_stages(payload, points, scales)
-    is_added = row >= first
-    rest = PulsePlan(**{item.name: getattr(planned.plan, item.name)[first:] for item in fields(PulsePlan)})
-    pulses = DecodedPulses(**{name: column[is_added] for name, column in vars(decoded).items()})
-    verify(rest, row[is_added] - first, pulses, budget, display.budget, lambda: on_progress(1.0))
+    proven = prove(planned.plan, points, scales, budget, display.budget, lambda: on_progress(1.0), first)
     pulsed_s = None if plan.cycle is None else plan.cycle.pulsed_s - plan.record.start_s
     return ExtendedPlan(
         planned=planned,
         points=points,
         added=added,
-        crc=zlib.crc32(payload),
+        crc=proven.crc,
         added_crc=zlib.crc32(added.encode_payload()),
         summary_json=summarize_plan(planned, None, pulsed_s).model_dump_json().encode(),
     )

@@ -1,7 +1,6 @@
 """Plan of a sequence from a planning snapshot, with the wire points and their proof."""
 
 import threading
-import zlib
 from collections.abc import Callable, Sequence
 from math import inf
 from typing import NamedTuple
@@ -15,10 +14,10 @@ from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.push import Push
 from optodrive.link.protocol.quantisation import WireScale
-from optodrive.link.protocol.stage_points import StagePoints, decode_stages
+from optodrive.link.protocol.stage_points import StagePoints
+from optodrive.link.proven_points import prove
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
-from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.pulse_table import PulseTable
@@ -76,9 +75,7 @@ def make_plan(
         planned = growth.plan_until()
         points = StagePoints.from_plan(planned.plan, scales, display.draws)
     on_progress(1.0)
-    payload = points.encode_payload()
-    row, decoded = decode_stages(payload, points, scales)
-    verify(planned.plan, row, decoded, snapshot.budget, display.budget, lambda: on_progress(1.0))
+    proven = prove(planned.plan, points, scales, snapshot.budget, display.budget, lambda: on_progress(1.0))
     on_progress(1.0)
     record = PlanRecord(
         plan_id=plan_id,
@@ -96,7 +93,7 @@ def make_plan(
         parameters=dict(built.parameters),
         streamed=push.streamed,
         refreshes=push.refreshes,
-        first_pulse_s=float(decoded.start_s.min()) if len(decoded.start_s) else None,
+        first_pulse_s=float(proven.pulses.start_s.min()) if len(proven.pulses.start_s) else None,
     )
     return ActivePlan(
         record=record,
@@ -105,7 +102,7 @@ def make_plan(
         heat_before=snapshot.heat,
         budget_before=snapshot.budget,
         epoch=push.epoch,
-        crc=zlib.crc32(payload),
+        crc=proven.crc,
         growth=None if growth is None or growth.is_complete else growth,
         cycle=snapshot.cycle,
         initial_pixels=snapshot.initial_pixels,

@@ -4,7 +4,6 @@ The rows of a plan fix which stage draws what. Once a stage was lost, what is le
 frames and parts of trains, is planned anew from the request, and so is each plan not yet begun.
 """
 
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,10 +15,10 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.link.protocol.quantisation import WireScale
-from optodrive.link.protocol.stage_points import StagePoints, decode_stages
+from optodrive.link.protocol.stage_points import StagePoints
+from optodrive.link.proven_points import prove
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.limiter.rest import delay_rest, limit_rest, replace_rest
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
@@ -169,9 +168,7 @@ def _restart(
         rest, budget_after = _plan_anew(display, plan, heat, budget, on_progress)
     points = StagePoints.from_plan(rest, scales, display.draws)
     on_progress()
-    payload = points.encode_payload()
-    row, decoded = decode_stages(payload, points, scales)
-    verify(rest, row, decoded, budget, display.budget, on_progress)
+    proven = prove(rest, points, scales, budget, display.budget, on_progress)
     heat_after = heat.copy()
     peaks = heat_after.apply_pulses(rest.pixel, rest.start_s, rest.width_s, rest.power_w, on_progress)
     after = ThermalEstimate.from_plan(heat_after, budget_after, start_s)
@@ -192,7 +189,7 @@ def _restart(
         zero_s=zero_s,
         planned=whole_planned,
         points=points.shift_rows(first),
-        crc=zlib.crc32(payload),
+        crc=proven.crc,
         summary_json=_summarize_again(whole_planned, plan.record.summary_json),
         before=before,
         after=after,
