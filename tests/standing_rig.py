@@ -39,7 +39,7 @@ class StandingRig(PlannerRig):
     """A planner whose newest frame stands, refreshed by the rules of a standing stream. Planning takes `planning_s`.
 
     page_m: the frame that stands, None without one
-    refusals: of new frames and refreshes
+    refusals: of new frames and refreshes; limited_by: caps that took light from them, as their client is told
     """
 
     def __init__(self, monkeypatch, display, **options):
@@ -49,7 +49,7 @@ class StandingRig(PlannerRig):
         super().__init__(monkeypatch, display=display, **options)
         self.display, self.planning_s = display, 0.002
         self.page = PageRefresh(display.layout, self.clock, self.remote.board_s, lambda: self.queue.stream.lead_s)
-        self.page_m, self.refusals, self.fingers_moved = None, [], False
+        self.page_m, self.refusals, self.limited_by, self.fingers_moved = None, [], set(), False
         self._began_s = -np.inf
         make_plan = plan_making.make_plan
 
@@ -100,11 +100,13 @@ class StandingRig(PlannerRig):
         built = BuiltRequest(sequence)
         request = PlanningRequest(lambda: built, push, self.remote.board_s(), select=self.page.select)
         try:
-            return self.planner.submit(request).result()
+            report = self.planner.submit(request).result()
         except OptodriveError as error:
             self.refusals.append(error)
             self.page_m = None
             return None
+        self.limited_by |= set(report.summary.trimmed.by_reason)
+        return report
 
     def stand(self, page_m, duration_s, send_period_s=np.inf, places=()):
         """Let a frame stand for a time, sent again after each period, under fingers whose tracker reports at 100 Hz."""

@@ -10,13 +10,14 @@ import numpy as np
 
 from optodrive.core.clock import Clock
 from optodrive.core.finger_tracks import FingerTracks, PredictedFinger
-from optodrive.core.types.arrays import BoolArray, FloatArray
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import RefreshCycle
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.device.config import PixelLayout
 from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 from optodrive.planning.sequence_checks import check_targets_reachable, remove_dead_pixels
 from optodrive.planning.stimuli.standing_page import SLOT_S, Refresh, build_refresh, select_bursts
 
@@ -52,6 +53,7 @@ class PageRefresh:
         self._seen_s = -inf
         self._lock = threading.Lock()
         self._page_m, self._selected_s = np.zeros(len(layout)), -inf
+        self._tour = np.zeros(0, dtype=np.int64)
         self._intervals_s = deque([inf], INTERVALS_KEPT)
         self._limited_s: dict[str, float] = {}
 
@@ -99,6 +101,8 @@ class PageRefresh:
         check_targets_reachable(display, page)
         now_s = self._clock.now_s()
         self._intervals_s.append(now_s - self._selected_s)
+        if not np.array_equal(frame.target_m > 0.0, self._page_m > 0.0):
+            self._tour = self._compute_tour(frame.target_m)
         self._page_m, self._selected_s = frame.target_m, now_s
         pixel_time_s = _find_width_s(frame.target_m, snapshot.cycle) + MOVE_S
         begin_s = now_s + snapshot.start_s - self._board_s()
@@ -107,8 +111,13 @@ class PageRefresh:
         touched = self._find_touched((begin_s + SLOT_S * np.arange(slots + LOOKAHEAD_SLOTS)).tolist())
         is_touched = np.logical_or.reduce([touched[step : slots + step] for step in range(LOOKAHEAD_SLOTS + 1)])
         drawn_s = self._find_drawn_s(snapshot)
-        bursts = select_bursts(frame.target_m, is_touched, drawn_s, snapshot.start_s, pixel_time_s)
-        return build_refresh(frame, bursts, self._layout, pixel_time_s)
+        bursts = select_bursts(self._tour, is_touched, drawn_s, snapshot.start_s, pixel_time_s)
+        return build_refresh(frame, bursts, pixel_time_s)
+
+    def _compute_tour(self, page_m: FloatArray) -> IntArray:
+        """Return the pixels of a page in their visiting order."""
+        layout = self._layout
+        return compute_visiting_order(np.flatnonzero(page_m > 0.0), layout.row, layout.column, layout.x_m, layout.y_m)
 
     def _find_drawn_s(self, snapshot: PlanningSnapshot) -> FloatArray:
         return np.full(len(self._layout), -inf) if snapshot.cycle is None else snapshot.cycle.drawn_s

@@ -22,29 +22,25 @@ LAYOUT = build_pixel_layout(load_config("display-1511").display)
 COUNT = len(LAYOUT)
 
 
-def draw_for(seconds, target_m, find_touched, cut_s=0.023, along_path=False):
-    """Draw a page as a stream does whose plans are replaced every cut_s. Return pixel and start of every pulse.
+def find_tour(target_m):
+    return compute_visiting_order(np.flatnonzero(target_m), LAYOUT.row, LAYOUT.column, LAYOUT.x_m, LAYOUT.y_m)
 
-    along_path: draw each burst along the path that `build_refresh` gives it
-    """
+
+def draw_for(seconds, target_m, find_touched, cut_s=0.023):
+    """Draw a page as a stream does whose plans are replaced every cut_s. Return pixel and start of every pulse."""
+    tour = find_tour(target_m)
     drawn_s, pulses, begin_s = np.full(len(target_m), -np.inf), [], 0.0
     while begin_s < seconds:
         is_touched = np.array([find_touched(begin_s + slot * SLOT_S) for slot in range(SLOTS)])
-        end_s, origin = begin_s + cut_s, None
-        for burst in select_bursts(target_m, is_touched, drawn_s, begin_s, PIXEL_S):
-            order = order_along_path(burst.pixels, origin) if along_path else burst.pixels
-            origin = int(order[-1])
-            for number, pixel in enumerate(order.tolist()):
+        end_s = begin_s + cut_s
+        for burst in select_bursts(tour, is_touched, drawn_s, begin_s, PIXEL_S):
+            for number, pixel in enumerate(burst.pixels.tolist()):
                 start_s = begin_s + burst.begin_s + number * PIXEL_S
                 if start_s < end_s:
                     pulses.append((pixel, start_s))
                     drawn_s[pixel] = start_s
         begin_s = max(end_s, pulses[-1][1] + PIXEL_S if pulses else 0.0)
     return np.array([pixel for pixel, _ in pulses]), np.array([start_s for _, start_s in pulses])
-
-
-def order_along_path(pixels, origin):
-    return compute_visiting_order(pixels, LAYOUT.row, LAYOUT.column, LAYOUT.x_m, LAYOUT.y_m, origin)
 
 
 def starts_of(pixels, starts_s, pixel):
@@ -81,7 +77,7 @@ def test_fingers_on_more_than_the_beam_can_refresh_share_it():
 def count_under_two_fingers():
     """Return the pulses under either of two fingers on a page that is raised everywhere, in 4 s."""
     hands = [np.argsort(np.hypot(LAYOUT.x_m - x_m, LAYOUT.y_m))[:13] for x_m in (-0.009, 0.009)]
-    pixels, _ = draw_for(4.0, np.full(COUNT, 50e-6), touch(*np.concatenate(hands)), 0.05, along_path=True)
+    pixels, _ = draw_for(4.0, np.full(COUNT, 50e-6), touch(*np.concatenate(hands)), 0.05)
     counts = np.bincount(pixels, minlength=COUNT)
     return sorted(int(counts[hand].sum()) for hand in hands)
 
@@ -89,9 +85,23 @@ def count_under_two_fingers():
 def test_neither_of_two_fingers_stays_without_light(monkeypatch):
     fewer, more = count_under_two_fingers()
     assert fewer >= 0.9 * more
-    monkeypatch.setattr(standing_page, "BURST_MAX_S", 1.0)  # mutant
+    take_stretch = standing_page._take_stretch
+
+    def take_from_the_begin(due_s, until_s, count):
+        return np.sort(take_stretch(due_s, until_s, len(due_s)))[:count]
+
+    monkeypatch.setattr(standing_page, "_take_stretch", take_from_the_begin)  # mutant
     fewer, more = count_under_two_fingers()
     assert fewer < 0.6 * more
+
+
+def test_a_page_is_drawn_along_its_tour():
+    target_m = np.zeros(COUNT)
+    target_m[::4] = 50e-6
+    pixels, _ = draw_for(8.0, target_m, touch())
+    steps_m = np.hypot(np.diff(LAYOUT.x_m[pixels]), np.diff(LAYOUT.y_m[pixels]))
+    tour = find_tour(target_m)
+    assert steps_m.mean() <= 1.2 * np.hypot(np.diff(LAYOUT.x_m[tour]), np.diff(LAYOUT.y_m[tour])).mean()
 
 
 def test_without_fingers_every_pixel_gets_its_turn():
@@ -139,8 +149,10 @@ def test_a_dot_that_comes_under_a_finger_is_next():
 def test_the_frames_of_a_refresh_hold_the_page_and_the_order_of_its_bursts():
     target_m = np.linspace(1e-5, 5e-5, COUNT)
     page = TactileFrame("page", 0.0, 1.0, target_m)
-    bursts = select_bursts(target_m, np.zeros((SLOTS, COUNT), dtype=bool), np.full(COUNT, -np.inf), 7.0, PIXEL_S)
-    sequence, orders = build_refresh(page, bursts, LAYOUT, PIXEL_S)
+    bursts = select_bursts(
+        find_tour(target_m), np.zeros((SLOTS, COUNT), dtype=bool), np.full(COUNT, -np.inf), 7.0, PIXEL_S
+    )
+    sequence, orders = build_refresh(page, bursts, PIXEL_S)
     drawn = np.concatenate([orders[k] for k in range(len(sequence.frames))])
     assert sorted(drawn.tolist()) == sorted(np.concatenate([burst.pixels for burst in bursts]).tolist())
     for k, frame in enumerate(sequence.frames):
@@ -151,8 +163,10 @@ def test_the_frames_of_a_refresh_hold_the_page_and_the_order_of_its_bursts():
 def test_a_page_that_is_not_due_is_a_frame_without_pixels():
     target_m = np.zeros(COUNT)
     page = TactileFrame("page", 0.0, 1.0, target_m)
-    bursts = select_bursts(target_m, np.zeros((SLOTS, COUNT), dtype=bool), np.full(COUNT, -np.inf), 0.0, PIXEL_S)
-    sequence, _ = build_refresh(page, bursts, LAYOUT, PIXEL_S)
+    bursts = select_bursts(
+        find_tour(target_m), np.zeros((SLOTS, COUNT), dtype=bool), np.full(COUNT, -np.inf), 0.0, PIXEL_S
+    )
+    sequence, _ = build_refresh(page, bursts, PIXEL_S)
     assert [frame.target_m.any() for frame in sequence.frames] == [False]
 
 
@@ -162,8 +176,8 @@ def test_no_frame_of_a_refresh_draws_a_pixel_twice(count, fingers, pixel_s):
     target_m = np.zeros(COUNT)
     target_m[:count] = 50e-6
     is_touched = np.tile(touch(*range(fingers))(0.0), (SLOTS, 1))
-    bursts = select_bursts(target_m, is_touched, np.full(COUNT, -np.inf), 0.0, pixel_s)
-    sequence, orders = build_refresh(TactileFrame("page", 0.0, 1.0, target_m), bursts, LAYOUT, pixel_s)
+    bursts = select_bursts(find_tour(target_m), is_touched, np.full(COUNT, -np.inf), 0.0, pixel_s)
+    sequence, orders = build_refresh(TactileFrame("page", 0.0, 1.0, target_m), bursts, pixel_s)
     for k, _ in enumerate(sequence.frames):
         assert len(set(orders[k].tolist())) == len(orders[k])
     assert sum(map(len, orders.values())) == sum(len(burst.pixels) for burst in bursts)
