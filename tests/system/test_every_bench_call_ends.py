@@ -11,7 +11,6 @@ from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.link_capture import CapturingTransport, LinkCaptureWriter
-from optodrive.link.transport.port_state import find_holders
 from optodrive.link.transport.serial_port import SerialPort
 from rig import Board, Command, config_text, is_alive, read_proc, wait_for
 from sensor_cable import Cable
@@ -140,26 +139,6 @@ def test_it_ends_in_one_line(bench, tmp_path, command, victim, number, stage):
         assert_stayed_dark(board, dark)
     assert not (tmp_path / "field.toml").exists()
     assert victim != "worker" or not is_alive(pid)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", SIGNALS)
-def test_doctor_names_a_board_that_does_not_answer(tmp_path, start, number):
-    """The board is suspended before, because the handshake is short, and killed, if at all, once the port is open."""
-    board = Board(tmp_path)
-    try:
-        with signalling() as send:
-            send(signal.SIGSTOP, [board.process.pid])
-            command = start(board, "doctor")
-            pid, port = command.process.pid, str(board.port)
-            wait_for(lambda: pid in [holder.pid for holder in find_holders(port)], "the open port")
-            send(number, [board.process.pid])
-            status, out, errors = command.ended()
-    finally:
-        board.stop()
-    assert not errors
-    assert status == 1, out
-    assert next(line for line in out.splitlines() if line.startswith("PROBLEM")).split()[1] == "board"
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,6 @@ import json
 import os
 import signal
 
-import pytest
-
 from forked_process import run_process
 from optodrive.link.transport.link_capture import LinkCapture
 from rig import OPTODRIVE, PATIENT_LEASE_S, long_train, wait_for
@@ -80,31 +78,6 @@ def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tm
     assert totals["ignored_bytes"] == totals["bad_bytes"] == 0
     assert totals["host_silence_s"] > 0.5 * PATIENT_LEASE_S  # the lease ended in it
     assert totals["round_trip_min_s"] > 0
-
-
-def doctor(config):
-    run = run_process([OPTODRIVE, "doctor", "--config", config, "--json"], capture_output=True, text=True)
-    document = json.loads(run.stdout)
-    assert run.returncode == (document["problems"] > 0)
-    return {finding["check"]: finding for finding in document["findings"]}
-
-
-@pytest.mark.slow
-def test_the_doctor_does_not_disturb_a_daemon_and_checks_a_free_board(board, daemon):
-    plan = play(daemon, 4.0)
-    findings = doctor(daemon.config)
-    assert findings["holder"]["status"] == "warning"
-    assert any(f"process {pid}:" in findings["holder"]["observation"] for pid in daemon.list_children())
-    assert "board" not in findings
-    assert daemon.finished(plan)["status"] == "done"
-    assert daemon.board_state() == "ARMED"
-    daemon.stop()
-    armings = len([event for event in board.of("state") if event["state"] == "ARMING"])
-    findings = doctor(daemon.config)
-    assert findings["holder"]["status"] == "ok"
-    assert "DISARMED" in findings["board"]["observation"]
-    assert len([event for event in board.of("state") if event["state"] == "ARMING"]) == armings
-    assert not board.of("fault")
 
 
 def test_a_capture_is_never_overwritten(board, tmp_path):

@@ -11,7 +11,7 @@ from link_process_rig import LinkProcess
 from optodrive.link.protocol.states import BoardState
 from rig import PATIENT_LEASE_S, wait_for
 from test_link_process import await_dark, emit
-from test_stages import DRIFTING, GOES_ON, Bench, build_trains
+from test_stages import GOES_ON, Bench, build_trains
 
 FAULTS = [
     ("write:error=ENODEV", "ENODEV", "openat:error=EPERM", "EPERM"),
@@ -101,7 +101,7 @@ def test_stty_on_the_open_port_is_named_and_the_board_is_found_again(link, board
 @pytest.mark.slow
 @pytest.mark.parametrize(("open_fault", "shown", "opening_fault", "shown_then"), FAULTS)
 def test_a_stage_whose_port_fails_and_returns_is_lost_alone(tmp_path, open_fault, shown, opening_fault, shown_then):
-    bench = Bench(tmp_path, DRIFTING, GOES_ON)
+    bench = Bench(tmp_path, GOES_ON)
     _, right = bench.boards
     try:
         bench.arm()
