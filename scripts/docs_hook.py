@@ -13,10 +13,17 @@ PROTOCOL_FOLDER = "firmware_protocol"
 PROTOCOL_PAGES = ("PROTOCOL.md", "SENSOR.md")
 DECISION_WORDS_MAX = 150
 """Words of a decision, its title and date apart."""
+CHANGELOG_LINES_MAX = 60
+"""Lines of the changelog: release notes, and no list of mends."""
 
 
 def on_config(config):
-    """Add every decision to the navigation."""
+    """Add every decision to the navigation. Bound the changelog."""
+    lines = len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines())
+    # A merge by union brings back what one side has removed.
+    if lines > CHANGELOG_LINES_MAX:
+        advice = "take that of main, and add only what a user notices"
+        raise PluginError(f"CHANGELOG.md has {lines} lines, expected at most {CHANGELOG_LINES_MAX}: {advice}")
     decisions = sorted(
         path.relative_to(config.docs_dir).as_posix() for path in Path(config.docs_dir).glob("decisions/*")
     )

@@ -64,7 +64,7 @@ def play_aims(
         for first in range(0, len(item.plan), PULSES_PER_JOB):
             recorder.first = recorder.count = first
             board.play(_cut_plan(item.plan, first), recorder.record)
-        # After a job and not within: a full disk must not end the light in the middle of a pulse's record.
+        # A write of the journal's thread may have failed since the last append.
         journal.raise_if_failed()
         if recorder.count != len(item.plan):
             raise RefusedError(f"sweep: aim {item.aim.name}: {recorder.count} of {len(item.plan)} pulses were reported")
