@@ -161,8 +161,8 @@ class ServiceRig:
     def extend(self, number, points, epoch=None, pause=None, crc=None):
         """Append points to a job. Return the result."""
         payload = points.encode_payload()
-        fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "counts": [len(points)]}
-        fields |= {"pause": self.pause_number if pause is None else pause}
+        fields = {"job": number, "epoch": self.epoch if epoch is None else epoch, "ahead_s": None}
+        fields |= {"pause": self.pause_number if pause is None else pause, "counts": [len(points)]}
         fields |= {"crc": zlib.crc32(payload) if crc is None else crc}
         return self.find_result(PLANNER, self.request(PLANNER, "extend", payload, **fields))
 

@@ -24,9 +24,9 @@ covers them from the limiter's verification to here. Only the fields around them
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import inf
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import NotReadyError, OptodriveError
@@ -56,6 +56,34 @@ class _ExecutedReport(NamedTuple):
     @property
     def end_point(self) -> int:
         return self.first_point + len(self.records) // EXECUTED.size
+
+
+class PointsOrder(NamedTuple):
+    """Fields that `begin`, `splice` and `extend` share, which say where the points in their payload belong.
+
+    job: the planner's number; epoch: in which the request was accepted; pause: number of the last one that the planner
+    knows; counts: number of points of each stage; crc: CRC-32 of the bytes that were verified
+    ahead_s: maximum time from sending a point to its start, None without one
+    """
+
+    job: int
+    epoch: int
+    pause: int
+    counts: list[int]
+    crc: int
+    ahead_s: float | None = None
+
+    @classmethod
+    def from_fields(cls, fields: Mapping[str, Any]) -> Self:
+        """Read the order of a message. Raise LookupError, TypeError or ValueError if it is malformed."""
+        numbers = {name: int(fields[name]) for name in ("job", "epoch", "pause", "crc")}
+        ahead_s = None if fields["ahead_s"] is None else float(fields["ahead_s"])
+        return cls(**numbers, counts=[int(count) for count in fields["counts"]], ahead_s=ahead_s)
+
+    @property
+    def send_ahead_s(self) -> float:
+        """Maximum time from sending a point to its start, s."""
+        return inf if self.ahead_s is None else self.ahead_s
 
 
 class PointHandover:
@@ -119,63 +147,61 @@ class PointHandover:
         }[message.kind](message)
 
     def _begin(self, message: Message) -> None:
-        fields = message.fields
-        number, start_s, points = int(fields["job"]), float(fields["start_s"]), _parse_points(message)
+        order, points = _parse_points(message)
+        start_s = float(message.fields["start_s"])
         try:
-            self._require_allowed(message)
+            self._require_allowed(order, message.payload)
             # A refusal and no queue: the planner starts a job only when the former has finished, so this one crossed
             # another.
             if self._boards.has_points:
                 raise NotReadyError("the board still executes an earlier job")
-            job = self._boards.begin(points, start_s, _parse_ahead_s(fields))
+            job = self._boards.begin(points, start_s, order.send_ahead_s)
         except OptodriveError as error:
-            paused = not self._permits(message)
-            self._send(Message("job_refused", {"job": number, "reason": str(error), "paused": paused}))
+            paused = not self._pauses.permits(order.pause)
+            self._send(Message("job_refused", {"job": order.job, "reason": str(error), "paused": paused}))
             return
-        self._jobs[number] = job
+        self._jobs[order.job] = job
 
     def _splice(self, message: Message) -> None:
-        fields, points = message.fields, _parse_points(message)
+        fields, (order, points) = message.fields, _parse_points(message)
         job, error = None, None
         try:
-            self._require_allowed(message)
-            kept, ahead_s = _parse_kept(fields, points), _parse_ahead_s(fields)
-            job = self._boards.splice(points, kept, ahead_s, bool(fields["holds_first"]))
+            self._require_allowed(order, message.payload)
+            kept = _parse_kept(fields, points)
+            job = self._boards.splice(points, kept, order.send_ahead_s, bool(fields["holds_first"]))
         except OptodriveError as refusal:
             error = refusal
         outcome: dict[str, Any] = {"start_tick": None, "first_index": None}
         if job is not None:
-            self._jobs[int(fields["job"])] = job
+            self._jobs[order.job] = job
             outcome = {"start_tick": job.zero_tick, "first_index": [part.first_index for part in job.parts]}
         self._send(build_result(int(fields["id"]), error, outcome))
 
     def _extend(self, message: Message) -> None:
-        fields, points = message.fields, _parse_points(message)
-        job, error, done = self._jobs.get(int(fields["job"])), None, False
+        order, points = _parse_points(message)
+        job, error, done = self._jobs.get(order.job), None, False
         try:
-            self._require_allowed(message)
+            self._require_allowed(order, message.payload)
             done = job is not None and self._boards.extend(job, points)
         except OptodriveError as refusal:
             error = refusal
-        self._send(build_result(int(fields["id"]), error, {"done": done}))
+        self._send(build_result(int(message.fields["id"]), error, {"done": done}))
 
-    def _require_allowed(self, message: Message) -> None:
+    def _require_allowed(self, order: PointsOrder, payload: bytes) -> None:
         """Raise NotReadyError for points of another epoch, of a board that is not armed, or that were damaged."""
         # The host's last refusal; behind it are only the session's times and the board's own guards.
-        epoch, crc = int(message.fields["epoch"]), int(message.fields["crc"])
         # Gate 1 of the epochs. The order of these checks is that of their reasons: the first one explains the others.
-        if not self._epoch.is_current(epoch):
-            raise NotReadyError(f"the plan is of epoch {epoch}, now is {self._epoch.number}: {self._epoch.reason}")
-        if not self._permits(message):
+        if not self._epoch.is_current(order.epoch):
+            raise NotReadyError(
+                f"the plan is of epoch {order.epoch}, now is {self._epoch.number}: {self._epoch.reason}"
+            )
+        if not self._pauses.permits(order.pause):
             raise NotReadyError("the light is paused, or was since the plan was made")
         if not self._boards.connected or self._boards.state not in ARMED_STATES:
             raise NotReadyError(f"the board is {self._boards.state}; arm it first")
         # Over the bytes as the limiter verified them: a fault in memory or on the way is no light.
-        if crc != zlib.crc32(message.payload):
+        if order.crc != zlib.crc32(payload):
             raise NotReadyError(DAMAGED_POINTS)
-
-    def _permits(self, message: Message) -> bool:
-        return self._pauses.permits(int(message.fields["pause"]))
 
     def _truncate(self, message: Message) -> None:
         kept_points = [int(count) for count in message.fields["kept_points"]]
@@ -239,8 +265,9 @@ class PointHandover:
                 del self._jobs[number], self._progress[number]
 
 
-def _parse_points(message: Message) -> StagePoints:
-    return StagePoints.from_payload(message.payload, [int(count) for count in message.fields["counts"]])
+def _parse_points(message: Message) -> tuple[PointsOrder, StagePoints]:
+    order = PointsOrder.from_fields(message.fields)
+    return order, StagePoints.from_payload(message.payload, order.counts)
 
 
 def _parse_kept(fields: dict[str, Any], points: StagePoints) -> list[int]:
@@ -248,7 +275,3 @@ def _parse_kept(fields: dict[str, Any], points: StagePoints) -> list[int]:
     if len(kept_points) != len(points.stages):
         raise ValueError(f"{len(kept_points)} counts for {len(points.stages)} stages")
     return kept_points
-
-
-def _parse_ahead_s(fields: dict[str, Any]) -> float:
-    return inf if fields["ahead_s"] is None else float(fields["ahead_s"])

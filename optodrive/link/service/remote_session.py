@@ -17,6 +17,7 @@ from optodrive.link.protocol.messages import Executed
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.stage_points import DAMAGED_POINTS, StagePoints
 from optodrive.link.service.link_connection import LinkConnection, ResultHandler, ignore_result
+from optodrive.link.service.point_handover import PointsOrder
 from optodrive.link.service.status import LinkStatus, ServiceStatus
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.staged_job import StagedJob
@@ -195,14 +196,8 @@ class RemoteSession(LinkStatus):
         self._job_number += 1
         job = RemoteJob(self._job_number, points, max(1, round(start_s / self.tick_s)), self._send_delay)
         self._jobs[job.number] = job
-        fields = {
-            "job": job.number,
-            "epoch": epoch,
-            "pause": self._drained_number,
-            "start_s": start_s,
-            **_build_points_fields(points, payload, send_ahead_s, crc),
-        }
-        if not self._send_command("begin", fields, payload):
+        order = self._build_order(job.number, epoch, points, zlib.crc32(payload) if crc is None else crc, send_ahead_s)
+        if not self._send_command("begin", {**order._asdict(), "start_s": start_s}, payload):
             self._keep_refusal(self.link_error or "")
         return job
 
@@ -236,9 +231,8 @@ class RemoteSession(LinkStatus):
         payload = points.encode_payload()
         self._job_number += 1
         number = self._job_number
-        fields: dict[str, Any] = {"job": number, "epoch": epoch, "pause": self._drained_number}
-        fields |= {"kept_points": list(kept_points), "holds_first": holds_first}
-
+        order = self._build_order(number, epoch, points, zlib.crc32(payload) if crc is None else crc, send_ahead_s)
+        fields = {**order._asdict(), "kept_points": list(kept_points), "holds_first": holds_first}
         added: list[RemoteJob] = []
 
         def add_job(result: dict[str, Any]) -> None:
@@ -253,7 +247,7 @@ class RemoteSession(LinkStatus):
                 self._jobs[number] = job
                 added.append(job)  # a job without points may be finished, and forgotten, before the next line is read
 
-        self._request("splice", fields | _build_points_fields(points, payload, send_ahead_s, crc), payload, add_job)
+        self._request("splice", fields, payload, add_job)
         return added[0] if added and self.connection.is_open else None
 
     def extend(self, job: StagedJob, points: StagePoints, epoch: int, crc: int) -> bool:
@@ -262,20 +256,21 @@ class RemoteSession(LinkStatus):
         # A newer frame has replaced the plan: its rest is of no use any more.
         if last is None or last is not job:
             return False
-        fields = {
-            "job": last.number,
-            "epoch": epoch,
-            "pause": self._drained_number,
-            "counts": points.counts,
-            "crc": crc,
-        }
+        order = self._build_order(last.number, epoch, points, crc)
 
         def extend(result: dict[str, Any]) -> None:
             if result["done"]:
                 last.extend(points)
 
-        result = self._request("extend", fields, points.encode_payload(), extend)
+        result = self._request("extend", order._asdict(), points.encode_payload(), extend)
         return result is not None and bool(result["done"])
+
+    def _build_order(
+        self, number: int, epoch: int, points: StagePoints, crc: int, send_ahead_s: float = inf
+    ) -> PointsOrder:
+        # JSON has no infinity: no bound is null.
+        ahead_s = None if send_ahead_s == inf else send_ahead_s
+        return PointsOrder(number, epoch, self._drained_number, points.counts, crc, ahead_s)
 
     def truncate(self, kept_points: Sequence[int]) -> bool:
         """Truncate the last job to `kept_points` points of each stage. Return False, unchanged, if more were sent."""
@@ -312,8 +307,3 @@ class RemoteSession(LinkStatus):
 
     def _find_last_job(self) -> RemoteJob | None:
         return next(reversed(self._jobs.values()), None)
-
-
-def _build_points_fields(points: StagePoints, payload: bytes, send_ahead_s: float, crc: int | None) -> dict[str, Any]:
-    ahead_s = None if send_ahead_s == inf else send_ahead_s
-    return {"counts": points.counts, "ahead_s": ahead_s, "crc": zlib.crc32(payload) if crc is None else crc}
