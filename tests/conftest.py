@@ -15,6 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import forked_process
 from displays import DISPLAYS
+from pieces import take_piece
 
 # Before any folder imports them: their assertions then explain themselves, whichever folder is collected first.
 pytest.register_assert_rewrite(
@@ -90,8 +91,7 @@ def pytest_collection_modifyitems(config, items):
             if "hardware" in item.keywords:
                 item.add_marker(skip)
     yield  # `-m` selects
-    number, count = map(int, config.getoption("--piece").split("/"))
-    items[:] = items[len(items) * (number - 1) // count : len(items) * number // count]
+    items[:] = take_piece(items, config.getoption("--piece"))
 
 
 @pytest.fixture(params=sorted(DISPLAYS))

@@ -1,11 +1,12 @@
 """Every test that went to the nightly run exists, and so does the test of the gate that covers it."""
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from pieces import take_piece
 
 sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 
@@ -34,25 +35,11 @@ def test_every_folder_with_tests_has_pieces():
     assert folders == set(slow.FOLDERS)
 
 
-def test_pieces_are_all_of_the_tests_once():
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "--collect-only",
-        "-q",
-        "tests/unit/core/test_quantity.py",
-        "-m",
-        "not slow",
-    ]
-
-    def list_tests(piece):
-        said = subprocess.run([*command, "--piece", piece], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-        return [line for line in said.splitlines() if "::" in line]
-
-    whole = list_tests("1/1")
-    assert len(whole) > 30
-    assert [test for k in (1, 2, 3) for test in list_tests(f"{k}/3")] == whole
+@pytest.mark.parametrize(("tests", "count"), [(37, 3), (6, 6), (2, 5), (0, 1)])
+def test_pieces_are_all_of_the_tests_once_and_in_order(tests, count):
+    pieces = [take_piece(list(range(tests)), f"{k}/{count}") for k in range(1, count + 1)]
+    assert [test for piece in pieces for test in piece] == list(range(tests))
+    assert max(map(len, pieces)) - min(map(len, pieces)) <= 1
 
 
 def test_the_piece_that_is_due_is_the_one_without_a_row_or_with_the_oldest():
