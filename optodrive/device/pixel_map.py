@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field as Item
@@ -28,8 +28,19 @@ MEASURED, DEAD, NOT_MEASURED = "measured", "dead", "not measured"
 Offset = Annotated[float, PlausibleRange(0.0, 5e-3, "m")]
 
 
-class _Pixel(Section):
+class MappedPixel(Section):
+    """One pixel of a map."""
+
     index: Annotated[int, Item(ge=0)]
+
+
+class MappedPixels(Section):
+    """All pixels of a display, in order."""
+
+    pixels: tuple[MappedPixel, ...]
+
+
+class _Pixel(MappedPixel):
     state: Literal["measured", "dead", "not measured"] = "measured"
     gain: Annotated[float, Item(ge=GAIN_MIN, le=GAIN_MAX)] = 1.0
     gain_sigma: Annotated[float, Item(ge=0)] | None = None
@@ -53,19 +64,26 @@ class _Model(Section):
     parameters: str
 
 
-class _Map(Section):
-    pixels: tuple[_Pixel, ...]
+class MapFile(Section):
+    """A file with numbers of every pixel of one display, and their origin."""
 
-
-class _PixelMapFile(Section):
     format: str
     version: int
     about: dict[str, str | float | int] = Item(default_factory=dict)
     display: MappedDisplay
+    map: MappedPixels
+
+
+class _Map(MappedPixels):
+    pixels: tuple[_Pixel, ...]
+
+
+class _PixelMapFile(MapFile):
     model: _Model
     map: _Map
 
 
+File = TypeVar("File", bound=MapFile)
 NUMERIC_FIELDS = ("gain", "gain_sigma", "offset_x_m", "offset_y_m", "offset_x_sigma_m", "offset_y_sigma_m")
 
 
@@ -130,9 +148,7 @@ def load_pixel_map(config: Config) -> PixelMap | None:
     if config.display.pixel_map is None:
         return None
     path = Path(config.display.pixel_map)
-    content = _read_file(path, *read_change(path))
-    check_mapped_display(path, content.display, config)
-    return _build_map(path, content, config)
+    return _build_map(path, read_map_file(path, _PixelMapFile, FORMAT, config), config)
 
 
 def build_aim_layout(config: Config) -> PixelLayout:
@@ -192,15 +208,26 @@ def read_change(path: Path) -> tuple[int, int]:
 
 
 # By time and size of the file: layout, field and table of each stage ask for the map again.
-@lru_cache(maxsize=8)
-def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
+@lru_cache(maxsize=16)
+def _read_file(path: Path, kind: type[MapFile], form: str, _changed_ns: int, _size: int) -> MapFile:
     table = read_toml(path, BYTES_MAX)
-    check_format(path, table, FORMAT, VERSION)
-    return parse_table(path, table, _PixelMapFile)
+    check_format(path, table, form, VERSION)
+    return parse_table(path, table, kind)
 
 
-def check_mapped_display(path: Path, mapped: MappedDisplay, config: Config) -> None:
-    """Raise InputError unless a map belongs to the configured display."""
+def read_map_file(path: Path, kind: type[File], form: str, config: Config) -> File:
+    """Read a map of pixels. form: its format. Raise InputError unless it belongs to the configured display."""
+    content = _read_file(path, kind, form, *read_change(path))
+    assert isinstance(content, kind)  # noqa: S101 - the cache does not know the kind
+    _check_mapped_display(path, content.display, config)
+    count = len(build_pixel_layout(config.display))
+    if [pixel.index for pixel in content.map.pixels] != list(range(count)):
+        expected = f"one entry per pixel, 0 to {count - 1} in order"
+        raise InputError(f"{path}: map.pixels", f"{len(content.map.pixels)} entries", expected)
+    return content
+
+
+def _check_mapped_display(path: Path, mapped: MappedDisplay, config: Config) -> None:
     display: DisplaySection = config.display
     for key in ("rows", "columns", "pitch_m"):
         given, expected = getattr(mapped, key), getattr(display, key)
@@ -213,11 +240,7 @@ def check_mapped_display(path: Path, mapped: MappedDisplay, config: Config) -> N
 
 
 def _build_map(path: Path, content: _PixelMapFile, config: Config) -> PixelMap:
-    pixels, count = content.map.pixels, len(build_pixel_layout(config.display))
-    if [pixel.index for pixel in pixels] != list(range(count)):
-        raise InputError(
-            f"{path}: map.pixels", f"{len(pixels)} entries", f"one entry per pixel, 0 to {count - 1} in order"
-        )
+    pixels = content.map.pixels
     numbers = {
         name: np.array([np.nan if (value := getattr(pixel, name)) is None else value for pixel in pixels])
         for name in NUMERIC_FIELDS

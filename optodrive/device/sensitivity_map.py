@@ -1,45 +1,36 @@
 """Sensitivity map, the file sensitivity.toml: how sensitive one person is at every pixel of a display."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field as Item
 
-from optodrive.core.errors import InputError
 from optodrive.core.files import write_text
-from optodrive.core.toml_model import Section, check_format, parse_table, read_toml
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
-from optodrive.device.config import Config, build_pixel_layout
-from optodrive.device.pixel_map import BYTES_MAX, MappedDisplay, check_mapped_display, format_map_head, read_change
+from optodrive.device.config import Config
+from optodrive.device.pixel_map import VERSION, MapFile, MappedPixel, MappedPixels, format_map_head, read_map_file
 
 FORMAT = "optodrive-sensitivity"
-VERSION = 1
 SENSITIVITY_MIN, SENSITIVITY_MAX = 0.1, 10.0
 """Range of plausible sensitivities."""
 PARTICIPANT_MAX = 40
 """Largest length of a person's code, characters."""
 
 
-class _Pixel(Section):
-    index: Annotated[int, Item(ge=0)]
+class _Pixel(MappedPixel):
     sensitivity: Annotated[float, Item(ge=SENSITIVITY_MIN, le=SENSITIVITY_MAX)]
     sensitivity_sigma: Annotated[float, Item(ge=0)]
 
 
-class _Map(Section):
+class _Map(MappedPixels):
     participant: Annotated[str, Item(pattern=r"^[A-Za-z0-9]+$", max_length=PARTICIPANT_MAX)]
     trials: Annotated[int, Item(ge=1)]
     pixels: tuple[_Pixel, ...]
 
 
-class _SensitivityFile(Section):
-    format: str
-    version: int
-    about: dict[str, str | float | int] = Item(default_factory=dict)
-    display: MappedDisplay
+class _SensitivityFile(MapFile):
     map: _Map
 
 
@@ -73,15 +64,9 @@ def load_sensitivity_map(config: Config) -> SensitivityMap | None:
     """Load the sensitivity map that a configuration names and check it against the display. None if it names none."""
     if config.display.sensitivity_map is None:
         return None
-    path = Path(config.display.sensitivity_map)
-    content = _read_file(path, *read_change(path))
-    check_mapped_display(path, content.display, config)
-    pixels, count = content.map.pixels, len(build_pixel_layout(config.display))
-    if [pixel.index for pixel in pixels] != list(range(count)):
-        expected = f"one entry per pixel, 0 to {count - 1} in order"
-        raise InputError(f"{path}: map.pixels", f"{len(pixels)} entries", expected)
-    sensitivity = np.array([pixel.sensitivity for pixel in pixels])
-    sigma = np.array([pixel.sensitivity_sigma for pixel in pixels])
+    content = read_map_file(Path(config.display.sensitivity_map), _SensitivityFile, FORMAT, config)
+    sensitivity = np.array([pixel.sensitivity for pixel in content.map.pixels])
+    sigma = np.array([pixel.sensitivity_sigma for pixel in content.map.pixels])
     return SensitivityMap(sensitivity, sigma, content.map.participant, content.map.trials)
 
 
@@ -98,10 +83,3 @@ def write_sensitivity_map(
     for index, (value, sigma) in enumerate(zip(sensitivity_map.sensitivity, sensitivity_map.sigma, strict=True)):
         lines += [f"  {{ index = {index}, sensitivity = {value:.5g}, sensitivity_sigma = {sigma:.3g} }},"]
     write_text(path, "\n".join([*lines, "]"]) + "\n")
-
-
-@lru_cache(maxsize=8)
-def _read_file(path: Path, _changed_ns: int, _size: int) -> _SensitivityFile:
-    table = read_toml(path, BYTES_MAX)
-    check_format(path, table, FORMAT, VERSION)
-    return parse_table(path, table, _SensitivityFile)
