@@ -82,8 +82,8 @@ def diagnose_recording(path: Path) -> dict[str, Any]:
     from optodrive.lab.recording import read_recording
 
     measurement = read_recording(path)
-    prior, epsilon, _ = build_prior(measurement, None)
-    return json.loads(json.dumps(build_answer(diagnose(measurement, 0, prior, epsilon))))
+    prior, _ = build_prior(measurement, None)
+    return json.loads(json.dumps(build_answer(diagnose(measurement, 0, prior))))
 
 
 def name_baseline_causes(answer: dict[str, Any]) -> dict[str, str]:

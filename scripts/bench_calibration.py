@@ -110,8 +110,8 @@ def diagnose_recording(path: Path) -> dict[str, str]:
     from optodrive.lab.recording import read_recording
 
     measurement = read_recording(path)
-    prior, epsilon, _ = build_prior(measurement, None)
-    found = diagnose(measurement, 0, prior, epsilon)
+    prior, _ = build_prior(measurement, None)
+    found = diagnose(measurement, 0, prior)
     stated = found.probabilities
     explanations = {NO_EFFECT: stated.no_effect, NONE_OF_THESE: stated.none_of_these}
     explanations |= {"+".join(keys): probability for keys, probability in stated.ranked}

@@ -181,10 +181,10 @@ def _diagnose_jointly(
     from optodrive.lab.diagnosis.priors import build_prior
 
     measurement, paths = _read_recordings(recordings), [str(path) for path in recordings]
-    prior, epsilon, width_m = build_prior(measurement, config)
+    prior, width_m = build_prior(measurement, config)
     announce_compilation()
     with show_step("reading") as on_progress:
-        diagnosis = study(measurement, seed, prior, epsilon, on_progress, use=use)
+        diagnosis = study(measurement, seed, prior, on_progress, use=use)
         discovery = None
         if discovers or diagnosis.verdict == "unexplained":
             from optodrive.lab.diagnosis.search_log import SearchLog
@@ -194,7 +194,7 @@ def _diagnose_jointly(
             log = SearchLog(omissions=diagnosis.omissions)
             step = "the search for a term that no catalogue holds"
             usable = inspect_recording(measurement, use).measurement
-            discovery = log.attempt(step, discover_in_pixel, None, usable, prior, epsilon, on_progress)
+            discovery = log.attempt(step, discover_in_pixel, None, usable, prior, on_progress)
     return _build_output(diagnosis, title, paths, provenance, out or OUT, config_name, width_m, discovery)
 
 

@@ -51,8 +51,8 @@ def study_runs(measurement: "Measurement", config: "Config", seed: int) -> "Disc
     from optodrive.lab.diagnosis.diagnose import diagnose
     from optodrive.lab.diagnosis.priors import build_prior
 
-    prior, epsilon, _ = build_prior(measurement, config)
-    return diagnose(measurement, seed, prior, epsilon, hold_out=False)
+    prior, _ = build_prior(measurement, config)
+    return diagnose(measurement, seed, prior, hold_out=False)
 
 
 def measure_live(request: LiveRequest, quiet: bool) -> "CampaignResult":

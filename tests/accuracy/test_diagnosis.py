@@ -211,9 +211,9 @@ def test_a_fit_that_still_improves_is_not_abandoned(resistance, capacity):
     From far away a linear prediction is pessimistic.
     """
     measurement = round_temperature(WALL, 0.1)
-    prior, epsilon, _ = build_prior(measurement, None)
+    prior, _ = build_prior(measurement, None)
     (data,) = build_dataset(measurement).split_subsystems()
-    problem, base = fit_nominal(data.select(split_runs(data)[0]), prior, epsilon)
+    problem, base = fit_nominal(data.select(split_runs(data)[0]), prior)
     (wall,) = (item for item in build_hypotheses(data) if item.key == "wall_heating")
     start = ParameterPoint(base.point.base, {"wall_heating": {"resistance": resistance, "capacity": capacity}})
     assert fit(problem, start, wall.free, chi2_abandon=1_000.0).chi2 < 1_000.0
@@ -221,9 +221,9 @@ def test_a_fit_that_still_improves_is_not_abandoned(resistance, capacity):
 
 def test_a_pair_is_not_named_for_a_cause_whose_own_fit_had_ended_elsewhere():
     measurement = round_temperature(WALL, 0.1)
-    prior, epsilon, _ = build_prior(measurement, None)
+    prior, _ = build_prior(measurement, None)
     (data,) = build_dataset(measurement).split_subsystems()
-    problem, base = fit_nominal(data, prior, epsilon)
+    problem, base = fit_nominal(data, prior)
     hypotheses = [item for item in build_hypotheses(data) if item.key in ("wall_heating", "membrane_creep")]
     singles = []
     for item in hypotheses:

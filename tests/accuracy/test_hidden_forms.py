@@ -49,8 +49,8 @@ def draw_other_form(key):
 def judge(case):
     """Return the diagnosis, and whether each parameter whose meaning does not depend on the form is in its interval."""
     measurement = read_recording(case.path)
-    prior, epsilon, _ = build_prior(measurement, None)
-    found = diagnose(measurement, 0, prior, epsilon)
+    prior, _ = build_prior(measurement, None)
+    found = diagnose(measurement, 0, prior)
     truth = {name: case.base[name] for name in BASE}
     effect = case.effects[0]
     if effect.form == "gas_apart":

@@ -100,7 +100,7 @@ def test_bins_of_pure_noise_have_their_degrees_and_repeats_set_the_scale():
         kind: ColouredNoise(own.white, (1e-9 * own.white,) * 2, (1e-2, 1.0)) for kind, own in noise.coloured.items()
     }
     problem = replace(problem, noise=replace(noise, coloured=plain))
-    shared = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    shared = compute_jitter_sensitivity(data, base.point, base.prediction)
     rng = np.random.default_rng(3)
     residual, oscillation = np.zeros(len(data.value)), np.zeros(len(data.value))
     for block in data.blocks:
@@ -119,7 +119,7 @@ def test_bins_of_pure_noise_have_their_degrees_and_repeats_set_the_scale():
 def test_an_effect_that_all_groups_share_is_seen_in_their_joined_bins():
     problem, base = fit_nominal(build_dataset(lab(21, {}, repeats=2)))
     data, rng = problem.data, np.random.default_rng(4)
-    jitter = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    jitter = compute_jitter_sensitivity(data, base.point, base.prediction)
     plain = {
         kind: ColouredNoise(own.white, (1e-9 * own.white,) * 2, (1e-2, 1.0))
         for kind, own in problem.noise.coloured.items()
@@ -154,7 +154,7 @@ def test_a_late_clock_has_no_other_form_than_its_share_in_each_signal():
     for key, is_free in (("clock_offset", False), ("laser_lag", True)):
         item = every[key][0]
         point = ParameterPoint(base.point.base, {key: dict(item.starts[0])})
-        fitted = replace(base, point=point, prediction=predict(data, point, problem.epsilon))
+        fitted = replace(base, point=point, prediction=predict(data, point))
         columns = compute_discrepancy_basis(problem, fitted, (item,), every[key])
         assert (columns.shape[1] > len(data.kinds) - 1) == is_free
 
@@ -237,7 +237,7 @@ def test_an_experiment_is_asked_for_only_where_it_would_tell_and_as_often_as_it_
 
 def test_noise_is_known_as_well_as_its_part_by_which_two_fits_differ():
     problem, base = fit_nominal(build_dataset(lab(21, {}, repeats=2)))
-    jitter = compute_jitter_sensitivity(problem.data, base.point, problem.epsilon, base.prediction)
+    jitter = compute_jitter_sensitivity(problem.data, base.point, base.prediction)
     certainty = NoiseCertainty(problem, base)
     jitter_degrees = count_noise_degrees(problem.data)
     as_power = replace(base, prediction=base.prediction + 0.3 * jitter.power)

@@ -76,8 +76,8 @@ class Answer:
 def measure(case: Case) -> Answer:
     """Return what is found in a recording. An instrument's line is subtracted before, and is the answer then."""
     measurement = read_recording(case.path)
-    prior, epsilon, _ = build_prior(measurement, None)
-    found = discover_in_pixel(measurement, prior, epsilon)
+    prior, _ = build_prior(measurement, None)
+    found = discover_in_pixel(measurement, prior)
     strongest = max(found.findings, key=lambda finding: finding.term.chosen.gain, default=None)
     node, kind, gain, verdict = "", "", 0.0, found.claim.verdict
     if strongest is not None:

@@ -176,8 +176,8 @@ def diagnose_quickly(path: Path) -> Said:
     began = time.monotonic()
     try:
         measurement = read_recording(path)
-        prior, epsilon, _ = build_prior(measurement, None)
-        answer, message = json.loads(json.dumps(build_answer(study(measurement, 0, prior, epsilon)))), ""
+        prior, _ = build_prior(measurement, None)
+        answer, message = json.loads(json.dumps(build_answer(study(measurement, 0, prior)))), ""
     except OptodriveError as error:
         answer, message = {}, f"optodrive: {error}"
     except Exception:

@@ -54,8 +54,8 @@ class LoopResult:
 def close_loop(case: Case, folder: Path) -> LoopResult:
     """Diagnose the case, plan the same heights with both models, and compute their errors on the hidden display."""
     measurement = read_recording(case.path)
-    prior, epsilon, width_m = build_prior(measurement, None)
-    found = diagnose(measurement, prior=prior, epsilon=epsilon)
+    prior, width_m = build_prior(measurement, None)
+    found = diagnose(measurement, prior=prior)
     model = build_model_toml(found.base, found.terms, found.verdict, "blind", width_m or WIDTH_M)
     return _compare_plans(case, folder, found.verdict, found.causes, model, width_m or WIDTH_M)
 
@@ -63,8 +63,8 @@ def close_loop(case: Case, folder: Path) -> LoopResult:
 def close_discovery_loop(case: Case, folder: Path) -> LoopResult | None:
     """Do the same with what a discovery finds. Return None if heights cannot be planned with it."""
     measurement = read_recording(case.path)
-    prior, epsilon, width_m = build_prior(measurement, None)
-    planned = build_planned_terms(discover_in_pixel(measurement, prior, epsilon))
+    prior, width_m = build_prior(measurement, None)
+    planned = build_planned_terms(discover_in_pixel(measurement, prior))
     if not planned.terms:
         return None
     width_m = width_m or WIDTH_M

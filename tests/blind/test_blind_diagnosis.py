@@ -45,8 +45,8 @@ pytestmark = pytest.mark.timeout(600)  # all cases are drawn and diagnosed befor
 
 def found(case):
     measurement = read_recording(case.path)
-    prior, epsilon, _ = build_prior(measurement, None)
-    return build_answer(diagnose(measurement, 0, prior, epsilon))
+    prior, _ = build_prior(measurement, None)
+    return build_answer(diagnose(measurement, 0, prior))
 
 
 @pytest.fixture(scope="module", params=[FIXED, pytest.param(DRAWN, marks=pytest.mark.slow)], ids=["fixed", "drawn"])

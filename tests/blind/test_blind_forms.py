@@ -14,8 +14,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 def find(kind, strength, seed, folder, key, form):
     case = draw_case_of_strength(kind, strength, seed, folder, (key,), form)
     measurement = read_recording(case.path)
-    prior, epsilon, _ = build_prior(measurement, None)
-    return case, diagnose(measurement, 0, prior, epsilon)
+    prior, _ = build_prior(measurement, None)
+    return case, diagnose(measurement, 0, prior)
 
 
 @pytest.mark.parametrize(

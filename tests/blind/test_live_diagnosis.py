@@ -25,8 +25,8 @@ NAMES_NOTHING = ("none", "instrument")
 
 
 def study_runs(measurement, config, hold_out=False):
-    prior, epsilon, _ = build_prior(measurement, config)
-    return diagnose(measurement, 0, prior, epsilon, hold_out=hold_out)
+    prior, _ = build_prior(measurement, config)
+    return diagnose(measurement, 0, prior, hold_out=hold_out)
 
 
 def ignore(_):

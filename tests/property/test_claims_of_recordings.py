@@ -57,8 +57,8 @@ def draw_recording(number, folder):
 
 
 def answer(measurement):
-    prior, epsilon, _ = build_prior(measurement, None)
-    return diagnose(measurement, 0, prior, epsilon)
+    prior, _ = build_prior(measurement, None)
+    return diagnose(measurement, 0, prior)
 
 
 def check(number):

@@ -84,7 +84,7 @@ def simulate_effects(
     """
     # Jitters act along the derivatives of this fit, for all candidates alike: their scores are comparable, refits have
     # their own.
-    sensitivity = compute_jitter_sensitivity(problem.data, base.point, problem.epsilon, base.prediction)
+    sensitivity = compute_jitter_sensitivity(problem.data, base.point, base.prediction)
     fitted_columns = compute_jacobian(problem, base.point, base.free, base.prediction)
     starts: list[tuple[Hypothesis, dict[str, float]]] = []
     effects: list[FloatArray] = []
@@ -111,7 +111,7 @@ def _simulate_start(problem: FitProblem, base: ModelFit, key: str, start: dict[s
         record(problem.data, term, start, signals)
     else:
         point = ParameterPoint(base.point.base, {**base.point.terms, key: start})
-        signals = predict(problem.data, point, problem.epsilon)
+        signals = predict(problem.data, point)
     return signals - base.prediction
 
 

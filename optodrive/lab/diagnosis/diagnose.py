@@ -60,7 +60,7 @@ from optodrive.lab.diagnosis.model_selection import (
     has_replicate_excess,
 )
 from optodrive.lab.diagnosis.next_steps import propose_for_verdict
-from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
+from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, fit_nominal, update_noise
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.lab.diagnosis.recording_checks import check_copied_runs, check_numeric_limits, check_recording_units
@@ -117,7 +117,6 @@ def diagnose(
     measurement: Measurement,
     seed: int = 0,
     prior: BaseParameterPrior = BROAD_PRIOR,
-    epsilon: float = DEFAULT_EPSILON,
     on_progress: ProgressCallback = ignore_progress,
     hold_out: bool = True,
     use: Iterable[str] = (),
@@ -134,7 +133,7 @@ def diagnose(
     measurement = inspection.measurement
     # Before the test of units, in which numbers out of range would overflow.
     check_numeric_limits(measurement)
-    check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel(epsilon))
+    check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel())
     check_copied_runs(measurement)
     subsystems: list[_SubsystemFit] = []
     for part in build_dataset(measurement).split_subsystems():
@@ -149,7 +148,7 @@ def diagnose(
             candidates = [item for item in candidates if len(discover_terms()[item.key].subsystems) == 1]
         subsystems.append(
             _diagnose_subsystem(
-                *(part, candidates, seed, prior, epsilon, timing_s, _find_shared_terms(subsystems)),
+                *(part, candidates, seed, prior, timing_s, _find_shared_terms(subsystems)),
                 SearchLog(on_progress),
                 hold_out,
             )
@@ -245,7 +244,6 @@ def _diagnose_subsystem(
     hypotheses: list[Hypothesis],
     seed: int,
     prior: BaseParameterPrior,
-    epsilon: float,
     min_timing_sigma_s: float,
     shared: Mapping[str, TermValues],
     log: SearchLog,
@@ -254,7 +252,7 @@ def _diagnose_subsystem(
     fitted, held_out_runs = split_runs(data) if hold_out else (list(range(len(data.runs))), [])
     fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
     log.on_progress("noise and nominal model")
-    problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, shared)
+    problem, base = fit_nominal(fitted_data, prior, min_timing_sigma_s, shared)
     nothing: tuple[tuple[InstrumentDisturbance, ...], FloatArray] = ((), np.zeros(len(data.value)))
     # Sought in all runs, held-out ones too: they are subtracted from the data, and no model gains by them.
     disturbances, added = log.attempt("disturbances of instruments", _find_disturbances, nothing, data, problem, base)
@@ -263,7 +261,7 @@ def _diagnose_subsystem(
         log.on_progress("nominal model without the instruments' disturbances")
         data = remove_disturbances(data, added)
         fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
-        problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, shared)
+        problem, base = fit_nominal(fitted_data, prior, min_timing_sigma_s, shared)
     # An AC coupling leaves no zero that differs from run to run; where one does, that explanation is out.
     residual = problem.data.value - base.prediction
     coupled = log.attempt("zeros of the runs", find_dc_coupled, frozenset[str](), problem.data, residual, problem.noise)
@@ -279,7 +277,7 @@ def _diagnose_subsystem(
     # Twins stay twins with more runs, so what they leave open is no reason to give up the held-out ones.
     first = claim(replace(selection.collect_evidence(), twins={}))
     # The noise stays that of the fitted runs, so that the two comparisons differ by the data alone.
-    all_data = FitProblem(data, problem.noise, prior, epsilon)
+    all_data = FitProblem(data, problem.noise, prior)
     if first.verdict in ("none", "undecided", "ambiguous") and held_out_runs:
         # The held-out, hottest runs may show an effect, or which one: compare the explanations with all runs.
         log.on_progress("fitting all runs")
@@ -339,8 +337,8 @@ def _find_disturbances(
     data: Dataset, problem: FitProblem, base: ModelFit
 ) -> tuple[tuple[InstrumentDisturbance, ...], FloatArray]:
     """Return the disturbances of the instruments beside the nominal fit, and their values in the data [m]."""
-    prediction = predict(data, base.point, problem.epsilon)
-    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, prediction)
+    prediction = predict(data, base.point)
+    sensitivity = compute_jitter_sensitivity(data, base.point, prediction)
     return find_disturbances(data, data.value - prediction, sensitivity, problem.noise)
 
 

@@ -54,7 +54,7 @@ def compute_discrepancy_basis(
     columns: list[FloatArray] = []
     for item in hypotheses:
         others = {key: values for key, values in terms.items() if key != item.key}
-        effect = fitted.prediction - predict(data, ParameterPoint(fitted.point.base, others), problem.epsilon)
+        effect = fitted.prediction - predict(data, ParameterPoint(fitted.point.base, others))
         columns += _separate_signals(data, effect)
         term = discover_terms()[item.key]
         # As a clock: it has no other form than its share in each signal.
@@ -80,7 +80,7 @@ def compute_discrepancy_basis(
             alternatives.append(ParameterPoint(fitted.point.base, {**others, item.key: start}))
         for alternative in alternatives:
             with suppress(*UNCOMPUTABLE):  # no form of the effect
-                columns.append(predict(data, alternative, problem.epsilon) - fitted.prediction)
+                columns.append(predict(data, alternative) - fitted.prediction)
     nonzero = [column for column in columns if np.abs(column).max(initial=0.0) > 0.0]
     return np.stack(nonzero, axis=1) if nonzero else np.zeros((len(data.value), 0))
 
@@ -111,10 +111,10 @@ def compute_covariance(
         return fitted.covariance
     data, point = problem.data, fitted.point
     other_terms = {key: values for key, values in point.terms.items() if key not in {item.key for item in hypotheses}}
-    effect = fitted.prediction - predict(data, ParameterPoint(point.base, other_terms), problem.epsilon)
+    effect = fitted.prediction - predict(data, ParameterPoint(point.base, other_terms))
     # The part along the effect itself is the fitted amplitude; a discrepancy is orthogonal to it.
     basis_columns = basis_columns - np.outer(effect, effect @ basis_columns / max(float(effect @ effect), 1e-300))
-    sensitivity = compute_jitter_sensitivity(data, fitted.point, problem.epsilon, fitted.prediction)
+    sensitivity = compute_jitter_sensitivity(data, fitted.point, fitted.prediction)
     jacobian = compute_jacobian(problem, fitted.point, fitted.free, fitted.prediction)
     residual = (data.value - fitted.prediction)[:, None]
     total = compute_normal_equations(

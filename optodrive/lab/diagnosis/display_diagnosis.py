@@ -167,8 +167,8 @@ def diagnose_pixel(task: PixelTask) -> PixelAnswer:
     """Run one task. Invalid data yield an answer with an error."""
     try:
         measurement = task.read()
-        prior, epsilon, width_m = build_prior(measurement, task.config)
-        discrepancy = diagnose(measurement, task.seed, prior, epsilon, use=task.use)
+        prior, width_m = build_prior(measurement, task.config)
+        discrepancy = diagnose(measurement, task.seed, prior, use=task.use)
     except InputError as error:
         return PixelAnswer(task.pixel, None, str(error))
     bare = replace(

@@ -154,17 +154,14 @@ class FitProblem:
     data: Dataset
     noise: NoiseModel
     prior: BaseParameterPrior
-    epsilon: float
 
 
-def compute_jitter_sensitivity(
-    data: Dataset, point: ParameterPoint, epsilon: float, prediction: FloatArray
-) -> JitterSensitivity:
+def compute_jitter_sensitivity(data: Dataset, point: ParameterPoint, prediction: FloatArray) -> JitterSensitivity:
     """Compute the sensitivities to power and timing by finite differences."""
-    more_power = predict(data, point, epsilon, power_factor=1.0 + POWER_STEP)
-    later = predict(data, point, epsilon, delay_s=DELAY_STEP_S)
+    more_power = predict(data, point, power_factor=1.0 + POWER_STEP)
+    later = predict(data, point, delay_s=DELAY_STEP_S)
     # Central, as a sample may lie at an edge, where both sides differ.
-    earlier = predict(data, point, epsilon, delay_s=-DELAY_STEP_S)
+    earlier = predict(data, point, delay_s=-DELAY_STEP_S)
     return JitterSensitivity((more_power - prediction) / np.log1p(POWER_STEP), 0.5 * (later - earlier) / DELAY_STEP_S)
 
 
@@ -205,7 +202,7 @@ def compute_jacobian(
         base = [
             number + BASE_LOG_STEP * (name in names) for name, number in zip(BASE_PARAMETERS, point.base, strict=True)
         ]
-        difference = predict(problem.data, replace(point, base=tuple(base)), problem.epsilon) - prediction
+        difference = predict(problem.data, replace(point, base=tuple(base))) - prediction
         for name in names:
             for block in blocks[name]:
                 columns[block.part, BASE_PARAMETERS.index(name)] = difference[block.part] / BASE_LOG_STEP
@@ -218,7 +215,7 @@ def compute_jacobian(
             if change != 0.0:
                 break
         shifted = replace(point, terms=terms)
-        columns[:, len(BASE_PARAMETERS) + row] = (predict(problem.data, shifted, problem.epsilon) - prediction) / change
+        columns[:, len(BASE_PARAMETERS) + row] = (predict(problem.data, shifted) - prediction) / change
     return columns
 
 
@@ -238,9 +235,9 @@ def fit(
     the last one brings χ² below this value.
     """
     data, count = problem.data, len(BASE_PARAMETERS) + len(free)
-    prediction = predict(data, point, problem.epsilon)
+    prediction = predict(data, point)
     # Once, at the start: with sensitivities that moved along, χ² of two steps would not be comparable.
-    sensitivity = compute_jitter_sensitivity(data, point, problem.epsilon, prediction)
+    sensitivity = compute_jitter_sensitivity(data, point, prediction)
     precision = np.concatenate([1.0 / np.square(problem.prior.sigma), np.zeros(len(free))])
     centre = np.concatenate([problem.prior.mean, np.zeros(len(free))])
     best: ModelFit | None = None
@@ -285,7 +282,7 @@ def fit(
         step = solve_within(hessian, gradient, *limits, damping)
         trial = apply_step(best.point, free, step)
         try:
-            prediction = predict(data, trial, problem.epsilon)
+            prediction = predict(data, trial)
         except DivergedError:
             prediction = np.full_like(prediction, np.nan)  # its χ² is no number, and the step is refused
     return best

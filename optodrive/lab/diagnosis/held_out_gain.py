@@ -65,17 +65,15 @@ def compute_held_out_gain(
     if not len(data.value):
         return None
     problem = replace(problem, data=data)
-    sensitivity = compute_jitter_sensitivity(data, nominal, problem.epsilon, predict(data, nominal, problem.epsilon))
-    nominal_chi2 = compute_omnibus_by_group(problem, data.value - predict(data, nominal, problem.epsilon), sensitivity)
-    extended_chi2 = compute_omnibus_by_group(
-        problem, data.value - predict(data, extended, problem.epsilon), sensitivity
-    )
+    sensitivity = compute_jitter_sensitivity(data, nominal, predict(data, nominal))
+    nominal_chi2 = compute_omnibus_by_group(problem, data.value - predict(data, nominal), sensitivity)
+    extended_chi2 = compute_omnibus_by_group(problem, data.value - predict(data, extended), sensitivity)
     excess = nominal_chi2[:, 0] - nominal_chi2[:, 1]
     # A share of an error that is not there could be anything.
     if excess.sum() < MIN_EXCESS_SIGMA * np.sqrt(2.0 * nominal_chi2[:, 1].sum()):
         return None
     floor2 = _compute_noise_floor2(problem, extended)
-    residuals = [data.value - predict(data, point, problem.epsilon) for point in (nominal, extended)]
+    residuals = [data.value - predict(data, point) for point in (nominal, extended)]
     kinds = data.kinds
     sums = np.zeros((len(kinds), 4))
     for block in data.blocks:
@@ -99,7 +97,7 @@ def compute_held_out_errors(
 ) -> list[HeldOutError]:
     """Return the RMSE of both models in every signal of every held-out group."""
     problem = replace(problem, data=data)
-    squares = [(data.value - predict(data, point, problem.epsilon)) ** 2 for point in (nominal, extended)]
+    squares = [(data.value - predict(data, point)) ** 2 for point in (nominal, extended)]
     squares.append(_compute_noise_floor2(problem, extended))
     errors = []
     for group, runs in data.groups.items():
@@ -123,8 +121,8 @@ def compute_held_out_changes(
     for group, runs in data.groups.items():
         for kind in data.select(runs).kinds:
             part = data.select(runs, (kind,))
-            before, after = (predict(part, point, problem.epsilon) for point in (nominal, extended))
-            jitter = compute_jitter_sensitivity(part, extended, problem.epsilon, after)
+            before, after = (predict(part, point) for point in (nominal, extended))
+            jitter = compute_jitter_sensitivity(part, extended, after)
             columns = np.column_stack([part.value - before, after - before])
             gram = compute_normal_equations(part, columns, problem.noise, jitter.power, jitter.timing).total
             norm2 = float(gram[1, 1])
@@ -165,7 +163,7 @@ def _compute_reduction(chi2_pairs: FloatArray) -> float:
 def _compute_noise_floor2(problem: FitProblem, point: ParameterPoint) -> FloatArray:
     """Return the expected square of each residual of the true model, [m]."""
     data, noise = problem.data, problem.noise
-    sensitivity = compute_jitter_sensitivity(data, point, problem.epsilon, predict(data, point, problem.epsilon))
+    sensitivity = compute_jitter_sensitivity(data, point, predict(data, point))
     out = (noise.power_sigma * sensitivity.power) ** 2 + (noise.timing_sigma_s * sensitivity.timing) ** 2
     for block in data.blocks:
         coloured = noise.coloured[block.kind]

@@ -29,8 +29,8 @@ class ModelComparison:
     def __init__(self, data: Dataset, problem: FitProblem, nominal: ParameterPoint, extended: ParameterPoint) -> None:
         self._data = data
         self._sigma = {kind: problem.noise.coloured[kind].white for kind in data.kinds}
-        self._nominal = data.value - predict(data, nominal, problem.epsilon)
-        self._extended = data.value - predict(data, extended, problem.epsilon)
+        self._nominal = data.value - predict(data, nominal)
+        self._extended = data.value - predict(data, extended)
 
     def trace_groups(self) -> tuple[ResidualTrace, ...]:
         """Return the signals of the first run of each group."""
@@ -95,8 +95,8 @@ def compute_height_error(
     if not len(data.value):
         return None
     problem = replace(problem, data=data)
-    predictions = [predict(data, point, problem.epsilon) for point in (nominal, extended)]
-    power = compute_jitter_sensitivity(data, extended, problem.epsilon, predictions[1]).power
+    predictions = [predict(data, point) for point in (nominal, extended)]
+    power = compute_jitter_sensitivity(data, extended, predictions[1]).power
     repeats: dict[tuple[str, int, int], list[_Push]] = {}
     for block in data.blocks:
         if block.kind == DISPLACEMENT:

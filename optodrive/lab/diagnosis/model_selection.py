@@ -387,7 +387,7 @@ def _is_seen_beside(
         return True
     data, point = problem.data, single.fit.point
     others = {key: values for key, values in point.terms.items() if key != first.key}
-    effect = single.fit.prediction - predict(data, replace(point, terms=others), problem.epsilon)
+    effect = single.fit.prediction - predict(data, replace(point, terms=others))
     acting = {
         block.kind
         for block in data.blocks

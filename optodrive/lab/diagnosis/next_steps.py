@@ -168,10 +168,10 @@ def _build_synthetic_dataset(pulses: FloatArray, pixel: int, span_s: float, kind
 
 def _compute_separation(problem: FitProblem, first: ModelFit, second: ModelFit, data: Dataset, repeats: int) -> float:
     """Return χ² between both predictions with the remaining freedom of either model projected out."""
-    first_prediction = predict(data, first.point, problem.epsilon)
-    second_prediction = predict(data, second.point, problem.epsilon)
-    sensitivity = compute_jitter_sensitivity(data, first.point, problem.epsilon, first_prediction)
-    synthetic = FitProblem(data, problem.noise, problem.prior, problem.epsilon)
+    first_prediction = predict(data, first.point)
+    second_prediction = predict(data, second.point)
+    sensitivity = compute_jitter_sensitivity(data, first.point, first_prediction)
+    synthetic = FitProblem(data, problem.noise, problem.prior)
     first_jacobian = compute_jacobian(synthetic, first.point, first.free, first_prediction)
     second_jacobian = compute_jacobian(synthetic, second.point, second.free, second_prediction)
     columns = np.column_stack([first_jacobian, second_jacobian, first_prediction - second_prediction])

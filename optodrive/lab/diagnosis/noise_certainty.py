@@ -63,7 +63,7 @@ class NoiseCertainty:
         """Return χ² of a fit, without priors, under the noise as it is and with each of its changes."""
         problem = self._problem
         residual = (problem.data.value - fitted.prediction)[:, None]
-        jitter = compute_jitter_sensitivity(problem.data, fitted.point, problem.epsilon, fitted.prediction)
+        jitter = compute_jitter_sensitivity(problem.data, fitted.point, fitted.prediction)
         equations = (
             compute_normal_equations(problem.data, residual, noise, jitter.power, jitter.timing)
             for noise in self._noises

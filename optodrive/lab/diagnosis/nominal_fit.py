@@ -12,7 +12,6 @@ from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_
 from optodrive.lab.diagnosis.prediction import ParameterPoint
 from optodrive.physics.term import TermValues
 
-DEFAULT_EPSILON = 0.66
 BROAD_PRIOR = BaseParameterPrior(
     (np.log(150.0), np.log(101e-6), np.log(3e-3), np.log(4e-6), np.log(2.3e-4)), (0.7, 0.16, 0.5, 0.5, 0.5)
 )
@@ -24,7 +23,6 @@ R_STARTS_K_PER_W = (100.0, 180.0, 320.0)
 def fit_nominal(
     data: Dataset,
     prior: BaseParameterPrior = BROAD_PRIOR,
-    epsilon: float = DEFAULT_EPSILON,
     min_timing_sigma_s: float = 0.0,
     shared: Mapping[str, TermValues] | None = None,
 ) -> tuple[FitProblem, ModelFit]:
@@ -35,7 +33,7 @@ def fit_nominal(
     """
     # The noise needs the jitters' sensitivities, these a fit, and a fit some noise.
     crude_noise = _estimate_crude_noise(data)
-    problem = FitProblem(data, crude_noise, prior, epsilon)
+    problem = FitProblem(data, crude_noise, prior)
     trials = [
         fit(problem, ParameterPoint((float(np.log(r)), *prior.mean[1:]), shared or {}), iterations=3)
         # From one start the fit may end with a wrong pair of R and C, of equal time constant.
@@ -52,7 +50,7 @@ def fit_nominal(
 def update_noise(problem: FitProblem, fitted: ModelFit, min_timing_sigma_s: float) -> FitProblem:
     """Return the problem with the noise model estimated from repeats, with jitter sensitivities at this fit."""
     data = problem.data
-    sensitivity = compute_jitter_sensitivity(data, fitted.point, problem.epsilon, fitted.prediction)
+    sensitivity = compute_jitter_sensitivity(data, fitted.point, fitted.prediction)
     noise = estimate_noise_model(data, data.value - fitted.prediction, sensitivity.power, sensitivity.timing)
     noise = replace(
         noise,

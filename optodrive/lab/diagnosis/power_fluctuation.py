@@ -29,8 +29,8 @@ RUN_POWER_SIGMA = 1.0
 def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> float:
     """Return the score statistic, in σ, for independent powers of the pulse slices added to the noise model."""
     data, noise = problem.data, problem.noise
-    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
-    pixel = base.point.pixel(problem.epsilon)
+    sensitivity = compute_jitter_sensitivity(data, base.point, base.prediction)
+    pixel = base.point.pixel()
     experiments = {number: experiment for experiment, numbers in data.experiments for number in numbers}
     pairs: dict[int, list[Contrast]] = {}
     for item in compute_contrasts(data, data.value - base.prediction, sensitivity.power, sensitivity.timing):

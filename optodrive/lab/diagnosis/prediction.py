@@ -17,6 +17,8 @@ from optodrive.physics.terms import all_terms
 
 BASE_PARAMETERS = ("R", "C", "tau_g", "kappa", "phi")
 """Fitted nominal parameters, all by their logarithms."""
+EPSILON = 0.66
+"""Absorbed share of the light. With another one, R and C are others in proportion, and nothing else."""
 BASE_UNITS = {"R": "K/W", "C": "J/K", "tau_g": "s", "kappa": "m/K", "phi": "N/K"}
 
 
@@ -27,22 +29,20 @@ class ParameterPoint:
     base: tuple[float, ...]
     terms: Mapping[str, TermValues]
 
-    def pixel(self, epsilon: float) -> Pixel:
+    def pixel(self, power_factor: float = 1.0) -> Pixel:
         """Return the nominal pixel of the base parameters."""
         r, c, tau_g, kappa, phi = np.exp(np.array(self.base)).tolist()
-        return Pixel(r, c, epsilon, tau_g, kappa, phi)
+        return Pixel(r, c, EPSILON * power_factor, tau_g, kappa, phi)
 
 
-def predict(
-    data: Dataset, point: ParameterPoint, epsilon: float = 0.66, power_factor: float = 1.0, delay_s: float = 0.0
-) -> FloatArray:
+def predict(data: Dataset, point: ParameterPoint, power_factor: float = 1.0, delay_s: float = 0.0) -> FloatArray:
     """Predict all samples [m]. power_factor scales all optical power, delay_s delays all signals.
 
     Raises DivergedError if a term is too fast for the integrator, a state leaves its range, or a sample is no number.
     """
     out = np.zeros(len(data.value))
     # All heat is proportional to the absorbed share, so a power factor needs no other pulses.
-    pixel = point.pixel(epsilon * power_factor)
+    pixel = point.pixel(power_factor)
     terms = [(all_terms()[key], values) for key, values in point.terms.items()]
     delays_s = BySignal(*(delay_s + sum(each) for each in _transpose([t.signal_delays(v) for t, v in terms])))
     rates = BySignal(*(sum(each) for each in _transpose([t.signal_rates(v) for t, v in terms])))

@@ -209,7 +209,7 @@ def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis
     zero = np.zeros(len(problem.data.value))
 
     def cost(point: ParameterPoint) -> float:
-        residual = problem.data.value - predict(problem.data, point, problem.epsilon)
+        residual = problem.data.value - predict(problem.data, point)
         # Without jitters: their sensitivities cost three predictions for each of many starts, which only need an order.
         return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total[0, 0])
 

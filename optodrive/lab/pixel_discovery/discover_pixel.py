@@ -10,7 +10,7 @@ from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, build_dataset
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, remove_disturbances
 from optodrive.lab.diagnosis.model_selection import has_replicate_excess
-from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal
+from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, fit_nominal
 from optodrive.lab.diagnosis.search_log import ProgressCallback, ignore_progress
 from optodrive.lab.discovery import discover
 from optodrive.lab.inference.claim import NOTHING_SOUGHT, TermForm
@@ -27,30 +27,29 @@ MIN_EXPERIMENTS = 4
 def discover_in_pixel(
     measurement: Measurement,
     prior: BaseParameterPrior = BROAD_PRIOR,
-    epsilon: float = DEFAULT_EPSILON,
     on_progress: ProgressCallback = ignore_progress,
 ) -> PixelDiscovery:
     """Return the terms that the nominal pixel lacks, with evidence from experiments that were held out.
 
-    measurement, prior, epsilon: as of `diagnose`
+    measurement, prior: as of `diagnose`
     """
     began_s = perf_counter()
     on_progress("discovery: noise and nominal model")
     parts = [part for part in build_dataset(measurement).split_subsystems() if set(part.kinds) <= set(PIXEL_KINDS)]
     if not parts:
-        return PixelDiscovery((), (), NOTHING_SOUGHT, "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
-    problem, base = fit_nominal(parts[0], prior, epsilon)
+        return PixelDiscovery((), (), NOTHING_SOUGHT, "", 0.0, 0.0, {}, perf_counter() - began_s)
+    problem, base = fit_nominal(parts[0], prior)
     if has_replicate_excess(problem):
         # Before disturbances are subtracted: missed pulses would pass for hops of an instrument.
         found, errors = find_random_light(problem, base)
         if found:
             claimed = found[0].term.claim
-            return PixelDiscovery(found, (), claimed, OTHER_SIGNALS, *errors, {}, epsilon, perf_counter() - began_s)
+            return PixelDiscovery(found, (), claimed, OTHER_SIGNALS, *errors, {}, perf_counter() - began_s)
     # A large effect shifts the sensitivities to jitters, and repeats then differ too; held-out experiments judge it.
     problem, base, disturbances = _subtract_disturbances(problem, base)
     records = build_records(problem, base)
     if len(records) < MIN_EXPERIMENTS:
-        return PixelDiscovery((), disturbances, NOTHING_SOUGHT, "", 0.0, 0.0, {}, epsilon, perf_counter() - began_s)
+        return PixelDiscovery((), disturbances, NOTHING_SOUGHT, "", 0.0, 0.0, {}, perf_counter() - began_s)
     measured = [name for name, kind in zip(OUTPUTS, PIXEL_KINDS, strict=True) if kind in problem.data.kinds]
     answer = discover(
         build_model(np.exp(np.array(base.point.base)).tolist(), measured),
@@ -65,7 +64,6 @@ def discover_in_pixel(
         answer.base_rmse,
         answer.extended_rmse,
         answer.parameters,
-        epsilon,
         perf_counter() - began_s,
     )
 
@@ -74,11 +72,11 @@ def _subtract_disturbances(
     problem: FitProblem, base: ModelFit
 ) -> tuple[FitProblem, ModelFit, tuple[InstrumentDisturbance, ...]]:
     """Return noise and nominal fit without disturbances of the instruments, and these."""
-    data, epsilon = problem.data, problem.epsilon
-    sensitivity = compute_jitter_sensitivity(data, base.point, epsilon, base.prediction)
+    data = problem.data
+    sensitivity = compute_jitter_sensitivity(data, base.point, base.prediction)
     disturbances, added = find_disturbances(data, data.value - base.prediction, sensitivity, problem.noise)
     if disturbances:
-        problem, base = fit_nominal(remove_disturbances(data, added), problem.prior, epsilon)
+        problem, base = fit_nominal(remove_disturbances(data, added), problem.prior)
     return problem, base, disturbances
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.prediction import EPSILON
 from optodrive.lab.discovery import Record
 from optodrive.lab.pixel_discovery.record_noise import BinnedSignal, build_whitening
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
@@ -59,7 +60,7 @@ def build_records(problem: FitProblem, base: ModelFit) -> list[Record]:
         run = data.blocks[max(numbers)].run
         if len(experiment.pulses) and (experiment.pulses[:, 3] == experiment.pixel).all():
             experiments.setdefault((data.runs[run].group, experiment.pixel), []).append((experiment, numbers))
-    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    sensitivity = compute_jitter_sensitivity(data, base.point, base.prediction)
     columns = np.column_stack([data.value - base.prediction, sensitivity.power, sensitivity.timing])
     return [
         replace(_build_record(repeats, problem, base, columns), name=name) for (name, _), repeats in experiments.items()
@@ -75,10 +76,10 @@ def _build_record(repeats: Repeats, problem: FitProblem, base: ModelFit, columns
     blocks = [[data.blocks[numbers[kind]] for _, numbers in repeats if numbers[kind] >= 0] for kind in PIXEL_KINDS]
     samples_s = [np.sort(np.concatenate([block.t_s for block in own] or [np.zeros(0)])) for own in blocks]
     finest_s = min(float(np.median(np.diff(block.t_s))) for own in blocks for block in own)
-    grid = _build_grid(first, problem.epsilon, samples_s, max(MIN_BIN_S, finest_s))
+    grid = _build_grid(first, samples_s, max(MIN_BIN_S, finest_s))
     nominal = simulate_signals(
         PixelExperiment(first.pulses, first.pixel, first.ambient_k, (grid.t_s,) * 3, full_w=first.full_w),
-        base.point.pixel(problem.epsilon),
+        base.point.pixel(),
         ActiveTerms.from_values(base.point.terms),
     )
     outputs = np.full((len(grid.t_s), len(PIXEL_KINDS)), np.nan)
@@ -100,26 +101,22 @@ def _build_record(repeats: Repeats, problem: FitProblem, base: ModelFit, columns
     return Record(grid.t_s, grid.inputs, outputs, build_whitening(signals, problem.noise))
 
 
-def _build_grid(
-    experiment: PixelExperiment, epsilon: float, samples_s: Sequence[FloatArray], first_bin_s: float
-) -> _Grid:
+def _build_grid(experiment: PixelExperiment, samples_s: Sequence[FloatArray], first_bin_s: float) -> _Grid:
     """Return the grid of an experiment, for sorted sample times of each kind of signal."""
     kept = 1
     while True:
-        grid = _divide(experiment, epsilon, samples_s, first_bin_s, kept)
+        grid = _divide(experiment, samples_s, first_bin_s, kept)
         if len(grid.t_s) <= MAX_SAMPLES or kept > len(experiment.pulses):
             return grid
         kept *= 2
 
 
-def _divide(
-    experiment: PixelExperiment, epsilon: float, samples_s: Sequence[FloatArray], first_bin_s: float, kept: int
-) -> _Grid:
+def _divide(experiment: PixelExperiment, samples_s: Sequence[FloatArray], first_bin_s: float, kept: int) -> _Grid:
     """Return the grid with the bins of the first pulses and of one in `kept` later ones."""
     rows, bins = list[tuple[float, ...]](), list[tuple[float, float, list[int]]]()
     gates = [(0.0, 0.0, 0.0)]  # begin, light, light of the pulse before
     for start_s, width_s, power_w, _ in experiment.pulses.tolist():
-        gates += [(start_s, epsilon * power_w, 0.0), (start_s + width_s, 0.0, epsilon * power_w)]
+        gates += [(start_s, EPSILON * power_w, 0.0), (start_s + width_s, 0.0, EPSILON * power_w)]
     for number, (begin_s, light_w, after_w) in enumerate(gates):
         is_last, pulse = number + 1 == len(gates), (number - 1) // 2
         end_s = max(float(t_s[-1]) for t_s in samples_s if len(t_s)) + 1e-6 if is_last else gates[number + 1][0]

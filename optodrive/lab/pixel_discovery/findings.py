@@ -44,7 +44,7 @@ class PixelDiscovery:
 
     disturbances: of the instruments, subtracted before all else; claim: of all terms; judged_by: what no fit has seen,
     empty if nothing was sought; error_before, error_after: root mean square errors of the nominal and the extended
-    pixel there, in units of the noise; parameters: of the extended pixel, SI; epsilon: absorptance that they hold for
+    pixel there, in units of the noise; parameters: of the extended pixel, SI
     """
 
     findings: tuple[PixelFinding, ...]
@@ -54,5 +54,4 @@ class PixelDiscovery:
     error_before: float
     error_after: float
     parameters: dict[str, float]
-    epsilon: float
     elapsed_s: float

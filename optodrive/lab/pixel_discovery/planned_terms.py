@@ -7,6 +7,7 @@ from pydantic import ValidationError
 
 from optodrive.core.toml_model import build_input_error
 from optodrive.core.types.arrays import FloatArray
+from optodrive.lab.diagnosis.prediction import EPSILON
 from optodrive.lab.discovery import Curve
 from optodrive.lab.pixel_discovery.findings import PixelDiscovery, PixelFinding
 from optodrive.lab.pixel_discovery.pixel_model import AFTER, LIGHT
@@ -48,7 +49,7 @@ def build_planned_terms(discovery: PixelDiscovery) -> PlannedTerms:
             refused.append(f"{finding.term.chosen.formula} acts on a pixel without light")
         else:
             try:
-                terms.append(_build_term(finding, finding.curve, discovery.parameters, discovery.epsilon))
+                terms.append(_build_term(finding, finding.curve, discovery.parameters))
             except ValidationError as error:
                 refused.append(str(build_input_error(error, finding.term.chosen.formula)))
     return PlannedTerms(base, tuple(terms), tuple(refused))
@@ -63,7 +64,7 @@ def _acts_when_cold(finding: PixelFinding, curve: Curve) -> bool:
     )
 
 
-def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float], epsilon: float) -> DiscoveredTerm:
+def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float]) -> DiscoveredTerm:
     """Return the function of one finding.
 
     Rates of the absorber become heat flows by its capacity, absorbed light becomes incident light.
@@ -86,7 +87,7 @@ def _build_term(finding: PixelFinding, curve: Curve, parameters: dict[str, float
         elif factor == [LIGHT]:
             where = "light"
         elif variable == LIGHT:
-            where, depends_on, low, high, capacity = "light", "power", low / epsilon, high / epsilon, capacity / epsilon
+            where, depends_on, low, high, capacity = "light", "power", low / EPSILON, high / EPSILON, capacity / EPSILON
         values = values * capacity
     if where == "light" and depends_on != "power":
         values = np.maximum(values, -1.0)  # darkness

@@ -82,7 +82,7 @@ def _fit_powers(
     judged = [kind for kind in PIXEL_KINDS[1:] if numbers[kind] >= 0]
     if numbers[0] < 0 or not judged:
         return None
-    data, pixel = problem.data, base.point.pixel(problem.epsilon)
+    data, pixel = problem.data, base.point.pixel()
     slices = slice_pulses(experiment.pulses, SLICE_S)
     nothing = ActiveTerms.from_values({})
     parts = [simulate_signals(replace(experiment, pulses=part[None, :]), pixel, nothing) for part in slices]

@@ -41,9 +41,9 @@ def record(folder, key, values):
 @pytest.mark.parametrize(("key", "values"), TRUTHS)
 def test_a_fit_of_the_true_cause_is_no_worse_than_the_truth(key, values, tmp_path):
     measurement = record(tmp_path, key, values)
-    prior, epsilon, _ = build_prior(measurement, None)
+    prior, _ = build_prior(measurement, None)
     (data,) = build_dataset(measurement).split_subsystems()
-    problem, base = fit_nominal(data, prior, epsilon)
+    problem, base = fit_nominal(data, prior)
     hypotheses = build_hypotheses(data)
     (own,) = (item for item in hypotheses if item.key == key)
     (candidate,) = refit_strongest(problem, base, (), detect(problem, base, [own]), SearchLog())

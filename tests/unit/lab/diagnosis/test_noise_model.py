@@ -101,7 +101,7 @@ def test_without_repeats_the_noise_is_a_guess():
 def test_noise_and_jitter_never_exceed_what_repeats_show(terms, repeats):
     data = build_dataset(lab(6, terms, repeats=repeats))
     problem, base = fit_nominal(data)
-    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    sensitivity = compute_jitter_sensitivity(data, base.point, base.prediction)
     contrasts = compute_contrasts(data, data.value - base.prediction, sensitivity.power, sensitivity.timing)
     noise, powers = problem.noise, []
     for kind in data.kinds:
