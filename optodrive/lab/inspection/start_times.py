@@ -9,12 +9,13 @@ recording; where they leave both orders open and the differences depend on it, t
 
 import itertools
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from datetime import UTC, datetime, tzinfo
+from typing import ClassVar
 from zoneinfo import ZoneInfo
 
 import numpy as np
+from dateutil.parser import parse, parserinfo
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import DataFinding, Run
@@ -23,12 +24,21 @@ ATTRIBUTE, ZONE_ATTRIBUTES = "started_at", ("timezone", "time_zone", "tz")
 KIND = "started_at"
 ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2, "BST": 1, "EST": -5, "EDT": -4}
 ZONES_H |= {"PST": -8, "PDT": -7, "JST": 9, "KST": 9}
-MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-GERMAN_MONTHS = {"mär": 3, "mrz": 3, "mai": 5, "okt": 10, "dez": 12}
-NUMERIC = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:[ ,T_]+(.*))?")
-COMPACT = re.compile(r"(\d{4})(\d\d)(\d\d)[ T_-]?(\d\d)(\d\d)(\d\d(?:[.,]\d+)?)(.*)")
-CLOCK = re.compile(r"(\d{1,2})[:.h](\d\d)(?:[:.](\d\d(?:[.,]\d+)?))?\s*([AaPp]\.?[Mm]\.?)?\s*(.*)")
-OFFSET = re.compile(r"(?:UTC|GMT)?([+-])(\d\d):?(\d\d)?")
+
+
+class _Info(parserinfo):
+    """Names of months, with the German ones."""
+
+    MONTHS: ClassVar = [
+        *[("Jan", "January", "Januar"), ("Feb", "February", "Februar"), ("Mar", "March", "Mär", "März", "Mrz")],
+        *[("Apr", "April"), ("May", "Mai"), ("Jun", "June", "Juni"), ("Jul", "July", "Juli"), ("Aug", "August")],
+        *[("Sep", "Sept", "September"), ("Oct", "October", "Okt", "Oktober"), ("Nov", "November")],
+        ("Dec", "December", "Dez", "Dezember"),
+    ]
+
+
+INFO = _Info()
+DOTTED_CLOCK = re.compile(r"(?<= )\d{1,2}\.\d\d(?:\.\d\d)?$")
 EPOCHS = (
     (1e8, 3.2e9, 1.0, 0.0, "Unix time in s"),
     (3.2e9, 4.6e9, 1.0, -2_082_844_800.0, "seconds since 1904"),
@@ -206,118 +216,53 @@ def _read_numbers(runs: tuple[Run, ...], values: FloatArray) -> StartTimes:
 
 
 def _parse_stamp(text: str) -> _Stamp | None:
-    text = " ".join(text.strip().strip('"').split())
-    for parse in (_parse_iso, _parse_numeric, _parse_named, _parse_compact, _parse_clock_alone):
-        stamp = _try(parse, text)
-        if stamp is not None:
-            return stamp
-    return None
-
-
-def _try(parse: Callable[[str], _Stamp | None], text: str) -> _Stamp | None:
+    """Return a date and time, or a time of the day alone, None for anything else."""
+    text = " ".join(re.sub(r'[_"()\[\]]', " ", text).split())
+    text = DOTTED_CLOCK.sub(lambda match: match[0].replace(".", ":"), re.sub(r"(?:UTC|GMT)(?=[+-])", "", text))
+    named = re.search(r"[A-Za-z]+/[\w/+-]+$", text)
     try:
-        return parse(text)
-    except (ValueError, OverflowError, KeyError, OSError):
+        return _parse(text, None) if named is None else _parse(text[: named.start()], ZoneInfo(named[0]))
+    except (ValueError, OverflowError, KeyError, OSError, TypeError):  # the last one for some texts of no meaning
         return None
 
 
-def _parse_iso(text: str) -> _Stamp | None:
-    if not re.match(r"\d{4}-?\d\d-?\d\d", text):
-        return None
-    bracket = re.fullmatch(r"(.*)\[(.+)\]", text)
-    zone = None if bracket is None else ZoneInfo(bracket[2])
-    when = datetime.fromisoformat((text if bracket is None else bracket[1]).replace(" +", "+"))
-    return _Stamp(when.replace(tzinfo=None), when.tzinfo or zone, has_seconds=text.count(":") > 1 or ":" not in text)
+def _parse(text: str, zone: tzinfo | None) -> _Stamp:
+    when, has_date, has_seconds = _complete(text, day_first=not text[:4].isdigit())
+    zone, when = when.tzinfo or zone, when.replace(tzinfo=None)
+    numeric = re.match(r"(\d{1,2})([./-])(\d{1,2})\2", text)
+    if numeric is None or numeric[2] == ".":  # written with points, the day comes first everywhere
+        return _Stamp(when, zone, None, None if numeric is None else True, has_seconds, has_date)
+    first, second = int(numeric[1]), int(numeric[3])
+    if max(first, second) > 12:
+        return _Stamp(when, zone, None, first > 12, has_seconds, has_date)
+    swapped = _complete(text, day_first=False)[0].replace(tzinfo=None)
+    return _Stamp(when, zone, swapped, None, has_seconds, has_date)
 
 
-def _parse_numeric(text: str) -> _Stamp | None:
-    match = NUMERIC.fullmatch(text)
-    if match is None:
-        return None
-    first, third = int(match[1]), int(match[4])
-    middle = int(match[3])
-    clock, zone, has_seconds = _parse_clock(match[5] or "0:00:00")
-    if len(match[1]) == 4:
-        return _Stamp(datetime(first, middle, third) + clock, zone, has_seconds=has_seconds)
-    year = third + 2000 if len(match[4]) <= 2 else third
-    if match[2] == ".":  # written with points, the day comes first everywhere
-        return _Stamp(datetime(year, middle, first) + clock, zone, is_day_first=True, has_seconds=has_seconds)
-    if first > 12 or middle > 12:
-        day, month = (first, middle) if first > 12 else (middle, first)
-        return _Stamp(datetime(year, month, day) + clock, zone, None, first > 12, has_seconds)
-    swapped = datetime(year, first, middle) + clock
-    return _Stamp(datetime(year, middle, first) + clock, zone, swapped, None, has_seconds)
+def _complete(text: str, day_first: bool) -> tuple[datetime, bool, bool]:
+    """Return a time, and whether its date and its seconds are written, which differ with what stands for them if not.
 
-
-def _parse_named(text: str) -> _Stamp | None:
-    """Read a date with the name of its month: 28 Nov 2026 10:03, Nov 28, 2026 3:04 PM, Sat Nov 28 10:03:05 2026."""
-    month = next((number for word in re.findall(r"[^\W\d_]+", text) if (number := _find_month(word))), None)
-    clock = re.search(r"\d{1,2}:\d\d.*", text)
-    if month is None:
-        return None
-    before = text if clock is None else text[: clock.start()]
-    tail = "0:00:00" if clock is None else clock[0]
-    year = re.search(r"(?:19|20)\d\d", before) or re.search(r"(?:19|20)\d\d$", tail)
-    if year is None:
-        return None
-    tail = tail.removesuffix(year[0]) if year.string is tail else tail
-    day = re.search(r"(?<!\d)\d{1,2}(?!\d)", before)
-    if day is None:
-        return None
-    span, zone, has_seconds = _parse_clock(tail.strip())
-    return _Stamp(datetime(int(year[0]), month, int(day[0])) + span, zone, has_seconds=has_seconds)
-
-
-def _find_month(word: str) -> int | None:
-    key = word.lower()[:3]
-    return MONTHS.index(key) + 1 if key in MONTHS else GERMAN_MONTHS.get(key)
-
-
-def _parse_compact(text: str) -> _Stamp | None:
-    match = COMPACT.fullmatch(text)
-    if match is None:
-        return None
-    clock, zone, _ = _parse_clock(f"{match[4]}:{match[5]}:{match[6]} {match[7]}".strip())
-    return _Stamp(datetime(int(match[1]), int(match[2]), int(match[3])) + clock, zone)
-
-
-def _parse_clock_alone(text: str) -> _Stamp | None:
-    clock, zone, has_seconds = _parse_clock(text)
-    return _Stamp(datetime(2000, 1, 1) + clock, zone, has_seconds=has_seconds, has_date=False)
-
-
-def _parse_clock(text: str) -> tuple[timedelta, tzinfo | None, bool]:
-    """Return the time of day, the zone if any, and whether seconds are stated. Raise ValueError for anything else."""
-    match = CLOCK.fullmatch(text.strip())
-    if match is None:
+    Raises ValueError where only a part of the date is written.
+    """
+    first, second = (
+        parse(text, INFO, dayfirst=day_first, default=missing, tzinfos=_find_offset)
+        for missing in (datetime(2000, 1, 1), datetime(2001, 2, 2, 1, 1, 1))
+    )
+    is_written = [getattr(first, name) == getattr(second, name) for name in ("year", "month", "day")]
+    if any(is_written) and not all(is_written):
         raise ValueError(text)
-    hour, minute, second = int(match[1]), int(match[2]), float((match[3] or "0").replace(",", "."))
-    if match[4]:
-        if not 1 <= hour <= 12:
-            raise ValueError(text)
-        hour = hour % 12 + (12 if match[4][0] in "Pp" else 0)
-    if hour > 23 or minute > 59 or second >= 61.0:
+    if not any(is_written) and first.hour != second.hour:
         raise ValueError(text)
-    return timedelta(hours=hour, minutes=minute, seconds=second), _parse_zone(match[5].strip()), match[3] is not None
+    return first, all(is_written), first.second == second.second or first.hour != second.hour
 
 
-def _parse_zone(text: str) -> tzinfo | None:
-    text = text.strip("()[] ")
-    if not text:
-        return None
-    if text.upper() in ZONES_H:
-        return timezone(timedelta(hours=ZONES_H[text.upper()]))
-    offset = OFFSET.fullmatch(text)
-    if offset is not None:
-        span = timedelta(hours=int(offset[2]), minutes=int(offset[3] or 0))
-        return timezone(span if offset[1] == "+" else -span)
-    return ZoneInfo(text)  # raises KeyError or ValueError for what is none
+def _find_offset(name: str | None, offset_s: int | None) -> int | None:
+    """Return the seconds by which a zone is ahead of UTC, None without one. Raises KeyError for an unknown name."""
+    return ZONES_H[name.upper()] * 3600 if offset_s is None and name is not None else offset_s
 
 
 def _find_zone(run: Run) -> tzinfo | None:
     """Return the zone that a run states beside its start."""
     stated = next((str(run.attributes[name]) for name in ZONE_ATTRIBUTES if name in run.attributes), "")
-    try:
-        return _parse_zone(stated)
-    except (ValueError, KeyError, OSError):
-        return None
+    stamp = _parse_stamp(f"2000-01-01 0:00:00 {stated}")
+    return None if stamp is None else stamp.zone
