@@ -78,7 +78,7 @@ def diagnose_recording(path: Path) -> dict[str, Any]:
     """Return the answer that `optodrive diagnose` gives."""
     from optodrive.lab.diagnosis.diagnose import diagnose
     from optodrive.lab.diagnosis.narrative import build_answer
-    from optodrive.lab.diagnosis.priors import build_prior
+    from optodrive.lab.diagnosis.nominal_fit import build_prior
     from optodrive.lab.recording import read_recording
 
     measurement = read_recording(path)

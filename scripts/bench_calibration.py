@@ -106,7 +106,7 @@ def diagnose_recording(path: Path) -> dict[str, str]:
     """Return the columns of the table that the diagnosis fills."""
     from optodrive.lab.diagnosis.dataset import build_dataset, build_hypotheses
     from optodrive.lab.diagnosis.diagnose import diagnose
-    from optodrive.lab.diagnosis.priors import build_prior
+    from optodrive.lab.diagnosis.nominal_fit import build_prior
     from optodrive.lab.recording import read_recording
 
     measurement = read_recording(path)

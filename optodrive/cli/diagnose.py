@@ -178,7 +178,7 @@ def _diagnose_jointly(
     """Diagnose one pixel, or a few pixels with common parameters, and seek a term where no known cause explains all."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
     from optodrive.lab.diagnosis.next_steps import OUT
-    from optodrive.lab.diagnosis.priors import build_prior
+    from optodrive.lab.diagnosis.nominal_fit import build_prior
 
     measurement, paths = _read_recordings(recordings), [str(path) for path in recordings]
     prior, width_m = build_prior(measurement, config)
@@ -187,7 +187,7 @@ def _diagnose_jointly(
         diagnosis = study(measurement, seed, prior, on_progress, use=use)
         discovery = None
         if discovers or diagnosis.verdict == "unexplained":
-            from optodrive.lab.diagnosis.search_log import SearchLog
+            from optodrive.lab.diagnosis.detection import SearchLog
             from optodrive.lab.inspection.inspection import inspect_recording
             from optodrive.lab.pixel_discovery import discover_in_pixel
 
@@ -209,8 +209,7 @@ def _build_output(
     discovery: "PixelDiscovery | None" = None,
 ) -> _DiagnosisOutput:
     from optodrive.core.document import Section
-    from optodrive.lab.diagnosis.model_file import build_model_toml
-    from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+    from optodrive.lab.diagnosis.narrative import build_answer, build_model_toml, build_narrative
     from optodrive.lab.diagnosis.report import build_report
     from optodrive.lab.pixel_discovery import narrative
     from optodrive.lab.pixel_discovery.planned_terms import build_planned_terms
@@ -253,7 +252,7 @@ def _diagnose_per_pixel(
         build_display_narrative,
         build_display_report,
     )
-    from optodrive.lab.diagnosis.model_file import build_model_toml
+    from optodrive.lab.diagnosis.narrative import build_model_toml
 
     announce_compilation()
     diagnosis = diagnose_display(runs, seed, config, dask, workers, use)

@@ -49,7 +49,7 @@ class LiveRequest(NamedTuple):
 def study_runs(measurement: "Measurement", config: "Config", seed: int) -> "Discrepancy":
     """Diagnose all runs of a campaign. Nothing is held out of so few."""
     from optodrive.lab.diagnosis.diagnose import diagnose
-    from optodrive.lab.diagnosis.priors import build_prior
+    from optodrive.lab.diagnosis.nominal_fit import build_prior
 
     prior, _ = build_prior(measurement, config)
     return diagnose(measurement, seed, prior, hold_out=False)

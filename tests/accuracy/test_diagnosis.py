@@ -16,20 +16,17 @@ from optodrive.core.provenance import Provenance
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dataset import build_dataset, build_hypotheses
-from optodrive.lab.diagnosis.detection import detect
+from optodrive.lab.diagnosis.detection import SearchLog, detect
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.fitting import fit
-from optodrive.lab.diagnosis.held_out_gain import split_runs
-from optodrive.lab.diagnosis.model_file import build_model_toml
+from optodrive.lab.diagnosis.model_comparison import split_runs
 from optodrive.lab.diagnosis.model_selection import compare_from_single_causes
-from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
-from optodrive.lab.diagnosis.nominal_fit import fit_nominal
+from optodrive.lab.diagnosis.narrative import build_answer, build_model_toml, build_narrative
+from optodrive.lab.diagnosis.nominal_fit import build_prior, fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import assign_bins
 from optodrive.lab.diagnosis.prediction import ParameterPoint
-from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.diagnosis.refitting import RefittedCandidate
 from optodrive.lab.diagnosis.report import build_report
-from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.inference.claim import claim
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.terms import discover_terms

@@ -18,8 +18,7 @@ from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer
 from optodrive.lab.diagnosis.display_report import build_display_answer, build_display_narrative, build_headline
 from optodrive.lab.diagnosis.estimates import describe_doubts
-from optodrive.lab.diagnosis.model_file import build_model_toml
-from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+from optodrive.lab.diagnosis.narrative import build_answer, build_model_toml, build_narrative
 from optodrive.lab.diagnosis.next_steps import list_next_steps
 from optodrive.lab.diagnosis.report import build_report
 from optodrive.physics.hypothesis import RecordingScope

@@ -12,7 +12,7 @@ from blind_causes import CATALOGUE
 from blind_lab import draw_case
 from blind_score import BASE, wilson
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.nominal_fit import build_prior
 from optodrive.lab.recording import read_recording
 
 DEVELOPMENT_SEEDS = (9_500_001, 9_500_002)

@@ -11,7 +11,7 @@ from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
-from optodrive.lab.diagnosis.model_file import build_model_toml
+from optodrive.lab.diagnosis.narrative import build_model_toml
 from optodrive.lab.recording import write_recording
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.planning.display_model import DisplayModel

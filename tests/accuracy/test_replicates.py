@@ -11,13 +11,19 @@ from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.lab.diagnosis import model_selection
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
-from optodrive.lab.diagnosis.evidence import compute_bin_evidence, temper
+from optodrive.lab.diagnosis.estimates import compute_discrepancy_basis
+from optodrive.lab.diagnosis.evidence import (
+    KNOWN_DEGREES,
+    MAX_DEGREES,
+    NoiseCertainty,
+    compute_bin_evidence,
+    count_noise_degrees,
+    temper,
+)
 from optodrive.lab.diagnosis.fitting import compute_jitter_sensitivity, fit
-from optodrive.lab.diagnosis.held_out_gain import split_runs
+from optodrive.lab.diagnosis.model_comparison import split_runs
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.next_steps import propose_experiment
-from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES, MAX_DEGREES, NoiseCertainty, count_noise_degrees
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import assign_bins, compute_omnibus

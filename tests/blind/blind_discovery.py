@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from blind_lab import Case
 from blind_score import wilson
-from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.nominal_fit import build_prior
 from optodrive.lab.pixel_discovery import discover_in_pixel
 from optodrive.lab.recording import read_recording
 

@@ -170,7 +170,7 @@ def diagnose_quickly(path: Path) -> Said:
     from optodrive.core.errors import OptodriveError
     from optodrive.lab.diagnosis.diagnose import diagnose as study
     from optodrive.lab.diagnosis.narrative import build_answer
-    from optodrive.lab.diagnosis.priors import build_prior
+    from optodrive.lab.diagnosis.nominal_fit import build_prior
     from optodrive.lab.recording import read_recording
 
     began = time.monotonic()

@@ -15,8 +15,8 @@ from optodrive.core.quantity import ZERO_CELSIUS_K
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.model_file import build_model_toml
-from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.narrative import build_model_toml
+from optodrive.lab.diagnosis.nominal_fit import build_prior
 from optodrive.lab.pixel_discovery import discover_in_pixel
 from optodrive.lab.pixel_discovery.planned_terms import build_planned_terms
 from optodrive.lab.recording import read_recording

@@ -14,7 +14,7 @@ import pytest
 from blind_lab import draw_case
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.narrative import build_answer
-from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.nominal_fit import build_prior
 from optodrive.lab.recording import read_recording
 
 

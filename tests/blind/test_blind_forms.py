@@ -5,7 +5,7 @@ import pytest
 from blind_strength import draw_case_of_strength
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
-from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.nominal_fit import build_prior
 from optodrive.lab.recording import read_recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]

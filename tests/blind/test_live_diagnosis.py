@@ -13,7 +13,7 @@ from blind_lab import Case, draw_case
 from blind_session import MAX_ABSORBER_K
 from optodrive.core.types.discrepancy import Discrepancy
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.nominal_fit import build_prior
 from optodrive.lab.live_diagnosis import CampaignRecording, CampaignResult, run_campaign
 from optodrive.lab.recording import read_recording
 

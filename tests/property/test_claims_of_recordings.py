@@ -20,7 +20,7 @@ from optodrive.core.errors import OptodriveError
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
-from optodrive.lab.diagnosis.priors import build_prior
+from optodrive.lab.diagnosis.nominal_fit import build_prior
 from optodrive.lab.recording import read_recording
 
 FAULTS_MAX, GROUPS_MAX, REPEATS_MAX = 4, 5, 3

@@ -10,9 +10,8 @@ from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.diagnosis import candidate_judgement
 from optodrive.lab.diagnosis.candidate_judgement import NOISE_CHI2, judge_candidates
 from optodrive.lab.diagnosis.detection import Detection, Score
-from optodrive.lab.diagnosis.evidence import Explanation, compute_probabilities, compute_score_evidence
+from optodrive.lab.diagnosis.evidence import KNOWN_DEGREES, Explanation, compute_probabilities, compute_score_evidence
 from optodrive.lab.diagnosis.model_selection import Selection
-from optodrive.lab.diagnosis.noise_certainty import KNOWN_DEGREES
 from optodrive.lab.inference.claim import Claim
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms

@@ -1,14 +1,17 @@
 """Detection of model errors: a score per hypothesis and an omnibus test over bins, both under the noise model.
 
 Each start of a hypothesis is a column beside the base fit, at a finite size; its likelihood ratio follows from one
-matrix of all columns.
+matrix of all columns. The log notes what cannot be computed.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
-from optodrive.core.errors import OptodriveError
+from optodrive.core.errors import DivergedError, OptodriveError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.evidence import compute_form_evidence
 from optodrive.lab.diagnosis.fitting import (
@@ -23,9 +26,44 @@ from optodrive.lab.diagnosis.fitting import (
 )
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict, record
-from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE, SearchLog
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
+
+T = TypeVar("T")
+UNCOMPUTABLE = (DivergedError, LinAlgError, FloatingPointError, ZeroDivisionError)
+"""Errors of a hypothesis that cannot be computed."""
+
+ProgressCallback = Callable[[str], None]
+
+
+def ignore_progress(stage: str) -> None:
+    """Report no progress."""
+
+
+@dataclass(frozen=True)
+class SearchLog:
+    """Log of a search.
+
+    failures: why a hypothesis could not be computed, by its label; omissions: why a step was left out that the verdict
+    does not need, by its name
+    """
+
+    on_progress: ProgressCallback = ignore_progress
+    failures: dict[str, str] = field(default_factory=dict)
+    omissions: dict[str, str] = field(default_factory=dict)
+
+    def add_failure(self, label: str, error: Exception) -> None:
+        """Note that a hypothesis could not be computed. Its first error is kept."""
+        self.failures.setdefault(label, str(error))
+
+    def attempt(self, step: str, function: Callable[..., T], default: T, *arguments: Any) -> T:
+        """Return the result of a step that the verdict does not need, or the default and a note if it fails."""
+        try:
+            return function(*arguments)
+        except Exception as error:
+            self.omissions.setdefault(step, f"{type(error).__name__}: {error}".splitlines()[0])
+            return default
+
 
 ROUNDING_FRACTION = 1e-12
 """An effect with a smaller share orthogonal to the fitted parameters is known only by rounding errors, and unseen."""

@@ -24,9 +24,9 @@ from optodrive.core.types.discrepancy import (
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.candidate_judgement import judge_candidates, list_rivals
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset, build_hypotheses
-from optodrive.lab.diagnosis.detection import detect
-from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
+from optodrive.lab.diagnosis.detection import ProgressCallback, SearchLog, detect, ignore_progress
 from optodrive.lab.diagnosis.estimates import (
+    compute_covariance,
     compute_estimates,
     describe_doubts,
     describe_limits,
@@ -40,18 +40,19 @@ from optodrive.lab.diagnosis.fitting import (
     compute_jitter_sensitivity,
     fit,
 )
-from optodrive.lab.diagnosis.held_out_gain import (
-    compute_held_out_changes,
-    compute_held_out_errors,
-    compute_held_out_gain,
-    split_runs,
-)
 from optodrive.lab.diagnosis.instrument_disturbances import (
     find_dc_coupled,
     find_disturbances,
     remove_disturbances,
 )
-from optodrive.lab.diagnosis.model_comparison import ModelComparison, compute_height_error
+from optodrive.lab.diagnosis.model_comparison import (
+    ModelComparison,
+    compute_height_error,
+    compute_held_out_changes,
+    compute_held_out_errors,
+    compute_held_out_gain,
+    split_runs,
+)
 from optodrive.lab.diagnosis.model_selection import (
     MAX_INTRA_PULSE_POWER_EXCESS,
     MAX_REPLICATE_EXCESS,
@@ -60,12 +61,10 @@ from optodrive.lab.diagnosis.model_selection import (
     has_replicate_excess,
 )
 from optodrive.lab.diagnosis.next_steps import propose_for_verdict
-from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, fit_nominal, update_noise
-from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
+from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, compute_intra_pulse_power_excess, fit_nominal, update_noise
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.lab.diagnosis.recording_checks import check_copied_runs, check_numeric_limits, check_recording_units
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
-from optodrive.lab.diagnosis.search_log import ProgressCallback, SearchLog, ignore_progress
 from optodrive.lab.inference.claim import HeldOutChange, claim, combine_claims
 from optodrive.lab.inspection.inspection import inspect_recording
 from optodrive.physics.hypothesis import Hypothesis

@@ -11,7 +11,7 @@ from optodrive.core.types.measurements import Measurement
 from optodrive.device.config import Config
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, whiten
-from optodrive.lab.diagnosis.priors import DEFAULT_PARAMETER_SET, build_prior
+from optodrive.lab.diagnosis.nominal_fit import DEFAULT_PARAMETER_SET, build_prior
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 

@@ -26,8 +26,8 @@ from math import log, log1p, prod
 import numpy as np
 
 from optodrive.core.types.discrepancy import Probabilities
-from optodrive.lab.diagnosis.detection import Detection, detect, score_effects, simulate_effects
-from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
+from optodrive.lab.diagnosis.detection import Detection, SearchLog, detect, score_effects, simulate_effects
+from optodrive.lab.diagnosis.estimates import compute_discrepancy_basis
 from optodrive.lab.diagnosis.evidence import (
     FORM_REST,
     MAX_FORM_PROBABILITY,
@@ -38,17 +38,17 @@ from optodrive.lab.diagnosis.evidence import (
     PRIOR_ONE_CAUSE,
     PRIOR_TWO_CAUSES,
     Explanation,
+    NoiseCertainty,
     compute_hidden_share,
     compute_log_evidence,
     compute_own_share,
     compute_probabilities,
     compute_score_evidence,
+    count_noise_degrees,
 )
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
-from optodrive.lab.diagnosis.noise_certainty import NoiseCertainty, count_noise_degrees
 from optodrive.lab.diagnosis.prediction import predict
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
-from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.inference.claim import UNJUDGED, Alternative, Claim, Evidence, HeldOutChange
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms

@@ -17,6 +17,7 @@ from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import Discrepancy, NextExperiment
 from optodrive.lab.diagnosis.dataset import NEVER_S, PIXEL_KINDS, SIGNALS, Dataset, RunInfo, Samples, assemble_dataset
+from optodrive.lab.diagnosis.detection import ProgressCallback
 from optodrive.lab.diagnosis.fitting import (
     FitProblem,
     ModelFit,
@@ -28,7 +29,6 @@ from optodrive.lab.diagnosis.fitting import (
 from optodrive.lab.diagnosis.model_selection import Selection
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.prediction import predict
-from optodrive.lab.diagnosis.search_log import ProgressCallback
 from optodrive.physics.pixel_ode import PixelExperiment
 from optodrive.physics.terms import discover_terms
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.lab.diagnosis.detection import Detection, Score, detect
+from optodrive.lab.diagnosis.detection import UNCOMPUTABLE, Detection, Score, SearchLog, detect
 from optodrive.lab.diagnosis.evidence import compute_log_evidence
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_normal_equations, fit
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
-from optodrive.lab.diagnosis.search_log import UNCOMPUTABLE, SearchLog
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
 CHI2_ABANDON = 300.0

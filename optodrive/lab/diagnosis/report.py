@@ -16,9 +16,9 @@ from optodrive.core.quantity import format_number, format_quantity
 from optodrive.core.svg_plot import Axis, Series, draw_plot
 from optodrive.core.types.discrepancy import Discrepancy, ExampleTrace, Probabilities, ResidualTrace
 from optodrive.lab.diagnosis.candidate_judgement import DETECTABLE_RATIO
+from optodrive.lab.diagnosis.detection import SearchLog
 from optodrive.lab.diagnosis.narrative import build_narrative
 from optodrive.lab.diagnosis.next_steps import OUT, NextStep, list_next_steps
-from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.inference.claim import format_probability
 from optodrive.lab.inference.sentences import MIN_SHOWN
 from optodrive.lab.inspection.page import build_section

@@ -26,7 +26,7 @@ ZONES_H = {"Z": 0, "UTC": 0, "GMT": 0, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2,
 ZONES_H |= {"PST": -8, "PDT": -7, "JST": 9, "KST": 9}
 
 
-class _Info(parserinfo):
+class _Info(parserinfo):  # type: ignore[misc]  # dateutil states no types
     """Names of months, with the German ones."""
 
     MONTHS: ClassVar = [

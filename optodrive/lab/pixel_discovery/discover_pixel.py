@@ -7,11 +7,11 @@ import numpy as np
 from optodrive.core.types.discrepancy import InstrumentDisturbance
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, build_dataset
+from optodrive.lab.diagnosis.detection import ProgressCallback, ignore_progress
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances, remove_disturbances
 from optodrive.lab.diagnosis.model_selection import has_replicate_excess
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, fit_nominal
-from optodrive.lab.diagnosis.search_log import ProgressCallback, ignore_progress
 from optodrive.lab.discovery import discover
 from optodrive.lab.inference.claim import NOTHING_SOUGHT, TermForm
 from optodrive.lab.pixel_discovery.experiment_records import build_records

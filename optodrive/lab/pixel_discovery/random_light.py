@@ -14,7 +14,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit
-from optodrive.lab.diagnosis.power_fluctuation import slice_pulses
+from optodrive.lab.diagnosis.nominal_fit import slice_pulses
 from optodrive.lab.inference.claim import (
     MAX_NO_EFFECT,
     Alternative,

@@ -6,13 +6,11 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.lab.diagnosis.dataset import build_dataset, build_hypotheses
-from optodrive.lab.diagnosis.detection import detect
+from optodrive.lab.diagnosis.detection import SearchLog, detect
 from optodrive.lab.diagnosis.fitting import fit
-from optodrive.lab.diagnosis.nominal_fit import fit_nominal
+from optodrive.lab.diagnosis.nominal_fit import build_prior, fit_nominal
 from optodrive.lab.diagnosis.prediction import ParameterPoint
-from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.diagnosis.refitting import refit_strongest
-from optodrive.lab.diagnosis.search_log import SearchLog
 from optodrive.lab.recording import read_recording
 from truth_file import write_truth
 
