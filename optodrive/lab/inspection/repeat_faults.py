@@ -35,20 +35,50 @@ from optodrive.lab.inspection.work import (
     select_finite,
 )
 
-NOISIER, MIN_NOISE_RUNS = 4.0, 4
-"""Noise of a run relative to that of all runs from which the signal is left out, and number of runs that tell."""
-MAX_LOST, MAX_GAP, LOST_EXCESS, LOST_LEAVES, LOST_GAIN, LOST_CAP = 40, 2.5, 1.2, 0.6, 60.0, 30.0
-"""Largest number of lost samples; intervals without a sample that are a gap; squares of the difference of repeats, in
-variances, from which they are sought; share that remains with them, by how many variances less, and
-the most that one sample counts."""
-GAIN_DIFFERS, GAIN_SIGMAS, GAIN_SPREAD, MIN_GAIN_RUNS = 0.025, 7.0, 0.004, 6
-GAIN_BLOCK, OFF_SHARE = 15, 0.75
-"""Smallest deviation of a run's scale, relative; in standard errors; least spread of scales; number of other runs;
-samples in the means by which the colour of noise is told; deviation relative to the largest among its repeats."""
-SAME_PHASE, EDGE_SAMPLES, EDGE_S, REPEAT_SIGMAS, NEAR = 0.05, 4.0, 3e-3, 4.5, 8
-"""Distance of samples of repeats that are compared, in intervals; of an outlier from an edge of the drive, in intervals
-and s; its deviation from a repeat, and the number of samples on either side that judge it."""
-MAX_PASSES, MAX_REPEATS, MIN_SAMPLES = 3, 3, 24
+NOISIER = 4.0
+"""Noise of a run relative to that of all runs, and to its quietest repeat's, from which the signal is left out."""
+MIN_NOISE_RUNS = 4
+"""Number of runs that tell the usual noise."""
+MAX_LOST = 40
+"""Largest number of lost samples."""
+MAX_GAP = 2.5
+"""Intervals without a sample that are a gap."""
+LOST_EXCESS = 1.2
+"""Mean square of the difference of repeats, in variances, from which lost samples are sought."""
+LOST_LEAVES = 0.6
+"""Largest share of these squares that is left with lost samples."""
+LOST_GAIN = 60.0
+"""Variances by which the sum of these squares is less with lost samples."""
+LOST_CAP = 30.0
+"""Variances that one sample counts at most, so that no few samples decide."""
+GAIN_DIFFERS = 0.025
+"""Smallest deviation of a run's scale from its repeats', relative."""
+GAIN_SIGMAS = 7.0
+"""The same in standard errors."""
+GAIN_SPREAD = 0.004
+"""Least spread of scales, relative."""
+MIN_GAIN_RUNS = 6
+"""Number of other runs that tell what scale to expect."""
+GAIN_BLOCK = 15
+"""Samples in the means by which the colour of noise is told."""
+OFF_SHARE = 0.75
+"""Smallest deviation of a scale relative to the largest among its repeats."""
+SAME_PHASE = 0.05
+"""Distance of samples of repeats that are compared, in intervals."""
+EDGE_SAMPLES = 4.0
+"""Distance of an outlier from an edge of the drive, in intervals."""
+EDGE_S = 3e-3
+"""The same as a time."""
+REPEAT_SIGMAS = 4.5
+"""Deviation of an outlier from a repeat."""
+NEAR = 8
+"""Samples on either side that judge an outlier."""
+MAX_PASSES = 3
+"""Passes by which outliers beside outliers are found."""
+MAX_REPEATS = 3
+"""Repeats with which outliers are compared."""
+MIN_SAMPLES = 24
+"""Smallest number of samples of a signal that is judged."""
 
 
 def find_noisy(work: Work, name: str) -> Found:

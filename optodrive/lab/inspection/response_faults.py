@@ -32,32 +32,56 @@ TAUS_S = (0.003, 0.0045, 0.0065, 0.009, 0.013, 0.018, 0.026, 0.037, 0.052, 0.1)
 SECOND_S = 0.003
 """Second lag of all signals but the temperature."""
 TEMPERATURE = "absorber_temperature_K"
-SAMPLES_MAX, PULSES_MAX, MIN_SAMPLES = 300, 60, 24
+SAMPLES_MAX = 300
+"""Samples of a run to which a response is fitted."""
+PULSES_MAX = 60
+"""Pulses of a run to which a response is fitted."""
+MIN_SAMPLES = 24
+"""Smallest number of samples of a signal that is judged."""
 INDEPENDENT = 5.0
 """Samples that count as one, because noise is correlated."""
-VISIBLE, FLAT_SHARE, LESS_LIGHT = 8.0, 0.15, 0.6
-"""Expected response in standard errors from which its absence shows; largest response of a dead signal, and expected
-response of a run that judges it, both relative to the expected one."""
+VISIBLE = 8.0
+"""Expected response in standard errors from which its absence shows."""
+FLAT_SHARE = 0.15
+"""Largest response of a dead signal, relative to the expected one."""
+LESS_LIGHT = 0.6
+"""Expected response of a run that judges another one, relative to that one's."""
 TURNED = 0.8
 """Share of a signal's variance that a response of opposite sign explains."""
-MIN_SHIFT_S, MAX_SHIFT_S, SHIFT_AGREES_S, GRID_S = 6e-3, 0.1, 3e-3, 5e-4
+MIN_SHIFT_S = 6e-3
+"""Smallest shift that is sought: a diagnosis names smaller ones as a clock's offset."""
+MAX_SHIFT_S = 0.1
+"""Largest shift."""
+SHIFT_AGREES_S = 3e-3
+"""Difference within which shifts of signals of one run agree."""
+GRID_S = 5e-4
+"""Resolution of shifts."""
 SHIFTS_S = np.arange(-MAX_SHIFT_S, MAX_SHIFT_S + 5e-4, 1e-3)
-"""Shifts that are sought: above those that a diagnosis names a clock's offset. Those of signals of one run agree."""
-SHIFT_EXPLAINS, SHIFT_LEAVES, FITS_UNSHIFTED, MIN_LEFT, PERIOD_SHARE = 0.95, 0.3, 0.98, 1e-4, 0.6
-"""Share of variance that a shifted response explains, largest share of what is left without a shift, share explained
-from which no shift is sought, smallest share that counts as left, and largest shift of a train in its periods."""
-OWN_FITS, OTHER_FITS, GAIN_AGREES, GAIN_DIFFERS, REPEATS_AGREE, MAX_SUSPICIOUS, FITS_WORSE = (
-    0.9,
-    0.97,
-    0.04,
-    0.1,
-    0.03,
-    0.3,
-    0.05,
-)
-"""Of exchanged runs: share explained below which a run is suspicious, and above which another's light suits; agreement
-of gains, in logarithms, their difference, and the agreement of those of repeats; largest share of such runs; by
-how much less than repeats the own light explains."""
+"""Shifts that are tried."""
+SHIFT_EXPLAINS = 0.95
+"""Smallest share of variance that a shifted response explains."""
+SHIFT_LEAVES = 0.3
+"""Largest share that it leaves of what is left without a shift."""
+FITS_UNSHIFTED = 0.98
+"""Share explained from which no shift is sought."""
+MIN_LEFT = 1e-4
+"""Smallest share of variance that counts as left."""
+PERIOD_SHARE = 0.6
+"""Largest shift of a train, in its periods."""
+OWN_FITS = 0.9
+"""Share of variance that a run's own light explains, below which it is suspected of being exchanged."""
+OTHER_FITS = 0.97
+"""Share that another run's light explains, above which it suits."""
+GAIN_AGREES = 0.04
+"""Agreement of gains with another run's light, in logarithms."""
+GAIN_DIFFERS = 0.1
+"""Difference of gains with the own light, in logarithms."""
+REPEATS_AGREE = 0.03
+"""Agreement of the gains of repeats, in logarithms."""
+MAX_SUSPICIOUS = 0.3
+"""Largest share of runs that can be exchanged."""
+FITS_WORSE = 0.05
+"""Share by which the own light explains less than in repeats."""
 FEW_TYPICAL = 0.01
 TYPICAL = {TEMPERATURE: 1.0, "displacement_m": 2e-6, "force_N": 1.15e-4}
 """Typical ratios of the signals, per K; a signal below a hundredth of it in all runs does not respond."""

@@ -23,20 +23,30 @@ from optodrive.lab.inspection.response_faults import (
 )
 from optodrive.lab.inspection.work import Work, select_finite
 
-BENDS, BEND_WIDTHS, BEND_TAUS_S = (
-    0.5 - 0.5 * np.cos(np.linspace(0.35, 2.79, 24)),
-    (0.0, 0.045),
-    np.geomspace(0.003, 0.1, 16),
-)
+BENDS = 0.5 - 0.5 * np.cos(np.linspace(0.35, 2.79, 24))
+"""Places at which a signal becomes level, relative to the largest response."""
+BEND_WIDTHS = (0.0, 0.045)
+"""Widths of the bend, relative to the largest response."""
+BEND_TAUS_S = np.geomspace(0.003, 0.1, 16)
+"""Time constants of the response."""
 REST_SHARE = 0.03
 """Share of the range of displacement or force within which a level part is the rest."""
-BEND_MEANS, BEND_PULSES, MIN_BEND_RUNS, LEVEL_SLOPE, BEND_SIGMAS, BEND_REACH, BEND_ERROR, OWN_LEAVES = (
-    *(60, 12, 3, 0.2, 4.5),
-    *(3.0, 0.02, 1.3),
-)
-"""Of saturation, relative to the largest response: where a signal becomes level, and widths of the bend; means and
-pulses of a run; smallest number of runs; largest slope of the level part relative to the other; significance; widths of
-the bend that are left out before it; error of its place; variance that bends of each run at least leave, relative."""
+BEND_MEANS = 60
+"""Means of a run."""
+BEND_PULSES = 12
+"""Pulses of a run."""
+MIN_BEND_RUNS = 3
+"""Smallest number of runs."""
+LEVEL_SLOPE = 0.2
+"""Largest slope of the level part relative to the other."""
+BEND_SIGMAS = 4.5
+"""Significance of a bend."""
+BEND_REACH = 3.0
+"""Widths of the bend that are left out before it."""
+BEND_ERROR = 0.02
+"""Error of its place, relative to the largest response."""
+OWN_LEAVES = 1.3
+"""Variance that bends of each run leave at least, relative to that left by a common one."""
 _Means = tuple[FloatArray, FloatArray, int, FloatArray]
 
 

@@ -17,29 +17,65 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 
-MIN_QUANTA, ROUNDING = 8, 1e-6
-"""Smallest number of steps between levels by which a converter's step is found, and rounding error of a value."""
+MIN_QUANTA = 8
+"""Smallest number of steps between levels by which a converter's step is found."""
+ROUNDING = 1e-6
+"""Rounding error of a value, relative."""
 SENTINELS = (999.0, 999.9, 9999.0, 99999.0, 32767.0, 32768.0, 65535.0, 2147483647.0, 1e30, 9.9e37, 9.91e37, 1e38)
 """Magnitudes that programs write in place of a missing value, beside float32's largest and 0 K."""
 LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
-SENTINEL_GAP, SENTINEL_SHARE = 0.2, 0.5
-"""Distance of a repeated impossible value from all others, relative to their range; largest share of such values."""
-MIN_STUCK, STUCK_TIES = 20, 0.2
-"""Smallest number of equal samples in a row that are stuck; largest share of equal neighbours among the others."""
-MIN_TIES, PILE, NEXT_LEVELS, CEILING_SIGMAS = 5, 2.0, 5, 4.0
-"""Equal samples at a ceiling, also relative to those at each of the next levels of a converter; σ below it that are
-left out too."""
-APPROACH, SLOWING, RISE, MIN_RISE = 0.02, 2.5, 0.5, 4
-"""Bands below a ceiling, relative to the range, in which the last approach is timed; by how much it may slow down;
-the rise before it, relative to the range, and its smallest number of samples."""
-HOLD_SHARE, HOLD_BLOCKS, FEW_BLOCKS, LONG_BLOCK, HOLD_REGULAR, HOLD_STEPS = 0.45, 8, 4, 5.0, 0.97, 0.3
-"""Of held samples: smallest share of equal neighbours, number of blocks, and of blocks of `LONG_BLOCK` samples, share
-of regular intervals, and of steps above the quantum."""
-COLLINEAR_SHARE, MIN_SEGMENTS, MIN_SEGMENT = 0.5, 8, 3
-"""Of interpolated samples: smallest share without curvature, number of straight parts, and of samples in each."""
-OUTLIER_SIGMAS, SMOOTH_SIGMAS, SIDE, MAX_WIDTH, ROUGHNESS = 6.0, 12.0, 5, 3, 6.0
-"""Smallest deviation, also of a signal that was smoothed, samples on either side that predict it, largest number of
-samples of an outlier, and ratio to the deviations of its neighbours."""
+SENTINEL_GAP = 0.2
+"""Distance of a repeated impossible value from all others, relative to their range."""
+SENTINEL_SHARE = 0.5
+"""Largest share of such values."""
+MIN_STUCK = 20
+"""Smallest number of equal samples in a row that are stuck."""
+STUCK_TIES = 0.2
+"""Largest share of equal neighbours among the others."""
+MIN_TIES = 5
+"""Equal samples at a ceiling."""
+PILE = 2.0
+"""The same relative to those at each of the next levels of a converter."""
+NEXT_LEVELS = 5
+"""Number of these levels."""
+CEILING_SIGMAS = 4.0
+"""σ below a ceiling that are left out too."""
+APPROACH = 0.02
+"""Bands below a ceiling in which the last approach is timed, relative to the range."""
+SLOWING = 2.5
+"""Factor by which the approach may slow down."""
+RISE = 0.5
+"""Rise before it, relative to the range."""
+MIN_RISE = 4
+"""Smallest number of samples of this rise."""
+HOLD_SHARE = 0.45
+"""Smallest share of equal neighbours of held samples."""
+HOLD_BLOCKS = 8
+"""Smallest number of blocks of held samples."""
+FEW_BLOCKS = 4
+"""Smallest number of blocks of at least `LONG_BLOCK` samples."""
+LONG_BLOCK = 5.0
+"""Samples of a long block."""
+HOLD_REGULAR = 0.97
+"""Smallest share of blocks at regular intervals."""
+HOLD_STEPS = 0.3
+"""Smallest share of steps between blocks above the quantum."""
+COLLINEAR_SHARE = 0.5
+"""Smallest share of interpolated samples without curvature."""
+MIN_SEGMENTS = 8
+"""Smallest number of straight parts."""
+MIN_SEGMENT = 3
+"""Smallest number of samples in each."""
+OUTLIER_SIGMAS = 6.0
+"""Smallest deviation of an outlier."""
+SMOOTH_SIGMAS = 12.0
+"""The same in a signal that was smoothed."""
+SIDE = 5
+"""Samples on either side that predict it."""
+MAX_WIDTH = 3
+"""Largest number of samples of an outlier."""
+ROUGHNESS = 6.0
+"""Ratio to the deviations of its neighbours."""
 
 
 @dataclass(frozen=True)
