@@ -20,6 +20,10 @@ from optodrive.physics.term import TermValues
 from optodrive.physics.terms import discover_terms
 
 MAX_RULED_OUT = 6
+MORE_REPEATS = (
+    "Measure next: every experiment again, each twice as often. The noise is known by repeats alone, and with few of "
+    "them no small effect can be told from it."
+)
 
 
 def _format_interval(item: Estimate) -> str:
@@ -58,6 +62,8 @@ def build_narrative(found: Discrepancy) -> list[str]:
         ]
     elif found.verdict == "ambiguous" and len(found.causes) > 1:
         lines.append("No pulse or train, repeated up to 30 times, would separate them in any signal at this noise.")
+    elif found.verdict == "undecided":
+        lines.append(MORE_REPEATS)
     return [*lines, *found.remarks]
 
 
