@@ -239,7 +239,7 @@ def _judge_verdict(verdict, causes, hidden, names, near, twins, *, named: bool, 
     if hidden:
         return "allowed", "overlooks " + "+".join(sorted(hidden))
     if verdict == "none":
-        return ("allowed", "overlooks the fault, heights hold") if names else ("right", "none")
+        return ("allowed", "overlooks the fault, heights hold") if names and not named else ("right", "none")
     if verdict in ("instrument", "incomplete"):
         return ("right", verdict) if named else ("allowed", verdict)
     return "missed", f"verdict {verdict!r}"
