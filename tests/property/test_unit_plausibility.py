@@ -13,14 +13,14 @@ from optodrive.core.plausibility import OTHER_UNITS, collect_ranges
 from optodrive.device.config import Config
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON
+from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR
 from optodrive.lab.diagnosis.prediction import ParameterPoint
 from optodrive.lab.diagnosis.recording_checks import check_recording_units
 from optodrive.lab.recording.checks import pop_ambient_k
 from sound_files import FIRST_SEEDS, write_toml
 from sound_recordings import NAMES, WRONG_UNITS, mistake_units, sound_recording
 
-REFERENCE = ParameterPoint(BROAD_PRIOR.mean, {}).pixel(DEFAULT_EPSILON)
+REFERENCE = ParameterPoint(BROAD_PRIOR.mean, {}).pixel()
 DRAWS = [
     ("development", 60),
     pytest.param("report", 1000, marks=[pytest.mark.slow, pytest.mark.timeout(1200)]),

@@ -16,7 +16,7 @@ def plan_with(where, depends_on, function, low, high):
     curve = Curve(x, function(x), function(x), function(x), function)
     form = TermForm(where, depends_on, "", "f", 1.0, 1.0)
     finding = PixelFinding("absorber", TermClaim(Claim("cause"), 1.0, (form,), form, ()), curve)
-    return build_planned_terms(PixelDiscovery((finding,), (), Claim("cause"), "", 2.0, 1.0, PARAMETERS, 0.66, 0.0))
+    return build_planned_terms(PixelDiscovery((finding,), (), Claim("cause"), "", 2.0, 1.0, PARAMETERS, 0.0))
 
 
 @pytest.mark.parametrize("quantity", ["memory", "gas"])
