@@ -240,9 +240,9 @@ def _parse(text: str, zone: tzinfo | None) -> _Stamp:
 
 
 def _complete(text: str, day_first: bool) -> tuple[datetime, bool, bool]:
-    """Return a time, and whether its date and its seconds are written, which differ with what stands for them if not.
+    """Return a time, whether its date is written, and whether its seconds are.
 
-    Raises ValueError where only a part of the date is written.
+    What is not written differs with what is given for it. Raises ValueError where only a part of the date is written.
     """
     first, second = (
         parse(text, INFO, dayfirst=day_first, default=missing, tzinfos=_find_offset)
