@@ -111,9 +111,9 @@ class SequencePlanner:
         self.display = display
         # Where a pulse may be refused, in order: here, for a height out of reach or a train on a dead pixel; by a cap,
         # in `max_power_w` of the limiter, which "trim" lowers instead, "delay" moves, and "refuse" raises; for a frame
-        # as a whole, in `feasibility/check.py` and `_refuse_late`; when its bytes are verified, in `verify`; at the
-        # link process, in `_require_allowed` (epoch, pause, arming, damaged bytes); by the session, if it comes too
-        # late; by the board's guards B1 to B15.
+        # as a whole, in `feasibility/check.py` and `_refuse_late`; for bytes that pass a cap, in
+        # `link/proven_points.py`; at the link process, in `_require_allowed` (epoch, pause, arming, damaged bytes); by
+        # the session, if it comes too late; by the board's guards B1 to B15.
         self._sequence, self._dead_pixels = remove_dead_pixels(display, sequence)
         self._heat = heat
         self._policy = policy
