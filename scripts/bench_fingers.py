@@ -143,11 +143,9 @@ def measure_virtual(display, heights_um, lines, speed, seconds, lead_s):
     """Plan the refreshes of a page without a daemon, and yield the largest use of each cap."""
     from optodrive.core.types.fingers import FingerPlace
     from optodrive.daemon.engine.page_refresh import PageRefresh
-    from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
-    from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
-    from optodrive.daemon.engine.request_body import BuiltRequest
+    from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
     from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-    from optodrive.daemon.push import Push
+    from optodrive.daemon.push import BuiltRequest, Push
     from optodrive.link.board_setup import build_scales
     from optodrive.planning.limiter.cap_checks import compute_panel_k, compute_usage
 

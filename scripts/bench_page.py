@@ -7,7 +7,7 @@ from statistics import median
 import numpy as np
 from measuring import build_display, measure_times_s, running_daemon, to_ms
 
-from optodrive.daemon.engine.display_snapshot import EmittedPulses, LiveThermalState
+from optodrive.daemon.engine.telemetry_events import EmittedPulses, LiveThermalState
 from optodrive.planning.pipeline import warm_up
 
 SECONDS, SNAPSHOTS = 12, 300

@@ -106,11 +106,9 @@ def draw_frame(rng, active):
 
 def measure_superseding():
     """Measure the CPU time of planning a stream's frame that truncates the one before it, mirrors near their cap."""
-    from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
-    from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
-    from optodrive.daemon.engine.request_body import BuiltRequest
+    from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
     from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-    from optodrive.daemon.push import Push
+    from optodrive.daemon.push import BuiltRequest, Push
     from optodrive.link.board_setup import build_scales
 
     display = build_display()

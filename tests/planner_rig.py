@@ -10,15 +10,13 @@ from displays import DISPLAYS
 from link_service_rig import PLANNER, ServiceRig
 from optodrive.core.ipc import MessageDecoder, encode_message
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.engine.dimmer import Dimmer
+from optodrive.daemon.engine.active_plan import PlanStore
 from optodrive.daemon.engine.kept_heat import KeptHeat
-from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
+from optodrive.daemon.engine.plan_making import NEVER, Dimmer, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
-from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.engine.thermal_memory import ThermalMemory
-from optodrive.daemon.push import Push
+from optodrive.daemon.engine.thermal_estimate import ThermalMemory
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.service import link_connection
 from optodrive.link.service.remote_session import RemoteSession

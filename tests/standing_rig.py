@@ -9,8 +9,7 @@ from optodrive.daemon.api.live_stream import REFRESH_MAX_S, REFRESH_MIN_S
 from optodrive.daemon.engine import plan_making, planner
 from optodrive.daemon.engine.page_refresh import PageRefresh
 from optodrive.daemon.engine.plan_making import PlanningRequest
-from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements, build_port_settings
 from optodrive.link.simulator.guards import build_settings

@@ -1,8 +1,16 @@
-"""A push on its way through the daemon's processes."""
+"""A push on its way through the daemon, its body, and the sequence that is built from it."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple, Never
 
+from optodrive.core.errors import InputError
 from optodrive.core.types.push_options import PushOptions
+from optodrive.core.types.stimuli import FrameSequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.stimuli.json_values import decode_json, parse_labels
+from optodrive.planning.stimuli.pattern_registry import build_pattern, find_pattern
+from optodrive.planning.stimuli.sequence_file import parse_request
 
 
 class Push(NamedTuple):
@@ -25,3 +33,28 @@ class Push(NamedTuple):
     lists_pulses: bool = True
     standing: bool = False
     refreshes: bool = False
+
+
+LabelValues = Mapping[str, str | int | float | bool]
+ParameterValues = Mapping[str, str | float | bool | None]
+NO_LABELS: Mapping[str, Never] = MappingProxyType({})
+
+
+class BuiltRequest(NamedTuple):
+    """Sequence of a body, labels of its caller, and all parameters of its pattern, in the units of their names."""
+
+    sequence: FrameSequence
+    labels: LabelValues = NO_LABELS
+    parameters: ParameterValues = NO_LABELS
+
+
+def build_request(display: DisplayModel, source: str, name: str, body: bytes) -> BuiltRequest:
+    """Build the sequence of a body: of FRAMES.json, or of the parameters of the named pattern. Raise InputError."""
+    if source == "sequence":
+        return BuiltRequest(*parse_request(body, display.config, "body"))
+    decoded = decode_json(body, "body") if body.strip() else {}
+    if not isinstance(decoded, dict):
+        raise InputError("body", decoded, "an object of the pattern's parameters")
+    labels = parse_labels(decoded.pop("labels", {}), "body: labels")
+    sequence = build_pattern(name, decoded, display.config)
+    return BuiltRequest(sequence, labels, find_pattern(name).describe_arguments(decoded, display.config))

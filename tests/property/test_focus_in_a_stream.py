@@ -7,12 +7,10 @@ from test_focus_on_absorber import PLACES, ROUNDING_M, with_servo
 from displays import DISPLAYS
 from focus_judge import compute_overhang_m
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.daemon.engine import planning_snapshot
-from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
-from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
-from optodrive.daemon.engine.request_body import BuiltRequest
+from optodrive.daemon.engine import plan_making
+from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_board_requirements, build_scales
 
 NAME, PLANS = "display-437", 200
@@ -74,12 +72,12 @@ def test_the_focus_lies_on_the_absorber_in_a_stream(seed):
 
 def test_mirrors_that_are_taken_for_where_a_withdrawn_plan_would_have_led_are_caught(monkeypatch):
     """Mutant: the mirrors stand at the last pixel of the plan of which nothing was played."""
-    find_pixels = planning_snapshot._find_initial_pixels
+    find_pixels = plan_making._find_initial_pixels
 
     def mistake(running, cut):
         return find_pixels(running, cut) if cut.row else (int(running.planned.plan.pixel[-1]),)
 
-    monkeypatch.setattr(planning_snapshot, "_find_initial_pixels", mistake)
+    monkeypatch.setattr(plan_making, "_find_initial_pixels", mistake)
     display = DISPLAYS[NAME]
     table, pixels, _ = stream(display, 0)
     assert max(overhang_m(display, table, pixels, place) for place in PLACES) > 1e-4

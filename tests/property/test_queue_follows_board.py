@@ -13,9 +13,9 @@ from link_service_rig import WEB
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.engine import queue_thermal
+from optodrive.daemon.engine import thermal_estimate
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.queue_thermal import QueueThermal
+from optodrive.daemon.engine.thermal_estimate import QueueThermal
 from standing_rig import StandingRig, build_display, build_page
 
 CAPS = ({}, {"display_mean_power_max_w": 0.2}, {"pixel_mean_power_max_w": 0.2}, {"touch_max_c": 41.0})
@@ -318,11 +318,11 @@ def forget_unreported(plans, *arguments):
     return KEPT_REWIND_ESTIMATE(plans, *arguments[:3])
 
 
-KEPT_REWIND, KEPT_REWIND_ESTIMATE = QueueThermal.rewind, queue_thermal.rewind_estimate
+KEPT_REWIND, KEPT_REWIND_ESTIMATE = QueueThermal.rewind, thermal_estimate.rewind_estimate
 MUTANTS = {
     "a plan that was never executed": (QueueThermal, "forget", lambda *_: None, 22),
     "light that was emitted": (QueueThermal, "rewind", go_back_to_the_first, 2000),
-    "light that is not reported yet": (queue_thermal, "rewind_estimate", forget_unreported, 2000),
+    "light that is not reported yet": (thermal_estimate, "rewind_estimate", forget_unreported, 2000),
     "light that was cut": (QueueThermal, "rewind", rewind_the_last_plan_only, 2776),
 }
 

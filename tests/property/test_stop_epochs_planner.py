@@ -14,11 +14,10 @@ import pytest
 from link_service_rig import OPERATOR, WEB, ServiceRig
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
-from optodrive.daemon.engine.dry_run import DryRunStart
+from optodrive.daemon.engine.plan_making import DryRunStart
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.request_body import BuiltRequest
 from optodrive.daemon.preview.jobs import plan_dry_run
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from planner_rig import DISPLAY, PlannerRig, build_frame
 

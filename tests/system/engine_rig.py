@@ -6,8 +6,7 @@ from concurrent.futures import Future
 from link_process_rig import BEAT_INTERVAL_S, Client, LinkProcess
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.service.link_connection import build_error
 from optodrive.link.service.remote_session import RemoteSession

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from optodrive.daemon.engine.plan_store import RECORDS_MAX
+from optodrive.daemon.engine.active_plan import RECORDS_MAX
 from process_memory import list_processes, read_memory_mib
 from rig import Board, Daemon, wait_for
 

@@ -15,10 +15,10 @@ from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import planner_server
-from optodrive.daemon.engine.dry_run import DryRunStart
-from optodrive.daemon.engine.loop_commands import LoopCommands
+from optodrive.daemon.engine.plan_making import DryRunStart
 from optodrive.daemon.engine.planner_server import PlannerServer
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
+from optodrive.daemon.message_loop import LoopCommands
 from optodrive.daemon.push import Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.daemon.engine.planning_time import FACTOR
+from optodrive.daemon.engine.planner import FACTOR
 from rig import ended, wait_for
 
 RESERVED_S = 1.0

@@ -17,8 +17,7 @@ from optodrive.daemon.api.peer import Peer
 from optodrive.daemon.api.reload_requests import ReloadRequests
 from optodrive.daemon.api.state_merge import merge_state
 from optodrive.daemon.api.telemetry_hub import TelemetryHub
-from optodrive.daemon.engine.request_body import NO_LABELS, LabelValues, ParameterValues
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import NO_LABELS, LabelValues, ParameterValues, Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
 from optodrive.daemon.runtime_folder import RuntimeFolder

@@ -16,22 +16,17 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.core.processes import use_usual_priority
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.engine.dimmer import Dimmer
+from optodrive.daemon.engine.active_plan import ActivePlan, PlanStore
 from optodrive.daemon.engine.kept_heat import KeptHeat
-from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
 from optodrive.daemon.engine.page_refresh import PageRefresh
-from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
-from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.plan_store import PlanStore
+from optodrive.daemon.engine.plan_making import NEVER, Dimmer, PlanningRequest
+from optodrive.daemon.engine.plan_queue import PlanQueue, build_queue_report
 from optodrive.daemon.engine.planner import Planner
-from optodrive.daemon.engine.progress import ClockShift, PlanProgress
-from optodrive.daemon.engine.queue_report import build_queue_report
-from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.engine.thermal_memory import ThermalMemory
-from optodrive.daemon.message_loop import MessageLoop
-from optodrive.daemon.push import Push
+from optodrive.daemon.engine.queued_plans import ClockShift, PlanProgress
+from optodrive.daemon.engine.thermal_estimate import ThermalMemory
+from optodrive.daemon.message_loop import LoopCommands, MessageLoop
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import LimitsReport, PlannerReport, PlannerState, PulseTotals
 from optodrive.link.protocol.quantisation import WireScale

@@ -7,7 +7,7 @@ that no other process uses the display meanwhile. From the begin of each arming 
 armed, the record says that the display is in use: no plan starts before it does. What ends without a word in between
 leaves a hot display to the next daemon.
 
-A planner process that is replaced leaves its estimate in the memory of the daemon (`thermal_memory.py`), which is
+A planner process that is replaced leaves its estimate in the memory of the daemon (`thermal_estimate.py`), which is
 newer than the record. It counts unless another process has written the record since.
 
 Threads. `follow` and `close` belong to the loop that owns the session; any thread may call `require_known`. The disk

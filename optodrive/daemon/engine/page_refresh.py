@@ -14,7 +14,7 @@ from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import RefreshCycle
-from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
+from optodrive.daemon.engine.plan_making import PlanningSnapshot
 from optodrive.device.config import PixelLayout
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order

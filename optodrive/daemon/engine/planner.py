@@ -1,6 +1,7 @@
 """Planner thread that plans sequences and verifies the wire bytes before the engine's loop accepts them."""
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import suppress
@@ -13,16 +14,55 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import BusyError, InputError, LinkError, NotReadyError, StoppedError
 from optodrive.core.processes import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.engine.dimmer import Dimmer
-from optodrive.daemon.engine.plan_growth import build_rest_frame, grow_plan
-from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest, make_plan
+from optodrive.daemon.engine.plan_making import NEVER, Dimmer, PlanningRequest, build_rest_frame, grow_plan, make_plan
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.planning_time import FACTOR, PlanningTime, StreamHorizon
 from optodrive.daemon.engine.queue_stream import GROWTH_MARGIN_S
-from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.daemon.responses.plan import PlanReport, PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
+
+INITIAL_S = 0.01
+RECENT_MAX = 8
+FACTOR = 1.25
+"""Time reserved per time expected, for a plan that takes longer than the recent ones."""
+
+HORIZON_MIN_S, HORIZON_MAX_S = 0.05, 0.1
+"""Light of a frame that is planned at once, at least and at most."""
+HORIZON_INTERVALS = 1.5
+"""The same, in intervals between two frames: a frame that comes somewhat later than expected finds it unspent."""
+
+
+class StreamHorizon:
+    """Time of a streamed frame's light that is planned at once, from the interval between the last two frames."""
+
+    def __init__(self) -> None:
+        self._arrived_s = -inf
+
+    def follow(self, arrived_s: float) -> float:
+        """Return the time for the frame that arrived now, s."""
+        interval_s, self._arrived_s = arrived_s - self._arrived_s, arrived_s
+        return min(HORIZON_MAX_S, max(HORIZON_MIN_S, HORIZON_INTERVALS * interval_s))
+
+
+class PlanningTime:
+    """Expected duration of the next planning, from the recent ones.
+
+    A plan that is late is made again, which takes longer than to wait for it: the expectation is the second longest of
+    the recent durations, so that one of them in eight may be exceptional.
+    """
+
+    def __init__(self) -> None:
+        self._recent_s = deque([INITIAL_S], RECENT_MAX)
+
+    def record(self, duration_s: float) -> None:
+        """Record the duration of a planning, s."""
+        self._recent_s.append(duration_s)
+
+    def compute_reserved_s(self, late_count: int) -> float:
+        """Return the time to reserve for a plan that was late `late_count` times, s."""
+        expected_s = sorted(self._recent_s)[-2] if len(self._recent_s) > 1 else self._recent_s[0]
+        return FACTOR * (1 + late_count) * expected_s
+
 
 STALL_TIMEOUT_S = 2.0
 """A planner without progress for this time counts as stalled, and the lease is no longer renewed."""

@@ -3,6 +3,7 @@
 It sends ended streamed plans, too.
 """
 
+import pickle
 import signal
 import threading
 from collections.abc import Callable
@@ -20,16 +21,15 @@ from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.json_model import iterate_json
 from optodrive.core.processes import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.core.types.fingers import FingerPlace
-from optodrive.daemon.engine.dry_run import build_dry_run_start
 from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.engine.plan_making import DryRunStart
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.request_body import BuiltRequest, build_request
 from optodrive.daemon.engine.session_recording import start_session_recorder
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
-from optodrive.daemon.engine.thermal_memory import ThermalMemory
+from optodrive.daemon.engine.thermal_estimate import ThermalMemory
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.message_loop import MessageServer
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push, build_request
 from optodrive.daemon.responses.messages import RefreshReport
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import build_error_problem, build_problem
@@ -324,3 +324,11 @@ def run_planner(
             engine.run(lambda: bool(ending))
         except SupervisorGoneError:
             return
+
+
+def build_dry_run_start(engine: Engine) -> bytes:
+    """Return the pickled start of a dry run."""
+    snapshot = engine.plan_queue.make_snapshot(streamed=False, planning_time_s=0.0)
+    starts_in_s, dimmer = snapshot.start_s - engine.board_s(), engine.dimmer
+    start = DryRunStart(snapshot.heat, snapshot.budget, starts_in_s, dimmer.power_share, dimmer.lost_stage)
+    return pickle.dumps(start, pickle.HIGHEST_PROTOCOL)

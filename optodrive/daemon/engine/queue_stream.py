@@ -10,17 +10,15 @@ because a stall of the host longer than the lead is an underrun (decision 16). A
 by link, and the plan is made again; after two such plans `truncate` cuts the running one at once, and the third begins
 behind it without a deadline.
 
-A plan may grow: its rest is planned when the points behind it must leave, unless a newer plan came (`plan_growth.py`).
+A plan may grow: its rest is planned when the points behind it must leave, unless a newer plan came (`plan_making.py`).
 If that is too late, because the computer stalled, the rest becomes a frame of its own behind it.
 """
 
 from math import inf
 
 from optodrive.daemon.engine.active_plan import ActivePlan, RefreshCycle
-from optodrive.daemon.engine.plan_growth import ExtendedPlan
-from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot, continue_cycle
-from optodrive.daemon.engine.progress import PlanRun
-from optodrive.daemon.engine.queued_plans import QueuedPlans
+from optodrive.daemon.engine.plan_making import ExtendedPlan, PlanningSnapshot, build_cut_snapshot, continue_cycle
+from optodrive.daemon.engine.queued_plans import PlanRun, QueuedPlans
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.stage_points import PointCut

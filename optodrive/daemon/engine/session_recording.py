@@ -11,10 +11,9 @@ import numpy as np
 
 from optodrive import __version__
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain
-from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.active_plan import ActivePlan, compute_simulated_m
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.plan_simulation import compute_simulated_m
 from optodrive.daemon.log import DaemonLog
 from optodrive.lab.recording.session import SessionRecorder
 from optodrive.link.session.clock_sync import ClockReading

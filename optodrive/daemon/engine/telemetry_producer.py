@@ -14,15 +14,18 @@ from optodrive.core.ipc import Message
 from optodrive.core.json_model import JsonModel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.engine.display_snapshot import EmittedPulses, ExecutedBatch, LiveThermalState, join_in_order
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.progress import ClockShift, merge_events
+from optodrive.daemon.engine.queued_plans import ClockShift, merge_events
 from optodrive.daemon.engine.telemetry_events import (
+    EmittedPulses,
+    ExecutedBatch,
+    LiveThermalState,
     TouchReport,
     build_display_event,
     build_page_event,
     build_pulse_batch,
     describe_caps,
+    join_in_order,
 )
 from optodrive.daemon.responses.telemetry import BudgetEvent, FingersEvent
 from optodrive.physics.nominal_display import DisplayState

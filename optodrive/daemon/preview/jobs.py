@@ -11,13 +11,9 @@ from typing import NamedTuple
 from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.json_model import iterate_json
-from optodrive.daemon.engine.dimmer import dim_display
-from optodrive.daemon.engine.dry_run import DryRunStart
-from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
-from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
-from optodrive.daemon.engine.request_body import BuiltRequest, build_request
+from optodrive.daemon.engine.plan_making import DryRunStart, PlanningRequest, PlanningSnapshot, dim_display, make_plan
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push, build_request
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import build_error_problem
 from optodrive.link.protocol.quantisation import WireScale

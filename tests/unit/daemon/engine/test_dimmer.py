@@ -4,12 +4,10 @@ import pytest
 
 from link_service_rig import REQUIREMENTS
 from optodrive.core.errors import InputError, OverBudgetError
-from optodrive.daemon.engine.dimmer import Dimmer
-from optodrive.daemon.engine.dry_run import DryRunStart
-from optodrive.daemon.engine.request_body import BuiltRequest
-from optodrive.daemon.engine.thermal_memory import ThermalMemory
+from optodrive.daemon.engine.plan_making import Dimmer, DryRunStart
+from optodrive.daemon.engine.thermal_estimate import ThermalMemory
 from optodrive.daemon.preview.jobs import plan_dry_run
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from planner_rig import DISPLAY, build_frame, build_train
 
 DUTY_MAX = 65535

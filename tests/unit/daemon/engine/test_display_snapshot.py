@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optodrive.daemon.engine.display_snapshot import EmittedPulses, LiveThermalState, join_in_order
+from optodrive.daemon.engine.telemetry_events import EmittedPulses, LiveThermalState, join_in_order
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 

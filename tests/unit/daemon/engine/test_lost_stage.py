@@ -6,8 +6,8 @@ import pytest
 from link_service_rig import OPERATOR, WEB
 from optodrive.core.errors import NotReadyError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.daemon.engine.display_snapshot import ExecutedBatch
-from optodrive.daemon.engine.plan_restart import DURATION_MIN_S, build_rest_sequence
+from optodrive.daemon.engine.queue_pause import DURATION_MIN_S, build_rest_sequence
+from optodrive.daemon.engine.telemetry_events import ExecutedBatch
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.board_group import BoardGroup
 from optodrive.planning.pipeline import plan_sequence

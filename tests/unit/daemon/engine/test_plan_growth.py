@@ -12,13 +12,17 @@ from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import planner as planner_module
-from optodrive.daemon.engine.plan_growth import grow_plan, may_grow
-from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
-from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
-from optodrive.daemon.engine.planning_time import HORIZON_MAX_S, HORIZON_MIN_S, StreamHorizon
-from optodrive.daemon.engine.request_body import BuiltRequest
+from optodrive.daemon.engine.plan_making import (
+    PlanningRequest,
+    PlanningSnapshot,
+    build_cut_snapshot,
+    grow_plan,
+    make_plan,
+    may_grow,
+)
+from optodrive.daemon.engine.planner import HORIZON_MAX_S, HORIZON_MIN_S, StreamHorizon
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.planning.batch_limiter import BatchLimiter

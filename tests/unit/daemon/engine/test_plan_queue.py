@@ -9,8 +9,8 @@ from link_service_rig import OPERATOR, PLANNER, WEB, ServiceRig
 from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import planner
+from optodrive.daemon.engine.active_plan import RevokedCallers
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.plan_store import RevokedCallers
 from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
 from optodrive.planning.pulse_table import PulseTable
 from planner_rig import PlannerRig, build_frame, build_train

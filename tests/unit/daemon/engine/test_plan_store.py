@@ -10,7 +10,7 @@ from link_service_rig import OPERATOR
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState, LimitedPlan
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
-from optodrive.daemon.engine import plan_store
+from optodrive.daemon.engine import active_plan
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.planning import pulse_table
 from optodrive.planning.planned_sequence import PlannedSequence
@@ -88,7 +88,7 @@ def test_the_report_of_a_trimmed_plan_states_its_reasons(rig):
 def test_old_plans_make_room_for_newer_ones(rig, monkeypatch):
     first, second = (submit(rig, build_frame()) for _ in range(2))
     rig.until(lambda: second.has_ended)
-    monkeypatch.setattr(plan_store, "BYTES_MAX", int(2.5 * second.nbytes))
+    monkeypatch.setattr(active_plan, "BYTES_MAX", int(2.5 * second.nbytes))
     third = submit(rig, build_frame())
     rig.until(lambda: third.has_ended)
     with pytest.raises(InputError, match="one of the latest that ended"):

@@ -5,11 +5,9 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
-from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot, build_cut_snapshot
-from optodrive.daemon.engine.request_body import BuiltRequest
+from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.daemon.push import Push
+from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 
 DISPLAY = DISPLAYS["display-1511"]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from optodrive.daemon.engine.planning_time import FACTOR, INITIAL_S, RECENT_MAX, PlanningTime
+from optodrive.daemon.engine.planner import FACTOR, INITIAL_S, RECENT_MAX, PlanningTime
 
 
 def test_one_exceptional_planning_reserves_nothing():

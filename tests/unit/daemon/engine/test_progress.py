@@ -1,6 +1,6 @@
 """Merging of progress events: one per uninterrupted sequence of a run, in order."""
 
-from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun, merge_events
+from optodrive.daemon.engine.queued_plans import ClockShift, PlanProgress, PlanRun, merge_events
 
 
 def test_consecutive_events_of_a_run_are_merged_and_nothing_is_lost_or_reordered():

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from optodrive.daemon.engine.active_plan import PlanStore
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.plan_store import PlanStore
-from optodrive.daemon.engine.queue_thermal import HOLD_MAX_S
-from optodrive.daemon.engine.thermal_memory import HEADER, LENGTH, ThermalMemory
+from optodrive.daemon.engine.thermal_estimate import HEADER, HOLD_MAX_S, LENGTH, ThermalMemory
 from optodrive.planning.limiter.cap_checks import compute_levels
 from planner_rig import DISPLAY, InlineExecutor, build_frame, build_train
 
@@ -90,7 +89,7 @@ def test_a_state_that_was_written_in_part_leaves_the_one_before(rig, monkeypatch
     for state in states[:3]:
         memory.save(state)
     with monkeypatch.context() as ending:
-        ending.setattr("optodrive.daemon.engine.thermal_memory.LENGTH", EndingLength(part))
+        ending.setattr("optodrive.daemon.engine.thermal_estimate.LENGTH", EndingLength(part))
         with pytest.raises(EndedError):
             memory.save(states[3])
     loaded = memory.load()
@@ -101,7 +100,7 @@ def test_a_state_that_was_written_in_part_leaves_the_one_before(rig, monkeypatch
 
 
 def test_a_state_beyond_its_room_is_refused(rig, monkeypatch):
-    monkeypatch.setattr("optodrive.daemon.engine.thermal_memory.SLOT_BYTES", HEADER.size + 10)
+    monkeypatch.setattr("optodrive.daemon.engine.thermal_estimate.SLOT_BYTES", HEADER.size + 10)
     memory = ThermalMemory()
     with pytest.raises(ValueError, match="exceeds its room"):
         memory.save(rig.queue.build_saved_state(1.0))

@@ -17,8 +17,8 @@ from displays import DISPLAYS
 from optodrive.core.child_process import BeatWriter
 from optodrive.core.errors import BusyError
 from optodrive.core.ipc import Message, MessageSocket
-from optodrive.daemon.engine import request_body
-from optodrive.daemon.engine.dry_run import DryRunStart
+from optodrive.daemon import push
+from optodrive.daemon.engine.plan_making import DryRunStart
 from optodrive.daemon.preview import jobs, worker
 from optodrive.daemon.preview.jobs import CALLER_WAITING_MAX, WAITING_MAX, Job, JobQueue
 from optodrive.daemon.preview.process import run_preview
@@ -188,12 +188,10 @@ def start(tmp_path, monkeypatch):
     """
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     warm_up(DISPLAY)
-    started, parse = [], request_body.parse_request
+    started, parse = [], push.parse_request
 
     def start_preview(act=build_slowly):
-        monkeypatch.setattr(
-            request_body, "parse_request", lambda body, *more: act() if body == b"bad" else parse(body, *more)
-        )
+        monkeypatch.setattr(push, "parse_request", lambda body, *more: act() if body == b"bad" else parse(body, *more))
         started.append(Preview())
         return started[-1]
 
