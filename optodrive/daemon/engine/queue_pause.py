@@ -172,7 +172,8 @@ def _restart(
         plan.growth.on_progress = lambda _: on_progress()
         planned = plan.growth.plan_until()
     heat, budget = before.shift_to_plan(start_s)
-    if display.draws.all() or (first and _is_made_for(display, plan)):
+    is_made_for_all = display.draws.all() or (first and _is_made_for(display, plan))
+    if is_made_for_all and (first or planned.delays):  # under "delay" its pulses have the times that caps allowed them
         rest, budget_after = limit_rest(planned.plan, first, -_find_origin_s(plan), budget, display.budget, on_progress)
     else:
         rest, budget_after = _plan_anew(display, plan, heat, budget, on_progress)
@@ -363,7 +364,8 @@ class QueuePause:
     @property
     def can_restart(self) -> bool:
         """Whether waiting plans are to be limited and proven again now. Any thread may read it."""
-        return self.off_s is not None and bool(self._plans.waiting) and not self.is_held
+        waits = bool(self._plans.waiting) and not self._plans.running
+        return self.off_s is not None and waits and not self.is_held
 
     def build_restart(
         self, display: DisplayModel, planning_time_s: float, on_progress: Callable[[], None]
