@@ -10,7 +10,7 @@ import numpy as np
 
 from optodrive.client.exchange import Endpoint, run_blocking
 from optodrive.client.fingers import Fingers
-from optodrive.client.heights import HeightsLike
+from optodrive.client.heights import HeightsLike, render_png
 from optodrive.client.hold import Hold
 from optodrive.client.http import BlockingHttp
 from optodrive.client.operations import RECONNECT_TIMEOUT_S, DisplayOperations, LabelsLike
@@ -224,8 +224,6 @@ class Display:
         return f"<Display at {self._client.endpoint.url}>"
 
     def _repr_png_(self) -> bytes | None:
-        from optodrive.client.heights import render_png
-
         try:
             layout = self.layout
         except OptodriveError:

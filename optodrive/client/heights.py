@@ -2,17 +2,19 @@
 
 import io
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from PIL import Image, ImageDraw, ImageFont
 
 from optodrive.core.errors import InputError
 from optodrive.core.quantity import um_to_m
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
 from optodrive.device.config import PixelLayout
+
+if TYPE_CHECKING:
+    from PIL import ImageDraw
 
 HeightsLike = Mapping[int, float] | ArrayLike
 """Peak heights in µm: {pixel: height}, [p] by pixel, or [rows, columns] by position; NaN or 0: no target."""
@@ -109,6 +111,9 @@ def render_png(layout: PixelLayout, heights_um: FloatArray) -> bytes:
     rows, columns = int(layout.row.max()) + 1, int(layout.column.max()) + 1
     cell_px = max(4, min(CELL_MAX_PX, WIDTH_MAX_PX // max(columns, rows)))
     size = max(columns * cell_px, 220) + 2 * MARGIN_PX, rows * cell_px + 2 * MARGIN_PX + FOOTER_PX
+    # Imported with the first picture: a client that shows none starts earlier without it.
+    from PIL import Image, ImageDraw
+
     image = Image.new("RGB", size, BACKGROUND)
     draw = ImageDraw.Draw(image)
     max_um, gap = float(heights_um.max()), max(1, cell_px // 10)
@@ -122,7 +127,9 @@ def render_png(layout: PixelLayout, heights_um: FloatArray) -> bytes:
     return output.getvalue()
 
 
-def _draw_scale(draw: ImageDraw.ImageDraw, top: int, max_um: float) -> None:
+def _draw_scale(draw: "ImageDraw.ImageDraw", top: int, max_um: float) -> None:
+    from PIL import ImageFont
+
     font = ImageFont.load_default(13)  # it has no µ
     for k in range(100):
         draw.rectangle((MARGIN_PX + 16 + k, top, MARGIN_PX + 17 + k, top + 10), fill=interpolate_colour(k / 99))
