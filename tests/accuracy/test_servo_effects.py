@@ -14,9 +14,11 @@ from hidden_servo import HiddenServo as LinearServo
 from hidden_servo import recording as step_recording
 from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.device.config_file import load_config
 from optodrive.lab.commissioning.mirror_steps import plan_step_runs, play_step_runs
 from optodrive.lab.recording import write_recording
 from optodrive.lab.servo_identification.effect_fit import LINEAR, find_effect
+from optodrive.lab.servo_identification.gate import move_sizes_rad
 from optodrive.lab.servo_identification.identify import identify
 from optodrive.lab.servo_identification.records import estimate_noise, extract_records, extract_trace
 from optodrive.link.simulator.galvos import measure_position_outputs
@@ -98,23 +100,24 @@ def test_a_small_friction_is_planned_with_and_takes_longer_to_settle(tmp_path, c
     assert settling_s(out) > settling_s(clean)
 
 
-def coupled_responses(exponent, lag, levels=(0.1, 0.2, 0.3), n=2048, realisations=5):
-    """Return u and y of two coupled resonances whose stiffness falls by 4 % times (A / 0.3)^exponent, with that lag."""
+def coupled_responses(exponent, lag, change=0.04, loss=0.03, noise=1e-3):
+    """Return u and y of two coupled resonances whose stiffness falls by change times (A / 0.3)^exponent, with a lag."""
+    levels, n, realisations = (0.1, 0.2, 0.3), 2048, 5
     random, responses = np.random.default_rng(11), {}
     line = np.arange(n // 2 + 1)
     modes = np.array([[1.0, 0.6], [-0.5, 1.0]])
     for level in levels:
-        softening = 0.04 * (level / 0.3) ** exponent * (1.0 + 1j * lag)
+        softening = change * (level / 0.3) ** exponent * (1.0 + 1j * lag)
         phases = np.exp(2j * np.pi * random.random((n // 2 + 1, 2, realisations)))
         u = np.fft.irfft(phases * ((line > 0) & (line < 900))[:, None, None], n, axis=0)
         u *= level / np.sqrt((u**2).mean(axis=(0, 1)))
         modal = 1.0 / (
-            1.0 - softening - (line[:, None] / np.array([330.0, 470.0])) ** 2 + 0.03j * line[:, None] / 400.0
+            1.0 - softening - (line[:, None] / np.array([330.0, 470.0])) ** 2 + 1j * loss * line[:, None] / 400.0
         )
         response = np.einsum("oa,la,ia->loi", modes, modal, modes)
         y = np.fft.irfft(response @ np.fft.rfft(u, axis=0), n, axis=0)
-        noise = 1e-3 * random.standard_normal((*y.shape, 2))
-        responses[f"u_{level}"], responses[f"y_{level}"] = np.stack([u, u], axis=3), y[..., None] + noise
+        error = noise * random.standard_normal((*y.shape, 2))
+        responses[f"u_{level}"], responses[f"y_{level}"] = np.stack([u, u], axis=3), y[..., None] + error
     return responses
 
 
@@ -132,6 +135,59 @@ def test_coupled_axes_are_told_apart_by_their_law_of_the_amplitude(tmp_path, cap
         return
     for level, error in report["error"]["model"].items():
         assert error < 0.3 * report["error"]["linear"][level]
+
+
+def held_responses(change, hz, damping, rate_hz=10_000.0, n=2048):
+    """Return u and y of two coupled mirrors behind a converter that holds, as exact responses of discrete modes.
+
+    Their stiffness falls by change times A / 0.3, with the lag of Rayleigh's hysteresis.
+    """
+    random, responses = np.random.default_rng(12), {"angle_per_output": np.array([[1.0, -0.2], [0.0, 1.0]])}
+    line, shapes = np.arange(n // 2 + 1), np.array([[1.0, 0.3], [0.0, 1.0]])
+    z = np.exp(2j * np.pi * line / n)[:, None]
+    for level in (0.1, 0.2, 0.3):
+        softening = change * (level / 0.3) * (1.0 - 0.42j)
+        omega = 2.0 * np.pi * np.array(hz) * np.sqrt(1.0 - softening)
+        pole = np.exp(omega * (-damping + 1j * np.sqrt(1.0 - damping**2)) / rate_hz)
+        # A step ends as 1 + 2 Re(ring exp(λ t)), at rest at its beginning.
+        ring = -0.5 * (1.0 - 1j * damping / np.sqrt(1.0 - damping**2))
+        first, second = ring * (pole - 1.0) / (z - pole), np.conj(ring) * (np.conj(pole) - 1.0) / (z - np.conj(pole))
+        modal = (first + second) / (1.0 - softening)
+        response = np.einsum("oa,la,ai->loi", shapes, modal, np.linalg.inv(shapes))
+        phases = np.exp(2j * np.pi * random.random((n // 2 + 1, 2, 5)))
+        u = np.fft.irfft(phases * ((line > 0) & (line < 900))[:, None, None], n, axis=0)
+        u *= level / np.sqrt((u**2).mean(axis=(0, 1)))
+        y = np.fft.irfft(response @ np.fft.rfft(u, axis=0), n, axis=0)[..., None]
+        responses[f"u_{level}"] = np.stack([u, u], axis=3)
+        responses[f"y_{level}"] = y + 1e-5 * random.standard_normal((*y.shape[:3], 2))
+    return responses
+
+
+@pytest.mark.parametrize(("change", "refused"), [(0.002, False), (0.04, True)])
+def test_plans_load_coupled_mirrors_with_the_error_that_stays(tmp_path, capsys, frames, change, refused):
+    np.savez(tmp_path / "r.npz", **held_responses(change, (900.0, 1300.0), 0.25))
+    out = str(tmp_path / "mirrors.toml")
+    assert run(["calibrate", "servo", f"{tmp_path}/r.npz", "--sample-rate", "10000", "--out", out, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    # The end of a move changes by a third of the change of stiffness on either side of the middle amplitude.
+    share = np.array(found["effect"]["error_rad"]) / max(move_sizes_rad(load_config(), 0))
+    assert np.all((share > 0.3 * change) & (share < 3.0 * change))
+    assert run(["plan", str(frames), "--json", "--mirrors", out]) == (2 if refused else 0)
+    answer = capsys.readouterr()
+    if refused:
+        assert "of mirror x leaves an error that no settling time removes" in answer.err
+        return
+    assert found["effect"]["name"] == ["hysteresis"] * 2
+    assert run(["plan", str(frames), "--json"]) == 0
+    assert json.loads(answer.out)["settling_s"] > json.loads(capsys.readouterr().out)["settling_s"]
+
+
+def test_coupled_mirrors_that_ring_longer_than_a_file_can_state_are_refused(tmp_path, capsys):
+    np.savez(tmp_path / "r.npz", **held_responses(0.002, (900.0, 1300.0), 0.01))
+    out = tmp_path / "mirrors.toml"
+    assert run(["calibrate", "servo", f"{tmp_path}/r.npz", "--sample-rate", "10000", "--out", str(out)]) == 2
+    assert "the slowest in a file" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_decoupled_axes_of_an_npz_are_judged_one_by_one(tmp_path, capsys):
@@ -177,11 +233,11 @@ def test_one_model_of_a_measured_piezo_mirror_predicts_an_amplitude_left_out(cap
     ("arguments", "words"),
     [
         ((), "--sample-rate: missing"),
-        (("--sample-rate", "5000", "--out", "m.toml"), "a plan cannot use responses in other units"),
+        (("--sample-rate", "5000", "--out", "m.toml"), "angle_per_output: missing"),
     ],
 )
 def test_what_an_npz_lacks_is_one_line(tmp_path, capsys, arguments, words):
-    np.savez(tmp_path / "r.npz", u_1=np.zeros((64, 1, 2, 2)))
+    np.savez(tmp_path / "r.npz", u_1=np.zeros((64, 1, 2, 2)), y_1=np.zeros((64, 1, 2, 2)))
     assert run(["calibrate", "servo", f"{tmp_path}/r.npz", *arguments]) == 2
     assert words in capsys.readouterr().err
 

@@ -12,6 +12,9 @@ from optodrive.core.errors import MISSING, InputError
 from optodrive.core.extras import import_extra
 
 if TYPE_CHECKING:
+    from optodrive.device.config import Config
+
+if TYPE_CHECKING:
     from optodrive.core.types.arrays import FloatArray
     from optodrive.core.types.measurements import Signal
     from optodrive.device.config import Config
@@ -121,7 +124,9 @@ def servo(
     from optodrive.physics.parameters import load_parameters
 
     if recording.suffix == ".npz":
-        _assess_responses(recording, sample_rate, out, json)
+        _assess_responses(
+            recording, sample_rate, out, load_config(config, measured_servo=False).select_stage(stage), json
+        )
         return
     check_output("--out", out, ".toml")
     # Servos measured before are not loaded: an invalid mirrors.toml must not prevent a new identification.
@@ -149,28 +154,39 @@ def servo(
     print_answer(document, [*format_report_lines(report), *list_written(out)], json)
 
 
-def _assess_responses(path: Path, sample_rate_hz: float | None, out: Path | None, json: bool) -> None:
+def _assess_responses(path: Path, sample_rate_hz: float | None, out: Path | None, config: "Config", json: bool) -> None:
     """Tell whether one linear servo suffices for periodic excitations of any axes in any unit."""
-    from optodrive.lab.servo_identification.amplitude_response import (
-        assess_coupled,
-        build_records,
-        describe_coupled,
-        is_coupled,
-        read_responses,
-    )
+    import numpy as np
+
+    from optodrive.lab.servo_identification.amplitude_response import assess_coupled, describe_coupled
     from optodrive.lab.servo_identification.effect_fit import find_effect
-    from optodrive.lab.servo_identification.report import describe_linearity, report_linearity
+    from optodrive.lab.servo_identification.gate import bound_coupled_moves
+    from optodrive.lab.servo_identification.periodic_responses import build_records, is_coupled, read_responses
+    from optodrive.lab.servo_identification.report import (
+        describe_linearity,
+        report_linearity,
+        scanner_table,
+        write_mirrors,
+    )
 
     if sample_rate_hz is None:
         raise InputError("--sample-rate", MISSING, "samples per second of the .npz file")
-    if out is not None:
-        raise InputError(
-            "--out", str(out), "a recording of both mirrors in rad: a plan cannot use responses in other units"
-        )
     responses = read_responses(path, sample_rate_hz)
-    if is_coupled(responses):
-        report = assess_coupled(responses)
-        lines = describe_coupled(report)
+    if out is not None and responses.angle_per_output is None:
+        raise InputError(
+            f"{path}: angle_per_output", MISSING, "rad of mirrors x and y per unit of each output, for --out"
+        )
+    if out is not None or is_coupled(responses):
+        axes = assess_coupled(responses)
+        report, lines = axes.report, describe_coupled(axes.report)
+        if out is not None:
+            servo, error_rad = bound_coupled_moves(axes, np.asarray(responses.angle_per_output), config)
+            name = axes.law if axes.report["verdict"] == "cause" else axes.report["verdict"]
+            effect = {"name": [name] * 2, "error_rad": list(error_rad)}
+            mirrors = {"scanner": scanner_table(servo), "galvo": {"share": 1.0}, "effect": effect, "axes": {}}
+            write_mirrors(out, mirrors, str(path))
+            report = report | {"scanner": mirrors["scanner"], "effect": effect, "mirrors": str(out)}
+            lines.append(f"error that stays {error_rad[0]:.3g} rad of x and {error_rad[1]:.3g} rad of y")
     else:
         found = [find_effect(*build_records(responses, axis)) for axis in range(responses.u.shape[1])]
         report = {"axes": [{"linearity": report_linearity(each)} for each in found]}
@@ -179,4 +195,4 @@ def _assess_responses(path: Path, sample_rate_hz: float | None, out: Path | None
             for axis, each in enumerate(report["axes"])
             for line in describe_linearity(each["linearity"])
         ]
-    print_answer(report, lines, json)
+    print_answer(report, [*lines, *list_written(out)], json)

@@ -4,17 +4,26 @@ Settling times and the error of a nonlinear mirror are those of simulated moves 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, exp, pi, sin, sqrt
 
 import numpy as np
 
+from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import DAMPING_MAX, Config
 from optodrive.device.config_sections import ServoSection
-from optodrive.device.gate_timing import settling_s
+from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.effect_fit import LINEAR, OTHER, STEPS_PER_TIME_CONSTANT, FormFit, Linearity
+from optodrive.lab.servo_identification.amplitude_response import CoupledAxes
+from optodrive.lab.servo_identification.effect_fit import (
+    LINEAR,
+    OTHER,
+    STEPS_MAX,
+    STEPS_PER_TIME_CONSTANT,
+    FormFit,
+    Linearity,
+)
 from optodrive.lab.servo_identification.effects import (
     SLEW_LIMIT,
     build_drive,
@@ -41,6 +50,8 @@ SETTLING_SLACK = 1.001
 """Permitted ratio of required to actual settling time."""
 HOLD_TIME_CONSTANTS = 40.0
 """Time at a position after a move, in 1/(ζω): the rest of a linear response is below 10⁻¹⁷."""
+RINGING_MIN = 1e-3
+"""Ringing after a move, relative to it, below which a mode counts as error in place of time."""
 VISITS = 40
 """Moves between random positions, whose histories a hysteresis remembers."""
 RESIDUAL_SIGMAS = 3.0
@@ -71,19 +82,16 @@ def find_common_servo(
 
     settle: further lower bound of the settling time of a move of an axis, s
     """
-    moves = [
-        (step_rad, share * tolerance_rad, axis)
-        for axis, tolerance_rad in enumerate(config.tolerance_rad)
-        for step_rad in move_sizes_rad(config, axis)
-        for share in TOLERANCE_SHARES
-    ]
+    moves = _list_moves(config)
     required_s = np.array(
         [
             max(mirrors[axis].settling_s(step, tolerance)[2], settle(axis, step, tolerance))
             for step, tolerance, axis in moves
         ]
     )
-    candidates = [_slow_to_required(mirror.servo, mirrors, moves, required_s) for mirror in mirrors]
+    delay_s, slew = max(each.servo.delay for each in mirrors), min(each.servo.slew for each in mirrors)
+    starts = [replace(mirror.servo, delay=delay_s, slew=slew) for mirror in mirrors]
+    candidates = [_slow_to_required(start, moves, required_s) for start in starts]
     servo = min(candidates, key=lambda each: float(_settling_times_s(each, moves).mean()))
     steps_rad = [step for step, _, _ in moves]
     ratio = max(
@@ -92,6 +100,53 @@ def find_common_servo(
         for step in steps_rad
     )
     return CommonServo(servo, min(1.0, 1.0 / sqrt(ratio)), _settling_excess(mirrors, servo, moves))
+
+
+def _list_moves(config: Config) -> list[tuple[float, float, int]]:
+    """Return size, tolerance and axis of the moves at which settling is compared."""
+    return [
+        (step_rad, share * tolerance_rad, axis)
+        for axis, tolerance_rad in enumerate(config.tolerance_rad)
+        for step_rad in move_sizes_rad(config, axis)
+        for share in TOLERANCE_SHARES
+    ]
+
+
+def bound_coupled_moves(
+    axes: CoupledAxes, angle_per_output: FloatArray, config: Config
+) -> tuple[Servo, tuple[float, float]]:
+    """Return a servo that settles no sooner than coupled axes at any measured amplitude, and the errors that stay, rad.
+
+    angle_per_output: [2, o]. Commands are those that turn the mirrors by their size at the model's own amplitude, since
+    the calibrated field absorbs gains. What stays of a move is the change of its end with the amplitude, what
+    creeps, and the model's error between amplitudes. Raise InputError for moves that settle too slowly for any servo.
+    """
+    model, zero = axes.model, np.zeros(1)
+    drive = np.linalg.pinv(angle_per_output @ model.at(model.level, zero)[0].real)
+    ringing = np.max([model.measure_ringing(float(level), angle_per_output, drive) for level in axes.levels], axis=0)
+    moves_with_amplitude = np.arange(len(ringing)) < len(model.poles)
+    rings = moves_with_amplitude & (ringing > RINGING_MIN)
+    poles = np.concatenate([model.list_poles(float(level))[rings] for level in axes.levels])
+    if not len(poles) or poles.real.max() >= 0.0:
+        raise InputError("response", "no mode, or one that does not decay", "modes that decay: more realisations")
+    count = min(int(HOLD_TIME_CONSTANTS * model.rate_hz / -poles.real.max()), STEPS_MAX) + 1
+    turns, slow_turns = (
+        [angle_per_output @ model.respond_to_step(float(level), count, each) @ drive for level in axes.levels]
+        for each in (rings, rings | ~moves_with_amplitude)
+    )
+    required_s = np.zeros(len(moves := _list_moves(config)))
+    for row, (size_rad, tolerance_rad, axis) in enumerate(moves):
+        allowed = np.array(config.tolerance_rad) * (tolerance_rad / config.tolerance_rad[axis]) / size_rad
+        for turn in turns:
+            outside = (np.abs(turn[:, :, axis] - turn[-1, :, axis]) > allowed).any(axis=1)
+            required_s[row] = max(required_s[row], np.flatnonzero(np.append(True, outside))[-1] / model.rate_hz)
+    # Background poles creep for as long as the lowest line of the excitation: that is error, not time to wait for.
+    begin = int(required_s.min() * model.rate_hz)
+    creep = max(float(np.abs(slow - fast)[begin:].max()) for slow, fast in zip(slow_turns, turns, strict=True))
+    share = axes.error_between + creep + float(ringing[moves_with_amplitude & ~rings].sum())
+    miss = np.max([np.abs(turn[-1] - np.eye(2)) for turn in turns], axis=0) + share * np.eye(2)
+    error_rad = miss @ [max(move_sizes_rad(config, axis)) for axis in range(2)]
+    return _slow_to_required(build_servo(config.scanner), moves, required_s), (float(error_rad[0]), float(error_rad[1]))
 
 
 def find_half_widths(
@@ -118,23 +173,20 @@ def move_sizes_rad(config: Config, axis: int) -> list[float]:
     return [pitch_rad * pitch_count for pitch_count in pitches]
 
 
-def _slow_to_required(
-    start: Servo,
-    mirrors: tuple[IdentifiedServo, IdentifiedServo],
-    moves: list[tuple[float, float, int]],
-    required_s: FloatArray,
-) -> Servo:
-    """Lower the frequency of a servo, with the longer delay and the lower slew, until it settles as required."""
-    damping = min(max(start.damping, DAMPING_MIN), COMMON_DAMPING_MAX)
-    delay_s, slew = max(each.servo.delay for each in mirrors), min(each.servo.slew for each in mirrors)
-    frequency = start.frequency
+def _slow_to_required(start: Servo, moves: list[tuple[float, float, int]], required_s: FloatArray) -> Servo:
+    """Lower the frequency of a servo until it settles as required. Raise InputError below the range of a file."""
+    servo = replace(start, damping=min(max(start.damping, DAMPING_MIN), COMMON_DAMPING_MAX))
     while True:
-        servo = Servo(frequency, damping, delay_s, slew)
-        if frequency * FREQUENCY_STEP < FREQUENCY_MIN_HZ or np.all(
-            _settling_times_s(servo, moves) * SETTLING_SLACK >= required_s
-        ):
+        settling_s = _settling_times_s(servo, moves) * SETTLING_SLACK
+        if np.all(settling_s >= required_s):
             return servo
-        frequency *= FREQUENCY_STEP
+        if servo.frequency * FREQUENCY_STEP < FREQUENCY_MIN_HZ:
+            worst = int(np.argmax(required_s - settling_s))
+            expected = (
+                f"at most {1e3 * settling_s[worst]:.3g} ms, those of {FREQUENCY_MIN_HZ:g} Hz, the slowest in a file"
+            )
+            raise InputError("settling time", f"{1e3 * required_s[worst]:.3g} ms", expected)
+        servo = replace(servo, frequency=servo.frequency * FREQUENCY_STEP)
 
 
 def _settling_times_s(servo: Servo, moves: list[tuple[float, float, int]]) -> FloatArray:

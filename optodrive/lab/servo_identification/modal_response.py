@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq, least_squares
 
-from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 
 MODES_MAX = 16
 """Largest number of modes that move with the amplitude."""
@@ -92,7 +92,7 @@ class ModalResponse:
 
     def at(self, level: float, frequency_hz: FloatArray) -> Any:
         """Return G at an amplitude, [lines, o, i], complex."""
-        poles = np.concatenate([self.poles_at(level), self.fixed])
+        poles = self.list_poles(level)
         columns = _build_columns(np.exp(2j * pi * frequency_hz / self.rate_hz), np.exp(poles / self.rate_hz))
         return np.tensordot(columns, self.residues, axes=1) * (1.0 + self.gains * self._law(level))
 
@@ -103,6 +103,34 @@ class ModalResponse:
         parts = [self.at(float(each), frequency_hz) @ spectrum[:, :, [row]] for row, each in enumerate(level)]
         answer: FloatArray = np.fft.irfft(np.concatenate(parts, axis=2), len(u), axis=0)
         return answer
+
+    def list_poles(self, level: float) -> Any:
+        """Return λ of all modes at an amplitude, [m + k], rad/s."""
+        return np.concatenate([self.poles_at(level), self.fixed])
+
+    def measure_ringing(self, level: float, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
+        """Return the largest ringing of each mode, [m + k], in outputs [a, o] after a step of inputs [i, a]."""
+        ends = self._pair_residues() / (1.0 - np.exp(self.list_poles(level) / self.rate_hz))[:, None, None]
+        ringing: FloatArray = 2.0 * np.abs(outputs @ ends @ inputs).max(axis=(1, 2))
+        return ringing
+
+    def respond_to_step(self, level: float, count: int, rings: BoolArray) -> FloatArray:
+        """Return the outputs at each of count samples after a unit step of each input from rest, [count, o, i].
+
+        rings: [m + k], modes that take time; others are at their end at once. The gains' imaginary parts, a lag at any
+        frequency, are left out: a step has no frequency.
+        """
+        poles = np.exp(self.list_poles(level) / self.rate_hz)
+        decays = np.where(rings, poles, 0.0) ** np.arange(count)[:, None]
+        modes = np.tensordot((1.0 - np.where(rings, decays, 0.0)) / (1.0 - poles), self._pair_residues(), axes=1)
+        direct = self.residues[-2] + self.residues[-1] * (np.arange(count) > 0)[:, None, None]
+        outputs: FloatArray = (2.0 * modes.real + direct) * (1.0 + self.gains.real * self._law(level))
+        return outputs
+
+    def _pair_residues(self) -> Any:
+        """Return R of each mode's first pole, [m + k, o, i]."""
+        pairs = self.residues[:-2].reshape(-1, 2, *self.residues.shape[1:])
+        return pairs[:, 0] + 1j * pairs[:, 1]
 
     def _law(self, level: float) -> float:
         return float((level / self.level) ** self.exponent) - 1.0
@@ -180,12 +208,16 @@ def fit_modes(
     start = np.concatenate([np.log(found[moves]), np.zeros(moves.sum() + values.shape[3])]).view(np.float64)
     fit = _ModalFit(rate_hz, z, law, values, found[~moves], 0.0)
     noise = float(np.sqrt(np.mean(fit.compute_residual(start) ** 2)))
+    low = start - CHANGE_MAX
+    # A pole whose logarithm has an imaginary part of π/2 does not decay.
+    angles = slice(1, 2 * moves.sum(), 2)
+    low[angles] = np.maximum(low[angles], 0.5 * (0.5 * pi + start[angles]))
     fit = replace(fit, weight=noise / CHANGE_SIGMA)
     end = least_squares(
         fit.compute_residual,
         start,
         jac=fit.differentiate,
-        bounds=(start - CHANGE_MAX, start + CHANGE_MAX),
+        bounds=(low, start + CHANGE_MAX),
         x_scale="jac",
         max_nfev=EVALUATIONS,
         ftol=1e-6,

@@ -14,7 +14,7 @@ from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.inference.sentences import describe_sufficiency
 from optodrive.lab.servo_identification.effect_fit import LINEAR, Linearity
-from optodrive.lab.servo_identification.effects import LABELS
+from optodrive.lab.servo_identification.effects import LABELS, SLEW_LIMIT
 from optodrive.lab.servo_identification.gate import CommonServo, MirrorEffect, find_half_widths, move_sizes_rad
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.lab.servo_identification.records import AXES
@@ -85,6 +85,9 @@ def describe_linearity(report: dict[str, Any]) -> list[str]:
     fits = [
         f"{report['form'][name]}: {misfit[name]:.3g} × noise, linear {misfit[LINEAR]:.3g}" for name in report["effects"]
     ]
+    if report["effects"] == [SLEW_LIMIT]:
+        # A slew limit is part of every servo: the name is no call for action.
+        headline += " The identified servo states it."
     return [" ".join([headline, *(f"{each}." for each in fits)]), *reasons]
 
 
