@@ -23,8 +23,7 @@ from optodrive.lab.servo_identification.effects import (
     SLEW_LIMIT,
     ServoNonlinearity,
     build_drive,
-    integrate,
-    propagate,
+    respond,
     sample_angle,
 )
 
@@ -154,13 +153,9 @@ class ServoData:
         self, form: ServoNonlinearity, base: FloatArray, effect: tuple[float, float], scale: float
     ) -> list[FloatArray]:
         """Return angle and speed on the grid of each record, [n, 2]."""
-        omega, zeta, h_s = float(np.exp(base[0])), float(base[1]), self.h_s / form.substeps
         of_command = (form, effect) if form.changes_command else (LINEAR_FORM, (1.0, 1.0))
-        step, states = propagate(omega, zeta, h_s), []
-        for drive in self.drives(*of_command, float(base[2]), form.substeps):
-            states.append(np.empty_like(drive))
-            integrate(form.kind, *effect, omega, zeta, step, drive, h_s, scale, states[-1])
-        return states
+        drives, cell = self.drives(*of_command, float(base[2]), form.substeps), (self.h_s / form.substeps, scale)
+        return [respond(form, effect, (base[0], base[1]), drive, cell) for drive in drives]
 
     def simulate(
         self,

@@ -112,21 +112,23 @@ FORMS = (
 )
 
 
+class Breakpoints(NamedTuple):
+    """Value at each breakpoint of a command, and slope from it on, all [n]."""
+
+    begin_s: FloatArray
+    value: FloatArray
+    slope: FloatArray
+
+
 @array_kernel
 def transform_command(
-    kind: int,
-    first: float,
-    second: float,
-    at_s: FloatArray,
-    command: FloatArray,
-    begin_s: FloatArray,
-    value: FloatArray,
-    slope: FloatArray,
+    kind: int, first: float, second: float, at_s: FloatArray, command: FloatArray, out: Breakpoints
 ) -> int:
     """Write the breakpoints of the command after an effect on it, and return their number.
 
-    at_s, command: [k] values that hold; begin_s, value, slope: [2 k], value at each breakpoint and slope from it on
+    at_s, command: [k] values that hold; out: [2 k]
     """
+    begin_s, value, slope = out.begin_s, out.value, out.slope
     target, last, state, count = command[0], command[0], 0.0, 0
     plays = np.full(BANK, command[0])
     for row in range(len(command)):
@@ -177,13 +179,12 @@ def transform_command(
 
 
 @array_kernel
-def average_cells(
-    count: int, begin_s: FloatArray, value: FloatArray, slope: FloatArray, start_s: float, h_s: float, out: FloatArray
-) -> None:
-    """Write mean and slope of a command in each cell of h_s from start_s on: [n, 2].
+def average_cells(count: int, command: Breakpoints, start_s: float, h_s: float, out: FloatArray) -> None:
+    """Write mean and slope of a command with count breakpoints in each cell of h_s from start_s on: [n, 2].
 
     The slope is that of the line with the command's first moment in the cell.
     """
+    begin_s, value, slope = command.begin_s, command.value, command.slope
     row = 0
     for cell in range(len(out)):
         now_s, end_s = start_s + cell * h_s, start_s + (cell + 1) * h_s
@@ -212,31 +213,52 @@ def build_drive(
     cells: time at which the first begins, duration, and number
     """
     kind, (first, second) = (form.kind, effect) if form.changes_command else (NONE, (1.0, 1.0))
-    begin_s, value, slope = (np.empty(2 * len(command)) for _ in range(3))
-    count = transform_command(kind, first, second, at_s, command, begin_s, value, slope)
+    changed = Breakpoints(*np.empty((3, 2 * len(command))))
+    count = transform_command(kind, first, second, at_s, command, changed)
     drive = np.empty((cells[2], 2))
-    average_cells(count, begin_s, value, slope, *cells[:2], drive)
+    average_cells(count, changed, *cells[:2], drive)
     return drive
 
 
-@array_kernel
-def integrate(
-    kind: int,
-    first: float,
-    second: float,
-    omega: float,
-    zeta: float,
-    step: FloatArray,
-    drive: FloatArray,
-    h_s: float,
-    scale: float,
-    out: FloatArray,
-) -> None:
-    """Write angle and speed after each cell of h_s for the command's mean and slope in each, from rest: [n, 2].
+class Motion(NamedTuple):
+    """A servo with an effect on its motion.
 
-    step: [2, 4], exact propagation of (θ, θ'), of a load and of its slope over a cell; scale: deflection to which
-    spring and Stribeck speed refer
+    step: [2, 4], exact propagation of (θ, θ'), of a load and of its slope over a cell of h_s; scale: deflection to
+    which spring and Stribeck speed refer
     """
+
+    kind: int
+    first: float
+    second: float
+    omega: float
+    zeta: float
+    h_s: float
+    scale: float
+    step: FloatArray
+
+
+def respond(
+    form: ServoNonlinearity,
+    effect: tuple[float, float],
+    base: tuple[float, float],
+    drive: FloatArray,
+    cell: tuple[float, float],
+) -> FloatArray:
+    """Return angle and speed after each cell for the command's mean and slope in each [n, 2], from rest: [n, 2].
+
+    base: log ω and ζ; cell: duration, s, and deflection to which spring and Stribeck speed refer
+    """
+    omega, zeta, states = float(np.exp(base[0])), float(base[1]), np.empty_like(drive)
+    motion = Motion(form.kind, *effect, omega, zeta, *cell, propagate(omega, zeta, cell[0]))
+    integrate(motion, drive, states)
+    return states
+
+
+@array_kernel
+def integrate(motion: Motion, drive: FloatArray, out: FloatArray) -> None:
+    """Write angle and speed after each cell for the command's mean and slope in each, from rest: [n, 2]."""
+    kind, first, second, scale, step = motion.kind, motion.first, motion.second, motion.scale, motion.step
+    omega, zeta, h_s = motion.omega, motion.zeta, motion.h_s
     angle, speed, state, w2 = drive[0, 0], 0.0, 0.0, omega * omega
     for row in range(len(drive)):
         target, tilt = drive[row, 0], drive[row, 1]

@@ -27,8 +27,7 @@ from optodrive.lab.servo_identification.effect_fit import (
 from optodrive.lab.servo_identification.effects import (
     SLEW_LIMIT,
     build_drive,
-    integrate,
-    propagate,
+    respond,
 )
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 
@@ -269,8 +268,7 @@ def _simulate_moves(fit: FormFit, config: Config, axis: int) -> tuple[float, Flo
     target = np.array(places)
     begin_s = np.asarray(h_s * hold * np.arange(len(target)), dtype=np.float64)
     drive = build_drive(fit.form, fit.effect, begin_s, target, (0.0, h_s, len(target) * hold))
-    states = np.empty_like(drive)
-    integrate(fit.form.kind, *fit.effect, omega, zeta, propagate(omega, zeta, h_s), drive, h_s, fit.scale, states)
+    states = respond(fit.form, fit.effect, fit.base[:2], drive, (h_s, fit.scale))
     angle = states[:, 0].reshape(len(target), hold)
     # The calibrated field absorbs gain and offset.
     model = np.column_stack([np.ones(len(target)), angle[:, -1]])
