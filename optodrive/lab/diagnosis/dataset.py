@@ -104,6 +104,14 @@ class Dataset:
         """Measured pixels, sorted."""
         return sorted({block.pixel for block in self.blocks if block.kind in PIXEL_KINDS})
 
+    @cached_property
+    def run_blocks(self) -> list[list[Block]]:
+        """Blocks of each run, none for a run without."""
+        blocks: list[list[Block]] = [[] for _ in self.runs]
+        for block in self.blocks:
+            blocks[block.run].append(block)
+        return blocks
+
     def split_subsystems(self) -> list["Dataset"]:
         """Split the data into pixel and mirror signals, which share only the clock. Empty parts are omitted."""
         subsystems = []

@@ -3,15 +3,15 @@
 The normal equations are those of each run under the noise model, with the jitters of the run marginalised.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from optodrive.core.errors import DivergedError, Unquoted
-from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Block, Dataset
 from optodrive.lab.diagnosis.noise_model import NoiseModel, whiten
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 from optodrive.physics.hypothesis import FreeParameter
@@ -52,25 +52,42 @@ def compute_normal_equations(
 
     power, timing: sensitivities [m] as in `JitterSensitivity`
     """
-    kinds, count = data.kinds, columns.shape[1]
+    count, kinds = columns.shape[1], data.kinds
+    places = np.arange(count)
+    grams = [
+        reduce_run([(block, columns[block.part], places) for block in blocks], count, kinds, noise, power, timing)
+        for blocks in data.run_blocks
+    ]
+    return NormalEquations(np.array(grams))
+
+
+def reduce_run(
+    parts: Iterable[tuple[Block, FloatArray, IntArray]],
+    count: int,
+    kinds: list[int],
+    noise: NoiseModel,
+    power: FloatArray,
+    timing: FloatArray,
+) -> FloatArray:
+    """Return the gram matrix [count, count] of the whitened columns of one run, its jitters marginalised.
+
+    parts: blocks of the run with their columns and the numbers of these; power, timing: as in `JitterSensitivity`
+    """
     size = 2 + len(kinds)
-    grams = np.zeros((len(data.runs), count + size, count + size))
-    for block in data.blocks:
-        part, index = block.part, kinds.index(block.kind)
-        jitters = np.zeros((part.stop - part.start, size))
-        jitters[:, 0] = noise.power_sigma * power[part]
-        jitters[:, 1] = noise.timing_sigma_s * timing[part]
+    gram = np.zeros((count + size, count + size))
+    for block, columns, places in parts:
+        jitters = [
+            noise.power_sigma * power[block.part],
+            noise.timing_sigma_s * timing[block.part],
+            np.full(len(block.t_s), noise.baseline_sigma[block.kind]),
+        ]
+        whitened, _ = whiten(block.t_s, np.column_stack([columns, *jitters]), noise.coloured[block.kind])
         # Each signal has its own zero in each run; power and time are common to all signals of the run.
-        jitters[:, 2 + index] = noise.baseline_sigma[block.kind]
-        whitened, _ = whiten(block.t_s, np.hstack([columns[part], jitters]), noise.coloured[block.kind])
-        grams[block.run] += whitened.T @ whitened
-    out = np.empty((len(data.runs), count, count))
-    for run, gram in enumerate(grams):
-        # The jitters have unit variance after their scaling: their prior is the identity, and they drop out in closed
-        # form.
-        inner = gram[count:, count:] + np.eye(size)
-        out[run] = gram[:count, :count] - gram[:count, count:] @ np.linalg.solve(inner, gram[count:, :count])
-    return NormalEquations(out)
+        own = np.concatenate([places, count + np.array([0, 1, 2 + kinds.index(block.kind)])])
+        gram[np.ix_(own, own)] += whitened.T @ whitened
+    # The jitters have unit variance after their scaling: their prior is the identity, and they drop out in closed form.
+    inner = gram[count:, count:] + np.eye(size)
+    return np.asarray(gram[:count, :count] - gram[:count, count:] @ np.linalg.solve(inner, gram[count:, :count]))
 
 
 def solve(gram: FloatArray, right: FloatArray) -> FloatArray:

@@ -14,8 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import Dataset
 from optodrive.lab.diagnosis.evidence import BinEvidence, compute_bin_evidence
-from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity, project_out
-from optodrive.lab.diagnosis.noise_model import whiten
+from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity, project_out, reduce_run
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS
 
 EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)
@@ -67,7 +66,7 @@ class _Noise:
 
 def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: JitterSensitivity) -> OmnibusStatistic:
     """Compute the statistic of the last of the columns [m, k], with the others projected out."""
-    data, noise, kinds = problem.data, problem.noise, problem.data.kinds
+    data = problem.data
     bins, width = _find_bins(data), columns.shape[1]
     labels, count = bins.label, len(bins.joined)
     total = np.zeros((width + count, width + count))
@@ -75,39 +74,19 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
         total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] = 1.0 / np.square(problem.prior.sigma)
     own_noise, joined_noise = _Noise(), _Noise()
     groups: dict[str, tuple[FloatArray, FloatArray]] = {}
-    by_run: dict[int, list[int]] = {}
-    for number, block in enumerate(data.blocks):
-        by_run.setdefault(block.run, []).append(number)
-    for run, numbers in by_run.items():
-        run_bins = _list_bins(np.concatenate([labels[data.blocks[number].part] for number in numbers]))
-        size = 2 + len(kinds)
-        gram = np.zeros((width + len(run_bins) + size, width + len(run_bins) + size))
-        for number in numbers:
-            block = data.blocks[number]
-            part, kind = block.part, kinds.index(block.kind)
-            block_bins = _list_bins(labels[part])
-            indicators = (labels[part][:, None] == block_bins).astype(np.float64)
-            jitters = np.column_stack(
-                [
-                    noise.power_sigma * sensitivity.power[part],
-                    noise.timing_sigma_s * sensitivity.timing[part],
-                    np.full(part.stop - part.start, noise.baseline_sigma[block.kind]),
-                ]
-            )
-            whitened, _ = whiten(block.t_s, np.hstack([columns[part], indicators, jitters]), noise.coloured[block.kind])
-            indices = np.concatenate(
-                [
-                    np.arange(width),
-                    width + np.searchsorted(run_bins, block_bins),
-                    width + len(run_bins) + np.array([0, 1, 2 + kind]),
-                ]
-            )
-            gram[np.ix_(indices, indices)] += whitened.T @ whitened
-        kept_size = width + len(run_bins)
-        inner = gram[kept_size:, kept_size:] + np.eye(size)
-        reduced = gram[:kept_size, :kept_size] - gram[:kept_size, kept_size:] @ np.linalg.solve(
-            inner, gram[kept_size:, :kept_size]
-        )
+    for run, blocks in enumerate(data.run_blocks):
+        if not blocks:
+            continue
+        run_bins = _list_bins(np.concatenate([labels[block.part] for block in blocks]))
+        parts = []
+        for block in blocks:
+            label = labels[block.part]
+            block_bins = _list_bins(label)
+            indicators = (label[:, None] == block_bins).astype(np.float64)
+            places = np.concatenate([np.arange(width), width + np.searchsorted(run_bins, block_bins)])
+            parts.append((block, np.hstack([columns[block.part], indicators]), places))
+        size = width + len(run_bins)
+        reduced = reduce_run(parts, size, data.kinds, problem.noise, sensitivity.power, sensitivity.timing)
         indices = np.concatenate([np.arange(width), width + run_bins])
         total[np.ix_(indices, indices)] += reduced
         bin_gram, bin_right = reduced[width:, width:], reduced[width:, width - 1]
@@ -126,11 +105,11 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
     projected = project_out(total, removed, [*range(width, width + count), last])
     correlation, scaled = _scale_informative(projected[:-1, :-1], projected[:-1, -1])
     chi2 = float(scaled @ cho_solve(cho_factor(correlation), scaled))
-    parts = [compute_bin_evidence(correlation, scaled, own_noise.chi2, own_noise.degrees)]
+    evidences = [compute_bin_evidence(correlation, scaled, own_noise.chi2, own_noise.degrees)]
     gram, right = bins.joined.T @ projected[:-1, :-1] @ bins.joined, bins.joined.T @ projected[:-1, -1]
-    parts.append(compute_bin_evidence(*_scale_informative(gram, right), joined_noise.chi2, joined_noise.degrees))
-    evidence = BinEvidence(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("gains", "rests")))
-    return OmnibusStatistic(chi2, len(scaled), own_noise.chi2, own_noise.degrees, evidence)
+    evidences.append(compute_bin_evidence(*_scale_informative(gram, right), joined_noise.chi2, joined_noise.degrees))
+    gains, rests = (np.concatenate([getattr(each, name) for each in evidences]) for name in ("gains", "rests"))
+    return OmnibusStatistic(chi2, len(scaled), own_noise.chi2, own_noise.degrees, BinEvidence(gains, rests))
 
 
 def _select_joined(bins: Bins, used: IntArray) -> FloatArray:
