@@ -178,6 +178,9 @@ def test_without_gains_of_runs_a_touched_sensor_would_pass_for_an_ageing_absorbe
     found = diagnose(touched)
     assert (found.verdict, found.causes) == ("cause", ("run_gain",))
     assert found.parameters["run_gain.displacement"].value == pytest.approx(0.06, abs=0.01)
+    (said,) = (item for item in found.remarks if item.startswith("run_gain"))
+    assert "displacement_m" in said
+    assert said.endswith("in run002, run003.")
     monkeypatch.setattr(type(discover_terms()["run_gain"]), "build_hypotheses", lambda self, scope: [])
     assert "absorber_ageing" in diagnose(touched).causes
 

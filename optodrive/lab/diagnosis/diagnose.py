@@ -23,7 +23,7 @@ from optodrive.core.types.discrepancy import (
 )
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.candidate_judgement import judge_candidates, list_rivals
-from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset, build_dataset, build_hypotheses
+from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS, Dataset, build_dataset, build_hypotheses
 from optodrive.lab.diagnosis.detection import ProgressCallback, SearchLog, detect, ignore_progress
 from optodrive.lab.diagnosis.estimates import (
     compute_covariance,
@@ -67,8 +67,9 @@ from optodrive.lab.diagnosis.recording_checks import check_copied_runs, check_nu
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_strongest
 from optodrive.lab.inference.claim import HeldOutChange, claim, combine_claims
 from optodrive.lab.inspection.inspection import inspect_recording
+from optodrive.lab.inspection.work import list_names
 from optodrive.physics.hypothesis import Hypothesis
-from optodrive.physics.term import TermValues
+from optodrive.physics.term import BySignal, TermValues
 from optodrive.physics.terms import discover_terms
 
 MIN_CHANGE_RATIO = 16.0
@@ -450,7 +451,7 @@ def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
                 f"{causes}: {1 - subsystem.selection.explained_fraction:.1%} of the excess χ² remains, because the "
                 "real effect deviates slightly from the form of its term."
             )
-        out += _describe_range_limits(subsystem.final)
+        out += [*_describe_range_limits(subsystem.final), *_list_runs(subsystem)]
     return tuple(dict.fromkeys(out))
 
 
@@ -463,3 +464,18 @@ def _describe_range_limits(final: ModelFit) -> list[str]:
                 f"{free.label} is at the limit of its plausible range, {format_quantity(value, free.parameter.unit)}."
             )
     return out
+
+
+def _list_runs(subsystem: _SubsystemFit) -> list[str]:
+    """Return in which runs an instrument's record differs, where it does not in all."""
+    runs: dict[tuple[str, str, str], list[str]] = {}
+    for key, values in subsystem.final.point.terms.items():
+        term = discover_terms()[key]
+        if term.only_records and term.varies_between_runs:
+            for block, recorded in zip(subsystem.data.blocks, subsystem.data.recorded_runs, strict=True):
+                name = BySignal._fields[block.kind]
+                change = float(term.record(values, name, np.zeros(1), np.ones(1), recorded)[0]) - 1.0
+                if change:
+                    place = key, SIGNALS[block.kind], f"{change:+.1%}"
+                    runs.setdefault(place, []).append(subsystem.data.runs[block.run].name)
+    return [f"{key}: {signal} is off by {off} in {list_names(names)}." for (key, signal, off), names in runs.items()]
