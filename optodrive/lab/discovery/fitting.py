@@ -113,15 +113,17 @@ class Simulation:
                 return np.array([each.item() for each in values])
         raise InputError("model.initial", "another result", f"a list of {len(self.model.states)} numbers")
 
-    def run(self, record: Record, point: Point, gains: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    def run(
+        self, record: Record, point: Point, gains: FloatArray | None = None, start: FloatArray | float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
         """Return predicted outputs [m, o] and states [m, n], which follow the data if there are gains [m, n, o].
 
-        The states of memories follow those of the model.
+        The states of memories follow those of the model. start: [n] added to the first state
         """
         work = self._allocate(point)
         m, n, o = len(record.t_s), work[0].shape[1], len(self.model.outputs)
         predicted, states = np.zeros((m, o)), np.zeros((m, n))
-        x0 = self.initial_state(record, point.parameters)
+        x0 = self.initial_state(record, point.parameters) + start
         self.kernels.run(
             (record.t_s, record.inputs, record.slopes, record.outputs),
             x0,
@@ -334,15 +336,20 @@ def output_sizes(records: Sequence[Record]) -> FloatArray:
 
 
 def run_errors(
-    simulation: Simulation, records: Sequence[Record], point: Point, sizes: FloatArray, gains: Gains = None
+    simulation: Simulation,
+    records: Sequence[Record],
+    point: Point,
+    sizes: FloatArray,
+    gains: Gains = None,
+    start: FloatArray | float = 0.0,
 ) -> list[FloatArray]:
     """Return the errors [m, o] of each record, whitened or in units of sizes [o], 0 where nothing was measured.
 
-    gains: as of `Simulation.run`, None for free runs
+    gains, start: as of `Simulation.run`, None for free runs
     """
     errors = []
     for k, record in enumerate(records):
-        predicted, _ = simulation.run(record, point, None if gains is None else gains[k])
+        predicted, _ = simulation.run(record, point, None if gains is None else gains[k], start)
         error = weigh(record, record.outputs - predicted, np.broadcast_to(1.0 / sizes, predicted.shape))
         error = np.clip(np.nan_to_num(error, nan=DIVERGED), -DIVERGED, DIVERGED)
         errors.append(np.where(np.isfinite(record.outputs), error, 0.0))

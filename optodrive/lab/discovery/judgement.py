@@ -17,6 +17,7 @@ from optodrive.core.types.discrepancy import Probabilities
 from optodrive.lab.discovery.fitting import Point, Simulation, fit, output_sizes, run_errors, weigh
 from optodrive.lab.discovery.forms import CHANGE, CURVE, LINEAR, NAMELESS, Form
 from optodrive.lab.discovery.held_out import Split, sum_parts
+from optodrive.lab.discovery.integration import STEP
 from optodrive.lab.discovery.memory import NONE, TEXTS, name_memory
 from optodrive.lab.discovery.model import Record
 from optodrive.lab.discovery.screening import Candidate, Filtered, find_twin
@@ -38,8 +39,6 @@ PARTS, EVIDENCE_PARTS = 64, 256
 """Parts of a split's held-out samples in which forms are compared, and in which the evidence for a term is summed."""
 WITHIN_NOISE = 1.1
 """Error in units of noise below which nothing is left to gain."""
-START_NOISE = 10.0
-"""Error of free runs in units of noise, below which it may be that of the first sample, from which the run starts."""
 SAME = 0.01
 """Squared difference of two functions, relative to the smaller one, below which they are one."""
 ALIKE_SIGMA, NEARLY = 2.0, 0.9
@@ -239,9 +238,8 @@ class Judge:
         no_effect, tries = 0.0, 2 * len(kept)  # in predictions that follow the data, and in free runs
         if start is not None:
             no_effect = self._compute_step_evidence(filtered, start, kept[chosen][0].point, tries)
-        if before.rmse[0, 1] > START_NOISE * self.floor:
-            run_evidence = self.compute_evidence(before.errors, kept[chosen][1].errors, self.splits[0].held_out, tries)
-            no_effect = min(no_effect, run_evidence)
+        without, with_term = self._remove_nuisances(before, (before.errors, kept[chosen][1].errors))
+        no_effect = min(no_effect, self.compute_evidence(without, with_term, self.splits[0].held_out, tries))
         names = {k: (f"{forms[k].name} ({forms[k].formula})",) for k in order}
         probabilities = Probabilities(no_effect, 0.0, {names[k]: (1.0 - no_effect) * weights[k] for k in order})
         ranked = sorted(order, key=lambda k: -weights[k])
@@ -275,6 +273,32 @@ class Judge:
             for point in (start, longer)
         )
         return self.compute_evidence(before, after, [each.fold < 0 for each in filtered], tries)
+
+    def _remove_nuisances(self, model: Measured, runs: Sequence[Sequence[FloatArray]]) -> list[list[FloatArray]]:
+        """Return the errors of free runs in what is held out first, less what another start or parameters could do.
+
+        A free run starts from a noisy sample, to which the parameters were fitted elsewhere.
+        """
+        point, masks = model.points[0], self.splits[0].held_out
+        if self.simulation.model.from_rest:
+            return [list(errors) for errors in runs]
+        states = np.concatenate([self.simulation.run(record, point)[1] for record in self.records])
+        sizes = np.maximum(np.nan_to_num(states[:, : len(self.simulation.model.states)].std(axis=0)), 1e-12)
+        moved = [(point, shift) for shift in STEP * np.diag(sizes)]
+        for k, value in enumerate(point.parameters):
+            parameters = point.parameters.copy()
+            parameters[k] += STEP * max(abs(value), 1e-3 * (self.simulation.high - self.simulation.low)[k])
+            moved.append((replace(point, parameters=parameters), 0.0 * sizes))
+        trials = [run_errors(self.simulation, self.records, trial, self.sizes, start=start) for trial, start in moved]
+        out = [[np.zeros_like(each) for each in errors] for errors in runs]
+        for r, mask in enumerate(masks):
+            columns = np.array([(trial[r] - model.errors[r])[mask].ravel() for trial in trials]).T
+            columns /= np.maximum(np.abs(columns).max(axis=0, initial=0.0), 1e-300)
+            for errors, cleaned in zip(runs, out, strict=True):
+                own = errors[r][mask]
+                rest = own.ravel() - columns @ np.linalg.lstsq(columns, own.ravel(), rcond=None)[0]
+                cleaned[r][mask] = rest.reshape(own.shape)
+        return out
 
     def _find_twin(self, filtered: Sequence[Filtered], proposal: Proposal) -> str:
         """Return another variable of which the term is a function too, "" if there is none."""
