@@ -54,9 +54,8 @@ A large effect leads free runs away from where it acts, and the first-order comp
 """
 JUDGED, JUDGED_PER_PLACE = 8, 4
 """Formulas that are judged on what is held out."""
-FREE_PLACES, FREE_JUDGED = 2, 5
-"""Places of free runs, beside those of a filter, of outputs and of memories each, and formulas that are judged of all.
-"""
+FREE_PLACES, FREE_PER_PLACE = 2, 2
+"""Places of free runs, beside those of a filter, of outputs and of memories each, and formulas judged of each."""
 REFINEMENTS = 2
 """How often formulas are ranked again along the free runs with the best one."""
 MIN_ERROR = 1e-3
@@ -68,8 +67,6 @@ MIN_FURTHER_GAIN, MIN_FURTHER_GAIN_WHITE = 0.05, 0.1
 
 Where it is known a little more than the first formula's form is seen, which is no term of its own.
 """
-MIN_REST = 0.1
-"""Share of the error beside the terms found before, by the removal of which a smaller further one is added, too."""
 MIN_GAIN_WHITE = 0.5
 """Share of the avoidable error that the first term removes at least, where noise is known: one that leaves more than it
 removes is not what is missing."""
@@ -96,11 +93,11 @@ def discover(model: OdeModel, train: Sequence[Record], progress: Progress = lamb
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A term by which the model is extended, the claim on it, all forms that were judged, and where they were found."""
+    """A term by which the model is extended, the claim on it, all forms that were tried, and where they were found."""
 
     proposal: Proposal
     term: TermClaim
-    judged: Sequence[Proposal]
+    tried: Sequence[Proposal]
     filtered: Sequence[Filtered]
 
 
@@ -125,9 +122,9 @@ class _Search:
         """Return the answer."""
         first = self._fit_base()
         base = current = self.judge.measure([[first]] * len(self.splits))
-        found, claims = list[Found](), list[Claim]()
-        for number in range(MAX_TERMS):
-            self.progress(f"term {number + 1}", 0.2 + 0.16 * number)
+        found, claims, is_settled = list[Found](), list[Claim](), False
+        while len(found) < MAX_TERMS:
+            self.progress(f"term {len(found) + 1}", 0.2 + 0.16 * len(found))
             if current.rmse[0, 1] < MIN_ERROR and not self.is_white:
                 break
             if found and (current.rmse[:, 1] <= WITHIN_NOISE * self.judge.floor).all():
@@ -146,6 +143,13 @@ class _Search:
                 break
             current = further.proposal.measured or current
             found.append(further)
+            if len(found) == 1 and not self.model.from_rest and not is_settled:
+                # A rule that suited the model without this term would be corrected by a further one.
+                is_settled, before = True, self.simulation.hold
+                self._choose_hold(current.points[0])
+                if self.simulation.hold != before:
+                    base = current = self.judge.measure([[point] for point in base.points])
+                    found = []
         if len(found) > 1:
             current, found = self._reconsider(base, current, found)
         # Of two equal terms neither explains half of the error alone, but both do together.
@@ -189,20 +193,21 @@ class _Search:
         self._measure_sizes(start)
         if self.model.from_rest:
             return self.judge.fit([start], self.splits[0].fitted, 15)
-        best: tuple[float, int, Point] | None = None
-        for hold in (0, 1, 2) if self.model.inputs else (0,):
-            simulation.hold, point, loss = hold, start, np.inf
-            for tightness in TIGHTNESS[:2]:
-                filtered = self._filter(point, tightness)
-                point, loss = self._fit_filtered(point, filtered)
-                self._measure_sizes(point)
-            if best is None or loss < best[0]:
-                best = (loss, hold, point)
-            self.progress("parameters", 0.02 + 0.04 * hold)
-        assert best is not None  # noqa: S101
-        simulation.hold, point = best[1], best[2]
+        point = self._choose_hold(start)
         simulation.h_max = choose_step(simulation, self.records, point)
         return self.judge.fit([point, start], self.splits[0].fitted, 15)
+
+    def _choose_hold(self, start: Point) -> Point:
+        """Take inputs between samples as fits best, and return the fitted parameters."""
+        fits = list[tuple[float, int, Point]]()
+        for hold in (0, 1, 2) if self.model.inputs else (0,):
+            self.simulation.hold, point, loss = hold, start, np.inf
+            for tightness in TIGHTNESS[:2]:
+                point, loss = self._fit_filtered(point, self._filter(point, tightness))
+                self._measure_sizes(point)
+            fits.append((loss, hold, point))
+        _, self.simulation.hold, point = min(fits, key=lambda each: each[0])
+        return point
 
     def _measure_sizes(self, point: Point) -> None:
         """Note rms of states and of their rates along the filtered records."""
@@ -250,7 +255,7 @@ class _Search:
         time = len(self.model.states) + len(self.model.inputs)
         # The curve of a term shows what its formula lacks at its own place; a curve without one lacks one.
         found = {tuple(row[[0, 2, 3, 4]].tolist()) for row in point.terms.table if row[1] not in CURVES}
-        judged = list[Proposal]()
+        judged, starts = list[Proposal](), list[Point]()
         for number, (start, filtered, ranked) in enumerate(searches):
             changes = [each for each in ranked if time in (each.at.variable, each.at.factor)]
             ranked = [each for each in ranked if each not in changes and each.at.key not in found]
@@ -265,25 +270,23 @@ class _Search:
                 shown = outputs[:FREE_PLACES] + past[:FREE_PLACES] + present[:1]
             if self.is_white:
                 shown = [each for each in shown if (1.0 - each.loss) * each.total >= MIN_SQUARES]
-            start, _ = self._fit_filtered(start, filtered, 5)
+            starts.append(self._fit_filtered(start, filtered, 5)[0])
             proposals = list[Proposal]()
             for screened in shown:
-                proposals += self._propose(screened, start, point.terms, filtered, evaluations)
+                proposals += self._propose(screened, starts[-1], point.terms, filtered, evaluations)
             if self.model.from_rest:
                 for _ in range(REFINEMENTS if proposals else 0):
                     with suppress(*UNCOMPUTABLE):
                         proposals += self._refine(point, min(proposals, key=lambda p: p.loss))
             known = {_identify(each) for each in judged}
-            best = self._choose_judged(proposals, {id(screened) for screened in changes})
-            best = [each for each in best if _identify(each) not in known]
-            judged += best[:FREE_JUDGED] if number > 0 else best
-        judged = self._measure(base, current, judged)
-        if not judged:
+            room = JUDGED_PER_PLACE if number == 0 else FREE_PER_PLACE
+            best = self._choose_judged(proposals, {id(screened) for screened in changes}, room)
+            judged += [each for each in best if _identify(each) not in known]
+        measured = self._measure(base, current, judged)
+        if not measured:
             return None
-        start, filtered, _ = searches[0]
-        start, _ = self._fit_filtered(start, filtered, 5)
-        is_further = len(point.terms) > 0
-        chosen, term = self.judge.judge(base, current, judged, filtered, start, is_further=is_further)
+        filtered = searches[0][1]
+        chosen, term = self.judge.judge(base, current, measured, filtered, starts[0])
         return Found(chosen, term, judged, filtered)
 
     def _propose(
@@ -308,7 +311,7 @@ class _Search:
         return self._propose(rest.add_curve(best.evaluate(rest.nodes)), best.point, point.terms, filtered, 20)
 
     @staticmethod
-    def _choose_judged(proposals: Sequence[Proposal], changes: set[int]) -> list[Proposal]:
+    def _choose_judged(proposals: Sequence[Proposal], changes: set[int], per_place: int) -> list[Proposal]:
         """Return the best formulas, few of each place, and of each one curve, and two that change with time.
 
         One with memory does at least as well as the best one without.
@@ -318,7 +321,7 @@ class _Search:
             at, is_curve = each.candidate.screened.at, each.candidate.form.kind == CURVE
             is_change, has_memory = id(each.candidate.screened) in changes, at.memory != NONE
             key: tuple[object, ...] = (at.key, is_curve and not is_change)
-            room = 2 if is_change else 1 if is_curve else JUDGED_PER_PLACE
+            room = 2 if is_change else 1 if is_curve else per_place
             if each.candidate.is_constant:
                 key, room = ("constant", at.place), 1
             is_plain = not (is_change or is_curve or has_memory)
@@ -328,7 +331,9 @@ class _Search:
                 physical += is_plain and not each.candidate.is_constant
         return chosen
 
-    def _measure(self, base: Measured, current: Measured, proposals: Sequence[Proposal]) -> list[Proposal]:
+    def _measure(
+        self, base: Measured, current: Measured, proposals: Sequence[Proposal], best: float = 0.0
+    ) -> list[Proposal]:
         """Return the proposals as measured in free runs, fitted in every split from the model without their term."""
         rivals = []
         for each in proposals:
@@ -336,7 +341,7 @@ class _Search:
             starts = [[point.with_terms(point.terms.extend(term))] for point in current.points]
             starts[0].insert(0, each.point)
             rivals.append((each, starts))
-        return self.judge.measure_rivals(base, current, rivals)
+        return self.judge.measure_rivals(base, current, rivals, best)
 
     def _reconsider(self, base: Measured, current: Measured, found: Sequence[Found]) -> tuple[Measured, list[Found]]:
         """Return the model and its terms, each judged again beside all others, which may have stood in for it."""
@@ -346,17 +351,16 @@ class _Search:
             each = kept.pop(0)  # the first row of the table, and then the last
             turned = [[point.with_terms(point.terms[1:].extend(point.terms[:1]))] for point in current.points]
             others = self.judge.measure([[point.with_terms(point.terms[1:])] for point in current.points])
-            first, alone = (
-                turned[0][0],
-                [trial for trial in each.judged if trial.candidate is not each.proposal.candidate],
-            )
+            first = turned[0][0]
             trials = [
                 replace(trial, point=first.with_terms(first.terms[:-1].extend(trial.point.terms[-1:])))
-                for trial in alone
+                for trial in each.tried
+                if trial.candidate is not each.proposal.candidate
             ]
-            own = replace(each.proposal, point=first, measured=self.judge.measure(turned))
-            judged = [own, *self._measure(base, others, trials)]
-            chosen, term = self.judge.judge(base, others, judged, each.filtered, None, is_further=True)
+            own = self.judge.measure(turned)
+            best = self.judge.measure_smallest_gain(base, others, own)
+            judged = [replace(each.proposal, point=first, measured=own), *self._measure(base, others, trials, best)]
+            chosen, term = self.judge.judge(base, others, judged, each.filtered, None)
             if self._is_enough(base, others, chosen, True, is_final=True):
                 current = chosen.measured or current
                 kept.append(replace(each, proposal=chosen, term=term))
@@ -383,13 +387,9 @@ class _Search:
         minimum_gain = MIN_FURTHER_GAIN if is_further else 0.0
         if self.is_white:
             minimum_gain = MIN_FURTHER_GAIN_WHITE if is_further else MIN_GAIN_WHITE
-        # A large first term does not hide what can be predicted of the rest.
-        used = slice(None) if is_final else slice(1)
-        left = proposal.measured.rmse[used, 1] / current.rmse[used, 1]
-        is_much_of_rest = is_further and not self.is_white and float(left.max()) < 1.0 - MIN_REST
         return (
             after < before * (1.0 - minimum)
-            and (min(shares, default=0.0) >= minimum_gain or is_much_of_rest)
+            and min(shares, default=0.0) >= minimum_gain
             and min((each.held_out for each in gains), default=0.0) > 0.0
         )
 

@@ -124,20 +124,14 @@ class Simulation:
         m, n, o = len(record.t_s), work[0].shape[1], len(self.model.outputs)
         predicted, states = np.zeros((m, o)), np.zeros((m, n))
         x0 = self.initial_state(record, point.parameters) + start
-        self.kernels.run(
-            (record.t_s, record.inputs, record.slopes, record.outputs),
-            x0,
-            self.pack(point.parameters[None, :]),
-            point.terms.table,
-            point.terms.values,
-            self.h_max,
-            self.hold,
-            np.zeros((m, n, o)) if gains is None else gains,
-            work,
-            predicted,
-            states,
-        )
+        gains = np.zeros((m, n, o)) if gains is None else gains
+        p, values = self.pack(point.parameters[None, :]), point.terms.values
+        self.kernels.run(self._fix(record, point), x0, p, values, gains, work, predicted, states)
         return predicted, states
+
+    def _fix(self, record: Record, point: Point) -> tuple[object, ...]:
+        samples = (record.t_s, record.inputs, record.slopes, record.outputs)
+        return (*samples, point.terms.table, self.h_max, self.hold)
 
     def _allocate(self, point: Point) -> tuple[FloatArray, ...]:
         return allocate_work(self._sizes[0] + len(point.terms.memories), *self._sizes[1:])
@@ -174,22 +168,10 @@ class Simulation:
         inner = np.array([1.0 if row[MEMORY] in PATH else sources[row[VARIABLE]] or 1.0 for row in rows])
         silent = np.zeros(len(rows))
         out = Linearisation.allocate(len(record.t_s), len(x0) + len(rows), len(noise), len(columns))
-        self.kernels.linearise(
-            (record.t_s, record.inputs, record.slopes, record.outputs),
-            x0,
-            self.pack(np.array(ps)),
-            point.terms.table,
-            np.array(values),
-            np.array(deltas),
-            np.concatenate([scales, inner]),
-            self.h_max,
-            self.hold,
-            np.concatenate([noise_rate, silent]),
-            noise,
-            np.concatenate([start_sigma**2, silent]),
-            work,
-            out,
-        )
+        variances = np.concatenate([noise_rate, silent]), noise, np.concatenate([start_sigma**2, silent])
+        sizes = np.concatenate([scales, inner])
+        packed, tables, steps = self.pack(np.array(ps)), np.array(values), np.array(deltas)
+        self.kernels.linearise(self._fix(record, point), x0, packed, tables, steps, sizes, variances, work, out)
         first = np.array(starts).T.reshape(len(x0), len(columns))
         return out, np.concatenate([first, np.zeros((len(rows), len(columns)))])
 

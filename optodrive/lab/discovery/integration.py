@@ -48,10 +48,10 @@ _to_tuple: Any = to_fixed_tuple  # its type takes the compiler's context for an 
 class Kernels(NamedTuple):
     """Compiled functions of one model.
 
-    run(samples, x0, p, terms, values, h_max, hold, gains, workspace, predicted, states);
-    linearise(samples, x0, ps, terms, values_s, deltas, scales, h_max, hold, q, r, p0, workspace, out);
+    run(fixed, x0, p, values, gains, workspace, predicted, states);
+    linearise(fixed, x0, ps, values_s, deltas, scales, (q, r, p0), workspace, out);
     describe(times, states, inputs, p, out): the model's quantities at each of m samples;
-    samples: times, inputs, their slopes and outputs of a record
+    fixed: times, inputs, their slopes and outputs of a record, table of terms, longest step, and rule for inputs
     """
 
     run: Callable[..., None]
@@ -75,7 +75,7 @@ def build_kernels(
     for count_references in (False, True):
         kernels = _build(rhs, output, quantity, n, i, o, count_references)
         try:
-            kernels.run((t, u, u, y), np.ones(n), p, terms, values, 1.0, 0, gains, work, y.copy(), np.zeros((2, n)))
+            kernels.run((t, u, u, y, terms, 1.0, 0), np.ones(n), p, values, gains, work, y.copy(), np.zeros((2, n)))
         except (NumbaError, TypeError, NotImplementedError):
             continue
         return kernels
@@ -139,9 +139,9 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         return float(u[which - n]) if which < n + i else t
 
     @compile_
-    def delayed(which: int, k: int, t: float, z: float, delay: float, hold: int, samples: Any, states: Any) -> float:
+    def delayed(which: int, k: int, t: float, z: float, delay: float, fixed: Any, states: Any) -> float:
         """Return a state or an input as it was before a delay, at time t after sample k, when it is z."""
-        times, u, d, _ = samples
+        times, u, d, _, _, _, hold = fixed
         at, is_state = t - delay, which < n
         column = which if is_state else which - n
         past = states if is_state else u
@@ -182,23 +182,21 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         dt: float,
         x: Any,
         u: Any,
-        terms: Any,
         values: Any,
         derived: Any,
         z0: Any,
-        hold: int,
-        samples: Any,
+        fixed: Any,
         states: Any,
         out: Any,
     ) -> None:
         """Write the memories at time t after sample k, dt after they were x and their variables z0. u: [i] inputs."""
-        slot = n
+        slot, terms = n, fixed[4]
         for row in range(len(terms)):
             kind = terms[row, MEMORY]
             if kind != NONE:
                 z = variable(terms[row, VARIABLE], t, out, u, derived)
                 if kind == DELAY:
-                    out[slot] = delayed(terms[row, VARIABLE], k, t, z, values[row, SCALE], hold, samples, states)
+                    out[slot] = delayed(terms[row, VARIABLE], k, t, z, values[row, SCALE], fixed, states)
                 else:
                     out[slot] = carry(kind, x[slot], z0[slot], z, dt, values[row, SCALE])
                 slot += 1
@@ -242,10 +240,15 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
             add_terms(n, n + o, terms, values, t, x, u, derived, out)
 
     @compile_
-    def start(t: float, u: Any, ps: Any, terms: Any, derived: Any, x: Any) -> None:
-        """Write the memories at the start of a record."""
-        derive(t, x, u, ps, 0, terms, derived)
-        read_variables(terms, t, x, u, derived, x)
+    def begin(fixed: Any, x0: Any, ps: Any, workspace: Any) -> None:
+        """Write the states and memories at the start of a record."""
+        (work, _, _, _, derived), terms = workspace, fixed[4]
+        x = work[5]
+        for s in range(n):
+            x[s] = x0[s]
+        work[6, :] = 0.0
+        derive(fixed[0][0], x, fixed[1][0], ps, 0, terms, derived)
+        read_variables(terms, fixed[0][0], x, fixed[1][0], derived, x)
         slot = n
         for row in range(len(terms)):
             if terms[row, MEMORY] != NONE:
@@ -253,31 +256,18 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
                 slot += 1
 
     @compile_
-    def advance(
-        k: int,
-        samples: Any,
-        h_max: float,
-        hold: int,
-        ps: Any,
-        q: int,
-        terms: Any,
-        values: Any,
-        offset: Any,
-        x: Any,
-        work: Any,
-        held: Any,
-        derived: Any,
-        states: Any,
-    ) -> None:
+    def advance(k: int, fixed: Any, ps: Any, q: int, values: Any, x: Any, workspace: Any, states: Any) -> None:
         """Advance x in place from sample k - 1 to k.
 
-        work: [10, n]; held: [i] inputs within a step; hold: 0, 1 or 2; states: [m, n] at samples before k
+        workspace: work [10, n], of which row 6 is added to the rates, inputs held within a step [i], and others;
+        states: [m, n] at samples before k
         """
-        t, u, d, _ = samples
+        t, u, d, _, terms, h_max, hold = fixed
+        work, held, _, _, derived = workspace
         t0, t1, u0, u1, d0, d1 = t[k - 1], t[k], u[k - 1], u[k], d[k - 1], d[k]
         steps = min(max(1, ceil((t1 - t0) / h_max - 1e-6)), MAX_SUBSTEPS)
         h = (t1 - t0) / steps
-        z0, has_memory = work[9], len(x) > n
+        offset, z0, has_memory = work[6], work[9], len(x) > n
         for step in range(steps):
             at = step / steps
             for stage in range(4):
@@ -298,19 +288,17 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
                     if stage == 0:
                         if step == 0 and hold == 0 and k > 1:  # the input jumped at the sample
                             read_variables(terms, t0, work[4], u[k - 2], derived, z0)
-                            remember(
-                                k - 1, t0, 0.0, x, held, terms, values, derived, z0, hold, samples, states, work[4]
-                            )
+                            remember(k - 1, t0, 0.0, x, held, values, derived, z0, fixed, states, work[4])
                             for j in range(n, len(x)):
                                 x[j] = work[4, j]
                         read_variables(terms, now, work[4], held, derived, z0)
-                    remember(k - 1, now, weight, x, held, terms, values, derived, z0, hold, samples, states, work[4])
+                    remember(k - 1, now, weight, x, held, values, derived, z0, fixed, states, work[4])
                 rates(now, work[4], held, ps, q, terms, values, offset, derived, work[stage])
             for j in range(n):
                 work[4, j] = x[j] + h / 6.0 * (work[0, j] + 2.0 * work[1, j] + 2.0 * work[2, j] + work[3, j])
             if has_memory:
                 derive(now, work[4], held, ps, q, terms, derived)
-                remember(k - 1, now, h, x, held, terms, values, derived, z0, hold, samples, states, work[4])
+                remember(k - 1, now, h, x, held, values, derived, z0, fixed, states, work[4])
             copy(work[4], x)
 
     @compile_
@@ -321,29 +309,14 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         return sound
 
     @compile_
-    def run(
-        samples: Any,
-        x0: Any,
-        ps: Any,
-        terms: Any,
-        values: Any,
-        h_max: float,
-        hold: int,
-        gains: Any,
-        workspace: Any,
-        predicted: Any,
-        states: Any,
-    ) -> None:
-        t, u, _, y = samples
-        work, held, _, _, derived = workspace
-        x, offset = work[5], work[6]
-        for s in range(n):
-            x[s] = x0[s]
-        offset[:] = 0.0
-        start(t[0], u[0], ps, terms, derived, x)
+    def run(fixed: Any, x0: Any, ps: Any, values: Any, gains: Any, workspace: Any, predicted: Any, states: Any) -> None:
+        t, u, _, y, terms, _, _ = fixed
+        work, _, _, _, derived = workspace
+        x = work[5]
+        begin(fixed, x0, ps, workspace)
         for k in range(len(t)):
             if k > 0:
-                advance(k, samples, h_max, hold, ps, 0, terms, values, offset, x, work, held, derived, states)
+                advance(k, fixed, ps, 0, values, x, workspace, states)
             if not is_sound(x):
                 predicted[k:] = np.nan
                 states[k:] = np.nan
@@ -357,30 +330,15 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
 
     @compile_
     def linearise(
-        samples: Any,
-        x0: Any,
-        ps: Any,
-        terms: Any,
-        values: Any,
-        deltas: Any,
-        scales: Any,
-        h_max: float,
-        hold: int,
-        noise_rate: Any,
-        noise: Any,
-        start_variance: Any,
-        workspace: Any,
-        out: Any,
+        fixed: Any, x0: Any, ps: Any, values: Any, deltas: Any, scales: Any, variances: Any, workspace: Any, out: Any
     ) -> None:
         predicted, variance, states, gains, transition, response, forcing, observation, direct = out
-        t, u, _, y = samples
-        work, held, y1, half, derived = workspace
+        t, u, _, y, terms, _, _ = fixed
+        work, _, y1, half, derived = workspace
+        noise_rate, noise, start_variance = variances
         x, offset, before, moved = work[5], work[6], work[7], work[8]
         size_n = len(x)
-        for s in range(n):
-            x[s] = x0[s]
-        offset[:] = 0.0
-        start(t[0], u[0], ps, terms, derived, x)
+        begin(fixed, x0, ps, workspace)
         covariance = half[0]
         covariance[:] = 0.0
         for s in range(size_n):
@@ -403,9 +361,7 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
                     elif case > 2 * size_n:
                         q = case - 2 * size_n
                         size = deltas[q - 1]
-                    advance(
-                        k, samples, h_max, hold, ps, q, terms, values[q], offset, moved, work, held, derived, states
-                    )
+                    advance(k, fixed, ps, q, values[q], moved, workspace, states)
                     for s in range(size_n):
                         if case == 0:
                             x[s] = moved[s]

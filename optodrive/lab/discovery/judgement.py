@@ -136,19 +136,29 @@ class Judge:
             if not quiet
         )
 
+    def measure_smallest_gain(self, base: Measured, before: Measured, after: Measured) -> float:
+        """Return the smallest gain in held-out data, 0 where there is nothing to gain."""
+        return min((each.held_out for each in self.measure_gains(base, before, after)), default=0.0)
+
     def measure_rivals(
-        self, base: Measured, current: Measured, rivals: Iterable[tuple[Proposal, Sequence[Sequence[Point]]]]
+        self,
+        base: Measured,
+        current: Measured,
+        rivals: Iterable[tuple[Proposal, Sequence[Sequence[Point]]]],
+        best: float,
     ) -> list[Proposal]:
-        """Return proposals measured from starts in every split, without those that cannot be rivals of the best."""
-        found, best = list[Proposal](), 0.0
+        """Return proposals measured from starts in every split, without those that cannot be rivals of the best.
+
+        best: smallest held-out gain of another one
+        """
+        found = list[Proposal]()
         before, first = min(current.rmse[0, 1], base.rmse[0, 1]), base.rmse[0, 1]
         for each, starts in rivals:
             with suppress(*UNCOMPUTABLE):
                 # What gains less than this share of another's gain in one split is no rival of it.
                 enough = max(before - MIN_KEPT * best * (first - self.floor), WITHIN_NOISE * self.floor)
                 measured = self.measure(starts, enough if best > 0.0 else np.inf)
-                gains = self.measure_gains(base, current, measured)
-                best = max(best, min((gain.held_out for gain in gains), default=0.0))
+                best = max(best, self.measure_smallest_gain(base, current, measured))
                 found.append(replace(each, measured=measured))
         return found
 
@@ -177,13 +187,10 @@ class Judge:
         proposals: Sequence[Proposal],
         filtered: Sequence[Filtered],
         start: Point | None,
-        *,
-        is_further: bool,
     ) -> tuple[Proposal, TermClaim]:
         """Return the proposal to extend the model by, and the claim on its term.
 
-        filtered: the search's records; start: the model without the term there, None where it is known to be missing;
-        is_further: whether there are other terms, beside which a curve only follows what they leave
+        filtered: the search's records; start: the model without the term there, None where it is known to be missing
         """
         fitted = [(each, each.measured) for each in proposals if each.measured is not None]
         kept = list[tuple[Proposal, Measured]]()
@@ -226,14 +233,10 @@ class Judge:
             for form, weight, gain in zip(forms, weights, minimum, strict=True)
         ]
         # A term has no other forms of its own, and is a name only beside terms that explain half of all together.
-        explained = [
-            (min((each.held_out for each in self.measure_gains(base, base, measured)), default=0.0), 1.0)
-            for _, measured in kept
-        ]
+        explained = [(self.measure_smallest_gain(base, base, measured), 1.0) for _, measured in kept]
         is_usable = [form.gain > 0.0 and len(own) > 0 for form, own in zip(forms, gains, strict=True)]
         # Time explains any slow misfit: it is what is left where no state and no input extrapolates.
-        last = (CHANGE, CURVE) if is_further else (CHANGE,)
-        order = sorted(range(len(kept)), key=lambda k: (not is_usable[k], forms[k].kind in last, -weights[k]))
+        order = sorted(range(len(kept)), key=lambda k: (not is_usable[k], forms[k].kind == CHANGE, -weights[k]))
         chosen = order[0]
         no_effect, tries = 0.0, 2 * len(kept)  # in predictions that follow the data, and in free runs
         if start is not None:

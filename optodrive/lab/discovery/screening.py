@@ -75,6 +75,7 @@ class Place:
     factor: int
     memory: int = NONE
     scale: float = 0.0
+    shortest: float = 0.0
 
     @property
     def key(self) -> tuple[int, ...]:
@@ -144,7 +145,7 @@ class Candidate:
             np.array([[at.place, form.code, at.variable, at.factor, at.memory]]),
             np.array([[self.amplitude, self.first, self.second, at.scale]]),
             np.array([[True, form.free > 0, form.free > 1, at.memory != NONE]]),
-            np.array([[-np.inf, low, 0.01 * span, 0.05 * at.scale]]),
+            np.array([[-np.inf, low, 0.01 * span, at.shortest]]),
             np.array([[np.inf, high, 10.0 * span, 20.0 * at.scale + 1e-300]]),
         )
 
@@ -192,9 +193,11 @@ def list_memories(simulation: Simulation, filtered: Sequence[Filtered], places: 
         for kind in range(LAG, DELAY + 1):
             low, high = (MIN_WAY * span, MAX_WAY * span) if kind in PATH else (2.0 * step_s, MAX_TIME * long_s)
             count = 1 + ceil(np.log(high / low) / np.log(SCALE_RATIO))
-            found += [(variable, kind, scale) for scale in np.geomspace(low, high, count)]
+            # Over a shorter distance presliding is dry friction, which is a function of the present.
+            shortest = low if kind in PATH else 0.25 * low
+            found += [(variable, -1, kind, float(scale), shortest) for scale in np.geomspace(low, high, count)]
     spots = list(dict.fromkeys(at.place for at in places))
-    return [Place(spot, variable, -1, kind, float(scale)) for spot in spots for variable, kind, scale in found]
+    return [Place(spot, *each) for spot in spots for each in found]
 
 
 def screen_memories(filtered: Sequence[Filtered], places: Sequence[Place], n: int) -> list[Place]:

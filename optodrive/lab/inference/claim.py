@@ -55,7 +55,7 @@ MAX_GROWTH = 1.0
 """Largest increase of a held-out signal's mean square error, relative to that by noise, that counts as noise."""
 MAX_RATIO = 2.0
 """Ratio of a held-out signal's rms errors with and without an extension, above which it is no explanation at all."""
-MIN_TRAINED = 0.05
+MIN_TRAINED = 0.02
 """Share of the avoidable error that a term removes in training, below which a split cannot test it."""
 MIN_KEPT = 0.5
 """Smallest gain in held-out data, relative to that in training, with which a term extrapolates."""
