@@ -358,7 +358,7 @@ class _Search:
                 if trial.candidate is not each.proposal.candidate
             ]
             own = self.judge.measure(turned)
-            best = self.judge.measure_smallest_gain(base, others, own)
+            best = self.judge.measure_min_gain(base, others, own)
             judged = [replace(each.proposal, point=first, measured=own), *self._measure(base, others, trials, best)]
             chosen, term = self.judge.judge(base, others, judged, each.filtered, None)
             if self._is_enough(base, others, chosen, True, is_final=True):

@@ -151,8 +151,6 @@ def _build(rhs: Any, output: Any, quantity: Any, n: int, i: int, o: int, counts_
         while last > 0 and times[last] > at:
             last -= 1
         before, h = past[last, column], max((t if last == k else times[last + 1]) - times[last], 1e-300)
-        if hold == 0 and not is_state:
-            return float(before)
         after, part = z if last == k else past[last + 1, column], (at - times[last]) / h
         rise = after - before
         low = high = rise

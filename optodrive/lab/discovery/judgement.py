@@ -115,7 +115,9 @@ class Judge:
         for split, own in zip(self.splits, starts, strict=True):
             if rmse and rmse[0][1] > max_rmse:
                 raise ValueError(f"error {rmse[0][1]:.4g}: no rival of the best one")
-            points.append(self.fit([*own, *points[:1]], split.fitted))
+            # A memory's scale starts from a coarse grid.
+            evaluations = 24 if len(own[0].terms.memories) else 12
+            points.append(self.fit([*own, *points[:1]], split.fitted, evaluations))
             errors = self.run(points[-1])
             first = first or errors
             rmse.append([_compute_rms(errors, split.fitted), _compute_rms(errors, split.held_out)])
@@ -136,7 +138,7 @@ class Judge:
             if not quiet
         )
 
-    def measure_smallest_gain(self, base: Measured, before: Measured, after: Measured) -> float:
+    def measure_min_gain(self, base: Measured, before: Measured, after: Measured) -> float:
         """Return the smallest gain in held-out data, 0 where there is nothing to gain."""
         return min((each.held_out for each in self.measure_gains(base, before, after)), default=0.0)
 
@@ -158,7 +160,7 @@ class Judge:
                 # What gains less than this share of another's gain in one split is no rival of it.
                 enough = max(before - MIN_KEPT * best * (first - self.floor), WITHIN_NOISE * self.floor)
                 measured = self.measure(starts, enough if best > 0.0 else np.inf)
-                best = max(best, self.measure_smallest_gain(base, current, measured))
+                best = max(best, self.measure_min_gain(base, current, measured))
                 found.append(replace(each, measured=measured))
         return found
 
@@ -233,7 +235,7 @@ class Judge:
             for form, weight, gain in zip(forms, weights, minimum, strict=True)
         ]
         # A term has no other forms of its own, and is a name only beside terms that explain half of all together.
-        explained = [(self.measure_smallest_gain(base, base, measured), 1.0) for _, measured in kept]
+        explained = [(self.measure_min_gain(base, base, measured), 1.0) for _, measured in kept]
         is_usable = [form.gain > 0.0 and len(own) > 0 for form, own in zip(forms, gains, strict=True)]
         # Time explains any slow misfit: it is what is left where no state and no input extrapolates.
         order = sorted(range(len(kept)), key=lambda k: (not is_usable[k], forms[k].kind == CHANGE, -weights[k]))
@@ -278,7 +280,7 @@ class Judge:
         return self.compute_evidence(before, after, [each.fold < 0 for each in filtered], tries)
 
     def _remove_nuisances(self, model: Measured, runs: Sequence[Sequence[FloatArray]]) -> list[list[FloatArray]]:
-        """Return the errors of free runs in what is held out first, less what another start or parameters could do.
+        """Return errors of free runs in the first held-out part, without those by another start or parameters.
 
         A free run starts from a noisy sample, to which the parameters were fitted elsewhere.
         """

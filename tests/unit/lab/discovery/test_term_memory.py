@@ -73,7 +73,7 @@ def test_a_term_with_memory_of_a_state_in_free_run(kind):
     assert states.shape == (len(T_S), 2)
 
 
-def test_a_delay_of_an_input_follows_its_rule_between_samples():
+def test_a_delay_of_an_input_is_smooth_between_samples():
     terms = Terms(
         np.array([[1, POWER, 1, -1, DELAY]]),
         np.array([[1.0, 1.0, 0.0, 0.12]]),
@@ -82,8 +82,9 @@ def test_a_delay_of_an_input_follows_its_rule_between_samples():
         np.full((1, 4), np.inf),
     )
     record = Record(T_S, drive(T_S), np.zeros(len(T_S)))
-    for hold, late in ((0, drive(T_S[np.maximum(np.arange(400) - 3, 0)])), (2, drive(np.maximum(T_S - 0.12, 0.0)))):
+    for hold, tolerance in ((0, 5e-3), (2, 1e-4)):  # between samples always a line or a spline: smooth in the delay
+        late = drive(np.maximum(T_S - 0.12, 0.0))
         simulation = Simulation(MODEL, h_max=0.01, hold=hold)
         point = Point(np.array([1.0]), terms)
         plain = simulation.run(record, Point(np.array([1.0]), Terms.none()))[0][:, 0]
-        assert simulation.run(record, point)[0][:, 0] - plain == pytest.approx(late - drive(T_S), abs=1e-3)
+        assert simulation.run(record, point)[0][:, 0] - plain == pytest.approx(late - drive(T_S), abs=tolerance)
