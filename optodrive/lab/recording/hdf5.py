@@ -6,6 +6,7 @@ that a short-lived process has read from end to end is safe to be read in this p
 
 import os
 import resource
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -48,6 +49,7 @@ RUN_BYTES_PER_CPU_S = 20_000_000
 FILE_BYTES_PER_CPU_S = 200_000
 """Bytes per second of CPU time that the whole file may take beyond `CPU_LIMIT_S`; small runs take milliseconds."""
 MEMORY_BYTES = 2**32
+ERROR_CHARACTERS_MAX = 200
 _PROGRAM = "from optodrive.lab.recording.hdf5 import main; main()"
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
 _probed_files: set[tuple[str, int, int, int, int]] = set()
@@ -273,16 +275,21 @@ def probe_in_sandbox(path: Path) -> None:
             [sys.executable, "-P", "-c", _PROGRAM, str(path.absolute()), str(run_limit_s), str(file_limit_s)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
             env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(sys.path)},
             timeout=20 * file_limit_s,
             check=False,
         )
-        has_succeeded = process.returncode == 0
+        returncode, error_lines = process.returncode, process.stderr.decode(errors="replace").splitlines()
     except subprocess.TimeoutExpired:
-        has_succeeded = False
-    if not has_succeeded:
+        returncode, error_lines = -signal.SIGXCPU, []
+    if returncode < 0:
         raise InputError(str(path), Unquoted("damage on which the HDF5 library hangs or crashes"), "an undamaged file")
+    if returncode > 0:  # Python itself reported it, such as a lack of memory: the file need not be the cause
+        reason = " ".join(error_lines[-1:])[:ERROR_CHARACTERS_MAX]
+        raise InputError(
+            str(path), Unquoted(f"a file that could not be tried out ({reason})"), "a process that reads it"
+        )
     _probed_files.add(identity)
 
 

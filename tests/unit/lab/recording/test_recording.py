@@ -340,6 +340,12 @@ def test_a_process_that_hangs_or_crashes_is_refused(path, monkeypatch):
         assert "hangs or crashes" in refusal(path)
 
 
+def test_a_process_that_could_not_start_is_not_called_damage(path, monkeypatch):
+    monkeypatch.setattr(hdf5, "_PROGRAM", "raise ImportError('no such module')")
+    assert "could not be tried out (ImportError: no such module)" in refusal(path)
+    assert "damage" not in refusal(path)
+
+
 def test_a_file_is_tried_out_once(path, monkeypatch):
     read_recording(path)
     monkeypatch.setattr(hdf5, "_PROGRAM", "import os; os.abort()")
