@@ -104,7 +104,7 @@ class StandingRig(PlannerRig):
             self.refusals.append(error)
             self.page_m = None
             return None
-        self.limited_by |= set(report.summary.trimmed.by_reason)
+        self.limited_by |= set(report.summary.limited_by)
         return report
 
     def stand(self, page_m, duration_s, send_period_s=np.inf, places=()):

@@ -3,6 +3,9 @@
 from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel, OptionalFloatColumn, TextColumn
 from optodrive.planning.feasibility.report import FeasibilityReport
 
+GALVO_PAUSED_FRACTION = 0.2
+"""Share of a plan's time in pauses of the mirrors from which on they count as what limits it."""
+
 
 class TrimmedPulse(JsonModel):
     """One pulse that the limiter reduced. `target_um` is None for a pulse of a train given by its width.
@@ -274,6 +277,12 @@ class PlanSummary(JsonModel):
     frames: list[FrameSummary]
     late_messages: list[str]
     train_lateness_max_s: float
+
+    @property
+    def limited_by(self) -> list[str]:
+        """Caps that took light from the plan, by name: those that trimmed it, and the mirrors' by long pauses."""
+        pauses = self.galvo_pause_s > GALVO_PAUSED_FRACTION * self.duration_s
+        return sorted({*self.trimmed.by_reason, *(["galvo_acceleration"] if pauses else [])})
 
 
 class PulseColumns(JsonModel):

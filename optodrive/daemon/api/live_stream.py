@@ -178,7 +178,7 @@ def report_planned(number: int, report: PlanReport) -> FrameResult:
         pulses=report.planned,
         skipped=len(report.summary.skipped),
         trimmed=report.summary.trimmed.pulses,
-        limited_by=sorted(report.summary.trimmed.by_reason),
+        limited_by=report.summary.limited_by,
         starts_in_s=report.starts_in_s,
         duration_s=report.summary.duration_s,
         latency=report.latency,

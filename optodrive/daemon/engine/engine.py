@@ -228,7 +228,7 @@ class Engine:
 
     def _note_page_limits(self, future: "Future[PlanReport]") -> None:
         if not future.cancelled() and future.exception() is None:
-            self.page.note_limits(future.result().summary.trimmed.by_reason)
+            self.page.note_limits(future.result().summary.limited_by)
 
     def _require_armed(self) -> None:
         """Raise LinkError or NotReadyError if the board accepts no plans."""

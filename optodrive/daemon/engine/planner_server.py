@@ -278,7 +278,7 @@ def _encode(
             "plan_status": report.status,
         }
         if not is_read:
-            limited_by = sorted(report.summary.trimmed.by_reason)
+            limited_by = report.summary.limited_by
             return status, RefreshReport(limited_by=limited_by).model_dump_json().encode(), audit
         return status, b"".join(iterate_json(report)), audit
     except OptodriveError as error:

@@ -18,7 +18,7 @@ from optodrive.lab.discovery.fitting import Point, Simulation, fit, output_sizes
 from optodrive.lab.discovery.forms import CHANGE, CURVE, LINEAR, NAMELESS, Form
 from optodrive.lab.discovery.held_out import Split, sum_parts
 from optodrive.lab.discovery.integration import STEP
-from optodrive.lab.discovery.memory import NONE, TEXTS, name_memory
+from optodrive.lab.discovery.memory import FILTERS, NONE, TEXTS, name_memory
 from optodrive.lab.discovery.model import Record
 from optodrive.lab.discovery.screening import Candidate, Filtered, find_twin
 from optodrive.lab.inference.claim import (
@@ -306,8 +306,10 @@ class Judge:
         return out
 
     def _find_twin(self, filtered: Sequence[Filtered], proposal: Proposal) -> str:
-        """Return another variable of which the term is a function too, "" if there is none."""
+        """Return another variable, or a memory elsewhere, that would predict the same, "" if there is none."""
         model, at = self.simulation.model, proposal.candidate.screened.at
+        if at.memory in FILTERS:  # with other parameters, one at another place predicts nearly the same
+            return "a linear memory at another place"
         if model.from_rest:
             return ""
         return find_twin(filtered, at, proposal.evaluate, model.variable_names, len(model.states) + len(model.inputs))

@@ -16,6 +16,8 @@ from optodrive.core.types.arrays import FloatArray
 NONE, LAG, FOLLOWER, DAHL, SLIP, DELAY = range(6)
 PATH = (DAHL, SLIP)
 """Memories whose scale is a distance of the variable, not a time."""
+FILTERS = (LAG, FOLLOWER, DELAY)
+"""Memories that are linear filters of their variable: records of inputs and outputs hardly tell where one stands."""
 TEXTS = {
     LAG: "m, m' = ({z} - m) / {s}",
     FOLLOWER: "(m - {z}), m' = ({z} - m) / {s}",

@@ -31,6 +31,10 @@ def test_trim_reports_the_pixel_and_the_delay_after_which_everything_fits():
     result = plan_sequence(with_caps(touch_k=2.0), frames(6), *DISPLAY.build_cold_state())
     summary = summarize_plan(result)
     assert summary.trimmed.by_reason == {"touch_temperature": summary.trimmed.pulses}
+    assert summary.limited_by == ["touch_temperature"]
+    for share, further in ((0.19, []), (0.21, ["galvo_acceleration"])):  # the mirrors' cap takes time, not power
+        paused = summary.model_copy(update={"galvo_pause_s": share * summary.duration_s})
+        assert paused.limited_by == [*further, "touch_temperature"]
     shortfall = summary.shortfall
     assert shortfall.pixel in (200, 201)
     assert shortfall.cap == "touch_temperature"
