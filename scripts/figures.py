@@ -29,7 +29,7 @@ SHOWN = {
     "field": r"worst geometry|two sigma|positions to codes",
     "page": r".",
     "memory": r"all processes|first answer",
-    "stream": r".",
+    "stream": r"^(?!.*memory of (?!all)).*(first|round trip|per second|of 200|, limited|underruns|memory)",
     "stop": r".",
     "fingers": r".",
 }

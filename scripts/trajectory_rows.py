@@ -166,7 +166,7 @@ def measure_trajectories(bench):
     config = bench.display.config
     servo, tolerance_rad = build_servo(config.scanner), find_tolerance_rad(config)
     frame = [np.full(len(bench.layout), FRAME_HEIGHT_M)]
-    floor_s = bench.plan_order(frame, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
+    floor_s = bench.plan_order(frame, bench.order_by_scheduler, lambda *_: 0)["full_power_s"]
     ways_rad = [bench.settling.pitch_rad * pitches for pitches in range(1, FRAME_PITCHES_MAX + 1)]
     yield from measure_frame(bench, floor_s, "steps")
     for name, (relative, delay_s) in UNCERTAINTIES.items():
