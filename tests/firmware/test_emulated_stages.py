@@ -64,6 +64,9 @@ def rig(monkeypatch, library, chips):
 def test_two_boards_draw_a_frame_and_stop_together(rig):
     record = rig.play(build_frame(60.0, range(437), 3.0, 437))
     plan = rig.queue.waiting[0].planned.plan
+    # As the link states it for the plan's end. It follows from stamps, which are random: an exchange may miss a turn.
+    end_s = rig.clock.now_s() + 1.0
+    known_s = np.array([session.clock_sync.fit(end_s).uncertainty_s for session in rig.boards.sessions])
     rig.until(lambda: record.has_ended)
     assert (record.status, record.error, record.executed_count) == ("done", None, 437)
     counts = rig.count_pulses()
@@ -71,7 +74,7 @@ def test_two_boards_draw_a_frame_and_stop_together(rig):
     assert min(counts) > 150
     pulses = rig.list_pulses()
     late_s = pulses[:, 0] - np.sort(record.start_s + plan.start_s)
-    assert np.abs(late_s).max() < LATE_MAX_S
+    assert (np.abs(late_s) <= known_s[pulses[:, 4].astype(int)]).all()
     record = rig.play_trains()
     stopped_s = rig.clock.now_s()
     assert rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))["error"] is None
