@@ -31,7 +31,7 @@ SHOWN = {
     "memory": r"all processes|first answer",
     "stream": r"^(?!.*memory of (?!all)).*(first|round trip|per second|of 200|, limited|underruns|memory)",
     "stop": r".",
-    "fingers": r".",
+    "fingers": r"dots under|first light|per second|underruns",
 }
 """Rows of each benchmark that the page shows, by a pattern within their quantity."""
 OPTIONS = {"fingers": ("--virtual-s", "0")}

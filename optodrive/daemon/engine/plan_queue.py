@@ -17,8 +17,8 @@ the plan that waits for its rest.
 
 Lateness. A plan may start later than it was planned for, because the heat that it relied on can only have decayed; all
 plans behind it are then delayed by as much (`delay_all`). It may not start so much later that a bump comes out lower
-than `cooling_max_m` allows, and behind a cancelled one it is
-planned again. Several boards emit nothing late, so such a plan is paused and limited again instead.
+than `cooling_max_m` allows, and behind a cancelled one it is planned again. Several boards emit nothing late, so such a
+plan is paused and limited again instead.
 
 What streams add stands in `queue_stream.py`, what pauses and lost stages add in `queue_pause.py`; `queued_plans.py`
 holds the plans and ends them.
