@@ -269,6 +269,7 @@ def name_effect(measurement, axis):
 )
 def test_a_rehearsal_names_the_slew_limit_of_the_configured_servo_and_nothing_else(name):
     measurement = rehearse(DISPLAYS[name])
+    assert [each.held_out for each in extract_records("r", measurement, 0)] == [False, True] * 3
     for axis in range(1 if name == "display-16" else 2):
         found = name_effect(measurement, axis)
         assert (found.claim.verdict, found.effect) == ("cause", "slew_limit")

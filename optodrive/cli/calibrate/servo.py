@@ -30,15 +30,15 @@ NOTES = "Steps of optodrive calibrate steps. Add mirror_x_rad.csv and mirror_y_r
 
 def steps(
     out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Write the commands: a recording to complete.")],
-    step_count: Annotated[int, typer.Option("--steps", help="Steps of mirror x per size; y has half as many.")] = 24,
+    step_count: Annotated[int, typer.Option("--steps", help="Steps of mirror x per run; y has half as many.")] = 24,
     pause_s: Annotated[
-        float, typer.Option("--pause", metavar="SECONDS", help="Pause between sizes, in which a scope rearms.")
+        float, typer.Option("--pause", metavar="SECONDS", help="Pause between runs, in which a scope rearms.")
     ] = 2.0,
     config: ConfigOption = None,
     stage: StageOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Play steps of both mirrors in three sizes with the gate off, for a recording of their position outputs."""
+    """Play steps of both mirrors, three sizes twice, with the gate off, for a recording of their position outputs."""
     from optodrive.cli.commissioning import open_board
     from optodrive.core.files import check_output
     from optodrive.lab.commissioning.mirror_steps import LEAD_IN_S, plan_step_runs, play_step_runs

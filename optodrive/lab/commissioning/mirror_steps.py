@@ -1,6 +1,7 @@
 """Mirror steps with the gate off, to be recorded for `optodrive calibrate servo`.
 
-Each run has steps of one size around the middle of the display. The times of the commands are those that the board has
+Each run has steps of one size around the middle of the display, and each size has two runs: the calibration judges its
+models by the second one, which no fit sees. The times of the commands are those that the board has
 reported, so a trace that is triggered at the first step has their time line.
 """
 
@@ -18,6 +19,8 @@ from optodrive.planning.limiter.limiter import galvo_feasible_prefix
 
 SIZE_FRACTIONS = (1.0, 0.2, 0.033)
 """Sizes of the steps relative to the display: small ones determine the bandwidth, large ones the slew rate."""
+ROUNDS = ("", "b")
+"""Ends of the names of the runs. All sizes are played in the first round before any is played again."""
 STEPS_MIN, STEPS_MAX = 6, 100
 LEAD_IN_S = 0.1
 """Time at the first position before the first step, in which a mirror comes to rest; the first step's time."""
@@ -44,20 +47,25 @@ class StepRun:
 
 
 def plan_step_runs(board: ExclusiveBoard, step_count: int) -> tuple[StepRun, ...]:
-    """Plan the runs, one per size. Mirror x moves at every step and mirror y at every other one.
+    """Plan the runs, two per size that differ in the times of their steps.
 
-    Steps follow each other as fast as the mirrors settle and the galvo cap permits. Raises InputError for a number of
-    steps outside STEPS_MIN to STEPS_MAX, or if they exceed the cap at HOLD_MAX_S.
+    Mirror x moves at every step and mirror y at every other one. Steps follow each other as fast as the mirrors settle
+    and the galvo cap permits. Raises InputError for a number of steps outside STEPS_MIN to STEPS_MAX, or if they exceed
+    the cap at HOLD_MAX_S.
     """
     if not STEPS_MIN <= step_count <= STEPS_MAX:
         raise InputError("--steps", step_count, f"{STEPS_MIN} to {STEPS_MAX}")
     number = np.arange(step_count + 1)
     signs = np.column_stack([np.where(number % 2 == 1, 1, -1), np.where((number + 1) // 2 % 2 == 1, 1, -1)])
-    jitter_s = np.random.default_rng(0).uniform(0.0, HOLD_JITTER_S, step_count)
+    travel, random = np.array(board.half_travel_codes), np.random.default_rng(0)
     return tuple(
         _plan_run(
-            board, f"size{k}", CENTRE_CODE + signs * np.rint(fraction * np.array(board.half_travel_codes)), jitter_s
+            board,
+            f"size{k}{end}",
+            CENTRE_CODE + signs * np.rint(fraction * travel),
+            random.uniform(0.0, HOLD_JITTER_S, step_count),
         )
+        for end in ROUNDS
         for k, fraction in enumerate(SIZE_FRACTIONS, 1)
     )
 
