@@ -125,9 +125,9 @@ def build_async_reference():
         rows = []
         for key, message in channel["messages"].items():
             sender = "client" if key in FROM_CLIENT[name] else "daemon"
-            rows.append(f"| `{key}` | {sender} | {_format_payload(message['payload'])} | {message['summary']} |")
-        head = [f"## {channel['address']}", "", channel["description"], "", "| message | from | type | |"]
-        parts.append("\n".join([*head, "|---|---|---|---|", *rows, ""]))
+            summary = "" if message["summary"] == f"event {key}" else f": {message['summary']}"
+            rows.append(f"- `{key}` from the {sender}, {_format_payload(message['payload'])}{summary}")
+        parts.append("\n".join([f"## {channel['address']}", "", channel["description"], "", *rows, ""]))
     return "\n".join(parts)
 
 

@@ -14,7 +14,7 @@ from rest_reference import build_openapi_text, build_rest_reference
 
 from optodrive.core.toml_model import read_field_docstrings
 from optodrive.device.config import VERSION, Config
-from optodrive.physics.term_reference import build_example, describe_term
+from optodrive.physics.term_reference import describe_term
 from optodrive.physics.terms import discover_terms
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
@@ -22,21 +22,27 @@ CONFIGURATION_HEAD = f"""# Configuration
 
 Generated from `optodrive/device/config_sections.py` by `scripts/reference`. A configuration is one TOML file per
 display, format version {VERSION}. `optodrive config check` checks it, and `optodrive config show --json` prints it with
-every default and derived number. Quantities are in SI units, named by the suffix of the key.
+every default and derived number. Quantities are in SI units, named by the suffix of the key. In brackets stand the
+value and its default.
 """
 TERMS_HEAD = """# Terms
 
-Generated from `optodrive/physics/terms` by `scripts/reference`; `optodrive terms TERM` prints the same, as a complete
-file. A term is a physical effect beyond the nominal pixel. A parameter set may hold its parameters, `optodrive
-diagnose` looks for it in recordings, and the limiter bounds the heat that it can add.
+Generated from `optodrive/physics/terms` by `scripts/reference`. `optodrive terms TERM` prints one with a complete file
+that states it. A term is a physical effect beyond the nominal pixel. A parameter set may hold its parameters,
+`optodrive diagnose` looks for it in recordings, and the limiter bounds the heat that it can add.
 
-A [parameter set](formats/parameter-sets.md) (`model.toml`) states a term by the lines below its table. A parameter with
-a value under "if omitted" need not be stated: the value has no effect, or is the usual shape. `planner_terms` names the
-terms that heights are planned with. `simulate --truth model.toml` simulates these and every term that the file itself
-states; those of its base count only if `planner_terms` names them. "Start" is where a diagnosis begins its search.
+A [parameter set](formats/parameter-sets.md) (`model.toml`) states a term as a table:
 
-The states of a term have time constants of 2.5 ms or more; one that is faster than the integrator's steps, or whose
-states or signals leave their range, is refused by name. A diagnosis that cannot compute a term says so and has the
+```toml
+[terms.heat_capacity]
+slope = { value = 0.002, unit = "1/K", source = "measured on …" }
+```
+
+In brackets stand unit, value if the parameter is omitted, value at which a diagnosis begins its search, and range.
+`planner_terms` names the terms that heights are planned with. `simulate --truth model.toml` simulates these and every
+term that the file itself states; those of its base count only if `planner_terms` names them.
+
+A term that the integrator cannot follow is refused by name. A diagnosis that cannot compute a term says so and has the
 verdict `incomplete` in place of `none`. CONTRIBUTING.md states what the integrator asks of a new term.
 """
 
@@ -80,45 +86,39 @@ def format_default(info: FieldInfo) -> str:
 
 
 def build_configuration_reference() -> str:
-    """Return Markdown with one section per TOML table and one row per key."""
+    """Return Markdown with one section per TOML table and one line per key."""
     parts = [CONFIGURATION_HEAD]
     for path, model in sections(Config):
+        schema, texts = model.model_json_schema()["properties"], read_field_docstrings(model)
         rows = [
-            f"| `{name}` | {format_type(model.model_json_schema()['properties'][name])} | {format_default(info)} |"
-            f" {' '.join(read_field_docstrings(model).get(name, '').split())} |"
+            f"- `{name}` ({format_type(schema[name])}; {format_default(info)}): {' '.join(texts.get(name, '').split())}"
             for name, info in model.model_fields.items()
             if not is_table(info)
         ]
         summary = " ".join((model.__doc__ or "").split())
         title = f"## `[{path}]`" if path else "## Top level"
-        parts.append("\n".join([title, "", summary, "", "| key | value | default | |", "|---|---|---|---|", *rows, ""]))
+        parts.append("\n".join([title, "", summary, "", *rows, ""]))
     return "\n".join(parts)
 
 
-def format_omitted(value: float | None) -> str:
-    """Return a parameter's value where it is omitted."""
-    return "required" if value is None else f"{value:g}"
-
-
 def build_terms_reference() -> str:
-    """Return Markdown with one section per term."""
+    """Return Markdown with one section per term. Parameters that differ in name only share a line."""
     parts = [TERMS_HEAD]
     for key, term in sorted(discover_terms().items()):
         about = describe_term(term)
-        rows = [
-            f"| `{item['name']}` | {item['unit']} | {format_omitted(item['if_omitted'])} | {item['start']:g} |"
-            f" {item['low']:g} to {item['high']:g} | {item['source']} |"
-            for item in about["parameters"]
-        ]
+        rows: dict[str, list[str]] = {}
+        for item in about["parameters"]:
+            omitted = "required" if item["if_omitted"] is None else f"{item['if_omitted']:g}"
+            values = f"{item['unit']}; {omitted}; {item['start']:g}; {item['low']:g} to {item['high']:g}"
+            rows.setdefault(f"({values}): {item['source']}", []).append(f"`{item['name']}`")
         notes = [f"Needs {', '.join(f'`{name}`' for name in term.requires)}."] if term.requires else []
         if not term.in_pixel:
             notes.append("Only the limiter accounts for it; heights are not planned with it.")
         if term.signature:
             notes.append(f"Visible in {term.signature}.")
-        head = ["| parameter | unit | if omitted | start | range | source |", "|---|---|---|---|---|---|"]
-        example = ["", *(f"    {line}" for line in build_example(term))]
         text = [about["label"][:1].upper() + about["label"][1:] + ".", "", about["equation"], *notes]
-        parts.append("\n".join([f"## `{key}`", "", *text, "", *head, *rows, *example, ""]))
+        lines = [f"- {', '.join(names)} {values}" for values, names in rows.items()]
+        parts.append("\n".join([f"## `{key}`", "", *text, "", *lines, ""]))
     return "\n".join(parts)
 
 

@@ -1,6 +1,7 @@
 """The REST reference, generated from the application's own OpenAPI document. Run as a script, it prints the page."""
 
 import json
+import re
 from pathlib import Path
 
 from optodrive.core.toml_model import Section
@@ -16,20 +17,19 @@ from optodrive.planning.display_model import DisplayModel
 HEAD = """# REST API
 
 Generated from the daemon's [OpenAPI document](openapi.json), which the daemon serves at `/openapi.json`. Every route
-except `/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route. Errors are
-problem documents (RFC 9457) with a stable `code`. A request whose query or body says something that its route does not
-read, such as a misspelt option, is refused with its name and the nearest known one; only STOP is never refused for
-that. [Streaming](../how-to/stream-frames.md) describes the WebSocket, [the client](../how-to/use-the-python-client.md)
-its use from Python.
+except `/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route.
+[Streaming](../how-to/stream-frames.md) describes the WebSocket, [the client](../how-to/use-the-python-client.md) the
+use from Python.
+
+Errors are problem documents (RFC 9457) with a stable `code`. A query or body with a name that the route does not read
+is refused with the nearest known name. Only STOP is never refused for that.
 """
 PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem):
-
-| status | meaning |
-|---|---|"""
+"""
 MODELS_HEAD = """## Models
 
-The JSON bodies. A type in parentheses may be null. Members of `Problem`, `FrameResult` and `HoldReport` that do not
-apply are absent; all other models always have all members.
+The JSON bodies: each member with its type and meaning. A type in parentheses may be null. Members of `Problem`,
+`FrameResult` and `HoldReport` that do not apply are absent; all other models always have all members.
 """
 
 
@@ -47,10 +47,11 @@ def build_openapi_text():
 def build_rest_reference():
     """Build the page: one section per route, then one per model."""
     document = build_openapi()
-    sections = [HEAD, PROBLEMS_HEAD, *(f"| {status} | {text} |" for status, text in list_problems()), ""]
+    sections = [HEAD, PROBLEMS_HEAD, *(f"- {status}: {text}" for status, text in list_problems()), ""]
+    stated = {}  # what a parameter says: the route that says it first
     for path, methods in document["paths"].items():
         for method, route in methods.items():
-            sections.append(format_route(f"{method.upper()} {path}", route))
+            sections.append(format_route(f"{method.upper()} {path}", route, stated))
     sections.append(MODELS_HEAD)
     schemas = document["components"]["schemas"]
     configured = {name for name in schemas if is_section(getattr(config_sections, name, None))}
@@ -71,22 +72,28 @@ def list_configured_members(name):
     return {member for base in bases if is_section(base) for member in base.model_fields}
 
 
-def format_route(title, route):
-    """Format one route: description, role, parameters, body and responses."""
-    lines = [f"## {title}", "", route.get("description", ""), "", f"Role: {route['x-min-role'] or 'none'}.", ""]
-    rows = [
-        f"| `{item['name']}` | {item['in']} | {format_parameter(item['schema'])} | "
-        f"{escape_cell(item.get('description', ''))} |"
-        for item in route.get("parameters", ())
-    ]
-    if rows:
-        lines += ["| parameter | in | type | |", "|---|---|---|---|", *rows, ""]
+def format_route(title, route, stated):
+    """Format one route: description, role, parameters, body and response. What `stated` has is referred to."""
+    responses = sorted(route["responses"].items())
+    bodies = {}  # the model of a response: its statuses
+    for status, response in responses:
+        if status < "300":
+            bodies.setdefault(format_content(response), []).append(status)
+    returns = "; ".join(f"{' or '.join(statuses)} {body}" for body, statuses in bodies.items())
+    lines = [f"## {title}", "", route.get("description", ""), ""]
+    lines += [f"Role: {route['x-min-role'] or 'none'}. Response: {returns}.", ""]
     if "requestBody" in route:
         body = route["requestBody"]
         lines += [f"Body: {format_type(body['content']['application/json']['schema'])}, {body['description']}.", ""]
-    responses = sorted(route["responses"].items())
-    bodies = [f"{status} {format_content(response)}" for status, response in responses if status < "300"]
-    return "\n".join([*lines, f"Response: {'; '.join(bodies)}.", ""])
+    rows, known = [], {}
+    for item in route.get("parameters", ()):
+        row = format_parameter(item)
+        if item["in"] == "query" and stated.setdefault(row, title) != title:
+            known.setdefault(stated[row], []).append(f"`{item['name']}`")
+        elif item["in"] == "query":
+            rows.append(row)
+    rows += [f"- {', '.join(names)}: as of {other}" for other, names in known.items()]
+    return "\n".join([*lines, *rows, ""] if rows else lines)
 
 
 def list_problems():
@@ -103,25 +110,54 @@ def format_content(response):
 def format_model(name, schema, configured):
     """Format one model: its description and members. The page on the configuration has those of `configured`."""
     lines = [f"### {name}", ""]
-    if schema.get("description"):
-        lines += [schema["description"].strip(), ""]
+    inherited = list_configured_members(name)
+    members = {
+        member: format_type(item, configured)
+        for member, item in schema.get("properties", {}).items()
+        if member not in inherited or "Effective" in str(item)
+    }
+    summary, meanings = read_meanings(schema.get("description", ""), members)
+    if summary:
+        lines += [summary, ""]
     if "properties" not in schema:
         return "\n".join([*lines, format_type(schema), ""])
-    inherited = list_configured_members(name)
     if inherited:
-        lines += ["Members as [configured](configuration.md), and:", ""]
-    rows = [
-        f"| `{member}` | {format_type(item, configured)} |"
-        for member, item in schema["properties"].items()
-        if member not in inherited or "Effective" in str(item)
-    ]
-    return "\n".join([*lines, "| member | type |", "|---|---|", *rows, ""])
+        lines += ["Members as [configured](configuration.md)" + (", and:" if members else "."), ""]
+    stated = [member for group in meanings for member in group]
+    rest = [(member,) for member in members if member not in stated]
+    rows = []
+    for group in sorted([*meanings, *rest], key=lambda group: list(members).index(group[0])):
+        kinds = list(dict.fromkeys(members[member] for member in group))
+        labels = (
+            [f"`{member}` {members[member]}" for member in group]
+            if len(kinds) > 1
+            else [", ".join(f"`{member}`" for member in group) + f" {kinds[0]}"]
+        )
+        rows.append(f"- {', '.join(labels)}" + (f": {meanings[group]}" if group in meanings else ""))
+    return "\n".join([*lines, *rows, ""] if rows else lines)
 
 
-def format_parameter(schema):
-    """Format a parameter's type and default."""
-    text = ", ".join(f"`{value}`" for value in schema["enum"]) if "enum" in schema else schema.get("type", "any")
-    return escape_cell(text + (f", default {schema['default']}" if "default" in schema else ""))
+def read_meanings(description, members):
+    """Return a description without what it states of members, and that by group of members."""
+    if not members:
+        return description.strip(), {}
+    name = "|".join(map(re.escape, sorted(members, key=len, reverse=True)))
+    starts = list(re.finditer(rf"(?:^|\n|; ?\n?)((?:{name})(?:,\s(?:{name}))*): ", description))
+    meanings = {}
+    ends = [*(start.start() for start in starts[1:]), len(description)]
+    for start, end in zip(starts, ends, strict=False):  # a description that states no member has an end and no start
+        text = description[start.end() : end]
+        group = tuple(each.strip() for each in start[1].split(","))
+        meanings[group] = " ".join(text.split())
+    return description[: starts[0].start() if starts else len(description)].strip(), meanings
+
+
+def format_parameter(item):
+    """Format a parameter of a query: its name, type, default and meaning."""
+    schema = item["schema"]
+    kind = ", ".join(f"`{value}`" for value in schema["enum"]) if "enum" in schema else schema.get("type", "any")
+    default = f", default {schema['default']}" if "default" in schema else ""
+    return f"- `{item['name']}` {kind}{default}: {item.get('description', '')}"
 
 
 def format_type(schema, configured=frozenset()):
@@ -142,11 +178,6 @@ def format_type(schema, configured=frozenset()):
     if schema.get("type") == "object" and isinstance(schema.get("additionalProperties"), dict):
         return f"map of {format_type(schema['additionalProperties'])}"
     return schema.get("type", "any")
-
-
-def escape_cell(text):
-    """Escape text for a table cell."""
-    return str(text).replace("|", "\\|").replace("\n", " ")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,6 @@ def test_a_generated_page_is_current(name):
 
 
 def test_every_configuration_key_is_described():
-    rows = [line for line in PAGES["configuration.md"]().splitlines() if line.startswith("| `")]
+    rows = [line for line in PAGES["configuration.md"]().splitlines() if line.startswith("- `")]
     assert rows
-    assert [row for row in rows if row.endswith("|  |")] == []
+    assert [row for row in rows if row.endswith(": ")] == []
