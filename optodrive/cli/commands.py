@@ -42,6 +42,7 @@ MODULES = {
     "config": ("config",),
     "token": ("token",),
     "wire": ("wire",),
+    "board": ("board",),
     "doctor": ("doctor",),
     "support": ("support",),
     "docs": ("docs",),

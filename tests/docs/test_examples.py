@@ -27,7 +27,7 @@ from optodrive.cli.commands import UsageError, build_app
 
 ELSEWHERE = {
     "scripts/": "scripts of the checkout, which are run as they are",
-    "make ": "tests/firmware builds the ports",
+    "optodrive board": "tests/firmware/test_board_build.py, tests/unit/cli/test_board_flash.py",
     "python tests/blind/blind_instruments.py": "tests/blind/test_instruments.py runs its cases",
     "python3 -m venv": "tests/system/test_wheel.py checks the wheel",
     "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",

@@ -1,4 +1,4 @@
-/* Settings of this board: its limits, which no host can loosen. Edit them for its laser and mirrors. */
+/* Settings of this board: its limits, which no host can loosen. `optodrive board settings` writes those of a display. */
 
 #ifndef SETTINGS_H
 #define SETTINGS_H
@@ -7,7 +7,6 @@
 
 #define HOST_BAUD 1000000u
 #define GATE_HZ 50000u /* PWM frequency of the duty, within the bandwidth of the laser driver */
-#define FIRMWARE 0x00010100u
 #ifndef BOARD_UID
 #define BOARD_UID {'r', 'p', '2', '0', '4', '0', '-', '0', '0', '0', '0', '1'}
 #endif

@@ -149,7 +149,7 @@ class BoardRequirements:
         if abs(limits.full_power_uw - requested.full_power_uw) > 0.01 * requested.full_power_uw:
             # Neither number is known to be true: to follow the lower one would count less light than the diode emits.
             expected = (
-                f"the firmware's full power, now {limits.full_power_uw * 1e-6:g} W (full_power_uw in its settings.h). "
+                f"the firmware's full power, now {limits.full_power_uw * 1e-6:g} W (by `optodrive board build`). "
                 "Both state the power at the sample at full duty: measure it there with a power meter, the board off, "
                 "the driver's input at full level, then set both to what is measured, and neither lower"
             )

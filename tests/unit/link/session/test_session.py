@@ -220,7 +220,7 @@ def test_a_contradiction_about_full_power_names_both_sides_and_advises_neither_n
         rig.connect()
     line = str(caught.value)
     assert line.startswith(f"laser.max_power_w: got {configured_w}, expected the firmware's full power, now ")
-    assert f"{firmware_uw * 1e-6:g} W (full_power_uw in its settings.h)" in line
+    assert f"{firmware_uw * 1e-6:g} W (by `optodrive board build`)" in line
     assert "measure it there with a power meter" in line
     assert line.endswith("set both to what is measured, and neither lower")
 

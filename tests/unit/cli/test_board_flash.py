@@ -1,4 +1,4 @@
-"""scripts/flash: what it finds, what it writes, and one line for what it does not write."""
+"""`optodrive board flash`: what it finds, what it writes, and one line for what it does not write."""
 
 import struct
 import sys
@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-sys.path += [str(ROOT / "firmware_protocol" / "ports" / "rp2040"), str(ROOT / "scripts")]
+from optodrive.cli.main import run as run_command
 
-from flash import main  # noqa: E402
-from image import FAMILIES, build_uf2  # noqa: E402
+sys.path.append(str(Path(__file__).parents[3] / "firmware_protocol" / "ports" / "rp2040"))
+
+from image import FAMILIES, build_uf2
 
 BLOCK_BYTES = 512
 
@@ -51,7 +51,8 @@ def flash(mount, capsys, monkeypatch):
 
     def run(path, tools=""):
         monkeypatch.setenv("PATH", str(tools))
-        status = main([str(path)], mount.listed)
+        monkeypatch.setattr("optodrive.link.boot_loader.MOUNTS", mount.listed)
+        status = run_command(["board", "flash", str(path)])
         return status, *capsys.readouterr()
 
     return run
@@ -82,18 +83,21 @@ def foreign(content):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (cut, "1535 bytes, expected blocks of 512"),
-        (lambda content: b"", "0 bytes, expected blocks of 512"),
-        (lambda content: bytes(4) + content[4:], "block 0 does not begin and end like one of UF2"),
-        (lambda content: content[:BLOCK_BYTES], "block 0 says 0 of 3, expected 0 of 1"),
-        (gap, "block 1 is for 0x10000200, expected 0x10000100"),
-        (foreign, "family 0x1234, expected one of 0xe48bff56, 0xe48bff59"),
+        (cut, "got 1535 bytes, expected blocks of 512, of UF2"),
+        (lambda content: b"", "got 0 bytes, expected blocks of 512, of UF2"),
+        (
+            lambda content: bytes(4) + content[4:],
+            "got block 0 without the marks of UF2, expected its marks at begin and end",
+        ),
+        (lambda content: content[:BLOCK_BYTES], "got block 0 of 3, expected 0 of 1"),
+        (gap, "got block 1 for 0x10000200, expected 0x10000100"),
+        (foreign, "got family 0x1234, expected one of 0xe48bff56, 0xe48bff59"),
     ],
 )
 def test_a_damaged_file_is_not_written(uf2, mount, flash, change, says):
     path, drive = uf2(change=change), mount("RPI-RP2")
     status, _, err = flash(path)
-    assert (status, err) == (2, f"scripts/flash: {path}: {says}\n")
+    assert (status, err) == (2, f"optodrive: {path}: {says}\n")
     assert not (drive / path.name).exists()
 
 
@@ -101,18 +105,18 @@ def test_a_file_that_is_not_there_and_one_for_another_chip(uf2, mount, flash, tm
     drive = mount("RP2350")
     status, _, err = flash(uf2())
     assert status == 2
-    assert "Board-ID RP2350, expected that of RP2040" in err
+    assert "Board-ID: got RP2350, expected that of RP2040" in err
     assert not (drive / "board.uf2").exists()
     status, _, err = flash(tmp_path / "nothing.uf2")
     assert status == 2
-    assert "nothing.uf2: No such file or directory, expected a UF2 file" in err
+    assert "nothing.uf2: got 'No such file or directory', expected a readable file" in err
     assert err.count("\n") == 1
 
 
 def test_of_two_boards_neither_is_written(uf2, mount, flash):
     drives = [mount("RPI-RP2", name) for name in ("one", "other")]
     status, _, err = flash(uf2())
-    assert status == 2
+    assert status == 1
     assert f"2 boards: {drives[0]}, {drives[1]}; expected one" in err
     assert not any((drive / "board.uf2").exists() for drive in drives)
 
@@ -125,11 +129,11 @@ def test_without_a_drive_picotool_writes(uf2, flash, tmp_path, code, said):
     (tools / "picotool").chmod(0o755)
     status, _, err = flash(path, tools)
     assert (tools / "told").read_text() == f"load -v -x {path}\n"
-    assert status == (2 if code else 0)
-    assert err == (f"scripts/flash: picotool ended with 249 and said: {said}\n" if code else "")
+    assert status == (1 if code else 0)
+    assert err == (f"optodrive: picotool ended with 249 and said: {said}\n" if code else "")
 
 
 def test_without_drive_and_picotool_it_says_what_to_do(uf2, flash):
     status, _, err = flash(uf2())
-    assert status == 2
+    assert status == 1
     assert "no drive with INFO_UF2.TXT is mounted, and no picotool in PATH: hold BOOTSEL" in err
