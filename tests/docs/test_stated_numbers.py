@@ -1,4 +1,4 @@
-"""Numbers in the prose of docs/how-to/show-stimuli.md are those that a plan states."""
+"""Numbers in the prose on stimuli are those that a plan states."""
 
 import json
 import re
@@ -11,7 +11,9 @@ from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.sequence_file import parse_sequence
 
-PAGE = " ".join((Path(__file__).parents[2] / "docs/how-to/show-stimuli.md").read_text().split())
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = ("how-to/show-stimuli.md", "reference/formats/frames-json.md")
+TEXT = " ".join(" ".join((DOCS / page).read_text().split()) for page in PAGES)
 DISPLAY = DISPLAYS["display-437"]
 
 
@@ -30,8 +32,8 @@ def find_square(side):
 
 
 def read_numbers(pattern):
-    """Return the numbers that a pattern finds in the page, where it stands once."""
-    (numbers,) = re.findall(pattern, PAGE)
+    """Return the numbers that a pattern finds in the pages, where it stands once."""
+    (numbers,) = re.findall(pattern, TEXT)
     return [float(each) for each in ([numbers] if isinstance(numbers, str) else numbers)]
 
 

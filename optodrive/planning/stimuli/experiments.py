@@ -1,6 +1,6 @@
 """The paper's six perceptual experiments (Text S5) as pulse trains, a comparison of two places, and bring-up waveforms.
 
-docs/how-to/show-stimuli.md lists what the paper leaves open. Directions are as seen from above: right is +x, up is +y.
+docs/reference/patterns.md lists what the paper leaves open. Directions are as seen from above: right is +x, up is +y.
 `centre` None is the display's middle pixel. `where` names the caller in errors. Every function raises InputError
 (does_not_fit) if the display lacks a pixel at a required place. A comparison shows two places one after the other.
 Waveforms for an oscilloscope on the converter's outputs, for the bring-up of a board, are weak pulses in turn.
