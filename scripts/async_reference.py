@@ -18,7 +18,7 @@ Generated from the daemon's models by `scripts/reference`, like the [AsyncAPI 3.
 JSON Schema of every message. The daemon's WebSockets and its server-sent events need `Authorization: Bearer TOKEN`;
 a browser's WebSocket, which cannot send it, offers the subprotocols `optodrive` and `bearer.` with the token in
 base64url. [Streaming](../how-to/stream-frames.md), [fingers](../how-to/read-by-fingers.md),
-[hold-to-run](../how-to/secure-access.md#hold-to-run) and [telemetry](../how-to/operate-the-page.md#telemetry) describe
+[hold-to-run](../how-to/secure-access.md#hold-to-run) and [telemetry](telemetry.md) describe
 their use; the models are those of the [REST reference](rest.md#models).
 """
 

@@ -32,7 +32,7 @@ RESIDUAL_BY_TRIALS = {
     0.2: {100: 0.081, 200: 0.060, 300: 0.048, 500: 0.037, 700: 0.030, 1000: 0.026},
     0.4: {300: 0.084, 1000: 0.047},
 }
-"""Mean of twelve participants by Weber fraction and trials, as docs/how-to/run-a-study.md states it."""
+"""Mean of twelve participants by Weber fraction and trials, as docs/how-to/find-thresholds.md states it."""
 
 
 def draw_hidden(kind, seed):

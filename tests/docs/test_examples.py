@@ -83,7 +83,7 @@ SCENARIOS = {
     ),
     "studies": (
         write_checkout,
-        ["docs/how-to/run-a-study.md:The paper's experiments, simulated", "docs/how-to/run-a-study.md:Thresholds"],
+        ["docs/how-to/run-a-study.md:The paper's experiments, simulated", "docs/how-to/find-thresholds.md:Thresholds"],
     ),
     "film": (write_film, ["docs/explanation/diagnosis.md:Whole displays"]),
     "recordings": (write_recordings, ["docs/reference/recordings.md:Recordings"]),
@@ -91,7 +91,11 @@ SCENARIOS = {
     "sessions": (write_measured, ["docs/reference/recordings.md:Sessions of the driver"]),
     "field": (
         write_calibration,
-        [f"docs/how-to/calibrate-the-field.md:{name}" for name in ("Commands", "Positions to codes", "Mirror servos")],
+        [
+            "docs/how-to/calibrate-the-field.md:Commands",
+            "docs/how-to/calibrate-the-field.md:Positions to codes",
+            "docs/how-to/calibrate-the-servos.md:Mirror servos",
+        ],
     ),
 }
 DRAWINGS = {

@@ -1,7 +1,7 @@
 """Driver of a Helios laser DAC over pyusb: version, name, status, shutter, stop and frames.
 
 The driver omits the command that erases the firmware on purpose. The DAC has neither an interlock nor a watchdog for
-the host: docs/how-to/use-a-laser-dac.md describes the consequences.
+the host: docs/reference/laser-dacs.md describes the consequences.
 """
 
 from contextlib import suppress
