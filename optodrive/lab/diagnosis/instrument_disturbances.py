@@ -76,8 +76,8 @@ def remove_disturbances(data: Dataset, added: FloatArray) -> Dataset:
 def find_dc_coupled(data: Dataset, residual: FloatArray, noise: NoiseModel) -> frozenset[str]:
     """Return the names of the signals, as in `BySignal`, whose zero differs from run to run.
 
-    Behind an AC coupling that has settled, no zero differs. The zero of a run is the generalised least squares mean of
-    its residuals before the first pulse, so slow noise does not pass for a difference.
+    Behind an AC coupling no zero differs by more than the noise of the sample from which it settles. The zero of a run
+    is the generalised least squares mean of its residuals before the first pulse, so slow noise is no difference.
     """
     found = set()
     for kind in (kind for kind in data.kinds if kind in PIXEL_KINDS):
@@ -89,7 +89,8 @@ def find_dc_coupled(data: Dataset, residual: FloatArray, noise: NoiseModel) -> f
                 columns = np.column_stack([np.ones(count), residual[block.part][:count]])
                 whitened, _ = whiten(block.t_s[:count], columns, noise.coloured[kind])
                 weight = float(whitened[:, 0] @ whitened[:, 0])
-                rows.append((float(whitened[:, 0] @ whitened[:, 1]) / weight, weight))
+                variance = 1.0 / weight + noise.coloured[kind].white ** 2
+                rows.append((float(whitened[:, 0] @ whitened[:, 1]) / weight, 1.0 / variance))
         if len(rows) >= MIN_DRIFT_RUNS:
             zeros, weights = np.array(rows).T
             spread = float(weights @ (zeros - np.average(zeros, weights=weights)) ** 2)

@@ -49,7 +49,7 @@ from optodrive.lab.diagnosis.evidence import (
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.prediction import predict
 from optodrive.lab.diagnosis.refitting import RefittedCandidate, refit_alone, refit_pairs, refit_strongest
-from optodrive.lab.inference.claim import UNJUDGED, Alternative, Claim, Evidence, HeldOutChange
+from optodrive.lab.inference.claim import MIN_EXPLAINED, UNJUDGED, Alternative, Claim, Evidence, HeldOutChange
 from optodrive.physics.hypothesis import Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -204,17 +204,27 @@ def compare_from_single_causes(
         best.setdefault(tuple(sorted(item.causes)), item)
     candidates = tuple(best[keys] for keys, _ in probabilities.ranked if keys in best)
     shares = {item: (rest.explained, rest.explained_with_forms) for item, rest in examined.items()}
-    has_repeats, twins = problem.noise.from_replicates, _pair_twins(hypotheses)
+    has_repeats, twins = problem.noise.from_replicates, _pair_twins(nominal_detection)
     return Selection(probabilities, candidates, shares, nominal_detection, base.chi2, has_repeats, twins)
 
 
-def _pair_twins(hypotheses: list[Hypothesis]) -> dict[str, str]:
-    """Return each of the causes sought by its twin, both ways."""
-    keys = {item.key for item in hypotheses}
-    # A twin in the gas shows in displacement and force; the same instrument term in the thermometer alone is none.
-    acting = {item.key for item in hypotheses if {"displacement", "force"}.intersection(item.free[0].names)}
-    pairs = [(key, twin) for key in acting if (twin := discover_terms()[key].twin) in keys]
-    return {first: second for pair in pairs for first, second in (pair, pair[::-1])}
+def _pair_twins(detection: Detection) -> dict[str, str]:
+    """Return the twins of the causes by these, both ways.
+
+    A twin explains at least half of what the other one does.
+    """
+    ratios: dict[str, float] = {}
+    acting = set()
+    for score in detection.scores:
+        key = score.hypothesis.key
+        ratios[key] = max(ratios.get(key, 0.0), score.ratio)
+        # A twin in the gas shows in displacement and force; the same instrument term in the thermometer alone is none.
+        if {"displacement", "force"}.intersection(score.hypothesis.free[0].names):
+            acting.add(key)
+    pairs = [(key, twin) for key in acting if (twin := discover_terms()[key].twin) in ratios]
+    both_ways = [each for pair in pairs for each in (pair, pair[::-1])]
+    # Where another signal is measured as well, it tells the twins apart.
+    return {first: second for first, second in both_ways if ratios[second] >= MIN_EXPLAINED * ratios[first]}
 
 
 def select_near(base: ModelFit, ranked: list[RefittedCandidate]) -> list[RefittedCandidate]:

@@ -52,6 +52,8 @@ NOISE_SIGMAS = 6.0
 """Noise beyond which a sample is outside its limits, in σ."""
 MAX_RATIO, MAX_WEAKNESS = 25.0, 100.0
 """Largest ratio of a response to that of the reference pixel, and of the reference pixel to a response."""
+MIN_SHAPE_SAMPLES = 8
+"""Smallest number of samples of a response; fewer agree with one in some unit by chance."""
 SHAPE_AGREES, SHAPE_DISAGREES, SHAPE_CERTAIN = 0.8, 0.3, 0.97
 """Share of a signal's variance that a response explains for a match; share of the unexplained variance to which another
 time unit reduces it, to be preferred; share explained above which no other unit is tried."""
@@ -198,7 +200,7 @@ def _check_pixel_signal(
         _check_temperature(f"{where}/{name}", run, t_s, value)
     own = run.pulses[run.pulses[:, 3] == measured_pixel]
     ratio = None
-    if float((own[:, 1] * own[:, 2]).sum()) > 0.0:
+    if len(value) >= MIN_SHAPE_SAMPLES and float((own[:, 1] * own[:, 2]).sum()) > 0.0:
         pulses, times_s, values = _thin(own, t_s, value)
         stated, ratio = _compare(name, pixel, pulses, times_s, values)
         likely = _find_time_units(name, pixel, pulses, times_s, values, stated)

@@ -280,15 +280,22 @@ def claim(evidence: Evidence) -> Claim:
     if certain is None:
         return Claim("ambiguous", sets, reasons)
     doubts = _list_doubts(certain)
-    twins = _list_twins(certain.causes, evidence.twins)
+    twins = _list_twins(certain.causes, evidence)
     reasons = (*doubts, *(f"No recording of this kind tells {key} from {twin}." for key, twin in twins.items()))
     sets = (certain.causes, *(tuple(twins.get(key, key) for key in certain.causes) for _ in twins))
     return Claim("ambiguous" if reasons else "cause", sets, reasons)
 
 
-def _list_twins(causes: Causes, twins: Mapping[str, str]) -> dict[str, str]:
-    """Return the twins of these causes, but for those that are among them."""
-    return {key: twins[key] for key in causes if key in twins and twins[key] not in causes}
+def _list_twins(causes: Causes, evidence: Evidence) -> dict[str, str]:
+    """Return the twins of these causes, but for those that are among them or that are refused in their place."""
+    fitted = {_sort(item.causes): item for item in evidence.alternatives}
+    found = {}
+    for key in causes:
+        twin = evidence.twins.get(key, key)
+        other = fitted.get(_sort(tuple(twin if each == key else each for each in causes)))
+        if twin not in causes and (other is None or not _list_refusals(other)):
+            found[key] = twin
+    return found
 
 
 def combine_claims(claims: Sequence[Claim], failures: Mapping[str, str], has_disturbances: bool) -> Claim:

@@ -46,6 +46,8 @@ DRIFT_SIGMAS = 1.5
 """Drift within runs and shift by the light, relative to the noise, from which they are stated."""
 LOWEST_K, HIGHEST_K = 1.0, 5000.0
 """Limits of a possible temperature."""
+FEW_PARTS = 3
+"""Smallest number of rows or lines of a slower channel in a run where others show it by more."""
 TEMPERATURE = "absorber_temperature_K"
 Slow = tuple[float, FloatArray, FloatArray] | None
 """Interval of a slower channel, s, and its own times and values."""
@@ -150,12 +152,14 @@ def _find_stuck(work: Work, name: str) -> Found:
     return edits, [describe(work, "stuck", name, edits, f"{name}: {samples} of {runs} are stuck at {shown}")]
 
 
-def _find_slow(work: Work, name: str, kind: str, find: Callable[[FloatArray, FloatArray], Slow], text: str) -> Found:
+def _find_slow(work: Work, name: str, kind: str, find: Callable[..., Slow], text: str) -> Found:
     """Find a slower channel whose own samples alone are kept."""
     edits, intervals_s = [], []
+    is_slow = any(find(*select_finite(signal)[1:]) for _, signal in work.list_signals(name))
     for number, signal in work.list_signals(name):
         _, t_s, value = select_finite(signal)
-        found = find(t_s, value)
+        # Once one run shows it, a few parts suffice in those too short to show it by themselves.
+        found = find(t_s, value, FEW_PARTS) if is_slow else None
         if found is not None:
             intervals_s.append(found[0])
             edit = Edit(number, name, replace(signal, t_s=found[1], value=found[2]), len(value) - len(found[1]), value)

@@ -216,12 +216,17 @@ def select_near_ceiling(value: FloatArray, ceiling: float, reach: float) -> Bool
     return np.asarray(np.convolve(is_near, np.ones(5), mode="same") > 0.5)
 
 
-def find_hold(t_s: FloatArray, value: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
-    """Return the interval of a slower channel whose samples are repeated, s, its times and values, or None."""
-    if len(value) < 2 * HOLD_BLOCKS:
+def find_hold(
+    t_s: FloatArray, value: FloatArray, few: int = HOLD_BLOCKS
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Return the interval of a slower channel whose samples are repeated, s, its times and values, or None.
+
+    few: smallest number of blocks of samples, `FEW_BLOCKS` suffice where they are long
+    """
+    if len(value) < 2 * few:
         return None
     starts, lengths = _find_rows(value)
-    fewest = FEW_BLOCKS if float(np.median(lengths)) >= LONG_BLOCK else HOLD_BLOCKS
+    fewest = min(few, FEW_BLOCKS) if float(np.median(lengths)) >= LONG_BLOCK else few
     if len(starts) < fewest + 2 or 1.0 - len(starts) / len(value) < HOLD_SHARE:
         return None
     dt_s = float(np.median(np.diff(t_s)))
@@ -240,9 +245,14 @@ def find_hold(t_s: FloatArray, value: FloatArray) -> tuple[float, FloatArray, Fl
     return period_s, t_s[starts[1:]], value[starts[1:]]  # the first block began before the recording
 
 
-def find_interpolation(t_s: FloatArray, value: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
-    """Return the interval of a slower channel whose samples are joined by lines, s, its times and values, or None."""
-    if len(value) < 2 * MIN_SEGMENTS * MIN_SEGMENT:
+def find_interpolation(
+    t_s: FloatArray, value: FloatArray, few: int = MIN_SEGMENTS
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Return the interval of a slower channel whose samples are joined by lines, s, its times and values, or None.
+
+    few: smallest number of lines
+    """
+    if len(value) < 2 * few * MIN_SEGMENT:
         return None
     dt_s, slope = np.diff(t_s), np.diff(value) / np.diff(t_s)
     precision = float(np.abs(value).max()) * (2.0**-22 if np.all(value == value.astype(np.float32)) else 2.0**-48)
@@ -258,7 +268,7 @@ def find_interpolation(t_s: FloatArray, value: FloatArray) -> tuple[float, Float
     for (a, b, one), (c, _, other) in itertools.pairwise(lines):
         if abs(one - other) > 20.0 * tolerance and c - b <= 1:
             knots_s.append((value[c] - other * t_s[c] - value[a] + one * t_s[a]) / (one - other))
-    if len(knots_s) < MIN_SEGMENTS:
+    if len(knots_s) < few:
         return None
     intervals_s = np.diff(knots_s)
     usual_s = float(np.median(intervals_s))

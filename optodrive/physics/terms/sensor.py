@@ -30,6 +30,9 @@ from optodrive.physics.term import (
     build_signal_parameters,
 )
 
+SETTLED, MAX_ORDER = 20.0, 4.0
+"""Time constants after which a filter has settled; largest order of a filter."""
+
 
 @array_kernel
 def _relax(t_s: FloatArray, value: FloatArray, tau_s: float, out: FloatArray) -> None:
@@ -53,9 +56,18 @@ def low_pass(t_s: FloatArray, value: FloatArray, tau_s: float) -> FloatArray:
     return out
 
 
-def low_pass_both_ways(t_s: FloatArray, value: FloatArray, tau_s: float) -> FloatArray:
-    """Return a signal [n] filtered forwards and backwards, as no instrument but a program does."""
-    return low_pass(-t_s[::-1], low_pass(t_s, value, tau_s)[::-1], tau_s)[::-1]
+def low_pass_both_ways(t_s: FloatArray, value: FloatArray, tau_s: float, order: float = 1.0) -> FloatArray:
+    """Return a signal [n] behind a Butterworth filter that a program ran forwards and backwards over its samples.
+
+    order: of one way; it had settled at both ends
+    """
+    dt_s = float(np.median(np.diff(t_s)))
+    even_s = np.linspace(t_s[0], t_s[-1], round((t_s[-1] - t_s[0]) / dt_s) + 1)
+    settled = 1 + int(SETTLED * tau_s / dt_s)
+    padded = np.pad(np.interp(even_s, t_s, value), settled, mode="edge")
+    ratio = 2.0 * pi * tau_s * np.fft.rfftfreq(len(padded), dt_s)
+    passed = np.fft.irfft(np.fft.rfft(padded) / (1.0 + ratio ** (2.0 * order)), len(padded))
+    return np.interp(t_s, even_s, passed[settled : settled + len(even_s)])
 
 
 def moving_mean(t_s: FloatArray, value: FloatArray, width_s: float, late_s: float = 0.0) -> FloatArray:
@@ -267,15 +279,18 @@ class HighPass(Term):
 
 SIGNALS = BySignal._fields
 SMOOTHING_STARTS_S = (1e-3, 5e-3, 2e-2)
-SMOOTHING_FORMS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0), (0.0, 0.5, 1.0))
-"""Tails, lateness and whether the width is in samples, from which a search begins."""
+SMOOTHING_FORMS = (
+    *((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (3.0, 0.0, 0.0)),
+    *((0.0, 0.5, 0.0), (0.0, 0.0, 1.0), (0.0, 0.5, 1.0)),
+)
+"""Order, lateness and whether the width is in samples, from which a search begins."""
 SAME_SPREAD = 24.0**-0.5
 """Time constant of a filter run both ways that spreads an edge as far as a moving mean of unit width."""
 UNIT_INTERVAL_S = 1e-3
 
 
 class Smoothing(Term):
-    """A moving mean over the width, or with tails = 1 a low-pass run both ways as wide, late by late · width.
+    """A moving mean over the width, or from order = 1 on a low-pass run both ways as wide, late by late · width.
 
     With by_samples = 1, the width is that at one sample per millisecond, and a mean over as many samples elsewhere.
     """
@@ -284,7 +299,9 @@ class Smoothing(Term):
     label = "a signal was smoothed before it was recorded"
     parameters = (
         *build_signal_parameters("s", 5e-3, 0.0, 0.1, "moving means and filters of loggers, to 50 ms", SIGNALS[:3]),
-        TermParameter("tails", "1", 0.0, 0.0, 1.0, "0 moving mean, 1 filter run both ways", (0.0, 1.0), True),
+        TermParameter(
+            "order", "1", 0.0, 0.0, MAX_ORDER, "0 moving mean, from 1 on filter run both ways", (0.0, 1.0), True
+        ),
         TermParameter("late", "1", 0.0, 0.0, 0.5, "0 centred, 0.5 mean of the last samples", (0.0, 0.5), True),
         TermParameter("by_samples", "1", 0.0, 0.0, 1.0, "0 width in time, 1 in samples", (0.0, 1.0), True),
     )
@@ -298,17 +315,18 @@ class Smoothing(Term):
         self, values: TermValues, signal: str, t_s: FloatArray, value: FloatArray, run: RecordedRun
     ) -> FloatArray:
         """Return the smoothed signal, [n]."""
-        width_s, tails = values.get(signal, 0.0), values["tails"]
+        width_s, order = values.get(signal, 0.0), values["order"]
         if width_s <= 0.0 or len(t_s) < 2:
             return value
         if values["by_samples"] > 0.5:
             width_s *= float(np.median(np.diff(t_s))) / UNIT_INTERVAL_S
         late_s = values["late"] * width_s
-        mean = moving_mean(t_s, value, width_s, late_s) if tails < 1.0 else value
-        if tails <= 0.0:
+        mean = moving_mean(t_s, value, width_s, late_s) if order < 1.0 else value
+        if order <= 0.0:
             return mean
-        both = np.interp(t_s - late_s, t_s, low_pass_both_ways(t_s, value, SAME_SPREAD * width_s))
-        return np.asarray(mean + tails * (both - mean))
+        filtered = low_pass_both_ways(t_s, value, SAME_SPREAD * width_s, max(order, 1.0))
+        both = np.interp(t_s - late_s, t_s, filtered)
+        return np.asarray(mean + min(order, 1.0) * (both - mean))
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
         """Return one width for all signals, and one of each signal alone where there are several."""
@@ -320,10 +338,10 @@ class Smoothing(Term):
                     dict.fromkeys(SIGNALS[:3], 0.0) | dict.fromkeys(names, width_s) | form
                     for width_s in SMOOTHING_STARTS_S
                     for form in (
-                        dict(zip(("tails", "late", "by_samples"), numbers, strict=True)) for numbers in SMOOTHING_FORMS
+                        dict(zip(("order", "late", "by_samples"), numbers, strict=True)) for numbers in SMOOTHING_FORMS
                     )
                 ),
-                (self.free(*names), self.free("tails"), self.free("late")),
+                (self.free(*names), self.free("order"), self.free("late")),
             )
             for names in scope.list_signal_sets(SIGNALS[:3])
         ]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, filtfilt, lfilter
+from scipy.signal import butter, cont2discrete, filtfilt, lfilter
 
 from optodrive.physics.term import RecordedRun
 from optodrive.physics.terms import discover_terms
@@ -30,27 +30,31 @@ def test_a_high_pass_is_that_of_a_circuit():
     assert term.record(values, "temperature", T_S, SIGNAL, RecordedRun()) is SIGNAL
 
 
-def test_smoothing_is_a_moving_mean_or_a_filter_run_both_ways():
+def test_smoothing_is_a_moving_mean():
     term, width_s = discover_terms()["smoothing"], 0.015
-    values = {"temperature": 0.0, "displacement": width_s, "force": 0.0, "tails": 0.0, "late": 0.0, "by_samples": 0.0}
+    values = {"temperature": 0.0, "displacement": width_s, "force": 0.0, "order": 0.0, "late": 0.0, "by_samples": 0.0}
     mean = np.convolve(SIGNAL, np.ones(15) / 15, "same")
     inside = slice(20, -20)
     assert term.record(values, "displacement", T_S, SIGNAL, RecordedRun())[inside] == pytest.approx(
         mean[inside], abs=4e-4
     )
-    tau_s = width_s / np.sqrt(24.0)
-    b, a, _ = cont2discrete(([1.0], [tau_s, 1.0]), 1e-3, "foh")
-    both = filtfilt(b[0], a, SIGNAL)
-    wide = term.record(values | {"tails": 1.0}, "displacement", T_S, SIGNAL, RecordedRun())
-    assert wide[inside] == pytest.approx(both[inside], abs=2e-4)
     assert low_pass_both_ways(T_S, SIGNAL, 1e-7) == pytest.approx(SIGNAL, abs=1e-4)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_smoothing_is_a_filter_run_both_ways(order):
+    cutoff_hz = 40.0
+    expected = filtfilt(*butter(order, cutoff_hz, fs=1e3), SIGNAL)
+    forms = {"displacement": np.sqrt(24.0) / (2.0 * np.pi * cutoff_hz), "order": order, "late": 0.0, "by_samples": 0.0}
+    smooth = discover_terms()["smoothing"].record(forms, "displacement", T_S, SIGNAL, RecordedRun())
+    assert smooth[:-60] == pytest.approx(expected[:-60], abs=1e-3)
 
 
 @pytest.mark.parametrize("interval_s", [1e-3, 4e-3])
 def test_a_mean_of_samples_is_as_wide_as_its_samples_and_late_if_of_past_ones(interval_s):
     t_s = np.arange(0.0, 0.5, interval_s)
     signal = np.sin(5.0 * t_s)
-    forms = {"tails": 0.0, "late": 0.0, "by_samples": 1.0}
+    forms = {"order": 0.0, "late": 0.0, "by_samples": 1.0}
     values = {"temperature": 0.0, "displacement": 0.015, "force": 0.0} | forms
     mean = np.convolve(signal, np.ones(15) / 15, "valid")
     term, inside = discover_terms()["smoothing"], slice(20, -20)

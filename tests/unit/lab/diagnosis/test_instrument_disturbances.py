@@ -8,12 +8,19 @@ import pytest
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.fitting import JitterSensitivity
-from optodrive.lab.diagnosis.instrument_disturbances import find_disturbances
+from optodrive.lab.diagnosis.instrument_disturbances import find_dc_coupled, find_disturbances
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel
 
 NOISE_M, NOISE_K = 2e-6, 0.2
 T_S = np.arange(600) / 2500.0
 POWERS_W = (0.5, 1.0, 1.5, 2.0, 2.45)
+
+
+COLOURED = {
+    0: ColouredNoise(NOISE_K, (1e-9, 1e-9), (0.01, 0.1)),
+    1: ColouredNoise(NOISE_M, (1e-12, 1e-12), (0.01, 0.1)),
+}
+NOISE = NoiseModel(COLOURED, 0.005, 2e-5, {0: NOISE_K, 1: NOISE_M}, True)
 
 
 def build_runs(add, seed=1, repeats=3, tau_s=0.0):
@@ -40,12 +47,7 @@ def build_runs(add, seed=1, repeats=3, tau_s=0.0):
 def find(measurement):
     data = build_dataset(measurement)
     nothing = np.zeros(len(data.value))
-    coloured = {
-        0: ColouredNoise(NOISE_K, (1e-9, 1e-9), (0.01, 0.1)),
-        1: ColouredNoise(NOISE_M, (1e-12, 1e-12), (0.01, 0.1)),
-    }
-    noise = NoiseModel(coloured, 0.005, 2e-5, {0: NOISE_K, 1: NOISE_M}, True)
-    return find_disturbances(data, data.value, JitterSensitivity(nothing, nothing), noise), data
+    return find_disturbances(data, data.value, JitterSensitivity(nothing, nothing), NOISE), data
 
 
 @pytest.mark.parametrize("is_random", [True, False])
@@ -148,3 +150,13 @@ def test_data_without_noise_has_no_disturbance():
     ]
     (found, _), _ = find(Measurement(tuple(runs)))
     assert found == ()
+
+
+@pytest.mark.parametrize(("spread_m", "found"), [(0.0, set()), (4.0 * NOISE_M, {"displacement"})])
+def test_zeros_that_differ_by_more_than_a_sample_show_that_no_input_is_ac_coupled(spread_m, found):
+    def add(number, rng):
+        # An amplifier that is AC coupled begins at zero with its first sample, noise included.
+        return (spread_m or NOISE_M) * rng.standard_normal(), 0.0
+
+    data = build_dataset(build_runs(add))
+    assert find_dc_coupled(data, data.value, NOISE) == found

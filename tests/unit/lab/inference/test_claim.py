@@ -118,6 +118,13 @@ def test_a_cause_with_a_twin_is_never_alone():
     assert "tells gas_leak from high_pass" in found.reasons[0]
 
 
+def test_a_twin_that_data_refuse_is_none():
+    evidence = replace(make_evidence(), twins={"gas_leak": "laser_droop"})
+    assert claim(evidence).sets == (("gas_leak",), ("laser_droop",))
+    worse = replace(evidence.alternatives[1], held_out=(WORSE,))
+    assert claim(replace(evidence, alternatives=(evidence.alternatives[0], worse))).verdict == "cause"
+
+
 def test_sets_that_explain_little_leave_an_ambiguity():
     evidence = make_evidence(0.8)
     assert claim(evidence).sets == (("gas_leak",), ("laser_droop",))

@@ -265,6 +265,23 @@ def test_interpolated_samples_leave_the_points_between_which_they_lie(period_s, 
         assert np.abs(known[rows] - signal.value).max() < 0.02
 
 
+@pytest.mark.parametrize("kind", ["held", "interpolated"])
+def test_a_slower_channel_is_slow_in_runs_too_short_to_show_it(kind):
+    clean = lab(7, {}, rate=2000.0, groups=("weak", "middle", "strong"))
+
+    def slow(t_s, value):
+        finite = np.isfinite(value)
+        every_s = np.arange(t_s[0] - 0.005, t_s[-1] + 0.02, 1.0 / 60.0)
+        known = np.interp(every_s, t_s[finite], value[finite])
+        return np.interp(t_s, every_s, known) if kind == "interpolated" else known[np.searchsorted(every_s, t_s) - 1]
+
+    measurement = change(change(clean, HEAT, slow), HEAT, lambda t_s, value: (t_s[:140], value[:140]), (2,))
+    kinds, inspection = find(measurement)
+    assert kinds == {kind}
+    # Of 70 ms at 60 Hz.
+    assert 3 <= len(inspection.measurement.runs[2].signals[HEAT].t_s) <= 5
+
+
 @EXAMPLES
 @given(
     marker=st.sampled_from([-9999.0, 9999.0, 0.0, 9.9e37, -1.0, 1e30, 3.4028234663852886e38, 65535.0]),
