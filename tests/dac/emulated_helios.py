@@ -184,7 +184,7 @@ class Device:
         if count * 7 != len(transfer) - 5:
             return
         frame, repeat = transfer[:-5], not flags & 2
-        if not self.playing or flags & 1:
+        if not self.playing:
             self.frame, self.repeat, self.at = frame, repeat, 0
             self.playing = True
             self.queued = None

@@ -1,10 +1,12 @@
 """Ether Dream: bytes, the emulated device in virtual time, and what ends playback."""
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 
 from dac.bench import build_config, build_frame, build_network_display, build_train, build_verified
-from dac.emulated_ether_dream import CLOCK_HZ, EtherDreamCore, HostDeadError, VirtualStream
+from dac.emulated_ether_dream import HostDeadError, VirtualStream
 from dac.judge import judge, read_light
 from dac.sample_log import dark_from_s
 from optodrive.core.clock import ManualClock
@@ -150,6 +152,17 @@ def test_a_second_client_that_stops_it_ends_playback_in_one_line(command):
     assert dark_from_s(desk.table()) <= done[0] + 1e-3
 
 
+@pytest.mark.parametrize("command", [b"c", b"p", b"?", b"b\0\0\x40\x9c\0\0", b"q\x10\x27\0\0"])
+def test_a_second_client_that_commands_adds_no_light(command):
+    """It clears an emergency stop, prepares, asks, begins before there are enough points, or queues another rate."""
+    desk = Desk()
+    with suppress(LinkError):
+        desk.play(LONG, lambda share: desk.core.run(command))
+    desk.stream.pass_time(2.0)
+    assert judge(desk.light(), desk.plan, desk.display)[1] <= 1e-9
+    assert len(desk.light().start_s) == len(desk.verified.pulses) or command[:1] == b"b"
+
+
 def test_a_cable_that_is_pulled_is_dark_at_once_and_the_next_play_begins():
     desk, done = Desk(), []
 
@@ -241,16 +254,3 @@ def test_a_host_that_answers_nothing_or_something_else_is_one_line():
     desk.core.answer = lambda command, code=b"a": b"HTTP/1.1 400 Bad Request"
     with pytest.raises(LinkError, match=r"it answered b'T' to b'\?'"):
         desk.dac.open()
-
-
-def test_the_emulated_device_keeps_its_capacity_and_stops_when_empty():
-    core = EtherDreamCore()
-    assert core.run(b"p")[:1] == b"a"
-    points = np.zeros((1799, 9), dtype=int)
-    points[:, 3] = 0xFFF0
-    assert core.take(points)
-    assert not core.take(points[:1])
-    assert core.run(b"b" + bytes(2) + (40_000).to_bytes(4, "little"))[:1] == b"a"
-    core.advance(CLOCK_HZ)
-    assert core.starved == 1
-    assert dark_from_s(core.log.table(1.0)) == pytest.approx(1800 / 40_000)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dac.bench import build_config, build_frame, build_network_display, build_train, build_verified
-from dac.emulated_idn import HostDeadError, IdnCore, VirtualRadio
+from dac.emulated_idn import HostDeadError, VirtualRadio
 from dac.judge import judge, read_light
 from dac.sample_log import dark_from_s
 from optodrive.core.clock import ManualClock
@@ -334,11 +334,3 @@ def test_every_chunk_is_one_slice_and_one_datagram():
     _, verified = build_verified(display, LONG)
     assert {chunk.points for chunk in verified.chunks} == {210}
     assert max(len(chunk.data) for chunk in verified.chunks) + 4 <= 1472
-
-
-def test_an_empty_device_holds_its_last_sample_until_its_time_out():
-    core = IdnCore()
-    core.receive(struct.pack(">BBH", 0x40, 0, 0) + wire.build_configuration(wire.CONFIGURATION), 0.0)
-    core.receive(struct.pack(">BBH", 0x40, 0, 1) + bytes(good()[:-1]) + b"\xff", 0.0)
-    core.advance(5.0)
-    assert dark_from_s(core.log.table(5.0)) == pytest.approx(1.0, abs=0.01)

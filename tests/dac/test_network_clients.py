@@ -1,11 +1,8 @@
 """Emulated network DACs as processes: clients that were written elsewhere, and discovery."""
 
 import os
-import shutil
 import socket
-import subprocess
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +11,6 @@ from ether_dream import ether_dream as foreign
 from dac.device_process import DeviceProcess, serve_ether_dream, serve_idn
 from optodrive.core.clock import MonotonicClock
 from optodrive.link.dac.discovery import find_ether_dreams, find_idn_devices
-
-HERE = Path(__file__).parent
-MODULES = HERE.parents[1] / ".node"
 
 
 def free_udp_port():
@@ -59,26 +53,6 @@ def test_the_client_of_pypi_finds_it_and_plays_every_point(tmp_path, monkeypatch
     assert levels.tolist() == [1 + number % 4095 for number in range(10_472)]
     assert set(light[:, 3]) == {2048 + 100}
     assert set(light[:, 4]) == {2048 - 50}
-
-
-def test_the_client_of_npm_plays_its_scene(tmp_path):
-    node = shutil.which("node")
-    assert node, "node is not installed"
-    assert (MODULES / "node_modules/@laser-dac/ether-dream").exists(), (
-        f"needed: npm install --prefix {MODULES} --no-save @laser-dac/core@0.4.2 @laser-dac/ether-dream@0.4.2"
-    )
-    device = DeviceProcess(serve_ether_dream, tmp_path)
-    environment = os.environ | {"ETHER_ADDRESS": f"{device.address}:7765"}
-    command = [node, HERE / "laser_dac_client.mjs", MODULES / "node_modules", "1000", "2500"]  # two seconds of buffer
-    subprocess.run(command, check=True, env=environment, capture_output=True)
-    log = device.finish()
-    assert log["played"] > 300
-    light = log["table"][log["table"][:, 5] > 0]
-    # Its x runs the other way: a quarter, a half and three quarters of the range.
-    assert {round((2048 - x) / 1024) for x in light[:, 3]} == {-1, 0, 1}
-    assert np.rint(light[:, 5] * 4095).min() == 4095
-    samples_on = np.append(light[1:, 2], 0) - light[:, 2]
-    assert np.median(samples_on[:-1]) == 100
 
 
 def test_discovery_lists_a_device_and_survives_what_else_arrives(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dac.bench import Bench, build_config, build_display, build_frame, build_train, build_verified
+from dac.bench import Bench, build_display, build_frame, build_train, build_verified
 from dac.emulated_helios import HostDeadError
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.dac import player as player_module
@@ -159,20 +159,6 @@ def test_unplugging_ends_emission_at_once_and_is_reported(moments_s):
         assert not bench.device.shutter
 
 
-def test_unplugging_during_a_transfer():
-    bench, verified = playing()
-    calls = []
-
-    def pull(share):
-        calls.append(share)
-        if len(calls) == 20:
-            bench.emulated.unplugged_at_s = bench.clock.now_s() + 0.0015  # a status takes 2 ms, a frame 5
-
-    with pytest.raises(LinkError, match="unplugged"):
-        play(bench.helios, verified, bench.clock, pull)
-    assert bench.device.dark_from_s() <= bench.emulated.unplugged_at_s + 1e-6
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, RuntimeError, InputError])
 def test_an_exception_of_the_progress_callback_ends_emission(error):
     bench, verified = playing()
@@ -187,16 +173,6 @@ def test_an_exception_of_the_progress_callback_ends_emission(error):
         play(bench.helios, verified, bench.clock, leave)
     assert bench.device.dark_from_s() <= raised[0] + 0.002
     assert not bench.device.shutter
-
-
-def test_without_an_interlock_the_shutter_stays_closed():
-    display = build_display()
-    _, verified = build_verified(display, build_frame(display))
-    bench = Bench(build_config(interlock_watched=False).board)
-    with bench.helios as helios, pytest.raises(InputError, match="interlock_watched: got False, expected true"):
-        play(helios, verified, bench.clock)
-    assert not list_emissions(bench)
-    assert not any(output.shutter for output in bench.device.log)
 
 
 def test_a_dac_that_is_never_ready_is_stopped():

@@ -12,7 +12,7 @@ from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.virtual_run import MemoryLink
 
 NO_ANSWER = "is open, but no board answers"
-STARTS_S = [2.5, 5.0, 8.0]
+STARTS_S = [2.5, 8.0]
 UNCERTAIN_S = 1.5
 """Longest time from the start to the next HELLO, and of the handshake."""
 
