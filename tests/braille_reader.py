@@ -6,7 +6,6 @@ import random
 import shutil
 import socket
 import subprocess
-from pathlib import Path
 
 from optodrive.core.child_process import die_with_parent
 from rig import wait_for
@@ -24,12 +23,6 @@ def is_installed():
     except OSError:
         return False
     return shutil.which("brltty") is not None
-
-
-def has_driver(name):
-    """Return whether BRLTTY is installed with a driver."""
-    program = shutil.which("brltty")
-    return bool(program) and (Path(program).resolve().parents[1] / f"lib/brltty/libbrlttyb{name}.so").exists()
 
 
 def claim_socket():
@@ -74,11 +67,6 @@ class BrlttyProcess:
 def drive_serial(port):
     """Return the options for one line at a serial port, without a screen."""
     return "-b", "hw", "-d", f"serial:{port}", "-x", "no"
-
-
-def drive_dots(port):
-    """Return the options for several lines at a serial port, without a screen."""
-    return "-b", "dp", "-d", f"serial:{port}", "-x", "no"
 
 
 def drive_lines(number, key_file):

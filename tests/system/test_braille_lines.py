@@ -1,4 +1,4 @@
-"""Several lines of braille under an unmodified BRLTTY: a screen of text in the executed pulses, keys, kills, rights."""
+"""Several lines of braille under an unmodified BRLTTY: cells in the executed pulses, keys, and rights."""
 
 import random
 import socket
@@ -6,11 +6,10 @@ import socket
 import pytest
 
 import braille_reader
-from braille_desk import COUNT, ServedLines, draw_text, find_raised, is_dark, running_desk
+from braille_desk import COUNT, ServedLines, draw_text, running_desk
 from braille_reader import ROUTING_KEY
 from forked_process import OPTODRIVE, run_process
 from optodrive.client.reader_port import FIRST_PORT, HOST
-from optodrive.planning.stimuli.braille_files import BRAILLE_ASCII
 from rig import wait_for
 from shared_screen import SharedScreen
 
@@ -18,23 +17,17 @@ pytestmark = pytest.mark.skipif(
     not braille_reader.is_installed(), reason="BRLTTY is not installed: scripts/test-packages"
 )
 ROWS, COLUMNS = 5, 7
-SHOWN = BRAILLE_ASCII.replace(" ", "")
 ROUTED_CELL = 10
 """From 0, on the second line."""
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def desk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lines")
     screen = SharedScreen(folder, 12, 30)
     with running_desk(folder, ServedLines) as desk:
-        yield desk, screen
+        yield desk
     screen.close()
-
-
-@pytest.fixture
-def desk(place):
-    return place[0]
 
 
 def dismiss_message(desk):
@@ -59,66 +52,6 @@ def test_a_program_writes_all_lines_and_gets_the_keys(desk):
         wait_for(lambda before=before: len(desk.board.of("pulse")) > before + 20, "the frame again")
         assert desk.find_emitted(since) == expected
     assert dismiss_message(desk) == ROUTING_KEY | ROUTED_CELL
-
-
-def wait_for_window(desk, lines):
-    """Wait until the board emits the dots of these lines of braille ASCII and no others."""
-    cells = bytes(BRAILLE_ASCII.index(chr(character)) for line in lines for character in line)
-    expected, since = find_raised(cells), len(desk.board.of("pulse"))
-
-    def is_shown():
-        nonlocal since
-        counts = desk.count_emitted(since)
-        if counts.keys() - expected:
-            since += counts.total()
-        return counts.keys() == expected
-
-    wait_for(is_shown, f"{lines}, after pulse {since}")
-
-
-def test_text_on_a_screen_is_read_by_window_and_keys_move_the_window(place):
-    desk, screen = place
-    desk.show(bytes(COUNT))
-    dismiss_message(desk)
-    desk.writer.close()  # BRLTTY itself has the display
-    rng = random.Random(2)
-    lines = [bytes(ord(rng.choice(SHOWN)) for _ in range(30)) for _ in range(12)]
-    screen.show(lines)
-    wait_for_window(desk, [line[:COLUMNS] for line in lines[:ROWS]])
-    desk.command.press("right")
-    wait_for_window(desk, [line[COLUMNS : 2 * COLUMNS] for line in lines[:ROWS]])
-    desk.command.press("next")
-    wait_for_window(desk, [line[COLUMNS : 2 * COLUMNS] for line in lines[1 : ROWS + 1]])
-    desk.command.press("home")
-    wait_for_window(desk, [line[:COLUMNS] for line in lines[:ROWS]])
-    screen.show([])
-    wait_for(lambda: is_dark(desk), "the dark of an empty screen")
-
-
-@pytest.fixture
-def own_desk(tmp_path):
-    screen = SharedScreen(tmp_path, 12, 30)
-    with running_desk(tmp_path, ServedLines) as desk:
-        yield desk
-    screen.close()
-
-
-def test_a_side_that_is_killed_is_dark_until_it_is_back(own_desk):
-    desk, rng = own_desk, random.Random(3)
-    desk.show(draw_text(rng))
-    desk.reader.kill()
-    desk.writer.close()
-    wait_for(lambda: is_dark(desk), "the dark after the reader")
-    desk.start_reader()
-    since, expected = desk.show(draw_text(rng))
-    assert desk.find_emitted(since) == expected
-    desk.command.stop()
-    wait_for(lambda: is_dark(desk), "the dark after the command")
-    desk.command.start()
-    desk.writer.write(draw_text(rng))  # of a display that is gone; BRLTTY looks for it every five seconds
-    since, expected = desk.show(draw_text(rng))
-    assert desk.find_emitted(since) == expected
-    assert not desk.board.of("fault")
 
 
 def test_a_client_without_the_key_neither_shows_nor_ends_what_is_shown(desk):

@@ -57,16 +57,6 @@ def test_a_preview_and_a_read_only_client_have_no_effect(board, daemon):
     assert not board.of("pulse")
 
 
-def test_an_intensity_is_planned_as_the_height_that_it_stands_for(daemon, display):
-    plans = [display.show(intensity={17: value}, dry_run=True) for value in (5.0, 10.0)]
-    assert [(plan.status, plan.planned) for plan in plans] == [("planned", 1)] * 2
-    assert plans[0].heights_um[17] == pytest.approx(75.6, rel=0.02)
-    assert plans[1].heights_um[17] == pytest.approx(147.0, rel=0.02)
-    with pytest.raises(InputError, match=r"frames\[0\].intensity.17: got 99.0, expected at most 24") as refused:
-        display.show(intensity={17: 99.0}, dry_run=True)
-    assert refused.value.problem["code"] == "target_unreachable"
-
-
 def test_an_exception_stops_the_plan(board, daemon):
     plans = []
 

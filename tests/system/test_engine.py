@@ -7,7 +7,7 @@ import pytest
 
 from optodrive.core.errors import StoppedError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from rig import ended, wait_for
+from rig import wait_for
 
 
 def frame(height_um=100.0, pixel=17, duration_s=0.05):
@@ -38,22 +38,6 @@ def test_a_busy_planner_keeps_the_lease(armed, board):
         assert answer.result().planned == 10_000
     assert armed.board_state == "RUNNING"
     assert not board.of("fault")
-
-
-def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
-    heated = np.zeros(437)
-    heated[17] = 300e-6
-    lead = frame(100.0, pixel=100, duration_s=1.0).frames[0]  # time to hand over the second, which must not be late
-    sequence = FrameSequence((lead, TactileFrame("f", 1.0, 0.05, heated)))
-    first = armed.submit_sequence(sequence, "first").result()
-    second = armed.submit_sequence(frame(350.0), "second").result()
-    rest = armed.submit_sequence(frame(350.0, pixel=300), "rest").result()
-    assert second.pulses.energy_j[0] < 0.99 * rest.pulses.energy_j[0]
-    for answer, height_um in ((first, 300.0), (second, 350.0)):
-        record = ended(armed, answer)
-        assert record.status == "done"
-        if record.delay_s < 1e-3:  # what a stalled computer emits late finds a pixel that has cooled
-            assert record.max_target.simulated_um == pytest.approx(height_um, rel=0.01)
 
 
 def test_a_crash_of_the_loop_aborts_the_board(armed, board, monkeypatch):

@@ -96,17 +96,6 @@ def test_a_defect_is_named(make_board, start, script, arguments, says):
     assert_dark(board)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("interlock", "false"), pytest.param("key", "false", marks=pytest.mark.slow), ("estop", "true")]
-)
-def test_an_unsafe_input(make_board, start, name, value):
-    board = make_board(script=step_of(0.0, "set", name) + f"value = {value}\n")
-    status, _, errors = start(board, "home").ended()
-    assert status == 1
-    assert name.upper() in errors
-    assert "ARMING" not in [event["state"] for event in assert_dark(board, ("FAULT",)).of("state")]
-
-
 def armed(board):
     wait_for(lambda: board.of("state") and board.of("state")[-1]["state"] in ("ARMED", "RUNNING"), "ARMED")
 
@@ -127,21 +116,6 @@ def test_a_signal_ends_it(make_board, start, number):
         assert status == 130
         assert errors == "optodrive: interrupted\n"
         assert board.of("state")[-1]["reason"] in ("abort", "link lost")
-
-
-@pytest.mark.parametrize(
-    ("script", "says"),
-    [
-        (f'{step_of(0.2, "set", "interlock")}from = "light"\n', "INTERLOCK"),
-        (f'{step_of(0.2, "do", "close")}from = "light"\n', "lost"),
-    ],
-)
-def test_a_failure_during_the_run(make_board, start, script, says):
-    board = make_board(sensor=(), script=script)
-    status, _, errors = start(board, "home", "--spot-power-mw", "5").ended()
-    assert status == 1
-    assert says in errors
-    assert_dark(board, ("DISARMED", "FAULT"))
 
 
 def test_a_board_in_use_by_a_daemon(board, daemon, start):

@@ -72,15 +72,3 @@ def test_a_small_push_behind_dry_runs_never_lights_afterwards(rig, ending):
                 push.receive()
             assert_only_a_later_push_lights(rig, begin)
         assert waiting.receive()[0] in (200, 422)  # the latter if it takes more than a minute, on a slow computer
-
-
-def test_a_push_whose_body_began_before_never_lights(rig):
-    """The head of the request and half of its body arrive before STOP, the rest after arming."""
-    rig.arm()
-    with RawPush(rig.daemon, len(SMALL)) as push:
-        push.send(SMALL[:40])
-        begin = end_and_arm_again(rig, "stop")
-        push.send(SMALL[40:])
-        status, _ = push.receive()
-    assert_only_a_later_push_lights(rig, begin)
-    assert status == 409

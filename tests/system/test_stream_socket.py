@@ -124,14 +124,6 @@ def test_sigterm_turns_the_gate_off_at_once_despite_a_connected_client(make_boar
     assert "Traceback" not in daemon.errors.read_text()
 
 
-def test_without_arming_a_frame_is_refused(make_board, make_daemon):
-    daemon = make_daemon(make_board())
-    with socket(daemon) as stream:
-        stream.send(binary(0, [1]))
-        (refused,) = until(stream, {"status": "refused"})
-        assert refused["problem"]["status"] == 409
-
-
 def test_the_newest_plan_wins_over_rest(daemon):
     frames = {"frames": [{"show_at_s": 0, "duration_s": 9, "target_um": [100.0] * PIXELS}]}
     first = daemon.call("POST", "/v1/plans", json=frames)

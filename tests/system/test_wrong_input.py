@@ -146,16 +146,6 @@ def test_what_is_not_there(armed, path, method, status):
     assert answer["code"]
 
 
-def test_policy_refuse_refuses_what_would_be_trimmed_or_late(armed):
-    body = {"frames": [frame(duration_s=0.01, target_um=dict.fromkeys(map(str, range(40)), 100))]}
-    answer = armed.call("POST", "/v1/plans?policy=refuse", status=409, json=body)
-    assert answer["code"] == "refused"
-    assert "needs" in answer["detail"]
-    body = {"trains": [train(gap_s=0.0, pulse_width_s=0.05)]}
-    answer = armed.call("POST", "/v1/plans?policy=refuse", status=409, json=body)
-    assert "cap" in answer["detail"]
-
-
 def test_wrong_arguments(tmp_path):
     picture = tmp_path / "picture.png"
     picture.write_bytes(b"no picture at all")

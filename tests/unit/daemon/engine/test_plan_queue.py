@@ -66,6 +66,14 @@ def test_a_streamed_plan_replaces_the_unsent_rest_without_a_pause(rig):
     assert rig.session.board.underruns == 0
 
 
+def test_an_empty_frame_ends_the_one_before(rig):
+    first = submit(rig, build_frame(300.0, duration_s=9.0), streamed=True)
+    rig.until(lambda: first.executed_count >= 1)
+    nothing = finish(rig, submit(rig, build_frame(300.0, (), duration_s=9.0), streamed=True))
+    assert (finish(rig, first).status, nothing.status) == ("superseded", "done")
+    assert len(rig.list_emitted()) == first.executed_count < 16
+
+
 def test_a_refresh_that_has_not_begun_is_replaced_as_a_whole(rig):
     first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
     rig.until(lambda: first.executed_count >= 1)
