@@ -1,4 +1,4 @@
-"""Write the table of docs/reference/benchmarks.md: what takes at most twenty minutes in all, in one run on one machine.
+"""Write the figures of docs/reference/benchmarks.md: what takes at most twenty minutes, in one run on one machine.
 
 Each row is of the present program and names its command; rows of an earlier run do not stay. What takes longer is not
 here: the page states its commands.
@@ -19,7 +19,7 @@ from measuring import ROOT, format_number
 PAGE = ROOT / "docs" / "reference" / "benchmarks.md"
 BEGIN, END = "<!-- scripts/figures -->", "<!-- end -->"
 SHOWN = {
-    "plan": r".",
+    "plan": r"^(50|400) µm|whole",
     "start": r".",
     "limit": r"full frame|1,000,000|after all",
     "wire": r".",
@@ -29,7 +29,7 @@ SHOWN = {
     "field": r"worst geometry|two sigma|positions to codes",
     "page": r".",
     "memory": r"all processes|first answer",
-    "stream": r"^(?!.*memory of (?!all)).*(first|round trip|per second|of 200|, limited|underruns|memory)",
+    "stream": r"^(?!.*memory of (?!all))(?!.*truncates).*(first|round trip|per second|, limited|underruns|memory)",
     "stop": r".",
     "fingers": r"dots under|first light|per second|underruns",
 }
@@ -46,14 +46,13 @@ def measure(name):
     return [row for row in rows if re.search(SHOWN[name], row["quantity"])], time.monotonic() - begin_s
 
 
-def format_row(name, row):
-    """Return a line of the table. A single value has neither percentile nor count."""
-    is_single = row["n"] == 1
-    p99 = "" if is_single else format_number(row["p99"])
-    ratio = f"{format_number(row['ratio'])} × {row['reference']}" if row["ratio"] else ""
-    median = f"{format_number(row['median'])} {'' if row['unit'] == '1' else row['unit']}"
-    count = "" if is_single else str(row["n"])
-    return f"| {name} | {row['quantity']} | {median.strip()} | {p99} | {count} | {ratio} |"
+def format_row(row):
+    """Return a line of the list. A single value has neither percentile nor count."""
+    unit = "" if row["unit"] == "1" else row["unit"]
+    notes = [] if row["n"] == 1 else [f"p99 {format_number(row['p99'])} of {row['n']}"]
+    notes += [f"{format_number(row['ratio'])} × {row['reference']}"] if row["ratio"] else []
+    text = f"- {row['quantity']}: {format_number(row['median'])} {unit}".rstrip()
+    return f"{text} ({'; '.join(notes)})" if notes else text
 
 
 def describe_machine():
@@ -76,14 +75,13 @@ def main():
     lines, spent = [], []
     for name in names:
         rows, seconds = measure(name)
-        lines += [format_row(name, row) for row in rows]
+        lines += ["", f"**{name}**", "", *map(format_row, rows)]
         spent.append(f"{name} {seconds:.0f}")
         print(f"{name}: {len(rows)} rows in {seconds:.0f} s", file=sys.stderr, flush=True)
     if names != list(SHOWN):
         print("\n".join(lines))
         return
-    heading = ("| benchmark | quantity | median | p99 | values | ratio |", "|---|---|---|---|---|---|")
-    table = "\n".join((describe_machine(), "Seconds taken: " + ", ".join(spent) + ".", "", *heading, *lines))
+    table = "\n".join((describe_machine(), "Seconds taken: " + ", ".join(spent) + ".", *lines))
     before, _, rest = PAGE.read_text().partition(BEGIN)
     PAGE.write_text(f"{before}{BEGIN}\n\n{table}\n\n{END}{rest.partition(END)[2]}")
 

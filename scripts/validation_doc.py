@@ -15,7 +15,7 @@ INTRODUCTION = """\
 # Validation
 
 This page compares the models with the paper. `scripts/validation-doc` generates it; `optodrive validate` prints the
-same rows.
+same rows, and those of the inputs that the models take from the paper.
 
 `literal` is the set `paper_s1_literal`, Text S1 without any fit. `calibrated` drives the displays; it is
 fitted by `scripts/calibrate-parameters` to three facts, one per parameter: κ to `z_peak_w020`, τ_g to
@@ -84,24 +84,19 @@ Excluded facts:
 JSON_KEYS = """\
 `--diagnose --json` prints one object, SI units, temperatures as rises in K:
 
-- `parameter_set`: the parameter set that is diagnosed
-- `verdict`, `sets` (the causes named), `reasons`, as of a diagnosis
+- `parameter_set`, `verdict`, `sets` (the causes named), `reasons`, as of a diagnosis
 - `probabilities`: `no_effect`, `none_of_these`, `causes` (each set above 1 %: `causes`, `probability`)
 - `facts`: each `id`, `group`, `value`, `relative_error` (from `reading_error`, of a `source`, and `scatter`),
   `nominal_ratio`, `extended_ratio`, `error_sigma`
-- `excluded`: outcome → reason why it is not a measurement
-- `chi2`, `factor`: `nominal`, `extended`; of χ² also `degrees_of_freedom`
-- `aicc_per_cause`, `aicc_indistinguishable`: thresholds
+- `excluded`: outcome → reason; `unexplained`: facts that deviate by more than two standard errors
+- `chi2`, `factor`: `nominal`, `extended`; of χ² also `degrees_of_freedom`; `aicc_per_cause`, `aicc_indistinguishable`
 - `causes`: each `cause`, `description`, `parameter`, `value`, `low`, `high` (95 %), `unit`, `chi2_reduction`,
   `evidence`, `alternatives`, `deciding_measurement`
-- `candidates`, the other causes: each `cause`, `description`, `probability`, `parameter`, `value` (beside the others),
-  `unit`, `chi2_reduction_alone`, `chi2_reduction_added`, `replaces`, `replaced_fraction`, `is_observable`,
-  `is_alternative_law`, `deciding_measurement`
+- `candidates`, the other causes: also `probability`, `chi2_reduction_alone`, `chi2_reduction_added`, `replaces`,
+  `replaced_fraction`, `is_observable`, `is_alternative_law`
 - `contradictions`: each `assumption`, `description`, `ratio`
-- `unexplained`: facts that deviate by more than two standard errors
 - `gain`: `groups` and `facts`, each `held_out`, `facts`, `causes`, `unobservable`, `nominal`, `extended` (ratios model
-  over measured), `changes` of χ² (`signal`, `chi2`, its deviation `noise`); `factor_groups` and `factor_each`, each
-  `nominal`, `extended`
+  over measured), `changes` of χ² (`signal`, `chi2`, `noise`); `factor_groups`, `factor_each`: `nominal`, `extended`
 """
 
 
@@ -116,10 +111,8 @@ def build_page():
         format_bullets((row.fact.id, row.remark) for row in rows if row.remark),
         LITERAL_SECTION,
         build_diagnosis_section(),
-        "## Inputs\n\nTaken from the paper, or derived from it by arithmetic.\n",
-        format_table(row for row in rows if row.role == "input"),
         "## Rows\n",
-        format_bullets((row.fact.id, describe_fact(row.fact)) for row in rows),
+        format_bullets((row.fact.id, describe_fact(row.fact)) for row in rows if row.role != "input"),
         "## Facts outside the models\n",
         format_bullets(NOT_MODELLED.items()),
     ]
@@ -132,7 +125,7 @@ def build_diagnosis_section():
     lines = [narrative.HEADINGS, ("---",) * len(narrative.HEADINGS), *narrative.build_rows(study_result)]
     parts = [
         DIAGNOSIS_SECTION,
-        format_quote(narrative.describe_findings(study_result)),
+        format_quote(keep_findings(narrative.describe_findings(study_result))),
         "".join("| " + " | ".join(line) + " |\n" for line in lines),
         format_quote(
             [*narrative.describe_predictions(study_result), "", *narrative.describe_assumptions(study_result)]
@@ -142,6 +135,12 @@ def build_diagnosis_section():
         JSON_KEYS,
     ]
     return "\n".join(parts)
+
+
+def keep_findings(lines):
+    """Return the lines on the named causes and the contradictions, without those on all other causes."""
+    others = next((k for k, line in enumerate(lines) if line.startswith("Other causes")), len(lines))
+    return [*lines[:others], "…"]
 
 
 def format_quote(lines):

@@ -7,7 +7,7 @@ all of this is done again: the board is DISARMED, and the session never arms on 
 
 Truth. State, position and errors are what the board reports (`board_view.py`), with the instant of the last message:
 silence for `SILENCE_TIMEOUT_S` ends the session, and for a lease where other boards' light depends on it.
-`link_watch.py` keeps what is needed to name the likely cause afterwards (decision 19).
+`link_watch.py` keeps what is needed to name the likely cause afterwards (docs/explanation/link.md).
 """
 
 import secrets
