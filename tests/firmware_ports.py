@@ -17,6 +17,7 @@ PACKAGES = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "qemu-system-arm": "qemu-system-arm",
     "node": "nodejs npm",
+    "ngspice": "ngspice",
     "clang": "clang",
     "cppcheck": "cppcheck",
 }

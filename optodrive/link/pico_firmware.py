@@ -21,8 +21,8 @@ from optodrive.link.protocol.messages import Limits
 CELLS_MAX = 1536
 """Spots that a Pico can guard: BOARD_CELLS of its Makefile."""
 PREFERRED_GATE_HZ = 50_000.0
-GATE_MIN_HZ, GATE_MAX_HZ = 20_000.0, 488_000.0
-"""PWM frequencies of the pin: the readback holds for 50 µs from a pulse to the next, and a period has 256 steps."""
+GATE_MIN_HZ, GATE_MAX_HZ = 30_000.0, 488_000.0
+"""PWM frequencies of the pin: the readback holds from a pulse to the next, and a period has 256 steps."""
 CHIPS = {"rp2040": "", "rp2350": "pico2"}
 """The chip of a board → the folder and the target of its image."""
 TOOLS = {"make": "make", "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi", "python3": "python3"}

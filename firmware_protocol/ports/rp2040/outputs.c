@@ -7,7 +7,7 @@
 
 #define GATE_PERIOD (CLOCK_HZ / GATE_HZ)
 /* A period of PWM has 256 steps or more, and the readback holds from one to the next: docs/how-to/wire-a-board.md. */
-_Static_assert(GATE_HZ >= 20000u && GATE_PERIOD >= 256u, "GATE_HZ: 20,000 to 488,000");
+_Static_assert(GATE_HZ >= 30000u && GATE_PERIOD >= 256u, "GATE_HZ: 30,000 to 488,000");
 
 #define GATE_FORCED_LOW (IO_PWM | IO_OUT_LOW)
 
