@@ -1,19 +1,32 @@
-"""Look up the code that a page names as `file:function`. A page must not outlive the code that it describes."""
+"""Look up the code that a page names as `file:function`, and the tests. A page must not outlive what it describes."""
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 NAMED = re.compile(r"`([\w/]+\.(?:py|c)):([\w.]+)`")
+NAMED_TEST = re.compile(r"`(test_\w+(?:\.py)?)`")
+NAMED_PATH = re.compile(r"`(tests/[\w./-]+)`")
 
 
 def find_missing(markdown: str, root: Path = ROOT) -> list[str]:
     """Return the code that a page names and that does not exist.
 
-    It consists of files below optodrive/ or firmware_protocol/, functions, classes.
+    It consists of files below optodrive/ or firmware_protocol/, functions, classes, tests and paths below tests/.
     """
-    return [f"{file}:{name}" for file, name in NAMED.findall(markdown) if not _has(root, file, name)]
+    missing = [f"{file}:{name}" for file, name in NAMED.findall(markdown) if not _has(root, file, name)]
+    missing += [name for name in NAMED_TEST.findall(markdown) if name not in _list_tests(root)]
+    return missing + [path for path in NAMED_PATH.findall(markdown) if not (root / path).exists()]
+
+
+@cache
+def _list_tests(root: Path) -> set[str]:
+    names = set()
+    for path in (root / "tests").rglob("test_*.py"):
+        names |= {path.name, *re.findall(r"def (test_\w+)\(", path.read_text(encoding="utf-8"))}
+    return names
 
 
 def _has(root: Path, file: str, name: str) -> bool:

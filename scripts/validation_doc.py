@@ -1,4 +1,6 @@
-"""Write docs/explanation/validation.md: the rows of `optodrive validate` with their discussion."""
+"""Write docs/explanation/validation.md, the rows of `optodrive validate` with their discussion, and
+docs/reference/paper-facts.md, what each row is.
+"""
 
 import argparse
 from pathlib import Path
@@ -15,7 +17,8 @@ INTRODUCTION = """\
 # Validation
 
 This page compares the models with the paper. `scripts/validation-doc` generates it; `optodrive validate` prints the
-same rows, and those of the inputs that the models take from the paper.
+same rows, and those of the inputs that the models take from the paper. [The paper's facts](../reference/paper-facts.md)
+says what each row is.
 
 `literal` is the set `paper_s1_literal`, Text S1 without any fit. `calibrated` drives the displays; it is
 fitted by `scripts/calibrate-parameters` to three facts, one per parameter: κ to `z_peak_w020`, τ_g to
@@ -78,11 +81,21 @@ Interpretation:
   display behaves.
 
 A rate is compared as the height in the time that it leaves per pixel: near the plateau 7 % of height is 24 % of time.
-Excluded facts:
+"""
+
+FACTS_INTRODUCTION = """\
+# The paper's facts
+
+[Validation](../explanation/validation.md) compares the models with these; `scripts/validation-doc` generates both
+pages.
+
+## Rows
 """
 
 JSON_KEYS = """\
-`--diagnose --json` prints one object, SI units, temperatures as rises in K:
+## `optodrive validate --diagnose --json`
+
+One object, SI units, temperatures as rises in K:
 
 - `parameter_set`, `verdict`, `sets` (the causes named), `reasons`, as of a diagnosis
 - `probabilities`: `no_effect`, `none_of_these`, `causes` (each set above 1 %: `causes`, `probability`)
@@ -111,10 +124,22 @@ def build_page():
         format_bullets((row.fact.id, row.remark) for row in rows if row.remark),
         LITERAL_SECTION,
         build_diagnosis_section(),
-        "## Rows\n",
-        format_bullets((row.fact.id, describe_fact(row.fact)) for row in rows if row.role != "input"),
+    ]
+    return "\n".join(parts)
+
+
+def build_facts_page():
+    """Return the page of the facts: what each is, why some are no measurement, and why no model predicts the others."""
+    parts = [
+        FACTS_INTRODUCTION,
+        format_bullets(
+            (row.fact.id, describe_fact(row.fact)) for row in build_validation_rows() if row.role != "input"
+        ),
+        "## Facts that a diagnosis excludes\n",
+        format_bullets(EXCLUDED.items()),
         "## Facts outside the models\n",
         format_bullets(NOT_MODELLED.items()),
+        JSON_KEYS,
     ]
     return "\n".join(parts)
 
@@ -131,8 +156,6 @@ def build_diagnosis_section():
             [*narrative.describe_predictions(study_result), "", *narrative.describe_assumptions(study_result)]
         ),
         DISCUSSION_SECTION,
-        format_bullets(EXCLUDED.items()),
-        JSON_KEYS,
     ]
     return "\n".join(parts)
 
@@ -167,5 +190,8 @@ def describe_fact(fact):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/explanation/validation.md"))
-    parser.parse_args().out.write_text(build_page(), encoding="utf-8")
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of the documentation")
+    folder = parser.parse_args().out
+    for name, build in (("explanation/validation.md", build_page), ("reference/paper-facts.md", build_facts_page)):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(build(), encoding="utf-8")

@@ -162,5 +162,5 @@ def _print_table(rows: list[ValidationRow]) -> None:
         if row.remark:
             console.print(f"  {row.fact.id}: {row.remark}", highlight=False, soft_wrap=True)
     console.print(
-        f"No parameter set predicts the other {len(NOT_MODELLED)} facts; docs/explanation/validation.md says why."
+        f"No parameter set predicts the other {len(NOT_MODELLED)} facts; docs/reference/paper-facts.md says why."
     )

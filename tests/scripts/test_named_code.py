@@ -12,9 +12,10 @@ from named_code import find_missing
 
 @pytest.fixture
 def root(tmp_path):
-    package, firmware = tmp_path / "optodrive" / "link", tmp_path / "firmware_protocol"
-    package.mkdir(parents=True)
-    firmware.mkdir()
+    package, firmware, tests = (tmp_path / name for name in ("optodrive/link", "firmware_protocol", "tests/link"))
+    for folder in (package, firmware, tests):
+        folder.mkdir(parents=True)
+    (tests / "test_arming.py").write_text("def test_it_arms(board):\n    pass\n")
     (package / "session.py").write_text("class Session:\n    def arm(self): ...\n\n\nasync def run(): ...\n")
     (firmware / "core.c").write_text("bool arm(int a,\n         int b) {\n}\nstatic int disarm(void);\n")
     return tmp_path
@@ -31,6 +32,12 @@ def root(tmp_path):
         ("link/gone.py:run", False),
         ("firmware_protocol/core.c:arm", True),
         ("firmware_protocol/core.c:disarm", False),  # declared, not defined
+        ("test_it_arms", True),
+        ("test_it", False),
+        ("test_arming.py", True),
+        ("test_gone.py", False),
+        ("tests/link", True),
+        ("tests/link/test_gone.py", False),
     ],
 )
 def test_named_code_is_looked_up(root, named, is_there):
