@@ -1,4 +1,7 @@
-"""Numbers of the paper, as shipped in configs/paper_facts.csv, one row per fact."""
+"""Numbers of the paper, as shipped in configs/paper_facts.csv, one row per fact.
+
+Further columns state what the validation makes of a fact (`optodrive.lab.validation`).
+"""
 
 import csv
 from dataclasses import dataclass
@@ -41,10 +44,21 @@ class PaperFact:
 
 
 @cache
+def read_shipped_table(name: str) -> tuple[dict[str, str], ...]:
+    """Return the rows of a shipped CSV file as text by column."""
+    with locate_shipped(name).open(encoding="utf-8", newline="") as file:
+        return tuple(csv.DictReader(file))
+
+
+@cache
 def load_paper_facts() -> dict[str, PaperFact]:
     """Return every fact by its id, in the order of the file."""
-    with locate_shipped("paper_facts.csv").open(encoding="utf-8", newline="") as file:
-        return {row["id"]: _parse_fact(row) for row in csv.DictReader(file)}
+    return {row["id"]: _parse_fact(row) for row in read_shipped_table("paper_facts.csv")}
+
+
+def list_stated(column: str) -> dict[str, str]:
+    """Return the entries of a further column by fact."""
+    return {row["id"]: row[column] for row in read_shipped_table("paper_facts.csv") if row[column]}
 
 
 def _parse_fact(row: dict[str, str]) -> PaperFact:

@@ -34,11 +34,11 @@ from optodrive.lab.inspection.work import (
     Step,
     Work,
     count,
-    describe,
+    count_samples,
+    describe_extent,
     find_unit,
     format_span,
     list_names,
-    remove_samples,
     select_finite,
 )
 
@@ -49,6 +49,8 @@ LOWEST_K, HIGHEST_K = 1.0, 5000.0
 FEW_PARTS = 3
 """Smallest number of rows or lines of a slower channel in a run where others show it by more."""
 TEMPERATURE = "absorber_temperature_K"
+HELD = "each sample is repeated until the next, every {every}; the first counts"
+INTERPOLATED = "samples lie on lines between points {every} apart; these points count"
 Slow = tuple[float, FloatArray, FloatArray] | None
 """Interval of a slower channel, s, and its own times and values."""
 
@@ -101,95 +103,67 @@ def inspect_recording(measurement: Measurement, use: Iterable[str] = ()) -> Insp
         for name in [""] if step.is_joint else work.names:
             try:
                 with np.errstate(all="ignore"):
-                    edits, new = step.find(work, name)
+                    for item in step.find(work, name):
+                        findings.append(item if isinstance(item, DataFinding) else _act(work, step.kind, used, *item))
             except Exception as error:  # an optional step never takes the answer along
                 failures.append(f"{step.kind}{' of ' if name else ''}{name}: {type(error).__name__}: {error}")
-                continue
-            if step.kind in used:
-                new = [replace(item, action="noted", text=_put_back(item.text)) for item in new]
-            else:
-                work.apply(edits)
-            findings += new
     return Inspection(tuple(findings), work.build(), tuple(failures))
 
 
-def _put_back(text: str) -> str:
-    return text.replace("; left out.", "; used all the same.")
+def _act(work: Work, kind: str, used: frozenset[str], edits: list[Edit], text: str) -> DataFinding:
+    """Apply the edits of a fault unless its kind is used, and return the finding."""
+    name, is_used = edits[0].name, kind in used
+    runs = tuple(dict.fromkeys(work.runs[item.run].name for item in edits))
+    values, unit = np.concatenate([item.values for item in edits]), find_unit(name)
+    numbers = {"lowest": (float(values.min()), unit), "highest": (float(values.max()), unit)} if len(values) else {}
+    if not is_used:
+        work.apply(edits)
+    action, end = ("noted", "used all the same") if is_used else ("left out", "left out")
+    return DataFinding(runs, name, kind, f"{text}; {end}.", action, count_samples(edits), numbers)
 
 
 def _mask_all(work: Work, name: str, find: Callable[[FloatArray], BoolArray]) -> list[Edit]:
-    edits = []
-    for number, signal in work.list_signals(name):
-        value = select_finite(signal)[2]
-        is_bad = find(value) if len(value) else np.zeros(0, dtype=bool)
-        if is_bad.any():
-            edits.append(remove_samples(number, name, signal, is_bad))
-    return edits
+    return work.remove(name, [(run, find(value)) for run, _, value in work.list_finite(name) if len(value)])
 
 
 def _find_sentinels(work: Work, name: str) -> Found:
     high = RECORDING[name].high
-    kept = np.concatenate([select_finite(signal)[2] for _, signal in work.list_signals(name)])
-    centre = float(np.median(kept))
+    centre = float(np.median(np.concatenate([value for _, _, value in work.list_finite(name)])))
     limits = (LOWEST_K, HIGHEST_K) if name == TEMPERATURE else (centre - high, centre + high)
-    edits = _mask_all(work, name, lambda value: find_sentinels(value, *limits))
-    if not edits:
-        return [], []
-    values = np.concatenate([item.values for item in edits])
-    samples, runs = count(len(values), "sample"), count(len(edits), "run")
-    shown = list_names([f"{value:.6g}" for value in np.unique(values).tolist()])
-    return edits, [
-        describe(work, "sentinel", name, edits, f"{name}: {samples} of {runs} are {shown}, no measured value")
-    ]
+    if edits := _mask_all(work, name, lambda value: find_sentinels(value, *limits)):
+        found = np.unique(np.concatenate([item.values for item in edits]))
+        shown = list_names([f"{value:.6g}" for value in found.tolist()])
+        yield edits, f"{name}: {describe_extent(edits)} are {shown}, no measured value"
 
 
 def _find_stuck(work: Work, name: str) -> Found:
-    edits = _mask_all(work, name, find_stuck)
-    if not edits:
-        return [], []
-    samples, runs = count(sum(item.samples for item in edits), "sample"), count(len(edits), "run")
-    shown = format_span(np.concatenate([item.values for item in edits]), find_unit(name))
-    return edits, [describe(work, "stuck", name, edits, f"{name}: {samples} of {runs} are stuck at {shown}")]
+    if edits := _mask_all(work, name, find_stuck):
+        shown = format_span(np.concatenate([item.values for item in edits]), find_unit(name))
+        yield edits, f"{name}: {describe_extent(edits)} are stuck at {shown}"
 
 
-def _find_slow(work: Work, name: str, kind: str, find: Callable[..., Slow], text: str) -> Found:
+def _find_slow(work: Work, name: str, find: Callable[..., Slow], text: str) -> Found:
     """Find a slower channel whose own samples alone are kept."""
-    edits, intervals_s = [], []
-    is_slow = any(find(*select_finite(signal)[1:]) for _, signal in work.list_signals(name))
-    for number, signal in work.list_signals(name):
-        _, t_s, value = select_finite(signal)
+    edits, intervals_s, signals = [], [], work.list_finite(name)
+    is_slow = any(find(t_s, value) for _, t_s, value in signals)
+    for run, t_s, value in signals:
         # Once one run shows it, a few parts suffice in those too short to show it by themselves.
         found = find(t_s, value, FEW_PARTS) if is_slow else None
         if found is not None:
-            intervals_s.append(found[0])
-            edit = Edit(number, name, replace(signal, t_s=found[1], value=found[2]), len(value) - len(found[1]), value)
-            edits.append(edit)
-    if not edits:
-        return [], []
-    every = format_span(np.array(intervals_s), "s")
-    text = f"{name}: in {count(len(edits), 'run')} {text.format(every=every)}"
-    return edits, [describe(work, kind, name, edits, text)]
-
-
-def _find_held(work: Work, name: str) -> Found:
-    text = "each sample is repeated until the next, every {every}; the first counts"
-    return _find_slow(work, name, "held", find_hold, text)
-
-
-def _find_interpolated(work: Work, name: str) -> Found:
-    text = "samples lie on lines between points {every} apart; these points count"
-    return _find_slow(work, name, "interpolated", find_interpolation, text)
+            interval_s, own_s, own = found
+            intervals_s.append(interval_s)
+            edits.append(Edit(run, name, replace(work.signals[run, name], t_s=own_s, value=own), value, len(own)))
+    if edits:
+        every = format_span(np.array(intervals_s), "s")
+        yield edits, f"{name}: in {count(len(edits), 'run')} {text.format(every=every)}"
 
 
 def _find_clipped(work: Work, name: str) -> Found:
-    edits, findings = [], []
     is_mirror = name.startswith("mirror")
     for sign, side in ((1.0, "highest"), (-1.0, "lowest")):
-        signals = [(number, signal, *select_finite(signal)[1:]) for number, signal in work.list_signals(name)]
-        may_be_smooth = sign > 0.0 and not is_mirror
-        found = [
-            top for _, _, t_s, value in signals if (top := find_ceiling(t_s, sign * value, may_be_smooth)) is not None
-        ]
+        signals = work.list_finite(name)
+        tops = [find_ceiling(t_s, sign * value, sign > 0.0 and not is_mirror) for _, t_s, value in signals]
+        found = [top for top in tops if top is not None]
         ceiling, reach, where = min(found, default=0.0), 0.0, f"where the signal is clipped, its {side} value"
         if not found:
             level = find_saturation(work, name)
@@ -197,28 +171,22 @@ def _find_clipped(work: Work, name: str) -> Found:
                 continue
             ceiling, reach = sign * level[1], level[2]
             where = f"where the signal saturates, its {side} value but for noise"
-        own = []
-        for number, signal, _, value in signals:
-            is_near = select_near_ceiling(sign * value, ceiling, reach)
-            if is_near.any():
-                own.append(remove_samples(number, name, signal, is_near))
-        work.apply(own)
-        samples, total = sum(item.samples for item in own), sum(len(value) for _, _, _, value in signals)
-        text = f"{name}: {count(samples, 'sample')} ({samples / total:.1%}) of {count(len(own), 'run')} are at or near "
-        text += f"{format_quantity(sign * ceiling, find_unit(name))}, {where}"
-        findings.append(describe(work, "clipped", name, own, text))
-        edits += own
-    return edits, findings
+        near = [(run, select_near_ceiling(sign * value, ceiling, reach)) for run, _, value in signals]
+        if edits := work.remove(name, near):
+            samples, runs = count_samples(edits), count(len(edits), "run")
+            share = samples / sum(len(value) for _, _, value in signals)
+            at = format_quantity(sign * ceiling, find_unit(name))
+            yield edits, f"{name}: {count(samples, 'sample')} ({share:.1%}) of {runs} are at or near {at}, {where}"
 
 
 def _note_start_times(work: Work, _: str) -> Found:
-    return [], list(read_start_times(work.runs).findings)
+    yield from read_start_times(work.runs).findings
 
 
 def _note_sampling(work: Work, name: str) -> Found:
     signals = [(number, signal) for number, signal in work.list_signals(name) if len(signal.t_s) > 2]
     if not signals:
-        return [], []
+        return
     intervals_s = np.array([float(np.median(np.diff(signal.t_s))) for _, signal in signals])
     total = sum(len(signal.t_s) for _, signal in signals)
     missing = sum(int(np.isnan(signal.value).sum()) for _, signal in signals)
@@ -226,7 +194,7 @@ def _note_sampling(work: Work, name: str) -> Found:
     rate += f" to {1.0 / intervals_s.min():.4g}" if np.ptp(intervals_s) > 0.01 * intervals_s.min() else ""
     text = f"{name}: {count(total, 'sample')} in {count(len(signals), 'run')} at {rate} Hz"
     text += f", {missing / total:.1%} of them missing" if missing else ""
-    gaps = [(float(np.diff(select_finite(signal)[1]).max(initial=0.0)), number) for number, signal in signals]
+    gaps = [(float(np.diff(select_finite(signal)[0]).max(initial=0.0)), number) for number, signal in signals]
     longest_s, at = max(gaps)
     if longest_s > 10.0 * intervals_s.max():
         text += f", the longest gap {format_quantity(longest_s, 's')} in {work.runs[at].name}"
@@ -234,7 +202,7 @@ def _note_sampling(work: Work, name: str) -> Found:
     text += f"; {count(len(free), 'run')} sampled at other phases than their repeats" if free else ""
     runs = tuple(work.runs[number].name for number, _ in signals)
     numbers = {"interval": (float(np.median(intervals_s)), "s"), "missing": (missing / total, "1")}
-    return [], [DataFinding(runs, name, "sampling", f"{text}.", samples=total, numbers=numbers)]
+    yield DataFinding(runs, name, "sampling", f"{text}.", samples=total, numbers=numbers)
 
 
 def _has_other_phase(work: Work, run: int, name: str, signal: Signal) -> bool:
@@ -249,11 +217,9 @@ def _has_other_phase(work: Work, run: int, name: str, signal: Signal) -> bool:
 
 
 def _note_noise(work: Work, name: str) -> Found:
-    found = [
-        measure_noise(value) for _, signal in work.list_signals(name) if len(value := select_finite(signal)[2]) >= 16
-    ]
+    found = [measure_noise(value) for _, _, value in work.list_finite(name) if len(value) >= 16]
     if not found:
-        return [], []
+        return
     sigma, quantum = (float(np.median([getattr(item, key) for item in found])) for key in ("sigma", "quantum"))
     unit = find_unit(name)
     text = f"{name}: noise of {format_quantity(sigma, unit)} between neighbouring samples"
@@ -265,18 +231,14 @@ def _note_noise(work: Work, name: str) -> Found:
     if -shift > DRIFT_SIGMAS * sigma:
         text += f"; {format_quantity(-shift, unit)} lower after the light than before it, as behind a high-pass"
     numbers = {"noise": (sigma, unit), "resolution": (quantum, unit), "drift": (drift, unit), "shift": (shift, unit)}
-    return [], [
-        DataFinding(
-            tuple(work.runs[n].name for n, _ in work.list_signals(name)), name, "noise", f"{text}.", numbers=numbers
-        )
-    ]
+    runs = tuple(work.runs[number].name for number, _ in work.list_signals(name))
+    yield DataFinding(runs, name, "noise", f"{text}.", numbers=numbers)
 
 
 def _measure_drift(work: Work, name: str) -> tuple[float, float]:
     """Return by how much ends of repeats differ that begin alike, rms, and ends from beginnings, the median."""
     ends = {}
-    for number, signal in work.list_signals(name):
-        _, t_s, value = select_finite(signal)
+    for number, t_s, value in work.list_finite(name):
         rows = int(np.searchsorted(t_s, work.runs[number].pulses[:, 0].min(initial=np.inf)))  # before any light
         if 3 < rows < len(value) // 2:
             ends[number] = float(value[-rows:].mean() - value[:rows].mean())
@@ -286,8 +248,8 @@ def _measure_drift(work: Work, name: str) -> tuple[float, float]:
 
 STEPS = (
     Step("sentinel", _find_sentinels),
-    Step("held", _find_held),
-    Step("interpolated", _find_interpolated),
+    Step("held", lambda work, name: _find_slow(work, name, find_hold, HELD)),
+    Step("interpolated", lambda work, name: _find_slow(work, name, find_interpolation, INTERPOLATED)),
     Step("stuck", _find_stuck),
     Step("clipped", _find_clipped),
     Step("outlier", find_outliers),

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from optodrive.core.document import Markup, Section, Table
+from optodrive.core.document import Markup, Section, Table, to_json
 from optodrive.core.types.measurements import DataFinding
 from optodrive.lab.inspection.work import count, list_names
 
@@ -24,15 +24,8 @@ def sort_findings(findings: tuple[DataFinding, ...]) -> list[DataFinding]:
 
 def build_finding(item: DataFinding) -> dict[str, Any]:
     """Return a finding as JSON values."""
-    return {
-        "runs": list(item.runs),
-        "signal": item.signal or None,
-        "kind": item.kind,
-        "action": item.action,
-        "samples": item.samples,
-        "numbers": {name: {"value": value, "unit": unit} for name, (value, unit) in item.numbers.items()},
-        "text": item.text,
-    }
+    numbers = {name: {"value": value, "unit": unit} for name, (value, unit) in item.numbers.items()}
+    return {**to_json(item), "signal": item.signal or None, "numbers": numbers}
 
 
 def build_section(findings: tuple[DataFinding, ...], failures: tuple[str, ...]) -> Section:

@@ -23,17 +23,7 @@ from optodrive.lab.inspection.response_faults import (
     measure_time_constant,
 )
 from optodrive.lab.inspection.signal_faults import find_outlier_candidates, measure_deviation, measure_noise
-from optodrive.lab.inspection.work import (
-    Found,
-    Work,
-    count,
-    describe,
-    drop_signal,
-    list_names,
-    measures_alike,
-    remove_samples,
-    select_finite,
-)
+from optodrive.lab.inspection.work import Found, Work, describe_extent, list_names, measures_alike, select_finite
 
 NOISIER = 4.0
 """Noise of a run relative to that of all runs, and to its quietest repeat's, from which the signal is left out."""
@@ -83,45 +73,36 @@ MIN_SAMPLES = 24
 
 def find_noisy(work: Work, name: str) -> Found:
     """Find runs with far more noise than most others, and than their repeats."""
-    sigmas = {
-        number: measure_noise(value).sigma
-        for number, signal in work.list_signals(name)
-        if len(value := select_finite(signal)[2]) >= MIN_SAMPLES
-    }
+    values = {run: value for run, _, value in work.list_finite(name) if len(value) >= MIN_SAMPLES}
+    sigmas = {run: measure_noise(value).sigma for run, value in values.items()}
     usual = float(np.median(list(sigmas.values()))) if len(sigmas) >= MIN_NOISE_RUNS else 0.0
     noisy = []
     for number, sigma in sigmas.items():  # a train that is sampled slowly differs from other runs, not from repeats
         repeats = [sigmas[other] for other in work.find_repeats(number) if other in sigmas]
         if sigma > NOISIER * max(usual, min(repeats, default=0.0)) > 0.0:
             noisy.append(number)
-    if not noisy or 4 * len(noisy) > len(sigmas):
-        return [], []
-    edits = [drop_signal(number, name, work.signals[number, name]) for number in noisy]
-    ratio = max(sigmas[number] for number in noisy) / usual
-    names = list_names([work.runs[number].name for number in noisy])
-    text = f"{name} of {names} has {ratio:.0f} times the noise of others"
-    return edits, [describe(work, "noisy", name, edits, text)]
+    if noisy and 4 * len(noisy) <= len(sigmas):
+        ratio = max(sigmas[number] for number in noisy) / usual
+        yield work.drop(name, noisy), f"{name} of {work.list_runs(noisy)} has {ratio:.0f} times the noise of others"
 
 
 def find_lost(work: Work, _: str) -> Found:
     """Find runs whose samples come too early from some sample on, because samples before it were lost."""
     found = {name: _list_early(work, name) for name in work.names if not name.startswith("mirror")}
     runs = [run for early in found.values() for run in early]
-    edits, findings = [], []
     for name, early in found.items():
         # what two signals of a run show is its trigger's, and holds for all of them
         all_of = {run: next(own[run] for own in found.values() if run in own) for run in runs if runs.count(run) > 1}
         off = {run: item for run, item in (all_of | early).items() if (run, name) in work.signals}
-        if not off:
-            continue
-        own = [drop_signal(number, name, work.signals[number, name]) for number in off]
-        shown = list_names(
-            [f"{work.runs[n].name} (by {format_quantity(s, 's', 2)} from {t:.3g} s on)" for n, (t, s) in off.items()]
-        )
-        text = f"{name} of {shown} is earlier than in repeats: samples were lost, or trigger or clock are off"
-        edits += own
-        findings.append(describe(work, "lost", name, own, text))
-    return edits, findings
+        if off:
+            shown = list_names(
+                [
+                    f"{work.runs[n].name} (by {format_quantity(s, 's', 2)} from {t:.3g} s on)"
+                    for n, (t, s) in off.items()
+                ]
+            )
+            text = f"{name} of {shown} is earlier than in repeats: samples were lost, or trigger or clock are off"
+            yield work.drop(name, off), text
 
 
 def _list_early(work: Work, name: str) -> dict[int, tuple[float, float]]:
@@ -137,12 +118,12 @@ def _list_early(work: Work, name: str) -> dict[int, tuple[float, float]]:
             and np.array_equal(work.runs[run].pulses, same.pulses)
             and measures_alike(work.runs[run], same)
         ]
-        own = select_finite(work.signals[number, name])[1:]
+        own = select_finite(work.signals[number, name])
         found = [
             early
             for other in repeats
             if shares[other] > share
-            and (early := _find_early(*own, *select_finite(work.signals[other, name])[1:])) is not None
+            and (early := _find_early(*own, *select_finite(work.signals[other, name]))) is not None
         ]
         if 2 * len(found) > len(repeats):
             lost[number] = found[0]
@@ -211,16 +192,15 @@ def find_gains(work: Work, name: str) -> Found:
         if abs(deviation) > max(GAIN_DIFFERS, GAIN_SIGMAS * error):
             off[item.run] = deviation
     if not off or 4 * len(off) > len(scales):
-        return [], []
+        return
     groups = {item.run: item.group for item in scales}
     largest = {groups[run]: max(abs(off[other]) for other in off if groups[other] == groups[run]) for run in off}
     off = {run: value for run, value in off.items() if abs(value) > OFF_SHARE * largest[groups[run]]}
-    edits = [drop_signal(number, name, work.signals[number, name]) for number in off]
     shown = list_names([f"{work.runs[n].name} ({np.expm1(value):+.1%})" for n, value in off.items()])
     text = f"{name} of {shown} has another scale than its repeats: the gain or the power was another"
     if len(off) > 1:
         text += ", in one of two where these are repeats of each other"
-    return edits, [describe(work, "gain", name, edits, text)]
+    yield work.drop(name, off), text
 
 
 def _expect(item: _Scale, others: list[_Scale]) -> tuple[float, float]:
@@ -252,34 +232,33 @@ def _expect(item: _Scale, others: list[_Scale]) -> tuple[float, float]:
 def _measure_scales(work: Work, name: str) -> list[_Scale]:
     """Return the scale of each run that responds and has repeats."""
     tau_s = measure_time_constant(work, name)
-    seen = {item.run for item in measure_responses(work, name) if item.is_seen and item.gain > 0.0}
+    gains = {item.run: item.gain for item in measure_responses(work, name) if item.is_seen and item.gain > 0.0}
     left: dict[int, tuple[FloatArray, FloatArray]] = {}
-    fits: dict[int, tuple[float, float]] = {}
+    sizes: dict[int, float] = {}
     for number, _, pulses, t_s, value in list_responding(work, name):
-        template = compute_template(pulses, t_s, tau_s, get_second_s(name))
-        template -= template.mean()
-        size = float(template @ template)
-        if number in seen and template @ value > 0.0:
-            gain = float(template @ value) / size
-            fits[number], left[number] = (gain, size), (t_s, value - value.mean() - gain * template)
+        if number in gains:
+            template = compute_template(pulses, t_s, tau_s, get_second_s(name))
+            template -= template.mean()
+            sizes[number] = float(template @ template)
+            left[number] = t_s, value - value.mean() - gains[number] * template
     out = []
-    for number, (gain, size) in fits.items():
-        repeats = [other for other in work.find_repeats(number) if other in fits]
+    for number, size in sizes.items():
+        repeats = [other for other in work.find_repeats(number) if other in sizes]
         if repeats:  # what repeats share is no noise but the form of the response
             t_s, own = left[number]
             noise = own - np.median([np.interp(t_s, *left[other]) for other in repeats], axis=0)
             rows = len(noise) // GAIN_BLOCK * GAIN_BLOCK
             means = noise[:rows].reshape(-1, GAIN_BLOCK).mean(axis=1)
             power = max(float((noise**2).mean()), GAIN_BLOCK * float((means**2).mean()))
-            out.append(_Scale(number, min(number, *repeats), float(np.log(gain)), float(np.sqrt(power / size)) / gain))
+            error = float(np.sqrt(power / size)) / gains[number]
+            out.append(_Scale(number, min(number, *repeats), float(np.log(gains[number])), error))
     return out
 
 
 def find_outliers(work: Work, name: str) -> Found:
     """Find single samples that deviate from those beside them and from the repeats."""
-    edits, largest = [], 0.0
-    for number, signal in work.list_signals(name):
-        _, t_s, value = select_finite(signal)
+    bad, largest = {}, 0.0
+    for number, t_s, value in work.list_finite(name):
         if len(value) < MIN_SAMPLES:
             continue
         rows, is_bad = np.arange(len(value)), np.zeros(len(value), dtype=bool)
@@ -292,14 +271,10 @@ def find_outliers(work: Work, name: str) -> Found:
                 largest = max(largest, score)
             if not new:
                 break
-        if is_bad.any():
-            edits.append(remove_samples(number, name, signal, is_bad))
-    if not edits:
-        return [], []
-    samples, runs = count(sum(item.samples for item in edits), "sample"), count(len(edits), "run")
-    where = list_names([work.runs[item.run].name for item in edits])
-    text = f"{name}: {samples} of {runs} ({where}) up to {largest:.0f} σ off the samples beside them, and no repeat is"
-    return edits, [describe(work, "outlier", name, edits, text)]
+        bad[number] = is_bad
+    if edits := work.remove(name, bad.items()):
+        extent = f"{describe_extent(edits)} ({work.list_runs(item.run for item in edits)})"
+        yield edits, f"{name}: {extent} up to {largest:.0f} σ off the samples beside them, and no repeat is"
 
 
 def _list_alike(work: Work, run: int, name: str, t_s: FloatArray) -> list[FloatArray]:
@@ -310,7 +285,7 @@ def _list_alike(work: Work, run: int, name: str, t_s: FloatArray) -> list[FloatA
         signal = work.signals.get((other, name))
         if signal is None:
             continue
-        _, other_s, value = select_finite(signal)
+        other_s, value = select_finite(signal)
         if len(other_s) < MIN_SAMPLES:
             continue
         row = np.clip(np.searchsorted(other_s, t_s), 1, len(other_s) - 1)

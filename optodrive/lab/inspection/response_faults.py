@@ -16,17 +16,7 @@ import numpy as np
 from optodrive.core.quantity import format_quantity
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import DataFinding, Signal
-from optodrive.lab.inspection.work import (
-    Edit,
-    Found,
-    Step,
-    Work,
-    count,
-    describe,
-    drop_signal,
-    list_names,
-    select_finite,
-)
+from optodrive.lab.inspection.work import Found, Step, Work, count, list_names
 
 TAUS_S = (0.003, 0.0045, 0.0065, 0.009, 0.013, 0.018, 0.026, 0.037, 0.052, 0.1)
 SECOND_S = 0.003
@@ -132,10 +122,9 @@ def list_responding(work: Work, name: str) -> list[Member]:
 
 def _select_responding(work: Work, name: str) -> list[Member]:
     out: list[Member] = []
-    for number, signal in work.list_signals(name):
-        pulses = work.runs[number].pulses
+    for number, t_s, value in work.list_finite(name):
+        pulses, signal = work.runs[number].pulses, work.signals[number, name]
         own = pulses[(pulses[:, 3] == signal.pixel) & (pulses[:, 1] * pulses[:, 2] > 0.0)]
-        _, t_s, value = select_finite(signal)
         if name.startswith("mirror") or not len(own) or len(value) < MIN_SAMPLES:
             continue
         own = own[np.argsort(own[:, 0])]
@@ -197,38 +186,31 @@ def _find_gain(response: Response, others: list[Response], repeats: list[int]) -
 
 def _find_dead(work: Work, name: str) -> Found:
     responses = measure_responses(work, name)
-    flat = []
+    flat, dark = [], []
     for item in responses:
         gain = _find_gain(item, responses, work.find_repeats(item.run))
         if gain is None or item.is_seen or VISIBLE * item.error > abs(gain):
             continue
         if abs(item.gain) + 3.0 * item.error < FLAT_SHARE * abs(gain):
-            flat.append(item)
-    edits: list[Edit] = []
-    dark = []
-    for item in flat:
-        beside = [own for (run, own) in work.signals if run == item.run and own != name and own in TYPICAL]
-        others = [found for own in beside for found in measure_responses(work, own) if found.run == item.run]
-        if others and not any(found.is_seen for found in others):
-            dark.append(work.runs[item.run].name)
-        edits.append(drop_signal(item.run, name, work.signals[item.run, name]))
-    findings = []
-    if edits:
-        names = [work.runs[item.run].name for item in edits]
-        stuck = [item for item in edits if len(np.unique(item.values)) == 1]
-        what = f"is stuck at {stuck[0].values[0]:.6g}" if len(stuck) == len(edits) else "does not respond to the light"
-        text = f"{name} of {list_names(names)} {what}, as other runs do"
-        text += f"; nor does any other signal of {list_names(dark)}: was the light off?" if dark else ""
-        findings.append(describe(work, "dead", name, edits, text))
-    elif not flat:
-        return _find_dead_everywhere(work, name, responses)
-    return edits, findings
+            flat.append(item.run)
+            beside = [own for (run, own) in work.signals if run == item.run and own != name and own in TYPICAL]
+            others = [found for own in beside for found in measure_responses(work, own) if found.run == item.run]
+            if others and not any(found.is_seen for found in others):
+                dark.append(item.run)
+    if not flat:
+        yield from _find_dead_everywhere(work, name, responses)
+        return
+    edits = work.drop(name, flat)
+    is_stuck = all(len(np.unique(item.values)) == 1 for item in edits)
+    what = f"is stuck at {edits[0].values[0]:.6g}" if is_stuck else "does not respond to the light"
+    lights = f"; nor does any other signal of {work.list_runs(dark)}: was the light off?" if dark else ""
+    yield edits, f"{name} of {work.list_runs(flat)} {what}, as other runs do{lights}"
 
 
 def _find_dead_everywhere(work: Work, name: str, responses: list[Response]) -> Found:
     """Find a signal that responds in no run although another signal does."""
     if len(responses) < 3 or any(item.is_seen for item in responses) or name not in TYPICAL:
-        return [], []
+        return
     bound = min(abs(item.gain) + 3.0 * item.error for item in responses)
     for other in (own for own in work.names if own in TYPICAL and own != name):
         seen = [item for item in measure_responses(work, other) if item.is_seen]
@@ -236,23 +218,18 @@ def _find_dead_everywhere(work: Work, name: str, responses: list[Response]) -> F
             continue
         expected = float(np.median([item.gain for item in seen])) * TYPICAL[name] / TYPICAL[other]
         if bound < FEW_TYPICAL * abs(expected):
-            edits = [drop_signal(number, name, signal) for number, signal in work.list_signals(name)]
-            text = f"{name} responds to the light in no run, while {other} does"
-            return edits, [describe(work, "dead", name, edits, text)]
-    return [], []
+            edits = work.drop(name, [run for run, _ in work.list_signals(name)])
+            yield edits, f"{name} responds to the light in no run, while {other} does"
+            return
 
 
 def _find_turned(work: Work, name: str) -> Found:
     seen = [item for item in measure_responses(work, name) if abs(item.share) > TURNED and item.is_seen]
-    turned = [item for item in seen if item.gain < 0.0]
-    if not turned:
-        return [], []
-    edits = [drop_signal(item.run, name, work.signals[item.run, name]) for item in turned]
-    if 2 * len(turned) > len(seen):
-        edits = [drop_signal(number, name, signal) for number, signal in work.list_signals(name)]
-    names = [work.runs[item.run].name for item in turned]
-    text = f"{name} falls while the light is on in {count(len(names), 'run')} ({list_names(names)}): multiply it by −1"
-    return edits, [describe(work, "sign", name, edits, text)]
+    turned = [item.run for item in seen if item.gain < 0.0]
+    if turned:
+        edits = work.drop(name, turned if 2 * len(turned) <= len(seen) else [run for run, _ in work.list_signals(name)])
+        which = f"{count(len(turned), 'run')} ({work.list_runs(turned)})"
+        yield edits, f"{name} falls while the light is on in {which}: multiply it by −1"
 
 
 def _measure_shifts(pulses: FloatArray, t_s: FloatArray, value: FloatArray, second_s: float) -> FloatArray:
@@ -318,24 +295,21 @@ def _find_shifts(work: Work, _: str) -> Found:
     if common and all(common.values()) and np.ptp(list(common.values())) < 2.0 * SHIFT_AGREES_S:
         late_s = float(np.median(list(common.values())))
         text = f"all signals respond {_describe_shift(late_s)} the light in all runs: correct t_s or start_s by it."
-        return [], [DataFinding(runs, "", "trigger", text, "refused", numbers={"shift": (late_s, "s")})]
+        yield DataFinding(runs, "", "trigger", text, "refused", numbers={"shift": (late_s, "s")})
+        return
     late: dict[int, list[float]] = {}
     for shift_s, number in ((item, run) for _, differing in found.values() for run, item in differing.items()):
         late.setdefault(number, []).append(shift_s)
     off = {run: min(some) for run, some in late.items() if len(some) > 1 and np.ptp(some) < 2.0 * SHIFT_AGREES_S}
-    edits, findings = [], []
     for name, (common_s, differing) in found.items():
         others = {run: shift_s for run, shift_s in off.items() if (run, name) in work.signals}  # one trigger for all
         own = {number: common_s for number, _ in work.list_signals(name)} if common_s else others | differing
-        if not own:
-            continue
-        mine = [drop_signal(number, name, work.signals[number, name]) for number in own]
-        late_s = float(np.median(list(own.values())))
-        which = list_names([work.runs[number].name for number in own])
-        text = f"{name} of {which} responds {_describe_shift(late_s)} the light: the trigger or the clock is off"
-        edits += mine
-        findings.append(describe(work, "trigger", name, mine, text))
-    return edits, findings
+        if own:
+            shift = _describe_shift(float(np.median(list(own.values()))))
+            yield (
+                work.drop(name, own),
+                f"{name} of {work.list_runs(own)} responds {shift} the light: the trigger or the clock is off",
+            )
 
 
 def _describe_shift(late_s: float) -> str:
@@ -348,7 +322,7 @@ def _find_exchanged(work: Work, name: str) -> Found:
     second_s = get_second_s(name)
     members = {number: (pulses, t_s, value) for number, _, pulses, t_s, value in list_responding(work, name)}
     if len(responses) < 3:
-        return [], []
+        return
     tau_s = measure_time_constant(work, name)
     expected: dict[int, tuple[float, float, float]] = {}  # gain, its tolerance and the share, of the repeats or of all
     deviations = []
@@ -380,7 +354,7 @@ def _find_exchanged(work: Work, name: str) -> Found:
 
     suspicious = [run for run in expected if responses[run].peak and is_suspicious(run)]
     if len(suspicious) > max(2, len(responses) * MAX_SUSPICIOUS):
-        return [], []
+        return
     pairs = []
     for at, run in enumerate(suspicious):
         for other in suspicious[at + 1 :]:
@@ -388,13 +362,10 @@ def _find_exchanged(work: Work, name: str) -> Found:
             is_possible = not is_same_light and responses[run].pixel == responses[other].pixel
             if is_possible and suits(run, other) and suits(other, run):
                 pairs.append((run, other))
-    runs = [run for pair in pairs for run in pair]
-    edits = [drop_signal(run, name, work.signals[run, name]) for run in dict.fromkeys(runs)]
-    if not edits:
-        return [], []
-    shown = list_names([" and ".join(work.runs[run].name for run in pair) for pair in pairs])
-    text = f"{name} of {shown} follow each other's light, not their own: the two are probably exchanged"
-    return edits, [describe(work, "exchanged", name, edits, text)]
+    if pairs:
+        shown = list_names([" and ".join(work.runs[run].name for run in pair) for pair in pairs])
+        edits = work.drop(name, dict.fromkeys(run for pair in pairs for run in pair))
+        yield edits, f"{name} of {shown} follow each other's light, not their own: the two are probably exchanged"
 
 
 def _log_ratio(one: float, other: float) -> float:

@@ -126,7 +126,7 @@ def _list_means(work: Work, name: str) -> list[_Means]:
     pixels = [signal.pixel for _, signal, _, _, _ in members]
     out = []
     for _, signal, pulses, _, _ in members:
-        _, t_s, value = select_finite(signal)
+        t_s, value = select_finite(signal)
         end = int(np.searchsorted(t_s, pulses[BEND_PULSES, 0])) if len(pulses) > BEND_PULSES else len(t_s)
         size = max(end // BEND_MEANS, 1)
         end -= end % size

@@ -9,6 +9,7 @@ recording; where they leave both orders open and the differences depend on it, t
 
 import itertools
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from typing import ClassVar
@@ -95,17 +96,21 @@ def read_start_times(runs: tuple[Run, ...]) -> StartTimes:
     stamps = [_parse_stamp(str(value)) for value in values]
     unreadable = [run for run, stamp in zip(runs, stamps, strict=True) if stamp is None]
     if unreadable:
-        return StartTimes(None, _refuse_reading(unreadable))
+        return _leave_unread(unreadable)
     return _combine(runs, [stamp for stamp in stamps if stamp is not None])
 
 
-def _refuse_reading(runs: list[Run]) -> tuple[DataFinding, ...]:
+def _leave_unread(runs: Sequence[Run]) -> StartTimes:
     shown = str(runs[0].attributes[ATTRIBUTE])[:40]
     text = f"{ATTRIBUTE} {shown!r} cannot be read as a time; the order of the runs' names replaces it."
-    return (_note(runs, text),)
+    return StartTimes(None, (_note(runs, text),))
 
 
-def _note(runs: list[Run], text: str, action: str = "noted") -> DataFinding:
+def _refuse(runs: Iterable[Run], text: str) -> StartTimes:
+    return StartTimes(None, (_note(runs, f"{ATTRIBUTE} {text}", "refused"),))
+
+
+def _note(runs: Iterable[Run], text: str, action: str = "noted") -> DataFinding:
     return DataFinding(tuple(run.name for run in runs), "", KIND, text, action)
 
 
@@ -113,23 +118,21 @@ def _combine(runs: tuple[Run, ...], stamps: list[_Stamp]) -> StartTimes:
     """Decide the order of day and month and the zone, and return the times."""
     orders = {stamp.is_day_first for stamp in stamps} - {None}
     if len(orders) > 1:
-        text = f"{ATTRIBUTE} has the day first in some runs and the month first in others; write 2026-11-28T10:03:05."
-        return StartTimes(None, (_note(list(runs), text, "refused"),))
+        return _refuse(runs, "has the day first in some runs and the month first in others; write 2026-11-28T10:03:05.")
     open_runs = [run for run, stamp in zip(runs, stamps, strict=True) if stamp.swapped is not None]
     whens = [stamp.when for stamp in stamps]
     if open_runs and not orders:
         other = [stamp.swapped or stamp.when for stamp in stamps]
         if [when - whens[0] for when in whens] != [when - other[0] for when in other]:
             shown = str(open_runs[0].attributes[ATTRIBUTE])
-            text = f"{ATTRIBUTE} {shown!r}: day and month can be exchanged, in every run; write 2026-11-28T10:03:05."
-            return StartTimes(None, (_note(open_runs, text, "refused"),))
+            text = "day and month can be exchanged, in every run; write 2026-11-28T10:03:05."
+            return _refuse(open_runs, f"{shown!r}: {text}")
     elif open_runs and orders == {False}:
         whens = [stamp.swapped or stamp.when for stamp in stamps]
     zones = [stamp.zone or _find_zone(run) for run, stamp in zip(runs, stamps, strict=True)]
     if len({zone is None for zone in zones}) > 1:
         without = [run for run, zone in zip(runs, zones, strict=True) if zone is None]
-        text = f"{ATTRIBUTE} has a zone in some runs and none in others; state it in all of them."
-        return StartTimes(None, (_note(without, text, "refused"),))
+        return _refuse(without, "has a zone in some runs and none in others; state it in all of them.")
     seconds, repeated = [], []
     for run, when, zone in zip(runs, whens, zones, strict=True):
         early, late = (when.replace(tzinfo=zone or UTC, fold=fold).timestamp() for fold in (0, 1))
@@ -138,16 +141,13 @@ def _combine(runs: tuple[Run, ...], stamps: list[_Stamp]) -> StartTimes:
         seconds.append(early)
     if repeated:
         shown = str(repeated[0].attributes[ATTRIBUTE])
-        text = (
-            f"{ATTRIBUTE} {shown!r} occurs twice in its zone, where the clock was set back; state the offset, +01:00."
-        )
-        return StartTimes(None, (_note(repeated, text, "refused"),))
+        text = "occurs twice in its zone, where the clock was set back; state the offset, +01:00."
+        return _refuse(repeated, f"{shown!r} {text}")
     times_s = np.array(seconds)
     if zones[0] is None and _is_set_back(whens):
-        text = (
-            f"{ATTRIBUTE} goes back within an hour on a Sunday in autumn and states no zone; state the offset, +01:00."
+        return _refuse(
+            runs, "goes back within an hour on a Sunday in autumn and states no zone; state the offset, +01:00."
         )
-        return StartTimes(None, (_note(list(runs), text, "refused"),))
     resolution_s = 1.0 if all(stamp.has_seconds for stamp in stamps) else 60.0
     said = []
     if open_runs:
@@ -156,9 +156,7 @@ def _combine(runs: tuple[Run, ...], stamps: list[_Stamp]) -> StartTimes:
             text = f"are told by the other runs: the {'month' if orders == {False} else 'day'} comes first"
         said.append(_note(open_runs, f"{ATTRIBUTE}: day and month {text}."))
     if not any(stamp.has_date for stamp in stamps):
-        said.append(
-            _note(list(runs), f"{ATTRIBUTE} states a time without a date; all runs are taken to be of one day.")
-        )
+        said.append(_note(runs, f"{ATTRIBUTE} states a time without a date; all runs are taken to be of one day."))
     return StartTimes(times_s, (*said, *_examine(runs, times_s, resolution_s)))
 
 
@@ -179,7 +177,7 @@ def _examine(runs: tuple[Run, ...], seconds: FloatArray, resolution_s: float) ->
     found = []
     backwards = [later for later, step_s in zip(runs[1:], np.diff(seconds), strict=True) if step_s < 0.0]
     if len(runs) > 1 and not np.ptp(seconds):
-        found.append(_note(list(runs), f"{ATTRIBUTE} is the same in all runs, so nothing can be said of their order."))
+        found.append(_note(runs, f"{ATTRIBUTE} is the same in all runs, so nothing can be said of their order."))
     elif backwards:
         text = f"{ATTRIBUTE} of {len(backwards)} runs is before that of the run that precedes it by name; times count."
         found.append(_note(backwards, text))
@@ -210,9 +208,9 @@ def _read_numbers(runs: tuple[Run, ...], values: FloatArray) -> StartTimes:
     for low, high, factor_s, zero_s, name in EPOCHS:
         if values.min() >= low and values.max() < high:
             seconds = np.asarray(values * factor_s + zero_s)
-            said = _note(list(runs), f"{ATTRIBUTE} is read as {name}.")
+            said = _note(runs, f"{ATTRIBUTE} is read as {name}.")
             return StartTimes(seconds, (said, *_examine(runs, seconds, 1e-3)))
-    return StartTimes(None, _refuse_reading(list(runs)))
+    return _leave_unread(runs)
 
 
 def _parse_stamp(text: str) -> _Stamp | None:

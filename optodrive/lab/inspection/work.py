@@ -1,6 +1,6 @@
 """Recording under inspection, with the edits of its signals and their texts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, cast
 
@@ -18,22 +18,23 @@ Known = TypeVar("Known")
 class Edit:
     """One signal of one run that is replaced, or left out if there is no replacement.
 
-    samples: number left out; values: some of them
+    values: that it concerns; kept: number of these that stay
     """
 
     run: int
     name: str
     replacement: Signal | None
-    samples: int
     values: FloatArray
+    kept: int = 0
 
 
-Found = tuple[list[Edit], list[DataFinding]]
+Found = Iterator[tuple[list[Edit], str] | DataFinding]
+"""Edits of one signal with what is wrong in words, and facts."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One search. find: returns edits and findings of one kind of signal, or of all with an empty name."""
+    """One search. find: yields faults and facts of one kind of signal, or of all with an empty name."""
 
     kind: str
     find: Callable[["Work", str], Found]
@@ -59,6 +60,30 @@ class Work:
     def list_signals(self, name: str) -> list[tuple[int, Signal]]:
         """Return the runs that have a signal, and the signal."""
         return [(run, signal) for (run, own), signal in self.signals.items() if own == name]
+
+    def list_finite(self, name: str) -> list[tuple[int, FloatArray, FloatArray]]:
+        """Return the runs that have a signal, and the times and values of its finite samples."""
+        return [(run, *select_finite(signal)) for run, signal in self.list_signals(name)]
+
+    def list_runs(self, runs: Iterable[int]) -> str:
+        """Return the names of runs as text."""
+        return list_names([self.runs[run].name for run in runs])
+
+    def drop(self, name: str, runs: Iterable[int]) -> list[Edit]:
+        """Return the edits that leave a signal of these runs out."""
+        return [Edit(run, name, None, select_finite(self.signals[run, name])[1]) for run in runs]
+
+    def remove(self, name: str, found: Iterable[tuple[int, BoolArray]]) -> list[Edit]:
+        """Return the edits that make samples missing, by run which of its finite ones are bad."""
+        edits = []
+        for run, is_bad in found:
+            if is_bad.any():
+                signal = self.signals[run, name]
+                rows = np.flatnonzero(np.isfinite(signal.value))[is_bad]
+                value = signal.value.copy()
+                value[rows] = np.nan
+                edits.append(Edit(run, name, replace(signal, value=value), signal.value[rows]))
+        return edits
 
     def apply(self, edits: list[Edit]) -> None:
         """Replace or remove signals."""
@@ -115,40 +140,10 @@ def measures_alike(own: Run, other: Run) -> bool:
     return all(signal.pixel == own.signals[name].pixel for name, signal in other.signals.items() if name in own.signals)
 
 
-def select_finite(signal: Signal) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return which samples are finite, and their times and values."""
+def select_finite(signal: Signal) -> tuple[FloatArray, FloatArray]:
+    """Return times and values of the finite samples."""
     is_finite = np.isfinite(signal.value)
-    return is_finite, signal.t_s[is_finite], signal.value[is_finite]
-
-
-def remove_samples(run: int, name: str, signal: Signal, is_bad: BoolArray) -> Edit:
-    """Return the edit that makes finite samples missing.
-
-    is_bad: of the finite samples
-    """
-    rows = np.flatnonzero(np.isfinite(signal.value))[is_bad]
-    value = signal.value.copy()
-    value[rows] = np.nan
-    return Edit(run, name, replace(signal, value=value), len(rows), signal.value[rows])
-
-
-def drop_signal(run: int, name: str, signal: Signal) -> Edit:
-    """Return the edit that leaves a signal out."""
-    finite = signal.value[np.isfinite(signal.value)]
-    return Edit(run, name, None, len(finite), finite)
-
-
-def describe(work: Work, kind: str, name: str, edits: list[Edit], text: str, action: str = "left out") -> DataFinding:
-    """Return the finding of edits, with the action at the end of its text."""
-    runs = tuple(dict.fromkeys(work.runs[item.run].name for item in edits))
-    samples = sum(item.samples for item in edits)
-    numbers: dict[str, tuple[float, str]] = {}
-    values = [item.values for item in edits if len(item.values)]
-    if name and values:
-        low, high = (float(pick([pick(item) for item in values])) for pick in (np.min, np.max))
-        numbers = {"lowest": (low, find_unit(name)), "highest": (high, find_unit(name))}
-    end = "; left out." if action == "left out" else "."
-    return DataFinding(runs, name, kind, f"{text}{end}", action, samples, numbers)
+    return signal.t_s[is_finite], signal.value[is_finite]
 
 
 def find_unit(name: str) -> str:
@@ -160,6 +155,16 @@ def list_names(names: tuple[str, ...] | list[str], max_names: int = MAX_NAMES) -
     """Return names as text, the first ones of many."""
     shown = ", ".join(names[:max_names])
     return shown if len(names) <= max_names else f"{shown} and {len(names) - max_names} more"
+
+
+def count_samples(edits: list[Edit]) -> int:
+    """Return the number of samples that are left out."""
+    return sum(len(item.values) - item.kept for item in edits)
+
+
+def describe_extent(edits: list[Edit]) -> str:
+    """Return the number of samples that are left out, and that of their runs, as text."""
+    return f"{count(count_samples(edits), 'sample')} of {count(len(edits), 'run')}"
 
 
 def count(number: int, noun: str) -> str:

@@ -17,6 +17,7 @@ from optodrive.lab.inference.claim import Alternative, Evidence, HeldOutChange
 from optodrive.lab.inference.fit import fit_residuals
 from optodrive.lab.validation.corrected_model import CorrectedModel
 from optodrive.lab.validation.facts import Datum
+from optodrive.physics.paper_facts import read_shipped_table
 from optodrive.physics.parameters import ParameterSet
 
 
@@ -38,7 +39,7 @@ class ParameterRange:
 
 @dataclass(frozen=True)
 class CauseHypothesis:
-    """Hypothesis on an error of Text S1, with one free parameter.
+    """Hypothesis on an error of Text S1, with one free parameter: a row of configs/paper_causes.csv.
 
     deciding_measurement: the measurement that would confirm it; excludes: causes for the same
     quantity, which make no sense together; replaces_law: it replaces a law of the nominal model that no value of its
@@ -53,141 +54,19 @@ class CauseHypothesis:
     replaces_law: bool = False
 
 
-GAS_CAUSES, LIFT_CAUSES, FORCE_CAUSES = (
-    ("gas_membrane", "gas_share"),
-    ("membrane_plate", "gas_membrane"),
-    ("force_area", "load_cell_gives"),
-)
-THERMAL_MEASUREMENT = "the absorber's temperature during a pulse and the cooling after it, at three powers"
+def _parse_cause(row: dict[str, str]) -> CauseHypothesis:
+    return CauseHypothesis(
+        row["key"],
+        row["description"],
+        ParameterRange(row["symbol"], row["unit"], float(row["low"]), float(row["high"])),
+        row["deciding_measurement"],
+        tuple(row["excludes"].split()),
+        row["replaces_law"] == "yes",
+    )
 
-CAUSES = (
-    CauseHypothesis(
-        "gas_lag",
-        "the gas lags the absorber by a time constant other than R_air C_air / 2",
-        # Conduction over half the cavity, 1.2 ms, to 64 ms of Text S1 and slower corners.
-        ParameterRange("tau_g", "s", 1e-3, 0.1),
-        "displacement at 10 kHz through the first 10 ms of a pulse",
-    ),
-    CauseHypothesis(
-        "gas_share",
-        "the gas settles at a share of the absorber's rise other than half",
-        # Half at most, conduction both ways.
-        ParameterRange("share", "1", 0.1, 0.5),
-        "pressure in a closed cavity together with displacement",
-        GAS_CAUSES,
-    ),
-    CauseHypothesis(
-        "membrane_plate",
-        "the constant of the membrane's plate formula differs from 3/1280",
-        # 3/16 of a clamped plate is 80 times as much; the added gas volume compensates part of it.
-        ParameterRange("kappa_factor", "1", 0.05, 80.0),
-        "displacement against a known static pressure, to 1 mm",
-        LIFT_CAUSES,
-    ),
-    CauseHypothesis(
-        "gas_membrane",
-        "the membrane stretches and the gas volume grows: neither plate nor constant volume",
-        # Half at most, conduction both ways; E, ν, h, r, V are the paper's.
-        ParameterRange("share", "1", 0.1, 0.5),
-        "displacement against a known static pressure, to 1 mm",
-        (*LIFT_CAUSES, *GAS_CAUSES),
-        replaces_law=True,
-    ),
-    CauseHypothesis(
-        "force_area",
-        "the blocked force was measured on less than the whole aperture",
-        # At most the aperture.
-        ParameterRange("area", "m^2", 0.1e-6, 7.07e-6),
-        "blocked force with probes of two areas, and the pressure in the cavity beside it",
-        FORCE_CAUSES,
-    ),
-    CauseHypothesis(
-        "load_cell_gives",
-        "the blocked membrane yielded: the gas volume grew against the load cell",
-        # Volume per pascal: 0.08 µL to several cavities at 8 kPa.
-        ParameterRange("compliance", "m^3/Pa", 1e-14, 1e-11),
-        "blocked force with probes of two areas, and the pressure in the cavity beside it",
-        FORCE_CAUSES,
-    ),
-    CauseHypothesis(
-        "absorber_resistance",
-        "all bridge resistances are wrong by one factor",
-        # R was fitted to the first 30 ms of a longer rise.
-        ParameterRange("r_factor", "1", 0.7, 1.4),
-        THERMAL_MEASUREMENT,
-    ),
-    CauseHypothesis(
-        "absorber_capacity",
-        "all heat capacities of the absorbers are wrong by one factor",
-        # The gas's share of 10 %, and C scattered by 16 %.
-        ParameterRange("c_factor", "1", 0.7, 1.4),
-        THERMAL_MEASUREMENT,
-    ),
-    CauseHypothesis(
-        "absorbed_power",
-        "the absorbed power is wrong by one factor",
-        # 2.45 W or 2.5 W, two estimates of the absorption.
-        ParameterRange("power_factor", "1", 0.8, 1.2),
-        THERMAL_MEASUREMENT,
-    ),
-    CauseHypothesis(
-        "bridge_conductivity",
-        "the bridges conduct worse when hot",
-        # k ~ 1/T is 1 (Text S2).
-        ParameterRange("exponent", "1", 0.0, 1.3),
-        THERMAL_MEASUREMENT,
-    ),
-    CauseHypothesis(
-        "radiation",
-        "the hot absorber radiates",
-        # Both faces of absorber and bridges.
-        ParameterRange("emitting_area", "m^2", 0.0, 2e-5),
-        THERMAL_MEASUREMENT,
-    ),
-    CauseHypothesis(
-        "wall_heating",
-        "the wall at the outer end of the bridges warms up",
-        # A cell of the laminate to its surroundings, 1.2 s with its capacity.
-        ParameterRange("resistance", "K/W", 0.0, 40.0),
-        "displacement through a train of seconds",
-    ),
-    CauseHypothesis(
-        "panel_heating",
-        "the whole panel around the walls warms up",
-        # Still air around 162 × 162 mm, 2 K/W, to a sample of 30 × 30 mm; 200 s with its capacity.
-        ParameterRange("resistance", "K/W", 0.0, 60.0),
-        "displacement of a pixel without light through ten minutes of light on another",
-    ),
-    CauseHypothesis(
-        "laser_late",
-        "the light of every pulse starts late",
-        # Driver and diode, 0.02 to 3 ms, less at 200 Hz; a ramp loses as much energy as a delay.
-        ParameterRange("delay", "s", 1e-5, 2.4e-3),
-        "a photodiode beside the sample",
-    ),
-    CauseHypothesis(
-        "dead_time",
-        "a pixel rate includes time without light per pulse: move and settling of the mirrors",
-        # Small steps of low-cost mirrors 0.3 ms, large steps several ms; the paper states pulse times only.
-        ParameterRange("dead_time", "s", 1e-4, 5e-3),
-        "pixel rates at two pixel distances, with mirror positions",
-    ),
-    CauseHypothesis(
-        "rate_pixel",
-        "the pixel rates belong to a bridge width other than 0.55 mm",
-        # The widths of Table S3.
-        ParameterRange("width", "m", 0.2e-3, 0.75e-3),
-        "displacement against pulse width on the pixel of Fig. 3F",
-    ),
-    CauseHypothesis(
-        "rate_power",
-        "the pixel rates were taken with less than full power",
-        # Fig. 3F states full power; the scanning optics attenuate it.
-        ParameterRange("power_factor", "1", 0.3, 1.0),
-        "power at the sample during the scan of Fig. 3F",
-    ),
-)
-"""All causes that can be identified."""
+
+CAUSES = tuple(map(_parse_cause, read_shipped_table("paper_causes.csv")))
+"""All causes that can be identified. The file states the reason of each range."""
 
 CAUSES_BY_KEY = {cause.key: cause for cause in CAUSES}
 
@@ -224,10 +103,7 @@ class CauseFit:
     @property
     def values(self) -> dict[str, float]:
         """Parameters of the causes, SI."""
-        return {
-            key: CAUSES_BY_KEY[key].parameter.compute_value(fraction)
-            for key, fraction in zip(self.keys, self.fractions, strict=True)
-        }
+        return _compute_values(self.keys, self.fractions)
 
     @property
     def cost(self) -> float:
@@ -245,6 +121,11 @@ class CauseFit:
         """Causes whose parameter lies at a limit of its range."""
         pairs = zip(self.keys, self.fractions, strict=True)
         return tuple(key for key, fraction in pairs if min(fraction, 1.0 - fraction) < 1e-3)
+
+
+def _compute_values(keys: Sequence[str], fractions: Sequence[float]) -> dict[str, float]:
+    pairs = zip(keys, fractions, strict=True)
+    return {key: CAUSES_BY_KEY[key].parameter.compute_value(fraction) for key, fraction in pairs}
 
 
 class CauseSearch:
@@ -279,12 +160,11 @@ class CauseSearch:
         BEAM_WIDTH sets.
         """
         best, beam = self.nominal, [self.nominal]
-        # Stop where even a perfect fit of a larger set would cost more than the best set.
-        while (
-            beam
-            and compute_cost(compute_aicc(0.0, len(beam[0].keys) + 1, len(self.data)), len(beam[0].keys) + 1)
-            < best.cost
-        ):
+        while beam:
+            size = len(beam[0].keys) + 1
+            # Stop where even a perfect fit of a larger set would cost more than the best set.
+            if compute_cost(compute_aicc(0.0, size, len(self.data)), size) >= best.cost:
+                break
             larger = {frozenset(fit.keys): fit for parent in beam for fit in self.fit_additions(parent)}
             beam = sorted(larger.values(), key=lambda fit: _rank(fit, fit.aicc))[:BEAM_WIDTH]
             best = min([best, *beam], key=lambda fit: _rank(fit, fit.cost))
@@ -351,27 +231,19 @@ class CauseSearch:
 
     def _list_allowed(self, keys: Sequence[str]) -> list[CauseHypothesis]:
         excluded = {other for key in keys for other in CAUSES_BY_KEY[key].excludes}
-        return [
-            cause
-            for cause in CAUSES
-            if cause.key not in keys and cause.key not in excluded and not set(cause.excludes) & set(keys)
-        ]
+        excluded |= set(keys)
+        return [cause for cause in CAUSES if cause.key not in excluded and not set(cause.excludes) & set(keys)]
 
     def _compute_residuals(self, keys: tuple[str, ...], fractions: FloatArray) -> FloatArray:
-        values = {
-            key: CAUSES_BY_KEY[key].parameter.compute_value(fraction)
-            for key, fraction in zip(keys, fractions.tolist(), strict=True)
-        }
+        values = _compute_values(keys, fractions.tolist())
         return np.asarray(CorrectedModel(self.base, values).compute_log_errors(self.data) / self._sigma)
 
     def _fit_from_starts(self, keys: tuple[str, ...], start_fit: "CauseFit | None") -> CauseFit:
         """Fit from the best of several starts of the causes that are not in start_fit."""
         start_values = {} if start_fit is None else dict(zip(start_fit.keys, start_fit.fractions, strict=True))
         is_new = any(key not in start_values for key in keys)
-        starts = [
-            np.array([start_values.get(key, start) for key in keys])
-            for start in (START_FRACTIONS if is_new else (0.0,))
-        ]
+        places = START_FRACTIONS if is_new else (0.0,)
+        starts = [np.array([start_values.get(key, start) for key in keys]) for start in places]
         found = fit_residuals(
             lambda fractions: self._compute_residuals(keys, fractions),
             min(starts, key=lambda fractions: float((self._compute_residuals(keys, fractions) ** 2).sum())),

@@ -1,7 +1,6 @@
 """Predictions of the measured facts by Text S1 with some of its hypothetical errors corrected."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache, cached_property
 from math import log, pi, sqrt
 
@@ -9,8 +8,10 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.validation.facts import RATE_HEIGHTS_M, Datum
+from optodrive.lab.validation.outcomes import RESPONSES, PaperModel, Peaks
 from optodrive.lab.validation.stimuli import (
     AMBIENT_K,
+    FULL_POWER_W,
     LONG_PULSE_S,
     FrozenTerms,
     PulseStimulus,
@@ -19,7 +20,7 @@ from optodrive.lab.validation.stimuli import (
     pulse_rises_k,
     train_gas_k,
 )
-from optodrive.physics.paper_facts import load_paper_facts
+from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import GAS_FRACTION, Pixel
 from optodrive.physics.terms.mechanical import ATMOSPHERE_PA, equilibrium_height_m
@@ -31,23 +32,9 @@ WALL_TAU_S = 1.2
 """Relaxation time of the wall, as estimated in the shipped parameter set `surroundings`."""
 PANEL_TAU_S = 185.0
 """Relaxation time of a panel in still air: heat capacity over loss, both per area, of `optodrive.device.panel`."""
-HALF_PERIOD_S = 2.5e-3
-"""Half a period of 200 Hz."""
 MIN_PULSE_S = 1e-5
 MAX_PULSE_S = 1.0
 """Limits of the search for the pulse that reaches a height."""
-PULSE_FACTS = {
-    "dT_peak_w020": (0.20e-3, LONG_PULSE_S),
-    "T_peak_w075": (0.75e-3, LONG_PULSE_S),
-    "z_peak_w020": (0.20e-3, LONG_PULSE_S),
-    "z_peak_w075": (0.75e-3, LONG_PULSE_S),
-    "z_tp8_w040": (0.40e-3, 8e-3),
-    "F_peak_w020": (0.20e-3, LONG_PULSE_S),
-    "F_peak_w055": (0.55e-3, LONG_PULSE_S),
-}
-"""Bridge width and pulse width of the facts read from one pulse."""
-
-
 GAS_GRID_K = np.linspace(0.0, 1500.0, 6001)
 """Gas rises at which the membrane's displacement is tabulated."""
 
@@ -59,12 +46,13 @@ def _membrane_table_m() -> FloatArray:
     return np.array([equilibrium_height_m(gas_k / AMBIENT_K, volume_m3) for gas_k in GAS_GRID_K])
 
 
-@dataclass(frozen=True)
-class CorrectedModel:
+class CorrectedModel(PaperModel):
     """Parameter set with active causes."""
 
-    base: ParameterSet
-    values: CauseValues
+    def __init__(self, base: ParameterSet, values: CauseValues) -> None:
+        super().__init__(base)
+        self.base, self.values = base, values
+        self._build_pixel = cache(self._scale_pixel)
 
     def compute_log_errors(self, data: Sequence[Datum]) -> FloatArray:
         """Return the logarithms of model over measured.
@@ -75,11 +63,7 @@ class CorrectedModel:
 
     def compute_outcome(self, name: str) -> float:
         """Return a fact, SI, temperatures as rises. For an unreachable height, return the rate of the longest pulse."""
-        if name in RATE_HEIGHTS_M:
-            return self._rate_per_s(RATE_HEIGHTS_M[name])
-        if name in PULSE_FACTS:
-            return self._compute_pulse_fact(name)
-        return self._compute_train_fact(name)
+        return RESPONSES[name](self) - (AMBIENT_C if name.startswith("T_") else 0.0)
 
     def _compute_log_error(self, datum: Datum) -> float:
         if datum.id in RATE_HEIGHTS_M:
@@ -87,21 +71,11 @@ class CorrectedModel:
             return log(height_m / RATE_HEIGHTS_M[datum.id])
         return log(self.compute_outcome(datum.id) / datum.value)
 
-    @cached_property
-    def _pixels(self) -> dict[tuple[float, bool], Pixel]:
-        return {}
-
-    def _build_pixel(self, width_m: float, from_table: bool = True) -> Pixel:
+    def _scale_pixel(self, width_m: float, from_table: bool = True) -> Pixel:
         """Return the pixel with scaled parameters.
 
         R and C are from Table S3, or from the smooth law between its rows.
         """
-        key = (width_m, from_table)
-        if key not in self._pixels:
-            self._pixels[key] = self._scale_pixel(width_m, from_table)
-        return self._pixels[key]
-
-    def _scale_pixel(self, width_m: float, from_table: bool) -> Pixel:
         base, values = self.base, self.values
         pixel = base.build_pixel(width_m)
         if not from_table:
@@ -135,10 +109,19 @@ class CorrectedModel:
         """Return the time with light per pulse."""
         return max(pulse_s - self.values.get("laser_late", 0.0), MIN_PULSE_S)
 
-    def _train_gas_k(self, pulse_s: float) -> FloatArray:
-        """Return the gas rise over a period of a steady train with equal on and off times."""
-        on_s = self._on_time_s(pulse_s)
-        return train_gas_k(TrainStimulus(self._build_pixel(0.55e-3), on_s, 2.0 * pulse_s - on_s), self._terms)
+    def ripple_m(self, on_s: float) -> tuple[float, float]:
+        """Return peak-to-peak and mean displacement of a steady train with equal pulses and pauses, m."""
+        light_s = self._on_time_s(on_s)
+        gas_k = train_gas_k(TrainStimulus(self._build_pixel(0.55e-3), light_s, 2.0 * on_s - light_s), self._terms)
+        height_m = self._displacement_m(gas_k)
+        return float(np.ptp(height_m)), float(0.5 * (height_m[1:] + height_m[:-1]).mean())
+
+    def peaks(self, width_mm: float, pulse_s: float = LONG_PULSE_S, power_w: float = FULL_POWER_W) -> Peaks:
+        """Return the peaks by a pulse on a pixel with bridges of a width."""
+        pixel = self._build_pixel(width_mm * 1e-3)
+        pixel = pixel._replace(epsilon=pixel.epsilon * power_w / FULL_POWER_W)
+        absorber_k, gas_k = self._pulse_rises_k(pixel, pulse_s)
+        return Peaks(absorber_k, gas_k, float(self._displacement_m(np.array([gas_k]))[0]), self._force_n(gas_k))
 
     def _pulse_rises_k(self, pixel: Pixel, pulse_s: float) -> tuple[float, float]:
         """Return the largest rises of absorber and gas."""
@@ -170,13 +153,6 @@ class CorrectedModel:
             return 2.0 * x / (1.0 + q + root) * aperture_m2 * ATMOSPHERE_PA
         return full_n
 
-    def _compute_pulse_fact(self, name: str) -> float:
-        width_m, pulse_s = PULSE_FACTS[name]
-        absorber_k, gas_k = self._pulse_rises_k(self._build_pixel(width_m), pulse_s)
-        if name.startswith("F_"):
-            return self._force_n(gas_k)
-        return float(self._displacement_m(np.array([gas_k]))[0]) if name.startswith("z_") else absorber_k
-
     def _rate_height_m(self, time_s: float) -> float:
         """Return the height that a pixel reaches in the time per pixel of a rate."""
         other = "rate_pixel" in self.values
@@ -185,22 +161,11 @@ class CorrectedModel:
         pulse_s = max(time_s - self.values.get("dead_time", 0.0), MIN_PULSE_S)
         return float(self._displacement_m(np.array([self._pulse_rises_k(pixel, pulse_s)[1]]))[0])
 
-    def _rate_per_s(self, height_m: float) -> float:
+    def rate_per_s(self, height_m: float) -> float:
+        """Return the rate of pulses that reach a height."""
         low, high = log(MIN_PULSE_S), log(MAX_PULSE_S)
         while high - low > 1e-4:
             middle = 0.5 * (low + high)
             reached = self._rate_height_m(float(np.exp(middle))) >= height_m
             low, high = (low, middle) if reached else (middle, high)
         return float(np.exp(-high))
-
-    def _compute_train_fact(self, name: str) -> float:
-        pixel = self._build_pixel(0.55e-3)
-        if name == "dpp_200Hz":
-            return float(np.ptp(self._displacement_m(self._train_gas_k(HALF_PERIOD_S))))
-        # The laws of Fig. 3D at t_p = t_g = τ. τ is that of Table S3 for all causes, as a setting of the drive.
-        tau_s = self.base.build_pixel(0.55e-3).tau_s
-        first_k = self._pulse_rises_k(pixel, tau_s)[1]
-        heights_m = self._displacement_m(np.append(self._train_gas_k(tau_s), first_k))
-        steady_m, first_m = heights_m[:-1], heights_m[-1]
-        numerator_m = np.ptp(steady_m) if name == "dpp_law" else 0.5 * (steady_m[1:] + steady_m[:-1]).mean()
-        return float(numerator_m / first_m)

@@ -6,19 +6,16 @@ from math import pi, sqrt
 
 from optodrive.core.quantity import format_quantity
 from optodrive.lab.validation.stimuli import AMBIENT_K
-from optodrive.physics.paper_facts import AMBIENT_C, PaperFact
+from optodrive.physics.paper_facts import AMBIENT_C, PaperFact, list_stated
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.terms.mechanical import ATMOSPHERE_PA
 
 READING_ERROR = 0.05
 """Relative error of a value read from a figure or rounded in the text, where the paper states none."""
 
+_GROUP_OF = list_stated("group")
 GROUPS = {
-    "temperatures": ("dT_peak_w020", "T_peak_w075"),
-    "displacements": ("z_peak_w020", "z_peak_w075", "z_tp8_w040"),
-    "forces": ("F_peak_w020", "F_peak_w055"),
-    "rates": ("N_50um", "N_400um"),
-    "vibration": ("dpp_200Hz", "dpp_law", "slow_law"),
+    group: tuple(name for name, own in _GROUP_OF.items() if own == group) for group in dict.fromkeys(_GROUP_OF.values())
 }
 """Measured facts by measurement."""
 
@@ -30,16 +27,7 @@ LAW_R2 = {"dpp_law": 0.95, "slow_law": 0.81}
 RATE_HEIGHTS_M = {"N_50um": 50e-6, "N_400um": 400e-6}
 """Heights of the rates; rates are compared by the height reached per pixel, because they saturate near the plateau."""
 
-EXCLUDED = {
-    "T_peak_w020": "the same reading as dT_peak_w020",
-    "z_repeat_w040": "an upper bound that every model here satisfies",
-    "F_linear_in_P": "a statement without a value",
-    "dT_air_isometric": "inferred from F_peak_w020, not measured",
-    "dQ_air": "inferred from F_peak_w020, not measured",
-    "eta_stroke": "arithmetic of F_peak_w020 and z_peak_w020",
-    "eta_qt": "arithmetic of dQ_air",
-    "eta_tm": "arithmetic of eta_stroke and eta_qt",
-}
+EXCLUDED = list_stated("excluded")
 """Outcomes that are no independent measurements."""
 
 

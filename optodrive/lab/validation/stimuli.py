@@ -55,21 +55,28 @@ def compute_steady_train(pixel: Pixel, power_w: float, width_s: float, gap_s: fl
 
     The mean is exact: over a period no net heat is stored, so the mean rises equal the steady rises at the mean power.
     """
-    theta_k = gamma_k = 0.0
-    period_s = width_s + gap_s
-    memory_s = pixel.tau_s + pixel.tau_g_s
-    for _ in range(1 + int(40.0 * memory_s / period_s)):
-        gate_off_state = advance(pixel, theta_k, gamma_k, power_w, width_s)
-        theta_k, gamma_k = advance(pixel, *gate_off_state, 0.0, gap_s)
-    max_k = max(
-        gas_peak(pixel, theta_k, gamma_k, power_w, width_s)[0],
-        cooling_peak(pixel, *gate_off_state, gap_s)[0],
-    )
+    (theta_k, gamma_k), gate_off_state = _find_steady_state(pixel, power_w, width_s, gap_s)
+    max_k = max(gas_peak(pixel, theta_k, gamma_k, power_w, width_s)[0], cooling_peak(pixel, *gate_off_state, gap_s)[0])
     # With the gate off the gas has no minimum in the interior. The equations are linear, so the minimum during the
     # pulse is the maximum of the negated motion.
     min_k = -gas_peak(pixel, -theta_k, -gamma_k, -power_w, width_s)[0]
-    mean_k = GAS_FRACTION * pixel.epsilon * pixel.r_k_per_w * power_w * width_s / period_s
+    mean_k = GAS_FRACTION * pixel.epsilon * pixel.r_k_per_w * power_w * width_s / (width_s + gap_s)
     return SteadyTrain(min_k, max_k, mean_k)
+
+
+def _find_steady_state(
+    pixel: Pixel, power_w: float, on_s: float, off_s: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the rises of absorber and gas at gate on and at gate off of a steady train."""
+
+    def advance_period(theta_k: float, gamma_k: float) -> FloatArray:
+        return np.array(advance(pixel, *advance(pixel, theta_k, gamma_k, power_w, on_s), 0.0, off_s))
+
+    # A period maps states linearly; the steady state is the fixed point of that map.
+    offset = advance_period(0.0, 0.0)
+    matrix = np.stack([advance_period(1.0, 0.0) - offset, advance_period(0.0, 1.0) - offset], axis=1)
+    theta_k, gamma_k = np.linalg.solve(np.eye(2) - matrix, offset).tolist()
+    return (theta_k, gamma_k), advance(pixel, theta_k, gamma_k, power_w, on_s)
 
 
 PERIOD_SAMPLES = 48
@@ -135,16 +142,7 @@ def train_gas_k(train: TrainStimulus, terms: FrozenTerms) -> FloatArray:
 def _closed_form_gas_k(train: TrainStimulus) -> FloatArray:
     pixel, on_s, off_s = train
 
-    def advance_period(theta_k: float, gamma_k: float) -> FloatArray:
-        gate_off_state = advance(pixel, theta_k, gamma_k, FULL_POWER_W, on_s)
-        return np.array(advance(pixel, *gate_off_state, 0.0, off_s))
-
-    # A period maps states linearly; the steady state is the fixed point of that map.
-    offset = advance_period(0.0, 0.0)
-    matrix = np.stack([advance_period(1.0, 0.0) - offset, advance_period(0.0, 1.0) - offset], axis=1)
-    state = np.linalg.solve(np.eye(2) - matrix, offset)
-    start = (float(state[0]), float(state[1]))
-    gate_off_state = advance(pixel, *start, FULL_POWER_W, on_s)
+    start, gate_off_state = _find_steady_state(pixel, FULL_POWER_W, on_s, off_s)
 
     def gas_k(at_s: float) -> float:
         after = (

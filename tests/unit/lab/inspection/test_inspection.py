@@ -153,6 +153,14 @@ def test_a_ceiling_is_left_out_with_what_is_near(share, quantum, noise):
         assert (kept & far).sum() > 0.9 * (far & np.isfinite(old.signals[HEIGHT].value)).sum()
 
 
+def test_a_clipped_signal_that_is_used_all_the_same_stays_whole():
+    clean = build_clean(5)
+    ceiling = 0.7 * max(float(np.nanmax(run.signals[HEIGHT].value)) for run in clean.runs)
+    clipped = change(clean, HEIGHT, lambda _, value: np.minimum(value, ceiling))
+    assert list_missing(clipped, find(clipped)[1].measurement, HEIGHT)
+    assert list_missing(clipped, find(clipped, ["clipped"])[1].measurement, HEIGHT) == []
+
+
 @pytest.mark.parametrize(("share", "side", "width"), [(0.6, 1.0, 0.05), (0.85, 1.0, 0.0), (0.3, -1.0, 0.0)])
 @pytest.mark.parametrize("name", [HEIGHT, HEAT])
 def test_a_sensor_that_saturates_before_the_noise_is_left_out_there(name, share, side, width):
