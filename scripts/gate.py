@@ -12,7 +12,6 @@ LIVE = (
     "tests/browser",
     "tests/docs",
     "tests/conformance/test_conformance_pty.py",
-    "tests/conformance/test_link_faults_pty.py",
 )
 PYTEST = (sys.executable, "-m", "pytest", "-m", "not slow", "--dist", "loadfile", "--no-loadscope-reorder")
 

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, settings
 # Before numpy is imported, also for the workers of xdist: a second thread of BLAS takes the time of the other worker.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import forked_probe
 import forked_process
 from displays import DISPLAYS
 from pieces import take_piece
@@ -50,12 +51,14 @@ def pytest_sessionstart():
 
 def pytest_collection_finish():
     forked_process.enable()  # in the environment that all tests share: OpenCV has changed it, no test has yet
+    forked_probe.enable()
     gc.collect()
     gc.freeze()  # what was imported and collected lives to the end; each collection would visit it again
 
 
 def pytest_sessionfinish():
     forked_process.disable()
+    forked_probe.disable()
 
 
 def pytest_addoption(parser):

@@ -193,18 +193,6 @@ def test_a_fault_its_cause_and_its_end_are_said_and_the_focus_is_kept(kept_windo
     assert read_focus(page) == "laser-title"
 
 
-def test_frames_of_a_stream_are_not_said_one_by_one(page, daemon, heard):
-    daemon.arm()
-    heard("^Board: ARMED")
-    while not is_said(page, "in turn", "Board: RUNNING"):  # its turn comes while the frames go on
-        daemon.finished(play_for(daemon, 0.1))
-    for _ in range(5):
-        daemon.finished(play_for(daemon, 0.1))
-    wait_for(lambda: daemon.board_state() == "ARMED", "the end of the last one")
-    wait_for(lambda: len(heard("^Board: ARMED")) == 2, "the laser to be dark for good")
-    assert len(heard("^Board: RUNNING")) == 1
-
-
 def test_a_stop_that_is_not_answered_is_said_at_once(page, heard):
     page.route("**/v1/stop", lambda route: route.abort())
     page.keyboard.press("Escape")

@@ -93,52 +93,6 @@ def test_planned_pulses_are_dropped_executed_ones_stay(page):
     assert shown == [f"{executed}1 starts within the next second.", executed]
 
 
-def test_planned_pulses_are_outlines_however_dense(page):
-    """Planned pulses are outlines and executed ones are filled, whichever their density.
-
-    The shares of the picture that are filled are measured at half the height of the pulses, before and after now, and
-    at the edge.
-    """
-    shares = page.evaluate("""async () => {
-        const { Timeline } = await import("/page/timeline.js");
-        const canvas = document.createElement("canvas");
-        canvas.style = "width: 500px; height: 100px";
-        document.body.append(canvas);
-        const timeline = new Timeline(canvas, document.createElement("p"), 1);
-        const batch = (beginS) => {
-            const row = Array.from({ length: 190 }, (_, k) => k);
-            const fill = (value) => row.map(() => value);
-            const start_s = row.map((k) => beginS + 0.005 * k);
-            return { plan: `p${beginS}`, row, pixel: fill(1), start_s, width_s: fill(0.004), power_w: fill(1),
-                trimmed_j: fill(0), reason: fill("") };
-        };
-        while (canvas.width !== Math.round(500 * devicePixelRatio)) { // its size is observed
-            await new Promise(requestAnimationFrame);
-        }
-        timeline.addPulses({ board_s: 10, planned: [batch(10.03)], executed: [batch(9.03)] });
-        timeline.paint();
-        const base = 100 - 18;
-        const one = document.createElement("canvas").getContext("2d");
-        one.fillStyle = timeline.colour.executed;
-        one.fillRect(0, 0, 1, 1);
-        const ink = [...one.getImageData(0, 0, 1, 1).data].slice(0, 3);
-        const share = (y, fromX) => {
-            const { data } = canvas.getContext("2d").getImageData(fromX, y, 90, 1);
-            const isNear = (a, b) => Math.abs(a - b) < 30;
-            const isInk = (k) => data[4 * k + 3] > 100 && ink.every((value, c) => isNear(data[4 * k + c], value));
-            return Array.from({ length: 90 }, (_, k) => isInk(k)).filter(Boolean).length / 90;
-        };
-        const top = Math.round(base - base / 1.2);
-        const edge = Math.max(...[-1, 0, 1].map((dy) => share(top + dy, 405)));
-        canvas.remove();
-        return [share(base / 2, 305), share(base / 2, 405), edge];
-    }""")
-    executed, planned, edge = shares
-    assert executed > 0.7
-    assert planned == 0.0
-    assert edge > 0.5
-
-
 def test_quantities_are_short(page):
     shown = page.evaluate("""async () => {
         const { formatQuantity } = await import("/page/quantities.js");

@@ -7,8 +7,6 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect
 
-from optodrive.device.config_file import load_config
-from optodrive.planning.stimuli.sequence_file import parse_sequence
 from page_bench import Bench
 from rig import TOKEN, long_train, wait_for
 from window import PHONE, WIDE, PageVisit, arm, list_violations, play_for
@@ -32,28 +30,6 @@ def draw_line(page):
 def preview(page):
     page.get_by_role("button", name="Preview").click()
     expect(page.get_by_role("button", name="Play")).to_be_enabled()
-
-
-def test_a_drawing_may_state_an_intensity(window, page):
-    height, result = page.locator("#height"), page.locator("#result")
-    draw_line(page)
-    page.get_by_label("By intensity").check()
-    expect(page.get_by_label("Intensity", exact=True)).to_have_value("8")
-    expect(page.locator("#drawn")).to_have_text("9 drawn")
-    frame = {"show_at_s": 0.0, "duration_s": 1.0, "intensity": {"218": 8.0}}
-    target_m = parse_sequence({"frames": [frame]}, load_config(), "f").frames[0].target_m
-    preview(page)
-    expect(result).to_contain_text(f"{1e6 * target_m[218]:.1f} µm requested")
-    page.locator("#display").press("ArrowLeft")
-    expect(page.locator("#picked")).to_contain_text("drawn 8 thresholds")
-    height.fill("99")
-    page.get_by_role("button", name="Preview").click()
-    expect(result).to_contain_text("got 99.0, expected at most 24")
-    page.get_by_label("By intensity").uncheck()
-    expect(page.get_by_label("Height, µm")).to_have_value("100")
-    preview(page)
-    expect(result).to_contain_text("100.0 µm requested")
-    assert window.unexpected_errors("422") == []
 
 
 def test_draw_preview_arm_play_and_what_was_felt(window, page, daemon):
@@ -319,20 +295,6 @@ def test_the_token_is_asked_for(visit, daemon, axe):
     page.goto(f"{daemon.url}/")
     page.get_by_label("Token of this daemon").wait_for()
     window.open()  # an address that differs only in its hash does not load the page anew
-
-
-def test_a_token_is_typed_by_keys_alone(visit, daemon):
-    page = visit().page
-    page.goto(f"{daemon.url}/")
-    field = page.get_by_label("Token of this daemon")
-    expect(field).to_be_focused()
-    page.keyboard.type("surely-another-token")
-    page.keyboard.press("Enter")
-    expect(page.get_by_role("alert")).to_contain_text("not the token of the daemon")
-    expect(field).to_be_focused()
-    page.keyboard.type(TOKEN)
-    page.keyboard.press("Enter")
-    page.get_by_text("live", exact=True).wait_for()
 
 
 def test_a_browser_that_keeps_no_cookie_is_told_so(visit, daemon):

@@ -7,7 +7,6 @@ from rig import wait_for
 from study_page_rig import PageStudy
 from study_rig import find_defects, read_records, write_study
 from study_visit import StudyVisit
-from window import PHONE, WIDE, list_violations
 
 TRIALS = 3
 
@@ -33,49 +32,6 @@ def visits(browser, study):
 def read_trials(folder):
     records = read_records(next((folder / "data").rglob("*_trials.jsonl")))
     return records, [record for record in records if record["record"] == "trial"]
-
-
-def check_with_axe(visit, axe):
-    for scheme, viewport in (("light", WIDE), ("dark", PHONE), ("light", PHONE), ("dark", WIDE)):
-        visit.page.emulate_media(color_scheme=scheme)
-        visit.page.set_viewport_size(viewport)
-        assert list_violations(visit.page, axe) == [], (scheme, viewport)
-        assert visit.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def test_every_trial_is_shown_as_it_comes_and_its_condition_to_the_operator_alone(study, visits, tmp_path, axe):
-    participant, operator = visits
-    page = operator.page
-    expect(page.locator("#page")).to_have_text("Participant’s page open")
-    check_with_axe(operator, axe)
-    seen = []
-
-    def answer():
-        number = len(seen) + 1
-        expect(page.locator("#progress-text")).to_contain_text(f"Trial {number} of {TRIALS}. Answered: {number - 1}")
-        expect(page.locator("#state")).to_have_text("Waits for the answer")
-        expect(page.locator("#now")).to_contain_text("pulses in")
-        seen.append(page.locator("#now dd").first.inner_text())
-        participant.page.keyboard.press("2")
-
-    assert participant.take(answer) == "done"
-    expect(page.locator("#state")).to_have_text("All trials are done")
-    expect(page.locator("#pause")).to_have_attribute("aria-disabled", "true")
-    check_with_axe(operator, axe)
-    assert study.end() == 0
-    records, trials = read_trials(tmp_path)
-    assert find_defects(records) == []
-    assert seen == [f"experiment-6: digits {trial['condition']['digits']}" for trial in trials]
-    rows = page.locator("#rows tr")
-    assert rows.count() == TRIALS
-    for row, trial in zip(rows.all(), reversed(trials), strict=True):
-        texts = row.locator("td").all_inner_texts()
-        assert texts[0] == str(trial["trial"] + 1)
-        assert texts[1] == f"digits {trial['condition']['digits']}"
-        assert texts[2] == ("2-3, correct" if trial["is_correct"] else "2-3, wrong")
-        assert texts[3] == f"{trial['response_time_s']:.3f}"
-        assert texts[5].startswith(f"{len(trial['presentations'][-1]['executed']['pixel'])} pulses")
-    assert operator.errors == participant.errors == []
 
 
 def test_pause_lets_no_further_stimulus_begin_until_the_operator_goes_on(study, visits, tmp_path, bench):

@@ -104,19 +104,6 @@ def test_a_session_by_single_keys(study, open_page, records):
     assert visit.errors == []
 
 
-def test_a_session_by_tab_and_enter_keeps_the_focus_on_the_answer(study, open_page, records):
-    visit = open_page(study)
-    page = visit.page
-    visit.wait_for("start")
-    page.keyboard.press("Space")
-    visit.wait_for("question")
-    while page.evaluate("document.activeElement.textContent")[:3] != "3-4":
-        page.keyboard.press("Tab")
-    assert visit.take(lambda: page.keyboard.press("Enter")) == "done"
-    assert study.end() == 0
-    assert [trial["answer"] for trial in list_trials(records())] == ["3-4"] * TRIALS
-
-
 def test_a_session_by_touch_on_a_phone(study, open_page, records):
     visit = open_page(study, viewport=PHONE, has_touch=True, is_mobile=True)
     page = visit.page

@@ -1,6 +1,6 @@
 """Many pulses on the emulated network DACs, judged from their own logs: place, energy and caps of each.
 
-A few thousand in every run, a million with --slow (nightly).
+A few thousand in every run, a million on all displays with --slow (nightly).
 """
 
 import numpy as np
@@ -22,6 +22,7 @@ from reference_models.thermal_display import build_true_display
 
 ROUNDING_M = 1e-9
 NAMES = ("display-1", "display-16", "display-357", "display-437", "display-1511")
+EVERY_TIME = ("display-16", "display-437")
 DEVICES = {"ether_dream": (VirtualStream, EtherDream), "idn": (VirtualRadio, Idn)}
 RATES = (20_000, 33_333, 40_000, 50_000)
 SOME, MANY = 600, 100_000
@@ -81,7 +82,7 @@ def count_judged(transport, name, count, seed=0):
 
 
 @pytest.mark.parametrize("transport", DEVICES)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_TIME)
 def test_some_pulses(transport, name):
     assert count_judged(transport, name, SOME) >= SOME
 

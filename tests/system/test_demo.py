@@ -42,14 +42,6 @@ def test_every_planned_pulse_is_executed(tmp_path):
     assert float(largest_um) > float(of_the_highest_target_um)  # by a train that states a power
 
 
-def test_a_small_display_shows_the_patterns_that_it_has_the_space_for(tmp_path):
-    ended = show(tmp_path, config_text(name="display-16"))
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    refused = [line for line in ended.stdout.splitlines() if line.startswith("left out: pattern ")]
-    assert [line.split()[3] for line in refused] == ["showcase:", "experiment-6:"]
-    assert "experiment-1" in ended.stdout
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_demo_with_its_daemon(tmp_path, number):
     config = tmp_path / "config.toml"

@@ -112,13 +112,6 @@ def test_a_study_that_is_left_keeps_its_trials_and_ends_dark(run_script, board, 
     assert_dark(board, daemon)
 
 
-@pytest.mark.parametrize("name", ["short_study.py", "psychopy_study.py"])
-def test_wrong_use_is_told_in_one_line(run_script, tmp_path, name):
-    (tmp_path / "psychopy.py").write_text(STAND_IN.format(keys=[]))
-    done = run_script(name)
-    assert (done.returncode, done.stderr) == (1, f"usage: python {name} answers.tsv\n")
-
-
 def test_without_psychopy_one_line_says_so(run_script, tmp_path):
     done = run_script("psychopy_study.py", "answers.tsv")
     assert done.returncode == 1

@@ -2,19 +2,16 @@
 
 import os
 import signal
-import time
 
 import pytest
 
 from forked_process import FULL_INDICATOR, run_process
 from optodrive.link.simulator.board_core import BoardClock
 from rig import OPTODRIVE, PATIENT_LEAD_S, PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
-from signalled_processes import assert_dark_within_lease, assert_stayed_dark
+from signalled_processes import assert_stayed_dark
 
 LEASE_S = PATIENT_LEASE_S
 SKEW_MAX_S = 0.01
-PERIOD_S = 0.02
-"""Time from one pulse of `long_train` to the next."""
 SKEW = ("[limits]\n", f"[limits]\nstage_skew_max_s = {SKEW_MAX_S}\n")
 """Change of the configuration: on a busy computer an exchange with a board takes milliseconds."""
 GOES_ON = '[daemon]\non_stage_loss = "that_stage"\n'
@@ -134,17 +131,6 @@ def test_two_boards_draw_a_frame_and_stop_together(bench):
         assert not board.of("gate")[-1]["on"]
 
 
-def test_the_loss_of_one_board_darkens_the_other_within_its_lease(bench):
-    bench.arm()
-    bench.begin(build_trains())
-    lost, left = bench.boards
-    lost.kill()
-    wait_for(lambda: left.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the other board")
-    assert_dark_within_lease(left)
-    state = wait_for(lambda: (s := bench.daemon.state())["link"]["state"] == "down" and s, "the loss")
-    assert "stage 'left'" in state["link"]["error"]
-
-
 def test_the_other_board_draws_what_is_left_where_configured(tmp_path):
     bench = Bench(tmp_path, GOES_ON)
     lost, left = bench.boards
@@ -170,23 +156,6 @@ def test_the_other_board_draws_what_is_left_where_configured(tmp_path):
         assert not left.of("fault")  # as it would have without a lease
     finally:
         bench.stop()
-
-
-def test_light_that_would_be_late_is_not_emitted(bench):
-    """The link process stands still until both boards have executed all points that they were sent ahead."""
-    bench.arm()
-    plan = bench.begin(build_trains(30.0))
-    link = bench.daemon.find_process("link")
-    os.kill(link, signal.SIGSTOP)
-    try:
-        wait_for(lambda: all(board.of("state")[-1]["state"] != "RUNNING" for board in bench.boards), "the last points")
-        time.sleep(2 * PERIOD_S)  # until the next pulse would be late on every board
-        begins = [len(board.events()) for board in bench.boards]
-    finally:
-        os.kill(link, signal.SIGCONT)
-    assert bench.daemon.finished(plan)["status"] == "failed"
-    for board, begin in zip(bench.boards, begins, strict=True):
-        assert_stayed_dark(board, begin)
 
 
 def test_status_shows_the_stages_and_the_commands_select_one(bench, tmp_path):

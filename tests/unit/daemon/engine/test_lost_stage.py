@@ -122,17 +122,6 @@ def test_a_board_that_is_lost_before_all_are_armed_leaves_none_armed(rig):
     assert list_states(rig) == [BoardState.DISARMED, BoardState.DISARMED, BoardState.FAULT]
 
 
-def test_by_default_all_go_dark(monkeypatch):
-    rig = LossRig(monkeypatch, 3, on_stage_loss="all_dark")
-    record = rig.push(build_trains())
-    rig.until(lambda: record.executed_count > 6)
-    lost_s = rig.lose(1, "fault")
-    rig.sleep(0.2)
-    assert rig.remote.lost is None
-    assert record.status == "failed"
-    assert find_last_light_s(rig) < lost_s + DARK_S
-
-
 def test_points_for_the_lost_board_are_refused(rig):
     points = []
     begin = rig.remote.begin

@@ -66,11 +66,6 @@ def test_frame_is_header_body_and_zlib_crc():
     assert cobs_decode(encode_frame(Frame(0x10, 9, 0x1234, b"body"))[:-1]) == raw + struct.pack("<I", crc32(raw))
 
 
-def test_decoded_whole_and_byte_by_byte():
-    assert read(STREAM) == (FRAMES, (0, 0))
-    assert read(*one_by_one(STREAM)) == (FRAMES, (0, 0))
-
-
 def test_a_frame_is_complete_at_its_delimiter():
     assert read(STREAM[:-1])[0] == FRAMES[:-1]
 
@@ -122,9 +117,3 @@ def test_every_flipped_bit_is_detected():
             damaged = bytearray(wire)
             damaged[at] ^= 1 << bit
             assert read(bytes(damaged))[0] == []
-
-
-def test_a_wrong_crc_is_counted():
-    raw = struct.pack("<BBH", 0x18, 0, 1)
-    wrong = cobs_encode(raw + struct.pack("<I", crc32(raw) ^ 1)) + b"\0"
-    assert read(wrong) == ([], (1, 0))

@@ -37,11 +37,6 @@ def places(pixels, centre=MIDDLE):
     )
 
 
-def test_the_middle_is_the_middle():
-    assert Lattice.from_config(CONFIG).middle_pixel() == MIDDLE
-    assert (LAYOUT.x_m[MIDDLE], LAYOUT.y_m[MIDDLE]) == (0.0, 0.0)
-
-
 @pytest.mark.parametrize(
     ("direction", "path"),
     [
@@ -70,13 +65,6 @@ def test_experiment_2_turns_from_the_bottom_left(speed, slot_s, each):
     assert clockwise == [(-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)]
     counter = places(pulses(build_rotation(CONFIG, "e", "ccw", speed, None))[3][::each])
     assert counter == [(-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1)]
-
-
-def test_experiment_2_turns_in_the_given_direction():
-    for direction, sign in (("cw", -1), ("ccw", 1)):
-        pixel = pulses(build_rotation(CONFIG, "e", direction, "64", None))[3].astype(int)
-        angle = np.unwrap(np.arctan2(LAYOUT.y_m[pixel], LAYOUT.x_m[pixel]))
-        assert np.all(sign * np.diff(angle) > 0)
 
 
 @pytest.mark.parametrize(("target", "place"), [(1, (1, -1)), (3, (1, 1)), (5, (0, 0)), (8, (-1, 0)), (9, (-1, 1))])
