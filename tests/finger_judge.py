@@ -35,18 +35,22 @@ class Pulses(NamedTuple):
 
 def read_pulses(board, display):
     """Return the pulses of a simulated board's log."""
+    return build_pulses(board.all_of("pulse"), read_zero_s(board), display)
+
+
+def build_pulses(events, zero_s, display):
+    """Return the pulses of a log's events, with its zero in the host's time."""
     from optodrive.link.board_setup import build_board_requirements
 
     layout, angle = display.layout, 1.0 / (2.0 * display.config.scanner.focal_length_m)
     scale = build_board_requirements(display.config).scale
     codes = np.column_stack([scale.to_codes(layout.x_m * angle), scale.to_codes(layout.y_m * angle)])
     pixel_of = {tuple(code): pixel for pixel, code in enumerate(codes.tolist())}
-    pulses = board.all_of("pulse")
-    pixel = np.array([pixel_of[pulse["x"], pulse["y"]] for pulse in pulses])
-    on_s, off_s = (1e-6 * np.array([pulse[key] for pulse in pulses]) for key in ("on_us", "off_us"))
-    power_w = scale.full_power_w / DUTY_MAX * np.array([pulse["duty"] for pulse in pulses])
+    pixel = np.array([pixel_of[event["x"], event["y"]] for event in events])
+    on_s, off_s = (1e-6 * np.array([event[key] for event in events]) for key in ("on_us", "off_us"))
+    power_w = scale.full_power_w / DUTY_MAX * np.array([event["duty"] for event in events])
     peaks = display.build_cold_heat().apply_pulses(pixel, on_s, off_s - on_s, power_w)
-    return Pulses(pixel, read_zero_s(board) + on_s, peaks.displacement_m, power_w * (off_s - on_s))
+    return Pulses(pixel, zero_s + on_s, peaks.displacement_m, power_w * (off_s - on_s))
 
 
 def read_zero_s(board):

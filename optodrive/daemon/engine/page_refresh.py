@@ -27,8 +27,13 @@ PAGE_TIMEOUT_S = 0.5
 """A page that was not refreshed for this time no longer stands."""
 CAP_GONE_S = 1.0
 """A cap limits a page for this time after it took light from a refresh."""
-LOOKAHEAD_SLOTS = 2
+LOOKAHEAD_SLOTS = 3
 """A dot is drawn for a finger that will touch it within this number of slots."""
+MARGIN_SHARE = 1.0 / 3.0
+"""Share of the margin of a finger's place within which dots have the priority of the dots under it.
+
+Three times as many dots lie within the whole margin as under the finger, more than the beam can refresh.
+"""
 MOVE_S = 4e-4
 """Typical time of a move between two pixels under the same finger."""
 FIRST_WIDTH_S = 4e-3
@@ -131,7 +136,7 @@ class PageRefresh:
         fingers = np.array(predicted, dtype=np.float64).reshape(len(times_s), -1, len(PredictedFinger._fields))
         _, x_m, y_m, radius_m, margin_m = np.moveaxis(fingers, -1, 0)[..., np.newaxis]
         distance_m2 = (self._layout.x_m - x_m) ** 2 + (self._layout.y_m - y_m) ** 2
-        is_under: BoolArray = (distance_m2 <= (radius_m + margin_m) ** 2).any(axis=1)
+        is_under: BoolArray = (distance_m2 <= (radius_m + MARGIN_SHARE * margin_m) ** 2).any(axis=1)
         return is_under
 
 
