@@ -142,9 +142,9 @@ class VirtualClock:
 def measure_virtual(display, heights_um, lines, speed, seconds, lead_s):
     """Plan the refreshes of a page without a daemon, and yield the largest use of each cap."""
     from optodrive.core.types.fingers import FingerPlace
+    from optodrive.daemon.engine.active_plan import ThermalEstimate
     from optodrive.daemon.engine.page_refresh import PageRefresh
     from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
-    from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
     from optodrive.daemon.push import BuiltRequest, Push
     from optodrive.link.board_setup import build_scales
     from optodrive.planning.limiter.cap_checks import compute_panel_k, compute_usage
@@ -155,7 +155,7 @@ def measure_virtual(display, heights_um, lines, speed, seconds, lead_s):
     push = Push("bench", {}, 0.0, 0, streamed=True, lists_pulses=False, standing=True)
     request = PlanningRequest(lambda: built, push, select=page.select)
     thermal = ThermalEstimate(*display.build_cold_state())
-    snapshot = PlanningSnapshot(thermal, lead_s, thermal.heat, thermal.budget)
+    snapshot = PlanningSnapshot(thermal, lead_s, thermal)
     used, panel_k, pulses = {}, 0.0, 0
     while clock.at_s < seconds:
         touches = hand.find_touches(clock.at_s)

@@ -106,8 +106,8 @@ def draw_frame(rng, active):
 
 def measure_superseding():
     """Measure the CPU time of planning a stream's frame that truncates the one before it, mirrors near their cap."""
+    from optodrive.daemon.engine.active_plan import ThermalEstimate
     from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
-    from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
     from optodrive.daemon.push import BuiltRequest, Push
     from optodrive.link.board_setup import build_scales
 
@@ -115,7 +115,7 @@ def measure_superseding():
     scales, push = build_scales(display.config), Push("bench", {}, 0.0, 0, streamed=True, lists_pulses=False)
     for planned, horizon_s in (("whole", inf), (f"its first {1e3 * HORIZON_S:g} ms", HORIZON_S)):
         thermal = ThermalEstimate(*display.build_cold_state())
-        snapshot = PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
+        snapshot = PlanningSnapshot(thermal, 0.0, thermal)
         rng, times = np.random.default_rng(7), []
         for number in range(SUPERSEDING):
             built = BuiltRequest(draw_frame(rng, ACTIVE))

@@ -14,8 +14,8 @@ from optodrive.daemon.engine.active_plan import PlanStore
 from optodrive.daemon.engine.kept_heat import KeptHeat
 from optodrive.daemon.engine.plan_making import NEVER, Dimmer, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
+from optodrive.daemon.engine.plan_rest import ThermalMemory
 from optodrive.daemon.engine.planner import Planner
-from optodrive.daemon.engine.thermal_estimate import ThermalMemory
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.service import link_connection
@@ -68,6 +68,42 @@ class ServiceChannel:
         self._rig.leave(PLANNER)
 
 
+class LiveRecord:
+    """The newest record of a plan, as long as the store has it."""
+
+    def __init__(self, newest):
+        self.newest = newest
+
+    def __getattr__(self, name):
+        return getattr(self.newest, name)
+
+
+class LiveStore(PlanStore):
+    """Store that returns the same object for a plan each time, which always is its newest record."""
+
+    def __init__(self):
+        super().__init__()
+        self._live = {}
+
+    def publish(self, record):
+        super().publish(record)
+        self._follow(record)
+
+    def end(self, plan, status, error):
+        plan = super().end(plan, status, error)
+        self._follow(plan.record)
+        return plan
+
+    def _follow(self, record):
+        self._live.setdefault(record.plan_id, LiveRecord(record)).newest = record
+
+    def find(self, plan_id):
+        return self._live[super().find(plan_id).plan_id]
+
+    def list_recent(self):
+        return [self._live[record.plan_id] for record in super().list_recent()]
+
+
 class PlannerRig(ServiceRig):
     """Planner, queue and session on a link service with its board, in one thread and in virtual time.
 
@@ -82,7 +118,7 @@ class PlannerRig(ServiceRig):
         self.hello_all()
         self.remote = RemoteSession(build_scales(display.config), Path("nowhere"), self.clock)
         self.remote.connection.attach(ServiceChannel(self))
-        self.store = PlanStore()
+        self.display, self.store = display, LiveStore()
         self.queue = queue_type(display, self.remote, self.store, InlineExecutor())
         self.before_loop_action = lambda: None
         self.dimmer = Dimmer(display, ThermalMemory())

@@ -47,7 +47,7 @@ class StandingRig(PlannerRig):
         options |= {"settings": build_settings(build_port_settings(config).own_settings)}
         super().__init__(monkeypatch, display=display, **options)
         self.display, self.planning_s = display, 0.002
-        self.page = PageRefresh(display.layout, self.clock, self.remote.board_s, lambda: self.queue.stream.lead_s)
+        self.page = PageRefresh(display.layout, self.clock, self.remote.board_s, lambda: self.queue.lead_s)
         self.page_m, self.refusals, self.limited_by, self.fingers_moved = None, [], set(), False
         self._began_s = -np.inf
         make_plan = plan_making.make_plan

@@ -47,7 +47,7 @@ def check_executed(rig, name, given, count):
     rig.run(0.01)
     planned = rig.submit(build_pattern(name, given, DISPLAY.config), rig.remote.epoch).result()
     record = rig.store.find(planned.plan)
-    plan = rig.queue.waiting[0].planned.plan
+    plan = rig.queue.state.waiting[0].planned.plan
     rig.until(lambda: record.has_ended)
     assert (record.status, record.error, record.executed_count) == ("done", None, count)
     pulses = [event for event in rig.log if event["event"] == "pulse"]

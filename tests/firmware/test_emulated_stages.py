@@ -63,7 +63,7 @@ def rig(monkeypatch, library, chips):
 
 def test_two_boards_draw_a_frame_and_stop_together(rig):
     record = rig.play(build_frame(60.0, range(437), 3.0, 437))
-    plan = rig.queue.waiting[0].planned.plan
+    plan = rig.queue.state.waiting[0].planned.plan
     # As the link states it for the plan's end. It follows from stamps, which are random: an exchange may miss a turn.
     end_s = rig.clock.now_s() + 1.0
     known_s = np.array([session.clock_sync.fit(end_s).uncertainty_s for session in rig.boards.sessions])

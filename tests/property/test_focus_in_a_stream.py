@@ -8,8 +8,8 @@ from displays import DISPLAYS
 from focus_judge import compute_overhang_m
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import plan_making
+from optodrive.daemon.engine.active_plan import ThermalEstimate
 from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_board_requirements, build_scales
 
@@ -34,7 +34,7 @@ def stream(display, seed):
     """
     rng, tick_s, withdrawn = np.random.default_rng(seed), build_scales(display.config)[0].tick_s, 0
     thermal = ThermalEstimate(*display.build_cold_state())
-    plan = make(display, rng, PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget))
+    plan = make(display, rng, PlanningSnapshot(thermal, 0.0, thermal))
     tables, pixels = [], []
     for number in range(PLANS):
         may_withdraw = number > 0

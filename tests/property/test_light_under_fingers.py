@@ -11,7 +11,7 @@ import bench_fingers
 
 from finger_judge import Touch, build_pulses, judge
 from optodrive.core.types.fingers import FingerPlace
-from optodrive.daemon.engine import page_refresh, queue_stream
+from optodrive.daemon.engine import page_refresh, plan_queue
 from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from standing_rig import StandingRig
@@ -57,7 +57,7 @@ def jump(at_s):
 def draw(monkeypatch, raised, find_touches, duration_s):
     """Let a page stand under fingers that a noisy tracker reports. Return its pulses and the share in time."""
     # Of a link process with real-time priority, as benchmarks have it.
-    monkeypatch.setattr(queue_stream, "SHARED_STREAM_LEAD_S", 0.0)
+    monkeypatch.setattr(plan_queue, "SHARED_STREAM_LEAD_S", 0.0)
     rig = StandingRig(monkeypatch, DISPLAY).ready()
     rig.planning_s = PLANNING_S
     rig.arm()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.daemon.engine.active_plan import ThermalEstimate
 from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import decode, quantise
@@ -25,7 +25,7 @@ def test_truncated_plans_in_succession_are_verified(seed):
     thermal, now_s, omitted, trimmed_by_touch = ThermalEstimate(*DISPLAY.build_cold_state()), 3.0, 0, 0
     for _ in range(40):
         start_s = round(now_s + random.uniform(0.05, 3.0), 6)
-        _, budget = thermal.shift_to_plan(start_s)
+        budget = thermal.shift(-start_s).budget
         width_s, gap_s, power_w = STRONG if random.random() < 0.6 else BRISK
         train = PulseTrain(200, 0.0, 3.0, width_s, gap_s, power_w)
         plan = plan_sequence(DISPLAY, FrameSequence((), (train,)), DISPLAY.build_cold_heat(), budget).plan
@@ -35,9 +35,8 @@ def test_truncated_plans_in_succession_are_verified(seed):
         omitted += len(plan) - len(decoded.index)
         trimmed_by_touch += np.count_nonzero(plan.reason == "touch_temperature")
         until_s = random.uniform(0.2, 4.0)
-        thermal = ThermalEstimate.from_plan(
-            DISPLAY.build_cold_heat(), commit_until(plan, until_s, budget, DISPLAY.budget), start_s
-        )
+        state = commit_until(plan, until_s, budget, DISPLAY.budget)
+        thermal = ThermalEstimate(DISPLAY.build_cold_heat(), state).shift(start_s)
         now_s = start_s + until_s
     assert omitted
     assert trimmed_by_touch

@@ -13,9 +13,9 @@ from link_service_rig import WEB
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.fingers import FingerPlace
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.engine import thermal_estimate
+from optodrive.daemon.engine import queue_state
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.thermal_estimate import QueueThermal
+from optodrive.daemon.engine.queue_state import PlanRun, QueueState
 from standing_rig import StandingRig, build_display, build_page
 
 CAPS = ({}, {"display_mean_power_max_w": 0.2}, {"pixel_mean_power_max_w": 0.2}, {"touch_max_c": 41.0})
@@ -51,21 +51,16 @@ STEPS = {
 
 
 class RecordingQueue(PlanQueue):
-    """Keeps every accepted plan."""
+    """Keeps every run that has ended its plan."""
 
     def __init__(self, *arguments):
         super().__init__(*arguments)
-        self.accepted, self.ended = [], []
+        self.ended = []
 
-    def commit(self, plan, *arguments):
-        is_accepted = super().commit(plan, *arguments)
-        if is_accepted:
-            self.accepted.append(plan)
-        return is_accepted
-
-    def conclude(self, run, status, error):
-        self.ended.append(run)
-        super().conclude(run, status, error)
+    def _apply(self, state):
+        jobs = {run.plan.plan_id: run.job for run in self.state.running}
+        self.ended += [PlanRun(plan, jobs[plan.plan_id]) for plan, *_ in state.ended if plan.plan_id in jobs]
+        super()._apply(state)
 
 
 class Scene:
@@ -138,7 +133,7 @@ class Scene:
         self.submit(FrameSequence((), (PulseTrain(pixel, 0.0, 0.3, 0.01, 0.01, 1.0),)))
 
     def do_cancel(self):
-        active = [*self.rig.queue.waiting, *(run.plan for run in self.rig.queue.running)]
+        active = [*self.rig.queue.state.waiting, *(run.plan for run in self.rig.queue.state.running)]
         if active:
             self.cancelled_s.append(self.rig.clock.now_s())
             self.rig.queue.cancel(active[int(self.rng.integers(len(active)))].record)
@@ -272,7 +267,7 @@ def check_times(run, log, is_late):
 
 def check_heat(plan, log, error_max_m):
     """Check that the heat from which a plan was made is that of the log when it begins, and never less."""
-    state = plan.heat_before.state_at(0.0)
+    state = plan.before.heat.state_at(0.0)
     begin_s = plan.record.start_s
     for number in set(log.pixels.tolist()):
         pixel = log.find_pixel(number, begin_s - START_ERROR_MAX_S)
@@ -302,15 +297,14 @@ def test_the_queue_follows_the_board(monkeypatch, seed):
     judge(Scene(monkeypatch, seed).run())
 
 
-def go_back_to_the_first(thermal, ended, behind=(), *_):
+def go_back_to_the_first(state, ended, light, at=0):
     """Mutant: the light of plans that end early is forgotten."""
-    thermal.forget(ended[0], behind)
+    return state._go_back(ended[0])._continue_from(at, state.end_s)
 
 
-def rewind_the_last_plan_only(thermal, ended, behind=(), *shifts):
+def rewind_the_last_plan_only(state, *arguments):
     """Mutant: plans that wait begin from the heat of pulses that were cut."""
-    if not behind:
-        KEPT_REWIND(thermal, ended, behind, *shifts)
+    return state if state.waiting else KEPT_REWIND(state, *arguments)
 
 
 def forget_unreported(plans, *arguments):
@@ -318,12 +312,12 @@ def forget_unreported(plans, *arguments):
     return KEPT_REWIND_ESTIMATE(plans, *arguments[:3])
 
 
-KEPT_REWIND, KEPT_REWIND_ESTIMATE = QueueThermal.rewind, thermal_estimate.rewind_estimate
+KEPT_REWIND, KEPT_REWIND_ESTIMATE = QueueState._rewind, queue_state.rewind_estimate
 MUTANTS = {
-    "a plan that was never executed": (QueueThermal, "forget", lambda *_: None, 22),
-    "light that was emitted": (QueueThermal, "rewind", go_back_to_the_first, 2000),
-    "light that is not reported yet": (thermal_estimate, "rewind_estimate", forget_unreported, 2000),
-    "light that was cut": (QueueThermal, "rewind", rewind_the_last_plan_only, 2776),
+    "a plan that was never executed": (QueueState, "_go_back", lambda state, plan: state, 22),
+    "light that was emitted": (QueueState, "_rewind", go_back_to_the_first, 2000),
+    "light that is not reported yet": (queue_state, "rewind_estimate", forget_unreported, 2000),
+    "light that was cut": (QueueState, "_rewind", rewind_the_last_plan_only, 2776),
 }
 
 

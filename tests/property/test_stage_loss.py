@@ -110,7 +110,7 @@ def test_all_light_ends_within_a_lease_and_nothing_else_is_emitted(
     if trains:
         sequence = FrameSequence((), tuple(PulseTrain(50 * k, 0.0, 1.5, 0.02, 0.01, 1.0) for k in range(count)))
     record = rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed and not trains).result().plan)
-    plan = rig.queue.waiting[0].planned.plan
+    plan = rig.queue.state.waiting[0].planned.plan
     rig.until(lambda: rig.clock.now_s() >= record.start_s + after_s)
     broken_s = rig.clock.now_s()
     break_board(rig, stage, kind)

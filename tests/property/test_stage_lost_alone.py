@@ -12,8 +12,8 @@ import pytest
 
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.daemon.engine import queue_pause
-from optodrive.daemon.engine.thermal_estimate import EndedPlan, EndedPlans, rewind_estimate
+from optodrive.daemon.engine import plan_queue, queue_state
+from optodrive.daemon.engine.plan_rest import EndedPlan, EndedPlans, rewind_estimate
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.session.board_group import BoardGroup
@@ -85,7 +85,7 @@ class Planned(NamedTuple):
     @classmethod
     def collect(cls, queue):
         """Collect those of all plans that run or wait."""
-        plans = [*(run.plan for run in queue.running), *queue.waiting]
+        plans = [*(run.plan for run in queue.state.running), *queue.state.waiting]
         columns = [
             (active.record.start_s + (plan := active.planned.plan).start_s, plan.pixel, plan.stage) for active in plans
         ]
@@ -257,7 +257,7 @@ def is_one_draining(group):
 
 
 MUTANTS = {
-    "drawn twice": ("unplug", "frames", 0.2, queue_pause, "find_emitted", forget_sent),
+    "drawn twice": ("unplug", "frames", 0.2, queue_state, "find_emitted", forget_sent),
     "before the lost board is dark": ("unplug", "page", 0.03, BoardGroup, "is_draining", property(is_one_draining)),
     "a lease again": ("lie", "frames", 0.2, BoardGroup, "_readmit_lost", arm_again),
     "not drawn": ("fault", "frames", 0.2, LinkService, "_interrupt_if_lost", lambda service: None),
@@ -280,7 +280,7 @@ def compute_touched(monkeypatch):
     """Drive one pixel up to the touch cap, lose its board at the begin, and return the share that is reached."""
     rig = LossRig(monkeypatch, 2, NAME, touch_max_c=23.0)
     record = rig.push(FrameSequence((), (PulseTrain(5, 0.0, 1.5, 0.02, 0.004, 2.45),)))
-    stage = int(rig.queue.waiting[0].planned.plan.stage[0])
+    stage = int(rig.queue.state.waiting[0].planned.plan.stage[0])
     rig.until(lambda: rig.clock.now_s() >= record.start_s)
     rig.lose(stage, "unplug")
     rig.until(lambda: record.has_ended)
@@ -299,5 +299,5 @@ def forget_heat(plan, budget, on_progress):
 
 def test_what_the_lost_board_may_have_emitted_counts_as_heat(monkeypatch):
     assert 0.85 < compute_touched(monkeypatch) <= 1.0
-    monkeypatch.setattr(queue_pause, "estimate_before_rest", forget_heat)
+    monkeypatch.setattr(plan_queue, "estimate_before_rest", forget_heat)
     assert compute_touched(monkeypatch) > 1.5

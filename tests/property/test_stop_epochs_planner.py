@@ -51,7 +51,7 @@ class Interleaving:
 
     answered_epoch: epoch when the latest command was answered; pushes of older ones must be refused from then on
     pauses: (board time, whether a pause lasts) at each answered pause and each end of one
-    epochs: (board time, epoch) at each begin of an epoch; plans: the accepted ones, of which some grow later
+    epochs: (board time, epoch) at each begin of an epoch; points: of the accepted plans
     epochs_by_duty: of the accepted plans with such a pulse
     """
 
@@ -60,8 +60,8 @@ class Interleaving:
         self.rig = PlannerRig(monkeypatch, queue_type=queue_type).ready()
         self.waiting = []
         self.epochs = [(0.0, self.rig.epoch)]
-        self.plans, self.epochs_by_duty = [], {}
-        self.rig.queue.commit = partial(self.commit, self.rig.queue.commit)
+        self.points, self.epochs_by_duty = [], {}
+        self.rig.queue._apply = partial(self.apply, self.rig.queue._apply)
         self.pauses = [(0.0, False)]
         self.answered_epoch = 0
         self.accepted = 0
@@ -112,17 +112,14 @@ class Interleaving:
         assert push.epoch >= self.answered_epoch, "a push of an older epoch was answered 201"
         self.accepted += 1
 
-    def commit(self, commit, plan, *arguments):
-        """Note what the queue accepts: the plans of pushes, and of what a frame's rest became if it came too late."""
-        if not commit(plan, *arguments):
-            return False
-        self.plans.append(plan)
-        self.note_duties(plan)
-        return True
-
-    def note_duties(self, plan):
-        for duty in plan.points.stages[0].table[:, 4].tolist():
-            self.epochs_by_duty.setdefault(duty, set()).add(plan.epoch)
+    def apply(self, apply, state):
+        """Note the points of what the queue accepts: of pushes, of their rests, and of what they became later."""
+        for plan in state.plans:
+            if plan.points not in self.points:
+                self.points.append(plan.points)
+                for duty in plan.points.stages[0].table[:, 4].tolist():
+                    self.epochs_by_duty.setdefault(duty, set()).add(plan.epoch)
+        apply(state)
 
     def run(self):
         self.rig.run(self.random.choice((0.002, 0.1, 0.4)))
@@ -168,7 +165,7 @@ class Interleaving:
         snapshot = self.rig.queue.make_snapshot(False, 0.0)
         before = [record.plan_id for record in self.rig.store.list_recent()]
         sequence = build_pattern("all", {"height_um": 20}, DISPLAY.config)
-        start = DryRunStart(snapshot.heat, snapshot.budget, 0.1)
+        start = DryRunStart(snapshot.before, 0.1)
         assert (
             plan_dry_run(DISPLAY, self.rig.remote.scales, BuiltRequest(sequence), start, Push("dry", {}, 0.0, 0)).status
             == "planned"
@@ -201,8 +198,6 @@ class Interleaving:
 
     def check_light(self):
         """Compare every pulse in the board's log with the epochs of the pushes that contain such a pulse."""
-        for plan in self.plans:  # some have grown
-            self.note_duties(plan)
         for at_s, duty in self.rig.list_emitted():
             allowed = {self.find_epoch(at_s), self.find_epoch(at_s - DARK_WITHIN_S)}
             assert self.epochs_by_duty[duty] & allowed, f"a push of an older epoch was lit at {at_s} s"

@@ -11,8 +11,8 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.daemon.engine import plan_queue
 from optodrive.daemon.engine import planner as planner_module
-from optodrive.daemon.engine import queue_stream
 from optodrive.daemon.engine.active_plan import RefreshCycle
 from optodrive.daemon.engine.plan_making import make_plan
 from optodrive.device.config_file import load_config
@@ -28,7 +28,7 @@ RATES_HZ = (5.0, 20.0, 30.0, 60.0, 100.0, 200.0)
 ALL_RATES_HZ = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0)
 IDLE_GAP_S = 2e-3
 """Longer than a move between neighbours: the beam is idle in a longer pause."""
-LEADS_S = queue_stream.SHARED_STREAM_LEAD_S + 0.03
+LEADS_S = plan_queue.SHARED_STREAM_LEAD_S + 0.03
 """Longest way of a frame to its light: what has left before it, its planning twice, and the pulse that is running."""
 
 
@@ -142,7 +142,7 @@ def test_the_newest_frame_begins_and_the_beam_does_not_wait_while_newer_ones_do(
 
 def test_frames_that_supersede_each_other_before_their_first_byte_are_caught(monkeypatch):
     """Mutant: nothing follows a plan whose points have all left, so each new frame replaces the one that waits."""
-    monkeypatch.setattr(queue_stream, "APPEND_LEAD_S", inf)
+    monkeypatch.setattr(plan_queue, "APPEND_LEAD_S", inf)
     falls, shown = find_falls(monkeypatch, 4, RATES_HZ, 0.6)
     assert falls, shown
     assert measure(monkeypatch, 8, 200.0, 0.6)[2] > 0.2
@@ -150,12 +150,12 @@ def test_frames_that_supersede_each_other_before_their_first_byte_are_caught(mon
 
 def test_an_older_frame_that_begins_is_caught(monkeypatch):
     """Mutant: a frame goes behind the whole of the one before it."""
-    build = queue_stream.build_cut_snapshot
+    build = plan_queue.build_cut_snapshot
 
     def build_behind(running, thermal, min_start_s, *arguments, **named):
         return build(running, thermal, inf, *arguments, **named)
 
-    monkeypatch.setattr(queue_stream, "build_cut_snapshot", build_behind)
+    monkeypatch.setattr(plan_queue, "build_cut_snapshot", build_behind)
     rig, _, _ = measure(monkeypatch, 40, 60.0, 0.6)
     assert max(rig.list_ages_s()) > 2 * LEADS_S
 
@@ -189,7 +189,7 @@ def test_a_frame_whose_end_came_after_the_board_had_ended_the_job_is_drawn(monke
             rig = StreamRig(patches)
             rig.stream(choose_pixels(4), 100.0, 0.1)
             rig.stream(choose_pixels(4), 1000.0, STEP_S)  # handed over, and not yet sent
-            assert rig.queue.running[-1].plan.record is rig.records[-1]
+            assert rig.queue.state.running[-1].plan.plan_id == rig.records[-1].plan_id
             rig.clock.sleep(0.06)
             rig.run(0.5)
             assert (rig.records[-1].status == "done") == is_drawn

@@ -1,26 +1,52 @@
-"""A plan that waits or runs, with its record, thermal states and points, and the plans that are kept for reports."""
+"""A plan that waits or runs as a value of its record, the heat before it, its points and its executed pulses.
+
+Every change makes another value, so that each thread that holds one reads a plan of one moment. `rebase` is the one
+way in which a plan goes on at another time, from other heat, or with other rows. `PlanStore` keeps the records.
+"""
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
-from math import inf
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from optodrive.core.errors import InputError, StoppedError
+from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses, concatenate_executed
 from optodrive.daemon.engine.plan_record import Execution, LargestTarget, PlanRecord
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.stage_points import StagePoints
 from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.limiter.limiter import shift_state
+from optodrive.planning.limiter.rest import delay_rest
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.pulse_table import PulseTable
 
 CUT_MIN_S = 1e-5
 """A pulse that is shorter than planned by more than this was cut short."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalEstimate:
+    """Heat (best estimate) and budget (bound) after all pulses up to a time, in board time or from a plan's zero."""
+
+    heat: ThermalState
+    budget: BudgetState
+
+    def shift(self, delay_s: float) -> "ThermalEstimate":
+        """Return the estimate with every pulse delay_s later. By −start_s it counts from a plan's zero at start_s."""
+        return ThermalEstimate(self.heat.copy_shifted(delay_s), shift_state(self.budget, delay_s))
+
+    def compute_cooling_m(self, from_s: float, to_s: float) -> float:
+        """Return the largest decrease of a pixel's displacement between two times, m.
+
+        The heat of an absorber counts as the displacement to which it leads: shortly after a pulse only that decreases.
+        """
+        before, after = self.heat.state_at(from_s), self.heat.state_at(to_s)
+        to_come_m = 0.5 * self.heat.pixels.kappa_m_per_k * (before.absorber_k - after.absorber_k)
+        return float(np.max(np.maximum(before.displacement_m - after.displacement_m, to_come_m)))
 
 
 class RefreshCycle(NamedTuple):
@@ -53,11 +79,23 @@ class RefreshCycle(NamedTuple):
         return np.asarray(active[np.argsort(drawn_s, kind="stable")], dtype=np.int64)
 
 
-@dataclass(eq=False)
+class PlanRows(NamedTuple):
+    """Rows of a whole plan, to which nothing is to be added, with the points that are left to be sent.
+
+    crc: CRC-32 of the verified bytes of the points
+    """
+
+    planned: PlannedSequence
+    points: StagePoints
+    crc: int
+    summary_json: bytes
+
+
+@dataclass(frozen=True, eq=False)
 class ActivePlan:
     """A plan with its thermal states and points, a megabyte for a frame of 1,500 pixels. Only its record outlives it.
 
-    heat_before, budget_before: initial state of the plan, on its own time line
+    before: heat and budget before the plan, from its own zero
     epoch: in which the request arrived; the board executes nothing of an older one
     crc: CRC-32 of the verified bytes of the points
     holds_first: whether its first point waits until it must leave, so that a newer plan can replace it as a whole
@@ -69,14 +107,12 @@ class ActivePlan:
     is_interrupted: whether the rows from first_row on were dropped, and are not yet planned again
     executed, executed_rows, simulated_m: what the board reports, [n executed] plan rows, and displacements computed
     from it
-    on_end: called with the plan at its end; must neither block nor raise
     """
 
     record: PlanRecord
     planned: PlannedSequence
     points: StagePoints
-    heat_before: ThermalState
-    budget_before: BudgetState
+    before: ThermalEstimate
     epoch: int
     crc: int
     holds_first: bool = False
@@ -90,7 +126,21 @@ class ActivePlan:
     executed: ExecutedPulses | None = None
     executed_rows: IntArray | None = None
     simulated_m: FloatArray | None = None
-    on_end: "Callable[[ActivePlan], None]" = field(default=lambda plan: None)
+
+    @property
+    def plan_id(self) -> str:
+        """Name of the plan, by which its values of different times belong together."""
+        return self.record.plan_id
+
+    @property
+    def after(self) -> ThermalEstimate:
+        """Heat and budget after all rows, in board time."""
+        return ThermalEstimate(self.planned.heat, self.planned.budget).shift(self.record.start_s)
+
+    @property
+    def points_start_s(self) -> float:
+        """Board time at which the points begin."""
+        return self.record.start_s + self.zero_s
 
     @property
     def executed_before(self) -> int:
@@ -111,6 +161,12 @@ class ActivePlan:
         return len(self.planned.plan) - self.first_row
 
     @property
+    def left_count(self) -> int:
+        """Number of rows behind the last executed one. Reports are collected."""
+        last = -1 if self.executed_rows is None or not len(self.executed_rows) else int(self.executed_rows[-1])
+        return len(self.planned.plan) - max(self.first_row, last + 1)
+
+    @property
     def unplanned_pixels(self) -> IntArray:
         """Pixels of a streamed frame whose pulses are not planned yet."""
         if self.growth is None:
@@ -119,91 +175,102 @@ class ActivePlan:
         planned = np.concatenate([self.planned.plan.pixel, np.array(skipped, dtype=np.int64)])
         return np.setdiff1d(np.flatnonzero(self.planned.sequence_target_m), planned)
 
-    def begin_from(self, heat: ThermalState, budget: BudgetState) -> None:
-        """Let a plan that has not begun start from less heat than it was made for: later, or after less light.
+    def note(self, **fields: Any) -> "ActivePlan":
+        """Return the plan with other fields of its record."""
+        return replace(self, record=replace(self.record, **fields))
 
-        The budget after it stays the bound for what it was made for.
+    def become(self, status: PlanStatus) -> "ActivePlan":
+        """Return the plan with another status. Raise ValueError if that cannot follow the present one."""
+        return replace(self, record=self.record.change_status(status))
+
+    def rebase(
+        self, start_s: float, before: ThermalEstimate | None = None, rows: PlanRows | None = None
+    ) -> "ActivePlan":
+        """Return the plan as it goes on: with its zero at a board time, from other heat, and with other rows.
+
+        before: from the plan's zero, never more heat than it was made for; the heat after it is predicted again, and
+        the budget after it stays the bound for what it was made for. None: as before, or as the rows state
+        rows: None for the same ones
         """
-        self.heat_before, self.budget_before = heat, budget
-        self.predict_heat()
+        plan, changes = self, {"start_s": start_s}
+        if rows is not None:
+            plan = replace(plan, planned=rows.planned, points=rows.points, crc=rows.crc, growth=None)
+            changes |= describe_rows(rows.planned) | {"summary_json": rows.summary_json}
+        if before is not None:
+            table, heat = plan.planned.plan, before.heat.copy()
+            heat.apply_pulses(table.pixel, table.start_s, table.width_s, table.power_w)
+            plan = replace(plan, before=before, planned=replace(plan.planned, heat=heat))
+        return plan.note(**changes)
 
-    def predict_heat(self) -> None:
-        """Compute the heat after all rows from the heat before the plan."""
-        rows, after = self.planned.plan, self.heat_before.copy()
-        after.apply_pulses(rows.pixel, rows.start_s, rows.width_s, rows.power_w)
-        self.planned = replace(self.planned, heat=after)
+    def delay_points(self, delay_s: float) -> "ActivePlan":
+        """Return a plan that was made again with its points later: never warmer."""
+        if not self.first_row:
+            return self.rebase(self.record.start_s + delay_s)
+        planned = replace(self.planned, plan=delay_rest(self.planned.plan, self.first_row, delay_s))
+        zero_s = self.zero_s + delay_s
+        return replace(self, planned=planned, zero_s=zero_s, origin_s=zero_s).note(**describe_rows(planned))
 
-    def replace_rows(self, planned: PlannedSequence, points: StagePoints, crc: int, summary_json: bytes) -> None:
-        """Replace all that follows from the rows, by those of a plan to which nothing is to be added."""
-        record = self.record
-        self.planned, self.points, self.crc, self.growth = planned, points, crc, None
-        record.pulse_count, record.duration_s = len(planned.plan), planned.duration_s
-        record.pulses, record.largest_target = PulseTable.from_planned(planned), LargestTarget.from_planned(planned)
-        record.summary_json = summary_json
-
-    def add_executed(self, executed: ExecutedPulses, rows: IntArray) -> None:
-        """Add the executed pulses that the board reports since the last interruption."""
+    def add_executed(self, executed: ExecutedPulses, rows: IntArray) -> "ActivePlan":
+        """Return the plan with the executed pulses that the board reports since the last interruption."""
         executed = replace(executed, start_s=executed.start_s + self.zero_s)
         if self.executed is not None and self.executed_rows is not None:
             executed = concatenate_executed(self.executed, executed)
             rows = np.concatenate([self.executed_rows, rows])
-        self.executed, self.executed_rows = executed, rows
+        return replace(self, executed=executed, executed_rows=rows)
 
-    def interrupt(self, off_s: float, first_row: int | None = None) -> None:
-        """Keep the rows behind the last executed one for later. off_s: board time at which the light went off.
+    def interrupt(self, off_s: float, first_row: int | None = None) -> "ActivePlan":
+        """Return the plan with the rows behind the last executed one kept for later. Its reports are collected.
 
-        The rows before it count as executed, also one that was cut short.
-        first_row: keep the rows from this one on instead
+        off_s: board time at which the light went off
+        first_row: keep the rows from this one on instead. Those before it count as executed, also one cut short
         """
-        if self.executed is None or self.executed_rows is None:
-            return
-        if first_row is not None:
-            self.first_row = first_row
-        elif len(self.executed_rows):
-            self.first_row = int(self.executed_rows[-1]) + 1
-        if self.first_row:
-            is_complete = len(self.executed_rows) == self.first_row
-            self.executed = replace(self.executed, complete=is_complete)
-        self._fold_delay()
-        self.is_interrupted = True
-        self.origin_s = max(self.zero_s, off_s - self.record.start_s)
-        self.record.change_status(PlanStatus.PAUSED)
-        self.record.sent = self.executed_before
+        executed, rows = self.executed, self.executed_rows
+        if executed is None or rows is None:
+            raise ValueError(f"plan {self.plan_id} is interrupted before its reports are collected")
+        if first_row is None:
+            first_row = int(rows[-1]) + 1 if len(rows) else self.first_row
+        if first_row:
+            executed = replace(executed, complete=len(rows) == first_row)
+        # The remaining rows are as late as the executed ones.
+        record, delay_s = self.record, max(0.0, self.record.delay_s)
+        start_s = record.start_s + delay_s
+        return (
+            replace(
+                self,
+                first_row=first_row,
+                executed=replace(executed, start_s=executed.start_s - delay_s),
+                is_interrupted=True,
+                origin_s=max(self.zero_s, off_s - start_s),
+            )
+            .become(PlanStatus.PAUSED)
+            .note(start_s=start_s, delay_s=0.0, folded_delay_s=record.folded_delay_s + delay_s, sent=len(rows))
+        )
 
     def reorder(self, emitted: BoolArray) -> "ActivePlan":
-        """Return the plan with some rows [n] before all others, each part in order of time.
-
-        It is another object, because the telemetry may still read this one by its rows.
-        """
+        """Return the plan with some rows [n] before all others, each part in order of time."""
         order = np.argsort(~emitted, kind="stable")
-        plan, record = self.planned.plan, self.record
+        plan = self.planned.plan
         columns = {item.name: getattr(plan, item.name)[order] for item in fields(plan) if item.name != "headroom_k"}
-        reordered = replace(plan, **columns)
-        planned = replace(self.planned, plan=reordered, predicted_m=self.planned.predicted_m[order])
-        record.pulses, record.largest_target = PulseTable.from_planned(planned), LargestTarget.from_planned(planned)
+        planned = replace(self.planned, plan=replace(plan, **columns), predicted_m=self.planned.predicted_m[order])
         rows = None if self.executed_rows is None else np.flatnonzero(np.isin(order, self.executed_rows))
-        return replace(self, planned=planned, executed_rows=rows)
+        return replace(self, planned=planned, executed_rows=rows).note(**describe_rows(planned))
 
-    def _fold_delay(self) -> None:
-        """Shift the plan's zero by the delay of the executed pulses, so that the remaining rows are as late."""
-        delay_s, self.record.delay_s = max(0.0, self.record.delay_s), 0.0
-        self.record.start_s += delay_s
-        self.record.folded_delay_s += delay_s
-        if self.executed is not None:
-            self.executed = replace(self.executed, start_s=self.executed.start_s - delay_s)
+    def update_execution(self) -> "ActivePlan":
+        """Return the plan with the pulses executed and the displacements simulated so far in its record."""
+        if self.executed is None or self.executed_rows is None:
+            return self
+        largest = self.record.largest_target
+        return self.note(execution=Execution.from_pulses(self.executed, self.executed_rows, self.simulated_m, largest))
 
-    def update_execution(self) -> None:
-        """Write the pulses executed and the displacements simulated so far to the record."""
-        if self.executed is not None and self.executed_rows is not None:
-            self.record.execution = Execution.from_pulses(
-                self.executed, self.executed_rows, self.simulated_m, self.record.largest_target
-            )
 
-    def end(self, status: PlanStatus, error: str | None) -> None:
-        """End the plan with a final status."""
-        self.record.change_status(status)
-        self.record.error = error
-        self.on_end(self)
+def describe_rows(planned: PlannedSequence) -> dict[str, Any]:
+    """Return the fields of a record that follow from the rows of a plan."""
+    return {
+        "pulse_count": len(planned.plan),
+        "duration_s": planned.duration_s,
+        "pulses": PulseTable.from_planned(planned),
+        "largest_target": LargestTarget.from_planned(planned),
+    }
 
 
 RECORDS_MAX = 200
@@ -213,7 +280,7 @@ RECENT_PLANS = 20
 
 
 class PlanStore:
-    """Records of plans by id, thread-safe. Beyond RECORDS_MAX or BYTES_MAX the oldest ended plans are dropped.
+    """Newest records of plans by id, thread-safe. Beyond RECORDS_MAX or BYTES_MAX the oldest ended plans are dropped.
 
     What counts is the size of a record at its plan's end.
 
@@ -227,12 +294,13 @@ class PlanStore:
         self._ended_bytes: dict[str, int] = {}
         self._kept_bytes = 0
 
-    def add(self, plan: ActivePlan) -> None:
-        """Keep the record of a plan."""
-        plan.on_end = self._run_end_callbacks
+    def publish(self, record: PlanRecord) -> None:
+        """Keep a record, in place of an earlier one of the same plan."""
         with self._lock:
-            self._records[plan.record.plan_id] = plan.record
-            self._make_room()
+            # What is known only after the end of a plan must not bring back a record that was dropped.
+            if record.plan_id in self._records or not record.has_ended:
+                self._records[record.plan_id] = record
+                self._make_room()
 
     def _make_room(self) -> None:
         while len(self._records) > RECORDS_MAX or self._kept_bytes > BYTES_MAX:
@@ -242,13 +310,17 @@ class PlanStore:
             del self._records[oldest]
             self._kept_bytes -= self._ended_bytes.pop(oldest)
 
-    def _run_end_callbacks(self, plan: ActivePlan) -> None:
+    def end(self, plan: ActivePlan, status: PlanStatus, error: str | None) -> ActivePlan:
+        """Return a plan with its final status, after all have been told."""
+        plan = plan.become(status).note(error=error)
         with self._lock:
-            ended_bytes = self._ended_bytes[plan.record.plan_id] = plan.record.nbytes
-            self._kept_bytes += ended_bytes
+            self._records[plan.plan_id] = plan.record
+            self._ended_bytes[plan.plan_id] = plan.record.nbytes
+            self._kept_bytes += plan.record.nbytes
             self._make_room()
         for callback in self.end_callbacks:
             callback(plan)
+        return plan
 
     def find(self, plan_id: str) -> PlanRecord:
         """Return a plan by its id. Raise InputError (plan_not_found) for an unknown plan."""
@@ -266,31 +338,15 @@ class PlanStore:
             return list(self._records.values())[-RECENT_PLANS:]
 
 
-class RevokedCallers:
-    """Names of callers with the board time of the last revocation, s. A name may belong to a new token since then."""
-
-    def __init__(self) -> None:
-        self._revoked_s: dict[str, float] = {}
-
-    def revoke(self, caller: str, board_s: float) -> str:
-        """Record a revocation at a board time, s, and return the reason for people."""
-        self._revoked_s[caller] = board_s
-        return f"the token {caller!r} was revoked"
-
-    def require_valid(self, caller: str, arrived_s: float) -> None:
-        """Raise StoppedError for a request that arrived at a board time, s, before the revocation of its token."""
-        if arrived_s <= self._revoked_s.get(caller, -inf):
-            raise StoppedError(f"the token {caller!r} was revoked")
-
-
-def simulate_plan(plan: ActivePlan, status: PlanStatus, error: str | None) -> None:
+def simulate_plan(store: PlanStore, plan: ActivePlan, status: PlanStatus, error: str | None) -> None:
     """Simulate the executed pulses of a plan and then end it, so that an ended plan always has its displacements."""
     try:
-        plan.simulated_m = compute_simulated_m(plan)
-        plan.update_execution()
+        plan = replace(plan, simulated_m=compute_simulated_m(plan)).update_execution()
     finally:
-        if not plan.record.has_ended:
-            plan.end(status, error)
+        if plan.record.has_ended:
+            store.publish(plan.record)
+        else:
+            store.end(plan, status, error)
 
 
 def compute_simulated_m(plan: ActivePlan) -> FloatArray | None:
@@ -299,4 +355,4 @@ def compute_simulated_m(plan: ActivePlan) -> FloatArray | None:
     if executed is None:
         return None
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-    return plan.heat_before.copy().apply_pulses(*columns).displacement_m
+    return plan.before.heat.copy().apply_pulses(*columns).displacement_m

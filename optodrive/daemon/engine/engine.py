@@ -18,13 +18,12 @@ from optodrive.core.processes import use_usual_priority
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan, PlanStore
 from optodrive.daemon.engine.kept_heat import KeptHeat
-from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
+from optodrive.daemon.engine.metrics import ClockShift, PlanCounters, PlanProgress, render_metrics
 from optodrive.daemon.engine.page_refresh import PageRefresh
 from optodrive.daemon.engine.plan_making import NEVER, Dimmer, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue, build_queue_report
+from optodrive.daemon.engine.plan_rest import ThermalMemory
 from optodrive.daemon.engine.planner import Planner
-from optodrive.daemon.engine.queued_plans import ClockShift, PlanProgress
-from optodrive.daemon.engine.thermal_estimate import ThermalMemory
 from optodrive.daemon.message_loop import LoopCommands, MessageLoop
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.daemon.responses.plan import PlanReport
@@ -80,7 +79,7 @@ class Engine:
         self._simulation_executor = ThreadPoolExecutor(1, "simulation", use_usual_priority)
         self._planning_executor = ThreadPoolExecutor(1, "planner", use_usual_priority)
         self._plan_queue = PlanQueue(display, session, self._plan_store, self._simulation_executor)
-        self.page = PageRefresh(display.layout, clock, self.board_s, lambda: self._plan_queue.stream.lead_s)
+        self.page = PageRefresh(display.layout, clock, self.board_s, lambda: self._plan_queue.lead_s)
         self._memory = ThermalMemory() if memory is None else memory
         self._heat = KeptHeat(
             display,
@@ -238,7 +237,7 @@ class Engine:
         if board.state not in ARMED_STATES:
             fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
-        if len(self._plan_queue.waiting) >= QUEUE_MAX:
+        if len(self._plan_queue.state.waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans are already waiting; wait for one to end, or cancel one")
         if self._plan_queue.count_pulses() >= QUEUED_PULSES_MAX:
             raise NotReadyError(
@@ -313,9 +312,8 @@ class Engine:
 
     def list_upcoming(self) -> list[ActivePlan]:
         """Return the running plans and the first waiting one, whose time is known unless the light is paused."""
-        plan_queue = self._plan_queue
-        waiting = [] if plan_queue.pause.off_s is not None else plan_queue.waiting.copy()
-        return [run.plan for run in plan_queue.running.copy()] + ([waiting[0]] if waiting else [])
+        state = self._plan_queue.state
+        return [*(run.plan for run in state.running), *(() if state.off_s is not None else state.waiting[:1])]
 
     @property
     def board_state(self) -> str:
@@ -327,7 +325,7 @@ class Engine:
         plans = tuple((record.plan_id, record.status) for record in self._plan_store.list_recent())
         heat = bool(self._heat.read_cooling()[1])
         planner = self._planner.is_busy, self._planner.is_alive, self._dimmer.power_share, heat
-        return plans, len(self._plan_queue.waiting), self._plan_queue.pause.is_held, planner
+        return plans, len(self._plan_queue.state.waiting), self._plan_queue.is_held, planner
 
     def build_planner_state(self) -> PlannerState:
         """Report queue and planner."""

@@ -7,7 +7,7 @@ that no other process uses the display meanwhile. From the begin of each arming 
 armed, the record says that the display is in use: no plan starts before it does. What ends without a word in between
 leaves a hot display to the next daemon.
 
-A planner process that is replaced leaves its estimate in the memory of the daemon (`thermal_estimate.py`), which is
+A planner process that is replaced leaves its estimate in the memory of the daemon (`plan_rest.py`), which is
 newer than the record. It counts unless another process has written the record since.
 
 Threads. `follow` and `close` belong to the loop that owns the session; any thread may call `require_known`. The disk
@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, NotReadyError
 from optodrive.core.types.plans import BudgetState
-from optodrive.daemon.engine.queued_plans import QueuedPlans
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.daemon.engine.active_plan import ThermalEstimate
+from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import LEASED_STATES
 from optodrive.link.service.remote_session import RemoteSession
@@ -58,7 +58,7 @@ class KeptHeat:
         self,
         display: DisplayModel,
         session: RemoteSession,
-        plan_queue: QueuedPlans,
+        plan_queue: PlanQueue,
         clock: Clock,
         executor: Executor,
         owner: str,
@@ -115,7 +115,7 @@ class KeptHeat:
 
     @property
     def _estimate(self) -> ThermalEstimate:
-        return self._plan_queue.thermal.estimate
+        return self._plan_queue.state.thermal
 
     # --- opening ------------------------------------------------------------------------------------------------
 
@@ -166,10 +166,8 @@ class KeptHeat:
         self._record = recalled.record
         self._plan_queue.end_all(PlanStatus.FAILED, "the board was replaced")
         if recalled.budget is not None:
-            with self._plan_queue.lock:
-                zero_s = self._session.board_s() - (read_boot()[1] - recalled.zero_s)
-                budget = shift_state(recalled.budget, zero_s)
-                self._plan_queue.thermal.set(ThermalEstimate(self._estimate.heat, budget))
+            zero_s = self._session.board_s() - (read_boot()[1] - recalled.zero_s)
+            self._plan_queue.know(ThermalEstimate(self._estimate.heat, shift_state(recalled.budget, zero_s)))
             self._written = self._estimate
         if self._record.read_cooling()[1]:
             self.on_warm(f"the display counts as {self._record.describe()}; until then plans get less light")

@@ -1,22 +1,122 @@
-"""Metrics of GET /metrics in the Prometheus text format, version 0.0.4."""
+"""Counts of pulses and plans, and the metrics of GET /metrics in the Prometheus text format, version 0.0.4.
 
-from collections import Counter
+`PulseAccounts` says how many pulses were planned, sent and executed, when, and with which error; events on the progress
+of running plans go to one reader in another thread.
+"""
+
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.queue_state import PlanRun
 from optodrive.daemon.responses.plan import ENDS, PlanStatus
 from optodrive.daemon.responses.state import PlannerState
 from optodrive.device.config import Config
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.remote_session import RemoteSession
+from optodrive.link.session.clock_sync import ClockReading, TimingTotals, compute_timing_error
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 LATENCY_BUCKETS_S = (0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 REPORTED_STATES = tuple(state for state in BoardState if state != BoardState.BOOT)
 Labels = Mapping[str, str]
+
+
+class PlanProgress(NamedTuple):
+    """Event: pulses begin to end of a run, in order of its points, were executed or will never be."""
+
+    run: PlanRun
+    begin: int
+    end: int
+
+
+class ClockShift(NamedTuple):
+    """Event: the board's clock restarted, and earlier events happened delay_s later on it."""
+
+    delay_s: float
+
+
+def merge_events(events: Iterable[PlanProgress | ClockShift]) -> list[PlanProgress | ClockShift]:
+    """Merge consecutive progress events of a run, because the cost of processing is per event."""
+    merged: list[PlanProgress | ClockShift] = []
+    for event in events:
+        last = merged[-1] if merged else None
+        if isinstance(event, PlanProgress) and isinstance(last, PlanProgress) and event.run.job is last.run.job:
+            merged[-1] = event._replace(begin=last.begin)  # the newer run, whose plan may have grown
+        else:
+            merged.append(event)
+    return merged
+
+
+EVENTS_MAX = 4000
+"""Maximum number of events without a reader, 20 s at least. An event keeps its plan in memory."""
+
+
+class PulseAccounts:
+    """Totals over all plans, and reader of the reports on the running ones.
+
+    Only the loop's thread changes them.
+    totals: numbers of pulses planned, sent and executed; timing: largest errors of their times
+    events: executed pulses and clock shifts, newest last, for one reader in another thread that removes them
+    """
+
+    def __init__(self, session: RemoteSession) -> None:
+        self.totals = {"planned": 0, "sent": 0, "executed": 0}
+        self.timing = TimingTotals()
+        self.events: deque[PlanProgress | ClockShift] = deque(maxlen=EVENTS_MAX)
+        self._session = session
+
+    def count(self, before: PlanRecord | None, after: PlanRecord) -> None:
+        """Count the pulses that a plan has more than before, None for a new one. Those sent again count again."""
+        self.totals["planned"] += after.pulse_count - (0 if before is None else before.pulse_count)
+        if before is not None:
+            self.totals["sent"] += max(0, after.sent - before.sent)
+            self.totals["executed"] += max(0, after.executed_count - before.executed_count)
+
+    def read_progress(self, run: PlanRun) -> PlanRun:
+        """Return a run with the numbers of its pulses that were sent and executed, the same one without news."""
+        (plan, job), record, before = run, run.plan.record, run.plan.executed_before
+        sent, executed = before + job.sent_count, before + job.executed_count
+        if (sent, executed) == (record.sent, record.executed_count):
+            return run
+        if executed > record.executed_count:
+            progress = PlanProgress(run, record.executed_count - before, job.executed_count)
+            self.events.append(progress)
+            if record.onset is None:
+                plan = plan.note(onset=self._read_onset(progress))
+        return PlanRun(plan.note(sent=sent, executed_count=executed), job)
+
+    def _read_onset(self, progress: PlanProgress) -> ClockReading | None:
+        """Convert the time of the first gate on as soon as it is reported: later, the clocks would have drifted."""
+        job, clocks = progress.run.job, self._session.read_clocks()
+        reported = job.read_reported(progress.begin, progress.end, self._session.scales)
+        on_tick = reported.on_tick[reported.on_ticks > 0]
+        return clocks.convert(float(on_tick[0]) * self._session.tick_s) if len(on_tick) and clocks else None
+
+    def collect_executed(self, run: PlanRun) -> PlanRun:
+        """Return a run with its executed pulses in its plan. The job ends with that, or is interrupted."""
+        run = self.read_progress(run)  # reports may have arrived with what ends the job
+        plan, job = run
+        record, start_s, session = plan.record, plan.planned.plan.start_s, self._session
+        if job.executed_count < job.pulse_count:
+            self.events.append(PlanProgress(run, job.executed_count, job.pulse_count))
+        plan = plan.add_executed(job.build_executed(plan.planned.plan, session.scales), job.list_executed_rows())
+        changes: dict[str, Any] = {}
+        if job.first_sent_tick is not None and record.first_byte_after_s is None:
+            changes["first_byte_after_s"] = job.first_sent_tick * session.tick_s - record.arrived_s
+        executed, rows = plan.executed, plan.executed_rows
+        if executed is not None and rows is not None and len(executed):
+            light_s = executed.start_s[executed.width_s > 0.0]
+            if len(light_s):
+                changes["first_light_after_s"] = record.start_s + float(light_s[0]) - record.arrived_s
+            if len(session.scales) == 1:  # several boards drop what would come late
+                changes["delay_s"] = float(executed.start_s[-1] - start_s[rows[-1]])
+            changes["timing_error"] = compute_timing_error(start_s[rows], executed.start_s)
+        return PlanRun(plan.note(**changes), job)
 
 
 class PlanCounters:

@@ -21,24 +21,20 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import IntArray
-from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.daemon.engine.active_plan import ActivePlan, RefreshCycle
-from optodrive.daemon.engine.plan_record import LargestTarget, PlanRecord
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, ThermalMemory
+from optodrive.daemon.engine.active_plan import ActivePlan, PlanRows, RefreshCycle, ThermalEstimate, describe_rows
+from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.plan_rest import ThermalMemory
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.stage_points import PointCut, StagePoints
 from optodrive.link.proven_points import prove
-from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.limiter.budget import Budget
-from optodrive.planning.limiter.limiter import commit_until, shift_state
+from optodrive.planning.limiter.limiter import commit_until
 from optodrive.planning.pipeline import SequencePlanner
 from optodrive.planning.plan_summary import summarize_plan
-from optodrive.planning.planned_sequence import PlannedSequence
-from optodrive.planning.pulse_table import PulseTable
 from optodrive.planning.stimuli.frame_json import FRAME_DURATION_S, can_split, delay_frames, stale_pixels_first
 from optodrive.planning.stimuli.standing_page import Refresh
 
@@ -49,7 +45,7 @@ class PlanningSnapshot:
 
     thermal: estimate from which the snapshot was derived; the snapshot is stale once the queue has another one
     start_s: board time of the plan's zero
-    heat, budget: state at that time, on the plan's own time line
+    before: heat and budget at that time, from the plan's zero
     predecessor, cut: running plan that the new one truncates, and where
     initial_pixels: pixel at which the mirrors of each stage point at the plan's zero; None if one is unknown
     cycle: when the stream has drawn each pixel last, None if no stream was before
@@ -58,8 +54,7 @@ class PlanningSnapshot:
 
     thermal: ThermalEstimate
     start_s: float
-    heat: ThermalState
-    budget: BudgetState
+    before: ThermalEstimate
     predecessor: ActivePlan | None = None
     cut: PointCut | None = None
     initial_pixels: tuple[int, ...] | None = None
@@ -92,15 +87,14 @@ def build_cut_snapshot(
     if (is_whole and zero_s + end_s < min_end_s) or (not cut.row and any(cut.kept_points)):
         return None
     kept = slice(cut.row)
-    heat = running.heat_before.copy()
+    heat = running.before.heat.copy()
     heat.apply_pulses(plan.pixel[kept], plan.start_s[kept], plan.width_s[kept], plan.power_w[kept])
     until_s = inf if is_whole else float(plan.start_s[cut.row])
-    state = commit_until(plan, until_s, running.budget_before, budget)
+    state = commit_until(plan, until_s, running.before.budget, budget)
     return PlanningSnapshot(
         thermal=thermal,
         start_s=zero_s + end_s,
-        heat=heat.copy_shifted(-end_s),
-        budget=shift_state(state, -end_s),
+        before=ThermalEstimate(heat, state).shift(-end_s),
         predecessor=running,
         cut=cut,
         initial_pixels=_find_initial_pixels(running, cut),
@@ -129,7 +123,7 @@ def continue_cycle(streamed: ActivePlan, row: int) -> RefreshCycle:
     """
     plan, zero_s = streamed.planned.plan, streamed.record.start_s
     if streamed.cycle is None:
-        pixels = len(streamed.heat_before.pixels)
+        pixels = len(streamed.before.heat.pixels)
         drawn_s, pulsed_s, width_s = np.full(pixels, -inf), np.full(pixels, -inf), np.full(pixels, nan)
         begun_s = zero_s
     else:
@@ -188,17 +182,11 @@ class Dimmer:
 
 
 class ExtendedPlan(NamedTuple):
-    """A plan with its rest.
+    """A plan with its rest: all rows, and the points behind the first part with the CRC-32 of their bytes."""
 
-    points: of the whole plan; added: those behind the first part; crc, added_crc: CRC-32 of the bytes of both
-    """
-
-    planned: PlannedSequence
-    points: StagePoints
+    rows: PlanRows
     added: StagePoints
-    crc: int
     added_crc: int
-    summary_json: bytes
 
 
 def may_grow(push: Push, sequence: FrameSequence, stages: int) -> bool:
@@ -225,20 +213,15 @@ def grow_plan(
     added = points.split_behind(plan.points)
     proven = prove(planned.plan, points, scales, budget, display.budget, lambda: on_progress(1.0), first)
     pulsed_s = None if plan.cycle is None else plan.cycle.pulsed_s - plan.record.start_s
-    return ExtendedPlan(
-        planned=planned,
-        points=points,
-        added=added,
-        crc=proven.crc,
-        added_crc=zlib.crc32(added.encode_payload()),
-        summary_json=summarize_plan(planned, None, pulsed_s).model_dump_json().encode(),
-    )
+    summary_json = summarize_plan(planned, None, pulsed_s).model_dump_json().encode()
+    rows = PlanRows(planned, points, proven.crc, summary_json)
+    return ExtendedPlan(rows, added, zlib.crc32(added.encode_payload()))
 
 
 def build_rest_frame(plan: ActivePlan) -> FrameSequence:
     """Return the frame of the pixels that a streamed plan has dropped, or has not planned yet."""
     plan_rows = plan.planned.plan.pixel
-    target_m = np.zeros(len(plan.heat_before.pixels))
+    target_m = np.zeros(len(plan.before.heat.pixels))
     left = np.concatenate([plan_rows[len(plan_rows) - plan.record.dropped :], plan.unplanned_pixels])
     target_m[left] = plan.planned.sequence_target_m[left]
     return FrameSequence((TactileFrame(plan.record.name, 0.0, FRAME_DURATION_S, target_m),))
@@ -249,14 +232,14 @@ NEVER = threading.Event()
 
 
 class DryRunStart(NamedTuple):
-    """State of the display at the start of a plan that is submitted now, on the plan's own time line.
+    """State of the display at the start of a plan that is submitted now.
 
-    starts_in_s: time from now to that start; power_share: to which the display is dimmed
+    before: heat and budget, from the plan's zero; starts_in_s: time from now to that start
+    power_share: to which the display is dimmed
     lost_stage: the stage that was lost while the others go on, None without
     """
 
-    heat: ThermalState
-    budget: BudgetState
+    before: ThermalEstimate
     starts_in_s: float
     power_share: float = 1.0
     lost_stage: int | None = None
@@ -299,7 +282,7 @@ def make_plan(
         is_page = request.select is not None
         planned = growth.plan_until(horizon_s if not is_page and may_grow(push, built.sequence, len(scales)) else inf)
     else:
-        heat, budget = snapshot.heat, snapshot.budget
+        heat, budget = snapshot.before.heat, snapshot.before.budget
         planned, feasibility = check_feasibility(display, built.sequence, heat, budget, on_progress, **push.options)
     on_progress(1.0)
     pulsed_s = None if snapshot.cycle is None else snapshot.cycle.pulsed_s - snapshot.start_s
@@ -309,16 +292,13 @@ def make_plan(
         planned = growth.plan_until()
         points = StagePoints.from_plan(planned.plan, scales, display.draws)
     on_progress(1.0)
-    proven = prove(planned.plan, points, scales, snapshot.budget, display.budget, lambda: on_progress(1.0))
+    proven = prove(planned.plan, points, scales, snapshot.before.budget, display.budget, lambda: on_progress(1.0))
     on_progress(1.0)
     record = PlanRecord(
         plan_id=plan_id,
         name=push.name,
-        pulse_count=len(planned.plan),
-        duration_s=planned.duration_s,
         summary_json=summarize_plan(planned, feasibility, pulsed_s).model_dump_json().encode(),
-        pulses=PulseTable.from_planned(planned),
-        largest_target=LargestTarget.from_planned(planned),
+        **describe_rows(planned),
         start_s=snapshot.start_s,
         arrived_s=request.arrived_s,
         arrived_host_s=push.arrived_s,
@@ -333,8 +313,7 @@ def make_plan(
         record=record,
         planned=planned,
         points=points,
-        heat_before=snapshot.heat,
-        budget_before=snapshot.budget,
+        before=snapshot.before,
         epoch=push.epoch,
         crc=proven.crc,
         growth=None if growth is None or growth.is_complete else growth,
@@ -363,5 +342,5 @@ def _begin_streamed(
     if snapshot.pause_s and request.select is None:
         sequence = delay_frames(sequence, snapshot.pause_s)
     policy, pixels = request.push.options.get("policy", "trim"), snapshot.initial_pixels
-    heat, budget = snapshot.heat, snapshot.budget
+    heat, budget = snapshot.before.heat, snapshot.before.budget
     return SequencePlanner(display, sequence, heat, budget, policy, on_progress, pixels, orders)

@@ -1,133 +1,240 @@
-"""Queue of running and waiting plans, and the heat and budget after them.
+"""Queue of plans on its session, which applies the transitions of `QueueState` and sends their consequences.
 
-Theory of operation
+The loop that owns the session calls everything. Any thread may read `state`, and call make_snapshot() and
+require_epoch(): a state is one value, so that no lock is needed.
 
-Problem. A plan is computed by another thread, from a heat and a budget that lie in the future: those after all plans
-accepted so far. Until it is accepted that future may change: a plan ends late, fails, is cancelled or replaced, the
-board restarts, the light is paused. A plan from a wrong past must never reach the board: its pulses would be too
-strong.
+Streams. A source that sends frames wants the newest shown, not a queue of the past (decision 16). Points of a streamed
+plan leave only `lead_s` before they are due; a newer plan cuts the running one at the first point that has not left
+(`build_cut_snapshot`) and goes on behind it, one job for the board. If all points have left it follows them, with a
+pause if it comes early, as long as the light of the last one is not about to end. Its first point is held back if yet
+another plan is expected before it must leave, and always for a refresh of a standing page: that one then withdraws the
+plan as a whole and begins where it would have begun. The lead is longer without real-time priority, because a stall of
+the host longer than the lead is an underrun. A cut that comes too late is refused by link, and the plan is made again;
+after two such plans `truncate` cuts the running one at once, and the third begins behind it without a deadline.
 
-Invariants. `thermal.estimate` is the state after everything that runs or waits, and is replaced by a new object
-whenever it changes. A snapshot holds that object; `commit` accepts a plan only if it is still the same one, so one
-comparison finds every change, and the planner plans again otherwise. An estimate may be too warm (a plan that was cut
-short), never too cold: heat is taken back only by recomputing it from executed pulses (`rewind`), also for the plans
-that wait. Plans run in the order of acceptance. What has left for the board is never withdrawn, except by turning the
-gate off (`flush`), which ends all running plans. Every pulse is counted exactly once: as executed, dropped, or left in
-the plan that waits for its rest.
-
-Lateness. A plan may start later than it was planned for, because the heat that it relied on can only have decayed; all
-plans behind it are then delayed by as much (`delay_all`). It may not start so much later that a bump comes out lower
-than `cooling_max_m` allows, and behind a cancelled one it is planned again. Several boards emit nothing late, so such a
-plan is paused and limited again instead.
-
-What streams add stands in `queue_stream.py`, what pauses and lost stages add in `queue_pause.py`; `queued_plans.py`
-holds the plans and ends them.
-
-Threads. The loop that owns the session calls everything; the planning thread takes snapshots and reads `is_busy` and
-`stream.must_preempt`. `lock` guards the estimate and both deques between them.
+A plan may grow: its rest is planned when the points behind it must leave, unless a newer plan came (`plan_making.py`).
+If that is too late, because the computer stalled, the rest becomes a frame of its own behind it.
 """
 
+from collections.abc import Callable
 from concurrent.futures import Executor
+from dataclasses import replace
 from math import inf
 from typing import Any
 
-from optodrive.core.errors import StoppedError
-from optodrive.daemon.engine.active_plan import ActivePlan, PlanStore, RevokedCallers
-from optodrive.daemon.engine.plan_making import PlanningSnapshot
+from optodrive.core.errors import NotReadyError, StoppedError
+from optodrive.daemon.engine.active_plan import ActivePlan, PlanStore, ThermalEstimate, simulate_plan
+from optodrive.daemon.engine.metrics import ClockShift, PulseAccounts
+from optodrive.daemon.engine.plan_making import ExtendedPlan, PlanningSnapshot, build_cut_snapshot, continue_cycle
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.queue_pause import START_LEAD_S, QueuePause
-from optodrive.daemon.engine.queue_stream import STREAM_RESTART_S, STREAM_START_LEAD_S, QueueStream
-from optodrive.daemon.engine.queued_plans import ClockShift, PlanRun, QueuedPlans
-from optodrive.daemon.engine.thermal_estimate import SavedThermalState
+from optodrive.daemon.engine.plan_rest import (
+    EndedPlans,
+    SavedThermalState,
+    estimate_before_rest,
+    restart_plans,
+    rewind_estimate,
+)
+from optodrive.daemon.engine.queue_state import LightEnd, PlanEnd, PlanRun, QueueState, Restart
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.daemon.responses.state import QueuedPlan, QueueReport, RecentPlan
+from optodrive.link.protocol.stage_points import PointCut
 from optodrive.link.protocol.states import UNARMED_STATES
-from optodrive.link.service.control import DISARM, STOP
+from optodrive.link.service.control import BEAT_AGE_MAX_S, DISARM, STOP
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.board_view import get_fault_hint
+from optodrive.link.session.session import SPLICE_LEAD_S
 from optodrive.planning.display_model import DisplayModel
 
+START_LEAD_S = 0.05
+"""Minimum time from now, and from the end of the queue, to a plan's zero. Its first points must arrive in time."""
+STREAM_START_LEAD_S = 0.02
+"""Time from the end of a frame's planning to its light if the beam is free."""
+STREAM_RESTART_S = 0.01
+"""Time from the end of a job to the light of the next one, so that the board's report and START pass meanwhile."""
+SHARED_STREAM_LEAD_S = 0.04
+"""Least lead of a stream if the link process has no real-time scheduling."""
+APPEND_LEAD_S = SPLICE_LEAD_S + 0.002
+"""Least time between a plan and the end of the light that it follows if all of that has left."""
+GROWTH_MARGIN_S = 0.01
+"""Time reserved for the loop and the hand-over of a plan's rest, besides its planning."""
+HOLD_MAX_S = 1.0
+"""Longest time for which the board waits for points before it ends a plan."""
+INTERRUPTED = (PlanStatus.STOPPED, PlanStatus.FAILED, PlanStatus.CANCELLED)
+"""Ends that are told at once; others are when the executed pulses have been simulated."""
 
-class PlanQueue(QueuedPlans):
+
+class PlanQueue:
     """Queue of the plans.
 
-    Any thread may call make_snapshot() and read is_busy and stream.must_preempt. Everything else belongs to the loop
-    that owns the session.
-    pause: keeps plans from starting while the light is paused; stream: lets the newest frame replace others
+    state: at this moment; on_progress: called during long computations in the loop's thread
+    accounts: what has become of the pulses
     """
 
     def __init__(
         self, display: DisplayModel, session: RemoteSession, plan_store: PlanStore, executor: Executor
     ) -> None:
-        super().__init__(display, session, executor)
+        self.on_progress: Callable[[], None] = lambda: None
+        cold = ThermalEstimate(*display.build_cold_state())
+        self.state = QueueState(display.budget, lambda: self.on_progress(), cold)
+        self.accounts = PulseAccounts(session)
+        self._config, self._budget = display.config, display.budget
+        self._session = session
         self._plan_store = plan_store
-        self.pause = QueuePause(self, session)
-        self.stream = QueueStream(self, display, session)
-        self._revoked_callers = RevokedCallers()
+        self._executor = executor
+        self._revoked_s: dict[str, float] = {}
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a plan runs or waits."""
+        return self.state.is_busy
+
+    def count_pulses(self) -> int:
+        """Count the pulses of all running and waiting plans."""
+        return sum(plan.record.pulse_count for plan in self.state.plans)
+
+    # --- transitions --------------------------------------------------------------------------------------------
+
+    def _apply(self, state: QueueState) -> None:
+        """Take over a state, count, delay jobs, publish records, and end plans."""
+        if state is self.state:
+            return
+        before = {plan.plan_id: plan.record for plan in self.state.plans}
+        self.state = state.clear_ended()
+        for plan in (*(end.plan for end in state.ended), *state.plans):
+            known = before.get(plan.plan_id)
+            if plan.record is not known:
+                self.accounts.count(known, plan.record)
+                self._plan_store.publish(plan.record)
+        for plan, job in state.running:
+            delay_s = plan.record.start_s - before.get(plan.plan_id, plan.record).start_s
+            if delay_s:
+                job.delay(round(delay_s / self._session.tick_s))
+        for end in state.ended:
+            self._conclude(end)
+
+    def _conclude(self, end: PlanEnd) -> None:
+        """End a plan that left the queue, now or after the simulation of its executed pulses."""
+        plan = end.plan.update_execution()
+        if plan.record.timing_error is not None:
+            self.accounts.timing.add(plan.record.timing_error)
+        self._plan_store.publish(plan.record)
+        if plan.executed is None or end.status in INTERRUPTED:
+            plan = self._plan_store.end(plan, end.status, end.error)
+        if plan.executed is not None:
+            self._executor.submit(simulate_plan, self._plan_store, plan, end.status, end.error)
+
+    def _collect(self) -> QueueState:
+        """Return the state with the executed pulses of all running plans, before a transition that ends them all."""
+        return self.state.update_runs([self.accounts.collect_executed(run) for run in self.state.running])
+
+    def _find_light_end(self, clock_shift_s: float = 0.0, notice_s: float = 0.0) -> LightEnd:
+        """Return when light is off that is turned off now.
+
+        clock_shift_s: by which the board's clock has jumped since the plans were queued
+        notice_s: time until the link process renews the lease no more
+        """
+        now_s = self._session.board_s() - clock_shift_s
+        dark_s = now_s + self._session.round_trip_s  # the command that turns the gate off is on its way
+        return LightEnd(dark_s, max(now_s + notice_s + self._config.lease_s, self._session.dark_s))
 
     # --- accepting plans ----------------------------------------------------------------------------------------
 
     def make_snapshot(self, streamed: bool, planning_time_s: float) -> PlanningSnapshot:
-        """Build the snapshot for the next plan.
+        """Build the snapshot for the next plan. Any thread may call it.
 
         A streamed plan truncates the running stream at the first pulse that is still unsent after planning_time_s.
         """
-        with self.lock:
-            thermal = self.thermal.estimate
-            start_s = self._earliest_start_s(streamed, planning_time_s)
-            last = self.stream.find_running() if streamed and not self.pause.is_held else None
-        snapshot = None if last is None else self.stream.build_cut_snapshot(last, thermal, planning_time_s)
+        state = self.state
+        start_s = self._earliest_start_s(state, streamed, planning_time_s)
+        last = state.replaceable if streamed and not self.is_held else None
+        snapshot = None if last is None else self._build_cut_snapshot(last, state.thermal, planning_time_s)
         if snapshot is not None:
             return snapshot
-        cycle = self.stream.find_cycle() if streamed else None
-        return PlanningSnapshot(thermal, start_s, *thermal.shift_to_plan(start_s), cycle=cycle)
+        newest, cycle = state.newest, None
+        if streamed and newest is not None:
+            cycle = continue_cycle(newest, newest.record.pulse_count - newest.record.dropped)
+        return PlanningSnapshot(state.thermal, start_s, state.thermal.shift(-start_s), cycle=cycle)
 
-    def _earliest_start_s(self, streamed: bool, planning_time_s: float = 0.0) -> float:
-        ready_s, end_s = self._session.board_s() + planning_time_s, self.thermal.end_s
+    def _earliest_start_s(self, state: QueueState, streamed: bool, planning_time_s: float = 0.0) -> float:
+        ready_s = self._session.board_s() + planning_time_s
         if streamed:
-            return max(end_s + STREAM_RESTART_S, ready_s + STREAM_START_LEAD_S)
-        return max(end_s, ready_s) + START_LEAD_S
+            return max(state.end_s + STREAM_RESTART_S, ready_s + STREAM_START_LEAD_S)
+        return max(state.end_s, ready_s) + START_LEAD_S
 
-    def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot, cooling_max_m: float = inf) -> bool:
-        """Accept a plan into the queue. Return False if its snapshot is stale, or if the plan is too late.
+    def _build_cut_snapshot(
+        self, running: ActivePlan, thermal: ThermalEstimate, planning_time_s: float
+    ) -> PlanningSnapshot | None:
+        """Build the snapshot of a plan that truncates a running one, None if that is not possible any more."""
+        planned_s = self._session.board_s() + planning_time_s
+        # Several boards end each job together: nothing follows what has left.
+        min_end_s = planned_s + APPEND_LEAD_S if len(self._session.scales) == 1 else inf
+        return build_cut_snapshot(
+            running,
+            thermal,
+            planned_s + self.lead_s,
+            self._budget,
+            self._session.tick_s,
+            running.holds_first,
+            min_end_s,
+            begin_s=planned_s + STREAM_START_LEAD_S,
+        )
 
-        A plan is too late if its splice has passed, or if it would start so much later than planned that a pixel's
+    def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot, cooling_max_m: float = inf) -> PlanRecord | None:
+        """Accept a plan into the queue, and return its record. Return None if its snapshot is stale, or it is too late.
+
+        A plan is too late if its cut has passed, or if it would start so much later than planned that a pixel's
         displacement meanwhile decreases by more than cooling_max_m, m.
         Raise StoppedError if the epoch of its request has passed, or if the token of its caller was revoked.
         """
         self._session.connection.receive()  # a STOP that has been answered is known from here on
+        record, state = plan.record, self.state
+        self.require_epoch(plan.epoch)
+        if record.streamed:
+            self.require_no_pause()
+        self._require_valid(record.caller, record.arrived_s)
+        # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
+        # Identity, not equality: every change makes a new object, so that one comparison finds all.
+        if state.thermal is not snapshot.thermal:
+            return None
+        plan = plan.note(planned_after_s=self._session.board_s() - record.arrived_s)  # link may send at once
+        if snapshot.predecessor is not None:
+            replaced = self._replace_from(state, plan, snapshot.predecessor, snapshot.cut)
+            if replaced is None:
+                return None
+            self._apply(replaced)
+        else:
+            start_s = max(record.start_s, self._earliest_start_s(state, record.streamed))
+            if start_s > record.start_s:
+                # Later is safe for the skin, but a bump from less heat is lower.
+                if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > cooling_max_m:
+                    return None
+                plan = plan.rebase(start_s, snapshot.thermal.shift(-start_s))
+            self._apply(state.accept(plan))
+        return self._plan_store.find(plan.plan_id)
+
+    def _replace_from(
+        self, state: QueueState, plan: ActivePlan, predecessor: ActivePlan, cut: PointCut | None
+    ) -> QueueState | None:
+        """Continue the points of a running plan with those of a new one. Return None if the cut has been sent."""
+        running = state.running[-1].plan if state.running else None
+        # It has ended, or another has replaced a part of it, since the snapshot.
+        if cut is None or running is None or running.plan_id != predecessor.plan_id:
+            return None
         record = plan.record
-        with self.lock:
-            self.require_epoch(plan.epoch)
-            if record.streamed:
-                self.pause.require_no_pause()
-            self._revoked_callers.require_valid(record.caller, record.arrived_s)
-            # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
-            # Identity, not equality: every change makes a new object, so that one comparison finds all.
-            if self.thermal.estimate is not snapshot.thermal:
-                return False
-            record.planned_after_s = self._session.board_s() - record.arrived_s  # link may send at once
-            if snapshot.predecessor is None:
-                start_s = max(record.start_s, self._earliest_start_s(record.streamed))
-                if start_s > record.start_s:
-                    # Later is safe for the skin, but a bump from less heat is lower.
-                    if snapshot.thermal.compute_cooling_m(record.start_s, start_s) > cooling_max_m:
-                        return False
-                    plan.begin_from(*snapshot.thermal.shift_to_plan(start_s))
-                record.start_s = start_s
-                self.waiting.append(plan)
-            elif snapshot.cut is None or not self.stream.splice(plan, snapshot.predecessor, snapshot.cut):
-                return False
-            # Before the lock is released: the next snapshot must contain this plan's heat.
-            self.thermal.append(plan)
-            self.stream.record_accepted(plan)
-            self.accounts.totals["planned"] += record.pulse_count
-            record.change_status(PlanStatus.QUEUED if snapshot.predecessor is None else PlanStatus.RUNNING)
-            self.stream.follow_withdrawn(plan, snapshot)
-            self._plan_store.add(plan)
-            if snapshot.predecessor is not None and not record.pulse_count:
-                self.end_waiting(plan, PlanStatus.DONE, None)
-            return True
+        if not record.pulse_count:  # it only ends what was shown: a job without points would be the last one
+            is_whole = cut.row == running.record.pulse_count
+            done = is_whole or self._session.truncate(cut.kept_points)
+            return state.end_behind(cut.row, plan) if done else None
+        due_in_s = plan.points_start_s - self.lead_s - self._session.board_s()
+        interval_s = record.arrived_s - running.record.arrived_s  # the next one may come after as much
+        holds_first = record.refreshes or due_in_s > interval_s
+        points, kept_points = plan.points, cut.kept_points
+        job = self._session.splice(points, kept_points, record.start_s, plan.epoch, self.lead_s, plan.crc, holds_first)
+        if job is None:
+            return None
+        if record.refreshes and not cut.row:  # its light counts from the fingers that the withdrawn one followed
+            plan = plan.note(arrived_s=min(record.arrived_s, running.record.arrived_s))
+        return state.replace_from(cut.row, PlanRun(replace(plan, holds_first=holds_first), job))
 
     def require_epoch(self, epoch: int) -> None:
         """Raise StoppedError if an epoch has passed. Any thread may call it."""
@@ -135,46 +242,41 @@ class PlanQueue(QueuedPlans):
             raise StoppedError(f"the request was stopped before it was carried out ({self._session.epoch_reason})")
 
     def revoke(self, caller: str) -> None:
-        """End all plans of a caller whose token was revoked, and accept none that was requested before now."""
-        reason = self._revoked_callers.revoke(caller, self._session.board_s())
-        for plan in [*self.waiting, *(run.plan for run in self.running)]:
+        """End all plans of a caller whose token was revoked, and accept none that was requested before now.
+
+        A later request is of a new token with the same name.
+        """
+        self._revoked_s[caller] = self._session.board_s()
+        for plan in self.state.plans:
             if plan.record.caller == caller:
-                self.cancel(plan.record, reason)
+                self.cancel(plan.record, f"the token {caller!r} was revoked")
+
+    def _require_valid(self, caller: str, arrived_s: float) -> None:
+        """Raise StoppedError for a request that arrived at a board time before the revocation of its caller's token."""
+        if arrived_s <= self._revoked_s.get(caller, -inf):
+            raise StoppedError(f"the token {caller!r} was revoked")
 
     # --- running plans ------------------------------------------------------------------------------------------
-
-    def cancel(self, record: PlanRecord, reason: str = "") -> None:
-        """Cancel a plan. Those behind it are planned again, because their pulses are for warmer pixels."""
-        super().cancel(record, reason)
-        if self.waiting:
-            self.pause.begin(self._session.board_s())
 
     def start_next(self) -> None:
         """Start the next plan if the board is ready for it.
 
         Several boards emit nothing late: a plan whose time has passed while it waited for them is proven again for now.
         """
-        # One job at a time; a stream's next plan is spliced into it, and does not pass here.
-        if self.running or not self.waiting or not self._session.is_ready or self.pause.off_s is not None:
+        state, now_s = self.state, self._session.board_s()
+        # One job at a time; a stream's next plan goes on in the running job, and does not pass here.
+        if state.running or not state.waiting or not self._session.is_ready or state.off_s is not None:
             return
-        if len(self._session.scales) > 1 and self._find_start_s(self.waiting[0]) < self._session.board_s():
-            self.pause.begin(self._session.board_s())
-            return
-        with self.lock:
-            plan = self.waiting.popleft()
-            record = plan.record
-            if not plan.rest_count:
-                self.end_waiting(plan, PlanStatus.DONE, None)
-                return
-            record.change_status(PlanStatus.RUNNING)
-            ahead_s = self.stream.lead_s if record.streamed else inf
-            job = self._session.begin(plan.points, self._find_start_s(plan), plan.epoch, ahead_s, plan.crc)
-            self.running.append(PlanRun(plan, job))
-
-    @staticmethod
-    def _find_start_s(plan: ActivePlan) -> float:
-        """Return the board time at which the points of a plan begin, s."""
-        return plan.record.start_s + plan.zero_s
+        plan = state.waiting[0]
+        if len(self._session.scales) > 1 and plan.points_start_s < now_s:
+            self._apply(state.hold(now_s))
+        elif not plan.rest_count:
+            self._apply(state.begin(None))
+        else:
+            ahead_s = self.lead_s if plan.record.streamed else inf
+            self._apply(
+                state.begin(self._session.begin(plan.points, plan.points_start_s, plan.epoch, ahead_s, plan.crc))
+            )
 
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
@@ -183,16 +285,19 @@ class PlanQueue(QueuedPlans):
             self.end_all(PlanStatus.FAILED, self._describe_unarmed())
         off_s = self._session.pop_drained()
         if off_s is not None:
-            self.pause.interrupt(off_s)
-        self.pause.end_if_idle()
-        for run in self.running:
-            self.accounts.count_progress(run)
+            self._apply(self._collect().interrupt(off_s, self._session.lost, self._find_light_end()))
+        if self.state.off_s is not None and not self.state.waiting and not self.is_held:
+            self._apply(self.state.go_on())
+        self._apply(self.state.update_runs([self.accounts.read_progress(run) for run in self.state.running]))
         # All of them: one report may end several short plans.
-        while self.running and self.running[0].job.is_finished:
-            self._finish_first()
-        if self.running and refusal is not None:
+        while self.state.running and self.state.running[0].job.is_finished:
+            first, *others = self.state.running
+            state = self.state.update_runs([self.accounts.collect_executed(first), *others])
+            self._apply(state.finish(self._find_light_end()))
+        if self.state.running and refusal is not None:
             self._session.flush()
-            self.end_running(PlanStatus.FAILED, f"the board refused a part of the plan ({refusal})")
+            error = f"the board refused a part of the plan ({refusal})"
+            self._apply(self._collect().end_running(PlanStatus.FAILED, error, self._find_light_end()))
 
     def _describe_unarmed(self) -> str:
         """Return why the board no longer executes plans, in one sentence."""
@@ -202,18 +307,20 @@ class PlanQueue(QueuedPlans):
         reason = f"{board.fault}: {cause_text}" if board.fault else self._session.last_event_reason
         return f"the board went to {board.state} ({reason})"
 
-    def _finish_first(self) -> None:
-        """End the first running plan. A delay of it shifts everything after it."""
-        with self.lock:
-            run = self.running.popleft()
-            record = run.plan.record
-            is_partial = record.dropped or run.plan.growth is not None
-            self.conclude(run, PlanStatus.SUPERSEDED if is_partial else PlanStatus.DONE, None)
-            # A late end delays the heat of all plans behind it.
-            self.delay_all(record.delay_s)
-            if run.plan.is_cut_short and not self.running:  # a pause has begun, and its last report is here first
-                self.thermal.rewind([run.plan], self.waiting)
-            self.stream.keep_unfinished(run.plan)
+    def cancel(self, record: PlanRecord, reason: str = "") -> None:
+        """Remove a waiting plan, or turn the gate off and end all running ones. reason: for people."""
+        state = self.state
+        if any(run.plan.plan_id == record.plan_id for run in state.running):
+            self._session.flush()
+            state = self._collect()
+        self._apply(state.cancel(record.plan_id, reason, self._find_light_end(), self._session.board_s()))
+
+    def end_all(self, status: PlanStatus, reason: str, clock_shift_s: float = 0.0) -> None:
+        """End all running and waiting plans.
+
+        clock_shift_s: by which the board's clock has jumped since they were queued, see on_board_restarted
+        """
+        self._apply(self._collect().end_all(status, reason, self._find_light_end(clock_shift_s)))
 
     def end_epoch(self, reason: str, clock_shift_s: float = 0.0) -> None:
         """End all plans of an epoch that has ended.
@@ -221,50 +328,200 @@ class PlanQueue(QueuedPlans):
         reason: what ended it; clock_shift_s: as for end_all
         """
         # What a person has asked for is no failure.
-        status = PlanStatus.STOPPED if reason in (STOP, DISARM) else PlanStatus.FAILED
-        self.stream.forget_cycle()
-        self.end_all(status, reason, clock_shift_s)
+        self.end_all(PlanStatus.STOPPED if reason in (STOP, DISARM) else PlanStatus.FAILED, reason, clock_shift_s)
+        self._apply(self.state.forget_stream())
 
     def on_board_restarted(self, delay_s: float) -> None:
         """Shift heat and budget to the restarted clock of the board."""
         self.accounts.events.append(ClockShift(delay_s))
-        self.stream.forget_cycle()
-        with self.lock:
-            self.thermal.shift_clock(delay_s)
+        self._apply(self.state.shift_clock(delay_s))
+
+    # --- pauses -------------------------------------------------------------------------------------------------
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the light is paused. Any thread may read it."""
+        return self._session.is_held
+
+    @property
+    def pause_ends_in_s(self) -> float | None:
+        """Time until the pause ends disarmed, s, or None if the light is not paused."""
+        return self._session.pause_ends_in_s
+
+    def require_no_pause(self) -> None:
+        """Raise NotReadyError while the light is paused. An interruption by a lost stage is over in a moment."""
+        self._session.connection.receive()
+        if self.is_held and not self._session.is_interrupted:
+            raise NotReadyError("the light is paused, and a streamed frame shows the present; resume first")
+
+    @property
+    def can_restart(self) -> bool:
+        """Whether waiting plans are to be limited and proven again now. Any thread may read it."""
+        state = self.state
+        return state.off_s is not None and bool(state.waiting) and not state.running and not self.is_held
+
+    def build_restart(
+        self, display: DisplayModel, planning_time_s: float, on_progress: Callable[[], None]
+    ) -> Restart | None:
+        """Limit and prove the waiting plans again, in any thread. Return None if none is to be restarted.
+
+        planning_time_s: time that is reserved for this. Raise LocalProtocolError if one exceeds a cap.
+        """
+        state = self.state
+        if not self.can_restart:
+            return None
+        start_s = self._session.board_s() + START_LEAD_S + planning_time_s
+        before = estimate_before_rest(state.waiting[0], display.budget, on_progress)
+        scales = self._session.scales
+        restarted = restart_plans(display, scales, state.waiting, before, start_s, START_LEAD_S, on_progress)
+        return Restart(state.waiting, restarted, state.off_s)
+
+    def commit_restart(self, restart: Restart) -> bool:
+        """Let the queue go on. Return False if the queue has changed meanwhile, or the light is paused again."""
+        self._session.connection.receive()  # a STOP or a pause that has been answered is known from here on
+        state = self.state
+        if not self.can_restart or state.waiting != restart.plans or state.off_s != restart.off_s:
+            return False
+        delay_s = max(0.0, self._session.board_s() + START_LEAD_S - restart.restarted[0].start_s)
+        self._apply(state.resume(restart, delay_s))
+        return True
+
+    # --- streams ------------------------------------------------------------------------------------------------
+
+    @property
+    def lead_s(self) -> float:
+        """Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
+        lead_s = self._config.stream_lead_s
+        # A stall longer than the lead is an underrun, and stalls are longer without real-time priority.
+        return lead_s if self._session.is_realtime else max(lead_s, SHARED_STREAM_LEAD_S)
+
+    def preempt(self) -> None:
+        """Supersede the waiting plans, and end a running plan that is not streamed, for a newer plan."""
+        self._apply(self.state.withdraw())
+        if self.state.running and not self.state.running[-1].plan.record.streamed and not self.is_held:
+            sent = self.state.running[0].job.sent_count
+            self._session.flush()
+            self._apply(self._collect().preempt(sent, self._find_light_end()))
+
+    def truncate(self) -> None:
+        """Truncate the running streamed plan at the first pulse not yet due to be sent.
+
+        The next plan then starts after it, without a deadline.
+        """
+        state = self.state
+        last = state.replaceable
+        snapshot = None if last is None else self._build_cut_snapshot(last, state.thermal, planning_time_s=0.0)
+        if snapshot is not None and snapshot.cut is not None and self._session.truncate(snapshot.cut.kept_points):
+            start_s = snapshot.start_s
+            self._apply(state.truncate(snapshot.cut.row, snapshot.before.shift(start_s), start_s))
+
+    def compute_due_in_s(self, planning_time_s: float) -> float:
+        """Return the time until the rest of the newest plan must be planned, infinity if it has none.
+
+        planning_time_s: time that this takes
+        """
+        state = self.state
+        plan = state.growing
+        if plan is None or state.waiting:
+            return inf
+        if not state.running:
+            return 0.0
+        rows = plan.planned.plan
+        last_point_s = float(rows.start_s[-2] + rows.width_s[-2]) if len(rows) > 1 else 0.0
+        due_s = plan.points_start_s + last_point_s - self.lead_s - planning_time_s - GROWTH_MARGIN_S
+        return due_s - self._session.board_s()
+
+    def extend(self, plan: ActivePlan, extended: ExtendedPlan) -> bool:
+        """Append the rest of a plan to it. Return False, unchanged, if it is too late or a newer plan came."""
+        self._session.connection.receive()
+        state = self.state
+        growing = state.growing
+        if growing is None or not state.is_busy or growing.plan_id != plan.plan_id:
+            return False
+        if not state.waiting:
+            job = state.running[-1].job
+            # Link first: if it refuses, nothing here has changed.
+            if not self._session.extend(job, extended.added, plan.epoch, extended.added_crc):
+                return False
+        self._apply(state.extend(extended.rows))
+        return True
+
+    def withdraw_rest(self, plan: ActivePlan) -> ActivePlan | None:
+        """Withdraw the points of a plan that have not left, before its rest becomes a frame of its own, and return it.
+
+        Return None if a newer plan came.
+        """
+        growing = self.state.growing
+        if growing is None or growing.plan_id != plan.plan_id:
+            return None
+        if self.state.waiting:
+            self.preempt()
+            return growing.note(dropped=growing.rest_count)
+        self.truncate()
+        growing = self.state.newest
+        self.give_up_rest()
+        return growing
+
+    def give_up_rest(self) -> None:
+        """Give up the rest of a plan that has ended without it."""
+        self._apply(self.state.give_up_rest())
 
     # --- restarts of the planner --------------------------------------------------------------------------------
 
+    def build_final_estimate(self) -> ThermalEstimate:
+        """Return the estimate after the end of this process, with which the link process ends all plans."""
+        return self.state.estimate_end(self._find_light_end(notice_s=BEAT_AGE_MAX_S), HOLD_MAX_S)
+
     def build_saved_state(self, host_s: float) -> SavedThermalState:
         """Return the state from which a successor of this process continues. host_s: present host time."""
-        with self.lock:
-            return self.thermal.build_saved_state(self.list_active(), host_s)
+        active = self.state.active
+        ended = EndedPlans.from_plans(active) if active else None
+        return SavedThermalState(host_s, self._session.board_s(), self.state.thermal, ended)
 
     @property
     def saved_key(self) -> object:
-        """A value that changes whenever build_saved_state() would return another state."""
-        return self.thermal.build_saved_key(self.list_active())
+        """A value that changes whenever build_saved_state() would return another state.
+
+        It leaves out that a plan has ended while the next one runs: the state before both counts the same pulses.
+        """
+        records = [plan.record for plan in self.state.active[-1:]]
+        return id(self.state.thermal), tuple((record.plan_id, record.dropped, record.start_s) for record in records)
 
     def restore(self, saved: SavedThermalState, host_s: float) -> None:
-        """Continue from the state of an earlier planner, whose plans the link process has ended."""
-        with self.lock:
-            self.thermal.restore(saved, host_s)
+        """Continue from the state of an earlier planner, whose plans the link process has ended.
+
+        Every pulse that may have started before now counts, up to the longest time late that the board permits. The
+        board's clock may have restarted meanwhile.
+        """
+        board_s = self._session.board_s()
+        expected_s = saved.board_s + host_s - saved.host_s
+        estimate = saved.estimate
+        if saved.ended is not None:
+            gate_off_s = expected_s + self._config.lease_s
+            estimate = rewind_estimate(saved.ended, gate_off_s, self._budget, self.on_progress, expected_s)
+        self.know(estimate.shift(board_s - expected_s + HOLD_MAX_S))
+
+    def know(self, estimate: ThermalEstimate) -> None:
+        """Continue from another estimate, as of an earlier planner or daemon."""
+        self._apply(self.state.know(estimate))
 
 
 def build_queue_report(
     plan_queue: PlanQueue, recent: list[PlanRecord], board_now_s: float, host_now_s: float
 ) -> QueueReport:
     """Report the running and waiting plans with their progress at a board and host time, s, and the recent ones."""
-    running = [run.plan.record for run in plan_queue.running.copy()]
-    waiting = [plan.record for plan in plan_queue.waiting.copy()]
+    state = plan_queue.state
+    running = [run.plan.record for run in state.running]
+    waiting = [plan.record for plan in state.waiting]
     if waiting and waiting[0].status == PlanStatus.PAUSED:
         running.append(waiting.pop(0))
-    pause = plan_queue.pause
-    times_at_s = board_now_s if pause.off_s is None else pause.off_s  # as if the queue went on now
+    pause_ends_in_s = plan_queue.pause_ends_in_s
+    times_at_s = board_now_s if state.off_s is None else state.off_s  # as if the queue went on now
     return QueueReport(
         waiting=len(waiting),
         running=running[0].plan_id if running else None,
-        paused=pause.ends_in_s is not None,
-        pause_ends_in_s=pause.ends_in_s,
+        paused=pause_ends_in_s is not None,
+        pause_ends_in_s=pause_ends_in_s,
         active=[_build_queued(record, times_at_s, host_now_s) for record in (*running, *waiting)],
         plans=[RecentPlan.from_object(record, **_name_counts(record, host_now_s)) for record in recent],
     )

@@ -1,6 +1,6 @@
 """Records of submitted plans, from queued to done, superseded, stopped, failed or cancelled."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, Self
 
@@ -104,9 +104,9 @@ class Execution:
         )
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class PlanRecord:
-    """One plan with its progress. It stays after the plan's end, so it holds only the data that its report states.
+    """One plan with its progress, at one moment. The last one stays, so it holds only the data that its report states.
 
     pulse_count, duration_s: of the whole plan; summary_json: encoded `PlanSummary`, which is larger in memory
     pulses: None if there are too many to list
@@ -150,11 +150,11 @@ class PlanRecord:
     first_pulse_s: float | None = None
     onset: ClockReading | None = None
 
-    def change_status(self, status: PlanStatus) -> None:
-        """Give the plan another status. Raise ValueError if that cannot follow the present one."""
+    def change_status(self, status: PlanStatus) -> Self:
+        """Return the record with another status. Raise ValueError if that cannot follow the present one."""
         if not self.status.may_become(status):
             raise ValueError(f"plan {self.plan_id} is {self.status}, and cannot become {status}")
-        self.status = status
+        return replace(self, status=status)
 
     @property
     def has_ended(self) -> bool:
@@ -172,12 +172,10 @@ class PlanRecord:
 
         pulses: whether the report lists them one by one; clocks: give the onset of a plan that has not begun
         """
-        # The status first: another thread gives a plan its last one when all else is final.
-        status, execution = self.status, self.execution
+        execution = self.execution
         return PlanReport.from_object(
             self,
             plan=self.plan_id,
-            status=status,
             starts_in_s=self.start_s + self.delay_s - board_now_s,
             planned=self.pulse_count,
             executed=self.executed_count,

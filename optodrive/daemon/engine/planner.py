@@ -15,8 +15,8 @@ from optodrive.core.errors import BusyError, InputError, LinkError, NotReadyErro
 from optodrive.core.processes import PLANNING, set_realtime_priority, use_usual_priority
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.plan_making import NEVER, Dimmer, PlanningRequest, build_rest_frame, grow_plan, make_plan
-from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.queue_stream import GROWTH_MARGIN_S
+from optodrive.daemon.engine.plan_queue import GROWTH_MARGIN_S, PlanQueue
+from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.daemon.responses.plan import PlanReport, PlanStatus
 from optodrive.link.service.remote_session import RemoteSession
@@ -163,7 +163,7 @@ class Planner:
         if self._is_at_own_work:
             return
         work = None
-        if self._plan_queue.pause.can_restart:
+        if self._plan_queue.can_restart:
             work = self._restart
         elif self.growth_due_in_s <= 0.0:
             work = self._grow
@@ -186,13 +186,12 @@ class Planner:
         """Time until the rest of the running plan must be planned, infinity if it has none, or is being planned."""
         if self._is_at_own_work:
             return inf
-        return self._plan_queue.stream.compute_due_in_s(self._growth_time.compute_reserved_s(0))
+        return self._plan_queue.compute_due_in_s(self._growth_time.compute_reserved_s(0))
 
     def _grow(self) -> None:
         """Plan the rest of the streamed frame that was accepted last, unless nobody waits for it any more."""
-        plan = self._plan_queue.stream.find_growing()
+        plan = self._plan_queue.state.growing
         if plan is None:
-            self._plan_queue.stream.forget_unfinished()
             return
         set_realtime_priority(PLANNING)
         check = self._build_check(plan.epoch, NEVER, streamed=True)
@@ -200,7 +199,8 @@ class Planner:
             if not self._extend(plan, check):
                 self._plan_rest(plan, check)
         except (NotReadyError, LinkError):  # it was stopped or paused, and a stream shows the present
-            self._plan_queue.stream.forget_unfinished()
+            with suppress(LinkError):
+                self._run_in_loop(self._plan_queue.give_up_rest)
         except Exception as error:  # of any kind: what cannot be proven is not played
             self._fail_all(f"the rest of a streamed frame could not be planned: {error}")
         finally:
@@ -218,17 +218,16 @@ class Planner:
 
         def commit() -> bool:
             # Asked in the loop's thread, which dims: in any other a change could come in between.
-            return self._dimmer.display is display and self._plan_queue.stream.extend(plan, grown)
+            return self._dimmer.display is display and self._plan_queue.extend(plan, grown)
 
         return self._run_in_loop(commit)
 
     def _plan_rest(self, plan: ActivePlan, check: Callable[[float], None]) -> None:
         """Plan the pixels that a plan has not drawn as a frame of its own, behind it."""
-        if self._plan_queue.stream.find_growing() is not plan:
+        withdrawn = self._run_in_loop(lambda: self._plan_queue.withdraw_rest(plan))
+        if withdrawn is None:
             return
-        self._run_in_loop(self._plan_queue.stream.withdraw)
-        self._plan_queue.stream.forget_unfinished()
-        record, built = plan.record, BuiltRequest(build_rest_frame(plan))
+        record, built = withdrawn.record, BuiltRequest(build_rest_frame(withdrawn))
         push = Push(record.name, {}, self._clock.now_s(), plan.epoch, record.caller, streamed=True, lists_pulses=False)
         self._plan_until_committed(built, PlanningRequest(lambda: built, push, record.arrived_s), check)
 
@@ -251,13 +250,13 @@ class Planner:
         began_s, display = self._clock.now_s(), self._dimmer.display
         on_progress()
         reserved_s = self._restart_time.compute_reserved_s(0)
-        restart = self._plan_queue.pause.build_restart(display, reserved_s, on_progress)
+        restart = self._plan_queue.build_restart(display, reserved_s, on_progress)
         if restart is None:
             return True
         self._restart_time.record(self._clock.now_s() - began_s)
 
         def commit() -> bool:
-            return self._dimmer.display is display and self._plan_queue.pause.commit_restart(restart)
+            return self._dimmer.display is display and self._plan_queue.commit_restart(restart)
 
         return self._run_in_loop(commit)
 
@@ -280,9 +279,9 @@ class Planner:
         check = self._build_check(request.push.epoch, request.caller_left, request.push.streamed)
         try:
             check(0.0)
-            plan = self._plan_until_committed(request.build(), request, check)
+            record = self._plan_until_committed(request.build(), request, check)
             clocks = self._session.read_clocks()
-            return plan.record.build_report(self._session.board_s(), request.push.lists_pulses, clocks)
+            return record.build_report(self._session.board_s(), request.push.lists_pulses, clocks)
         finally:
             self._progress_at_s = self._clock.now_s()
 
@@ -309,30 +308,30 @@ class Planner:
 
     def _plan_until_committed(
         self, built: BuiltRequest, request: PlanningRequest, check: Callable[[float], None]
-    ) -> ActivePlan:
+    ) -> PlanRecord:
         late_count, took_s, plan_id, horizon_s = 0, 0.0, f"p{next(self._ids)}", inf
         if request.push.streamed:
             reserved_s = self._growth_time.compute_reserved_s(0) + GROWTH_MARGIN_S
-            horizon_s = max(self._horizon.follow(request.arrived_s), self._plan_queue.stream.lead_s) + reserved_s
+            horizon_s = max(self._horizon.follow(request.arrived_s), self._plan_queue.lead_s) + reserved_s
         else:
             self._grow()  # what is pushed goes behind the whole of a frame
         while True:
             check(0.0)
             self._require_armed()
-            if request.push.streamed and self._plan_queue.pause.is_held:  # unless it was resumed a moment ago
-                self._run_in_loop(self._plan_queue.pause.require_no_pause)
-            if request.push.streamed and self._plan_queue.stream.must_preempt:
+            if request.push.streamed and self._plan_queue.is_held:  # unless it was resumed a moment ago
+                self._run_in_loop(self._plan_queue.require_no_pause)
+            if request.push.streamed and self._plan_queue.state.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
             began_s = self._clock.now_s()
             reserved_s = self._compute_reserved_s(request, late_count, took_s)
-            plan = self._plan_once(built, request, plan_id, late_count, reserved_s, horizon_s, check)
-            if plan is not None:
-                return plan
+            record = self._plan_once(built, request, plan_id, late_count, reserved_s, horizon_s, check)
+            if record is not None:
+                return record
             took_s = self._clock.now_s() - began_s
             # The snapshot is stale: a predecessor was late, has sent points beyond the splice, or its heat is gone.
             late_count += 1
             if request.push.streamed and late_count == SPLICE_TRIES:
-                self._run_in_loop(self._plan_queue.stream.truncate)
+                self._run_in_loop(self._plan_queue.truncate)
 
     def _compute_reserved_s(self, request: PlanningRequest, late_count: int, took_s: float) -> float:
         """Return the time to reserve for an attempt after late ones, of which the last took took_s."""
@@ -342,8 +341,8 @@ class Planner:
     def _preempt(self, request: PlanningRequest) -> None:
         """Make room for a streamed plan, unless its epoch has passed."""
         self._plan_queue.require_epoch(request.push.epoch)
-        self._plan_queue.pause.require_no_pause()
-        self._plan_queue.stream.preempt()
+        self._plan_queue.require_no_pause()
+        self._plan_queue.preempt()
 
     def _plan_once(
         self,
@@ -354,7 +353,7 @@ class Planner:
         reserved_s: float,
         horizon_s: float,
         check: Callable[[float], None],
-    ) -> ActivePlan | None:
+    ) -> PlanRecord | None:
         """Plan once. Return None if the plan is late, the snapshot stale, or the display was dimmed meanwhile."""
         began_s, display = self._clock.now_s(), self._dimmer.display
         cooling_max_m = COOLING_MAX_M if late_count < LATE_MAX else inf
@@ -363,7 +362,8 @@ class Planner:
         if request.push.streamed:
             self._planning_time.record(self._clock.now_s() - began_s)
 
-        def commit() -> bool:
-            return self._dimmer.display is display and self._plan_queue.commit(plan, snapshot, cooling_max_m)
+        def commit() -> PlanRecord | None:
+            is_as_dim = self._dimmer.display is display
+            return self._plan_queue.commit(plan, snapshot, cooling_max_m) if is_as_dim else None
 
-        return plan if self._run_in_loop(commit) else None
+        return self._run_in_loop(commit)

@@ -24,9 +24,9 @@ from optodrive.core.types.fingers import FingerPlace
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.plan_making import DryRunStart
 from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.plan_rest import ThermalMemory
 from optodrive.daemon.engine.session_recording import start_session_recorder
 from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
-from optodrive.daemon.engine.thermal_estimate import ThermalMemory
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.message_loop import MessageServer
 from optodrive.daemon.push import BuiltRequest, Push, build_request
@@ -330,5 +330,5 @@ def build_dry_run_start(engine: Engine) -> bytes:
     """Return the pickled start of a dry run."""
     snapshot = engine.plan_queue.make_snapshot(streamed=False, planning_time_s=0.0)
     starts_in_s, dimmer = snapshot.start_s - engine.board_s(), engine.dimmer
-    start = DryRunStart(snapshot.heat, snapshot.budget, starts_in_s, dimmer.power_share, dimmer.lost_stage)
+    start = DryRunStart(snapshot.before, starts_in_s, dimmer.power_share, dimmer.lost_stage)
     return pickle.dumps(start, pickle.HIGHEST_PROTOCOL)

@@ -14,7 +14,7 @@ import numpy as np
 from optodrive.core.finger_tracks import PredictedFinger
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
-from optodrive.daemon.engine.queued_plans import PlanProgress
+from optodrive.daemon.engine.metrics import PlanProgress
 from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PageEvent, PulseBatch, TouchedFinger
 from optodrive.device.config import PixelLayout
 from optodrive.device.config_sections import LimitsSection

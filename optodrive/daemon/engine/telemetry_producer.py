@@ -15,7 +15,7 @@ from optodrive.core.json_model import JsonModel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.queued_plans import ClockShift, merge_events
+from optodrive.daemon.engine.metrics import ClockShift, merge_events
 from optodrive.daemon.engine.telemetry_events import (
     EmittedPulses,
     ExecutedBatch,
@@ -69,7 +69,7 @@ class TelemetryProducer:
         self._limited_by: tuple[str, ...] = ()
         self._batches: deque[Message] = deque()
         self._batch_number = self._kept_pulses = 0
-        self._announced_rows: dict[ActivePlan, int] = {}
+        self._announced_rows: dict[tuple[str, int], int] = {}
         self._next_s: dict[str, float] = {}
         self._board_clock_reference = (0.0, 0.0)
         self._is_warm = self._has_upcoming = False
@@ -198,16 +198,18 @@ class TelemetryProducer:
         """Publish the planned pulses that start soon."""
         upcoming = self._engine.list_upcoming()
         self._has_upcoming = bool(upcoming)
-        self._announced_rows = {active: self._announced_rows.get(active, 0) for active in upcoming}
-        for active in upcoming:
+        # Rows after an interruption are others.
+        keys = [(active.plan_id, active.first_row) for active in upcoming]
+        self._announced_rows = {key: self._announced_rows.get(key, key[1]) for key in keys}
+        for key, active in zip(keys, upcoming, strict=True):
             record, plan = active.record, active.planned.plan
-            begin = max(self._announced_rows[active], active.first_row)
+            begin = self._announced_rows[key]
             end = int(np.searchsorted(plan.start_s, board_s + ANNOUNCE_LEAD_S - record.start_s))
             if end > begin:
                 row = np.arange(begin, end)
                 columns = (plan.start_s[begin:end] + record.start_s, plan.width_s[begin:end], plan.power_w[begin:end])
                 self._add_batch("planned", active, row, *columns)
-                self._announced_rows[active] = end
+                self._announced_rows[key] = end
 
     def _add_batch(
         self,

@@ -12,7 +12,6 @@ from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.core.json_model import iterate_json
 from optodrive.daemon.engine.plan_making import DryRunStart, PlanningRequest, PlanningSnapshot, dim_display, make_plan
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.push import BuiltRequest, Push, build_request
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import build_error_problem
@@ -60,8 +59,7 @@ def plan_dry_run(
 ) -> PlanReport:
     """Plan and prove a sequence without executing it. Raise InputError or RefusedError as the planner does."""
     request = PlanningRequest(lambda: built, push)
-    thermal = ThermalEstimate(start.heat, start.budget)
-    snapshot = PlanningSnapshot(thermal, start.starts_in_s, start.heat, start.budget)
+    snapshot = PlanningSnapshot(start.before, start.starts_in_s, start.before)
     dimmed = dim_display(display.without_stage(start.lost_stage), start.power_share)
     plan = make_plan(dimmed, scales, request, built, snapshot, DRY_RUN_PLAN, lambda fraction: None)
     return plan.record.build_report(0.0)

@@ -202,8 +202,8 @@ def _build_starts(
     session_path: Path | None,
 ) -> dict[str, Callable[[socket.socket, int], int]]:
     """Return how each forked process starts, by its name."""
+    from optodrive.daemon.engine.plan_rest import ThermalMemory
     from optodrive.daemon.engine.planner_server import run_planner
-    from optodrive.daemon.engine.thermal_estimate import ThermalMemory
     from optodrive.daemon.preview.process import run_preview
     from optodrive.daemon.server.acceptor import run_acceptor
     from optodrive.daemon.server.web_process import run_web

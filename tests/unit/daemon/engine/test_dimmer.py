@@ -4,8 +4,9 @@ import pytest
 
 from link_service_rig import REQUIREMENTS
 from optodrive.core.errors import InputError, OverBudgetError
+from optodrive.daemon.engine.active_plan import ThermalEstimate
 from optodrive.daemon.engine.plan_making import Dimmer, DryRunStart
-from optodrive.daemon.engine.thermal_estimate import ThermalMemory
+from optodrive.daemon.engine.plan_rest import ThermalMemory
 from optodrive.daemon.preview.jobs import plan_dry_run
 from optodrive.daemon.push import BuiltRequest, Push
 from planner_rig import DISPLAY, build_frame, build_train
@@ -86,7 +87,7 @@ def test_a_later_planner_is_as_dim():
 
 
 def test_a_dry_run_is_as_dim():
-    start = DryRunStart(*DISPLAY.build_cold_state(), 0.0, power_share=0.1)
+    start = DryRunStart(ThermalEstimate(*DISPLAY.build_cold_state()), 0.0, power_share=0.1)
     built, push = BuiltRequest(build_frame(90.0)), Push("dry", {}, 0.0, 0)
     report = plan_dry_run(DISPLAY, [REQUIREMENTS.scale], built, start, push)
     assert set(report.pulses.reason) == {"dim"}

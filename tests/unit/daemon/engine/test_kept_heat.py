@@ -41,7 +41,7 @@ def push(rig, sequence=MUCH_LIGHT):
 
 def touch_k(rig):
     """Return the bound on the hottest touch surface now."""
-    return float(rig.queue.thermal.estimate.budget.touch_k.max())
+    return float(rig.queue.state.thermal.budget.touch_k.max())
 
 
 def test_no_light_comes_before_the_record_says_that_the_display_is_in_use(rig, monkeypatch):

@@ -6,7 +6,7 @@ import pytest
 from link_service_rig import OPERATOR, WEB
 from optodrive.core.errors import NotReadyError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.daemon.engine.queue_pause import DURATION_MIN_S, build_rest_sequence
+from optodrive.daemon.engine.plan_rest import DURATION_MIN_S, build_rest_sequence
 from optodrive.daemon.engine.telemetry_events import ExecutedBatch
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.board_group import BoardGroup
@@ -183,7 +183,7 @@ def test_the_rest_of_a_streamed_frame_is_drawn_and_a_newer_one_cuts_it(rig):
     first = rig.push(build_frame(150.0), streamed=True)
     rig.until(lambda: first.executed_count > 2)
     rig.lose(1, "fault")
-    rig.until(lambda: rig.clock.now_s() > rig.remote.dark_s and len(rig.queue.running) == 1)
+    rig.until(lambda: rig.clock.now_s() > rig.remote.dark_s and len(rig.queue.state.running) == 1)
     executed = first.executed_count
     rig.until(lambda: first.executed_count > executed + 2)
     second = rig.push(build_frame(80.0, [0, 1, 2]), streamed=True)

@@ -1,5 +1,7 @@
 """Pause and resume over a real link service in virtual time, judged from the board's log."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,8 +69,7 @@ def test_without_its_mark_the_part_before_would_be_lit_twice(rig, monkeypatch):
     """Mutant: the first row that is left is not kept."""
 
     def interrupt(plan, off_s):
-        KEPT_INTERRUPT(plan, off_s)
-        plan.first_row = 0
+        return replace(KEPT_INTERRUPT(plan, off_s), first_row=0)
 
     monkeypatch.setattr(ActivePlan, "interrupt", interrupt)
     record = submit(rig, build_train(0.5))

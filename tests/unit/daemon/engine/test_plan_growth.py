@@ -12,6 +12,7 @@ from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import LimitedPlan
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import planner as planner_module
+from optodrive.daemon.engine.active_plan import ThermalEstimate
 from optodrive.daemon.engine.plan_making import (
     PlanningRequest,
     PlanningSnapshot,
@@ -21,7 +22,6 @@ from optodrive.daemon.engine.plan_making import (
     may_grow,
 )
 from optodrive.daemon.engine.planner import HORIZON_MAX_S, HORIZON_MIN_S, StreamHorizon
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 from optodrive.link.protocol.quantisation import DUTY_MAX
@@ -54,7 +54,7 @@ def make(display, sequence, snapshot, horizon_s=inf):
 
 def begin(display):
     thermal = ThermalEstimate(*display.build_cold_state())
-    return PlanningSnapshot(thermal, 0.0, thermal.heat, thermal.budget)
+    return PlanningSnapshot(thermal, 0.0, thermal)
 
 
 @pytest.mark.parametrize(
@@ -71,11 +71,11 @@ def test_the_bytes_of_500_random_frames_in_two_parts_are_those_of_the_whole(disp
         else:
             grown = grow_plan(plan, plan.growth, scales, lambda fraction: None)
             assert first + grown.added.encode_payload() == whole.points.encode_payload()
-            np.testing.assert_array_equal(grown.points.stages[0].row, whole.points.stages[0].row)
+            np.testing.assert_array_equal(grown.rows.points.stages[0].row, whole.points.stages[0].row)
             for item in fields(whole.planned.budget):
-                one, other = (getattr(each.planned.budget, item.name) for each in (grown, whole))
+                one, other = (getattr(each.planned.budget, item.name) for each in (grown.rows, whole))
                 np.testing.assert_array_equal(one, other, err_msg=item.name)
-            plan.replace_rows(grown.planned, grown.points, grown.crc, grown.summary_json)
+            plan = plan.rebase(plan.record.start_s, plan.before, grown.rows)
             grown_plans += 1
         assert plan.record.pulse_count == whole.record.pulse_count
         assert plan.crc == whole.crc
@@ -169,7 +169,7 @@ def finish(rig, record):
 
 def stall_until(rig, condition):
     """Run link and board without the planner's loop, once the plan has begun."""
-    rig.until(lambda: rig.queue.running)
+    rig.until(lambda: rig.queue.state.running)
     for _ in range(1000):
         if condition():
             return

@@ -9,9 +9,9 @@ from link_service_rig import OPERATOR, PLANNER, WEB, ServiceRig
 from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine import planner
-from optodrive.daemon.engine.active_plan import RevokedCallers
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.planner import LATE_MAX, PLANNING_MAX_S, REQUESTS_MAX
+from optodrive.daemon.engine.queue_state import PlanRun
 from optodrive.planning.pulse_table import PulseTable
 from planner_rig import PlannerRig, build_frame, build_train
 from standing_rig import StandingRig, build_display, build_page
@@ -105,7 +105,9 @@ def test_light_of_a_refresh_counts_from_the_fingers_of_the_one_that_it_replaced_
     first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
     rig.until(lambda: first.executed_count >= 1)
     second = submit(rig, build_frame(80.0, duration_s=9.0), streamed=True, refreshes=True)
-    second.arrived_s -= 0.005
+    *before, (plan, job) = rig.queue.state.running
+    plan = plan.note(arrived_s=second.arrived_s - 0.005)
+    rig.queue._apply(rig.queue.state.update_runs([*before, PlanRun(plan, job)]))
     third = submit(rig, build_frame(90.0, duration_s=9.0), streamed=True, refreshes=refreshes)
     assert second.dropped == 16
     assert third.arrived_s - second.arrived_s == pytest.approx(0.0 if refreshes else 0.005)
@@ -322,7 +324,7 @@ def test_a_request_from_before_the_revocation_of_its_token_is_refused(rig):
 
 def test_without_the_time_of_the_revocation_such_a_request_is_lit(rig, monkeypatch):
     """Mutant: forgets who was revoked."""
-    monkeypatch.setattr(RevokedCallers, "require_valid", lambda self, caller, arrived_s: None)
+    monkeypatch.setattr(PlanQueue, "_require_valid", lambda self, caller, arrived_s: None)
     record = rig.store.find(revoke_before_commit(rig).result().plan)
     assert finish(rig, record).executed_count
 

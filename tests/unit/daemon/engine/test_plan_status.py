@@ -34,5 +34,5 @@ def test_a_plan_is_paused_goes_on_and_ends():
     record = build_record(PlanStatus.PLANNED)
     for status in (PlanStatus.QUEUED, PlanStatus.RUNNING, PlanStatus.PAUSED, PlanStatus.RUNNING, PlanStatus.DONE):
         assert not record.has_ended
-        record.change_status(status)
+        record = record.change_status(status)
     assert record.has_ended

@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,8 +45,8 @@ def holds_heavy(record):
 def test_an_ended_plan_leaves_its_report_and_no_thermal_state(rig, ending):
     blocker = submit(rig, build_train(0.3)) if ending == "removed" else None
     record = submit(rig, build_frame(60.0, duration_s=9.0), streamed=ending == "superseded")
-    active = rig.queue.waiting[-1]
-    heat, points = weakref.ref(active.heat_before), weakref.ref(active.points)
+    active = rig.queue.state.waiting[-1]
+    heat, points = weakref.ref(active.before), weakref.ref(active.points)
     del active
     if blocker is None:
         rig.until(lambda: record.executed_count >= 1)
@@ -60,7 +61,7 @@ def test_an_ended_plan_leaves_its_report_and_no_thermal_state(rig, ending):
     rig.queue.accounts.events.clear()  # read by the telemetry
     gc.collect()
     assert record.status == ("cancelled" if ending == "removed" else ending)
-    assert holds_heavy(record) == []
+    assert holds_heavy(record.newest) == []
     assert (heat(), points()) == (None, None)
     report = record.build_report(0.0)
     assert len(report.pulses.pixel) == report.planned == 16
@@ -71,13 +72,13 @@ def test_an_ended_plan_leaves_its_report_and_no_thermal_state(rig, ending):
 
 def test_a_record_that_kept_its_plan_would_be_found(rig):
     record = submit(rig, build_frame())
-    record.name = rig.queue.waiting[0]
+    record = replace(record.newest, name=rig.queue.state.waiting[0])
     assert {"ActivePlan", "BudgetState"} - set(holds_heavy(record)) == {"ActivePlan"}
 
 
 def test_the_report_of_a_trimmed_plan_states_its_reasons(rig):
     record = submit(rig, FrameSequence((), (PulseTrain(3, 0.0, 3.0, 0.04, 0.001, 2.4),)))
-    plan = rig.queue.waiting[0].planned.plan
+    plan = rig.queue.state.waiting[0].planned.plan
     columns = record.build_report(0.0).pulses
     assert columns.reason == plan.reason.tolist()
     assert len(set(columns.reason)) > 1

@@ -1,12 +1,14 @@
 """Where a running stream is cut for a newer frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.daemon.engine.active_plan import ThermalEstimate
 from optodrive.daemon.engine.plan_making import PlanningRequest, PlanningSnapshot, build_cut_snapshot, make_plan
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.push import BuiltRequest, Push
 from optodrive.link.board_setup import build_scales
 
@@ -21,24 +23,23 @@ def running():
     sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, np.full(len(DISPLAY.layout), 20e-6)),))
     built = BuiltRequest(sequence)
     thermal = ThermalEstimate(*DISPLAY.build_cold_state())
-    snapshot = PlanningSnapshot(thermal, START_S, thermal.heat, thermal.budget)
+    snapshot = PlanningSnapshot(thermal, START_S, thermal)
     request = PlanningRequest(lambda: built, Push("f", {}, 0.0, 0, streamed=True))
     return make_plan(DISPLAY, SCALES, request, built, snapshot, "p1", lambda fraction: None)
 
 
 def cut(running, at_s, may_withdraw=False):
-    thermal = ThermalEstimate(running.heat_before, running.budget_before)
-    return build_cut_snapshot(running, thermal, START_S + at_s, DISPLAY.budget, SCALES[0].tick_s, may_withdraw)
+    return build_cut_snapshot(running, running.before, START_S + at_s, DISPLAY.budget, SCALES[0].tick_s, may_withdraw)
 
 
 @pytest.mark.parametrize("at_s", [-0.01, 0.0])
 def test_a_plan_that_may_be_withdrawn_is_cut_where_it_begins(running, at_s):
     for initial_pixels in ((17,), None):
-        running.initial_pixels = initial_pixels
-        snapshot = cut(running, at_s, may_withdraw=True)
+        plan = replace(running, initial_pixels=initial_pixels)
+        snapshot = cut(plan, at_s, may_withdraw=True)
         assert (snapshot.cut.kept_points, snapshot.cut.row) == ([0], 0)
         assert (snapshot.start_s, snapshot.initial_pixels, snapshot.cycle) == (START_S, initial_pixels, running.cycle)
-        assert np.array_equal(snapshot.budget.mirror_rad, running.budget_before.mirror_rad)
+        assert np.array_equal(snapshot.before.budget.mirror_rad, running.before.budget.mirror_rad)
         first = cut(running, at_s)
         assert first.cut.row == 1
         assert first.initial_pixels == (int(running.planned.plan.pixel[0]),)

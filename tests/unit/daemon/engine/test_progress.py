@@ -1,6 +1,7 @@
 """Merging of progress events: one per uninterrupted sequence of a run, in order."""
 
-from optodrive.daemon.engine.queued_plans import ClockShift, PlanProgress, PlanRun, merge_events
+from optodrive.daemon.engine.metrics import ClockShift, PlanProgress, merge_events
+from optodrive.daemon.engine.queue_state import PlanRun
 
 
 def test_consecutive_events_of_a_run_are_merged_and_nothing_is_lost_or_reordered():

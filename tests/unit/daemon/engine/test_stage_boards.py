@@ -99,7 +99,7 @@ def test_a_frame_is_drawn_by_all_boards_at_once(rig):
 )
 def test_gates_keep_the_planned_times(rig, duration_s):
     record = submit(rig, build_trains(len(rig.cores), duration_s))
-    plan = rig.queue.waiting[0].planned.plan
+    plan = rig.queue.state.waiting[0].planned.plan
     finish(rig, record)
     begin_s = record.start_s + plan.start_s
     pulses = rig.list_pulses()
@@ -347,7 +347,7 @@ def test_a_splice_of_points_that_are_not_those_verified_is_refused(wide_rig):
     rig = wide_rig
     first = submit(rig, fill(60.0), streamed=True)
     rig.until(lambda: first.executed_count > 20)
-    plan = rig.queue.running[0].plan
+    plan = rig.queue.state.running[0].plan
     kept = [count // 2 for count in plan.points.counts]
     assert rig.remote.splice(plan.points, kept, first.start_s + 1.0, rig.remote.epoch, 0.05, plan.crc ^ 1) is None
     assert "CRC-32" in rig.remote.pop_refusal()

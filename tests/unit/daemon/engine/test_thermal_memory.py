@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from optodrive.daemon.engine.active_plan import PlanStore
-from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.thermal_estimate import HEADER, HOLD_MAX_S, LENGTH, ThermalMemory
+from optodrive.daemon.engine.plan_queue import HOLD_MAX_S, PlanQueue
+from optodrive.daemon.engine.plan_rest import HEADER, LENGTH, ThermalMemory
 from optodrive.planning.limiter.cap_checks import compute_levels
 from planner_rig import DISPLAY, InlineExecutor, build_frame, build_train
 
@@ -29,7 +29,7 @@ def restart(rig, later_s=0.0):
 
 def levels(queue, rig):
     snapshot = queue.make_snapshot(streamed=False, planning_time_s=0.0)
-    return compute_levels(snapshot.budget, DISPLAY.budget, 0.0), snapshot.start_s - rig.remote.board_s()
+    return compute_levels(snapshot.before.budget, DISPLAY.budget, 0.0), snapshot.start_s - rig.remote.board_s()
 
 
 def test_a_successor_knows_the_heat_of_ended_plans(rig):
@@ -37,9 +37,9 @@ def test_a_successor_knows_the_heat_of_ended_plans(rig):
     rig.until(lambda: plan.has_ended)
     now_s, known = rig.remote.board_s(), rig.queue.make_snapshot(streamed=False, planning_time_s=0.0)
     inherited = restart(rig).make_snapshot(streamed=False, planning_time_s=0.0)
-    before = compute_levels(known.budget, DISPLAY.budget, now_s - known.start_s)
+    before = compute_levels(known.before.budget, DISPLAY.budget, now_s - known.start_s)
     # Pulses count as if the board had emitted them as late as it may.
-    after = compute_levels(inherited.budget, DISPLAY.budget, now_s + HOLD_MAX_S - inherited.start_s)
+    after = compute_levels(inherited.before.budget, DISPLAY.budget, now_s + HOLD_MAX_S - inherited.start_s)
     assert before[1].max() > 10.0
     np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12)
 
@@ -89,7 +89,7 @@ def test_a_state_that_was_written_in_part_leaves_the_one_before(rig, monkeypatch
     for state in states[:3]:
         memory.save(state)
     with monkeypatch.context() as ending:
-        ending.setattr("optodrive.daemon.engine.thermal_estimate.LENGTH", EndingLength(part))
+        ending.setattr("optodrive.daemon.engine.plan_rest.LENGTH", EndingLength(part))
         with pytest.raises(EndedError):
             memory.save(states[3])
     loaded = memory.load()
@@ -100,7 +100,7 @@ def test_a_state_that_was_written_in_part_leaves_the_one_before(rig, monkeypatch
 
 
 def test_a_state_beyond_its_room_is_refused(rig, monkeypatch):
-    monkeypatch.setattr("optodrive.daemon.engine.thermal_estimate.SLOT_BYTES", HEADER.size + 10)
+    monkeypatch.setattr("optodrive.daemon.engine.plan_rest.SLOT_BYTES", HEADER.size + 10)
     memory = ThermalMemory()
     with pytest.raises(ValueError, match="exceeds its room"):
         memory.save(rig.queue.build_saved_state(1.0))

@@ -18,6 +18,7 @@ from optodrive.core.child_process import BeatWriter
 from optodrive.core.errors import BusyError
 from optodrive.core.ipc import Message, MessageSocket
 from optodrive.daemon import push
+from optodrive.daemon.engine.active_plan import ThermalEstimate
 from optodrive.daemon.engine.plan_making import DryRunStart
 from optodrive.daemon.preview import jobs, worker
 from optodrive.daemon.preview.jobs import CALLER_WAITING_MAX, WAITING_MAX, Job, JobQueue
@@ -73,7 +74,7 @@ class Preview:
         self.send("build", job_id, body, source=source, push=Push(name, {}, 0.0, 0, caller)._asdict())
 
     def dry_run(self, job_id, body, caller=""):
-        start = pickle.dumps(DryRunStart(*DISPLAY.build_cold_state(), 0.05))
+        start = pickle.dumps(DryRunStart(ThermalEstimate(*DISPLAY.build_cold_state()), 0.05))
         push = Push("push", {}, 0.0, 0, caller)._asdict()
         self.send("dry_run", job_id, start + body, source="sequence", push=push, snapshot_bytes=len(start))
 
