@@ -29,9 +29,9 @@ SHOWN = {
     "field": r"worst geometry|two sigma|positions to codes",
     "page": r".",
     "memory": r"all processes|first answer",
-    "stream": r"^(?!.*memory of (?!all))(?!.*truncates).*(first|round trip|per second|, limited|underruns|memory)",
+    "stream": r"^(?!.*truncates).*(first|round trip|, limited|shown per second of (20|60|200)|underruns)",
     "stop": r".",
-    "fingers": r"dots under|first light|per second|underruns",
+    "fingers": r"dots under|first light",
 }
 """Rows of each benchmark that the page shows, by a pattern within their quantity."""
 OPTIONS = {"fingers": ("--virtual-s", "0")}

@@ -32,6 +32,9 @@ The JSON bodies: each member with its type and meaning. A type in parentheses ma
 `FrameResult` and `HoldReport` that do not apply are absent; all other models always have all members.
 """
 
+SAYS_NOTHING = re.compile(r"(of|its|their)( (the|its|each|a))?( \w+)?")
+"""A meaning that repeats the name of member and model, such as "of the pulse"."""
+
 
 def build_openapi():
     """Build the application's OpenAPI document without the other processes of the daemon."""
@@ -133,7 +136,10 @@ def format_model(name, schema, configured):
             if len(kinds) > 1
             else [", ".join(f"`{member}`" for member in group) + f" {kinds[0]}"]
         )
-        rows.append(f"- {', '.join(labels)}" + (f": {meanings[group]}" if group in meanings else ""))
+        meaning = meanings.get(group, "")
+        rows.append(
+            f"- {', '.join(labels)}" + (f": {meaning}" if meaning and not SAYS_NOTHING.fullmatch(meaning) else "")
+        )
     return "\n".join([*lines, *rows, ""] if rows else lines)
 
 
