@@ -193,14 +193,6 @@ def test_a_fault_its_cause_and_its_end_are_said_and_the_focus_is_kept(kept_windo
     assert read_focus(page) == "laser-title"
 
 
-def test_a_stop_that_is_not_answered_is_said_at_once(page, heard):
-    page.route("**/v1/stop", lambda route: route.abort())
-    page.keyboard.press("Escape")
-    assert set(heard("not answered yet")) == {"at once"}
-    page.unroute("**/v1/stop")
-    assert heard("^STOP is done") == ["at once"]
-
-
 def check_with_axe(page, axe):
     for scheme, viewport in (("light", WIDE), ("dark", PHONE), ("light", PHONE), ("dark", WIDE)):
         page.emulate_media(color_scheme=scheme)

@@ -54,29 +54,6 @@ def test_best_effort_is_executed_in_time(armed, fit):
     assert executed["start_s"][-1] + executed["width_s"][-1] <= summary["lead_in_s"] + 0.1 + 1e-4
 
 
-def test_wrong_input(armed, tmp_path):
-    wrong = armed.call("POST", "/v1/plans", status=422, json=LATE, params={"fit": "evenly"})
-    assert wrong["where"] == "query.fit"
-    high = {"frames": [LATE["frames"][0] | {"priority": "high"}]}
-    answer = armed.call("POST", "/v1/plans", status=422, json=high)
-    assert answer["code"] == "bad_priority"
-    assert answer["where"] == "body: frames[0].priority"
-    path = tmp_path / "frames.json"
-    path.write_text(json.dumps(high))
-    for arguments, naming in (
-        (("plan", path), "priority: got 'high', expected a whole number"),
-        (("plan", path, "--fit", "evenly"), "evenly"),
-        (("push", path, "--fit", "evenly", "--url", armed.url), "evenly"),
-        (("play", "dot", "--fit", "evenly", "--url", armed.url), "evenly"),
-        (("push", path, "--url", armed.url), f"{path}: frames[0].priority: got 'high', expected a whole number"),
-    ):
-        done = run(*arguments)
-        assert done.returncode == 2, done.stderr
-        assert done.stdout == ""
-        assert done.stderr.count("\n") == 1
-        assert naming in done.stderr
-
-
 def test_the_command_line_reports_it_in_one_line(armed, tmp_path):
     path = tmp_path / "frames.json"
     path.write_text(json.dumps(EASY))

@@ -113,18 +113,6 @@ def test_children_inherit_only_what_is_theirs(start):
     }
 
 
-@pytest.mark.parametrize("name", CHILDREN)
-def test_a_child_that_dies_starts_again_with_one_line_and_one_audit_entry(start, name):
-    tiny = start(**{name: "die,serve"})
-    tiny.wait_for(f"{name} starts", 2)
-    entry = tiny.wait_for("web receives")
-    assert entry["fields"] == {"event": "restarted", "process": name, "reason": "ended with status 3"}
-    errors = tiny.end()
-    assert errors.count("\n") == 1, errors
-    assert f"the {name} process ended with status 3" in errors
-    assert [len(tiny.notes(f"{other} starts")) for other in CHILDREN if other != name] == [1, 1]
-
-
 @waits
 def test_a_child_that_hangs_is_killed_and_starts_again(start):
     tiny = start(planner="hang,serve")
@@ -140,15 +128,6 @@ def test_without_its_check_a_child_that_hangs_stays(start):
     tiny.wait_for("planner hangs")
     time.sleep(2 * HANG_S)
     assert len(tiny.notes("planner starts")) == 1
-
-
-@waits
-def test_a_stopped_child_is_killed_and_starts_again(start):
-    tiny = start()
-    tiny.wait_for("serves")
-    os.kill(tiny.notes("web starts")[0]["pid"], signal.SIGSTOP)
-    tiny.wait_for("web starts", 2)
-    assert "the web process killed: no beat" in tiny.end()
 
 
 @waits

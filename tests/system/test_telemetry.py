@@ -155,18 +155,6 @@ def test_every_executed_pulse_is_reported_once_even_without_a_reader_at_first(da
     assert sorted(list_rows(follower, answer["plan"])) == list(range(answer["planned"]))
 
 
-def test_a_stop_is_reported_and_unexecuted_pulses_do_not_count(daemon, reader):
-    follower = reader()
-    daemon.arm()
-    answer = daemon.call("POST", "/v1/plans", json=long_train(seconds=5.0))
-    wait_for(lambda: executed(follower, answer["plan"]), "pulses")
-    daemon.call("POST", "/v1/stop")
-    wait_for(lambda: follower.last("state")["board"]["state"] == "DISARMED", "the state event")
-    plan = daemon.finished(answer["plan"])
-    wait_for(lambda: len(list_rows(follower, answer["plan"])) == plan["executed"], "what was executed")
-    wait_for(lambda: not follower.last("display")["warm"], "cold")
-
-
 def test_trimmed_pulses_have_their_reason_and_the_budget_rises(daemon, reader):
     follower = reader()
     daemon.arm()

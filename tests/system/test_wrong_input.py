@@ -80,17 +80,6 @@ def test_bad_bodies_get_a_problem_document(armed, case):
     assert unchanged(armed) == before
 
 
-@pytest.mark.parametrize("case", BODIES)
-def test_the_same_on_the_command_line_is_one_line_and_exit_2(case, tmp_path):
-    body, _ = BODIES[case]
-    path = tmp_path / "frames.json"
-    path.write_text(body if isinstance(body, str) else json.dumps(body))
-    assert_one_line(
-        ["plan", path, "--out", tmp_path / "plan.csv"], "frames.json" if case != "target out of reach" else ""
-    )
-    assert not (tmp_path / "plan.csv").exists()
-
-
 def assert_one_line(arguments, naming, environment=None):
     """Run a command in this process, to save its start. The daemon and its clients run in their own processes."""
     if arguments[0] == "serve" or "--url" in arguments:
@@ -128,22 +117,6 @@ def test_a_body_that_announces_no_length(armed):
     with contextlib.suppress(httpx.WriteError):  # the daemon may answer and close before everything was sent
         assert armed.client.post("/v1/plans", content=chunks()).status_code == 413
     assert armed.state()
-
-
-@pytest.mark.parametrize(
-    ("path", "method", "status"),
-    [
-        ("/v1/plans/none", "GET", 404),
-        ("/v1/plans/none", "DELETE", 404),
-        ("/v1/patterns/experiment-7", "POST", 404),
-        ("/v1/nothing", "GET", 404),
-        ("/v1/arm", "GET", 405),
-        ("/v1/plans?dry_run=perhaps", "POST", 422),
-    ],
-)
-def test_what_is_not_there(armed, path, method, status):
-    answer = armed.call(method, path, status=status, content=b"{}" if method == "POST" else None)
-    assert answer["code"]
 
 
 def test_wrong_arguments(tmp_path):
