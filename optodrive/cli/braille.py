@@ -9,6 +9,7 @@ import typer
 
 from optodrive.cli.options import HoldOption, UrlOption
 from optodrive.core.daemon_url import DEFAULT_URL
+from optodrive.core.errors import MISSING, InputError
 
 HEIGHT_UM = 150.0
 KEY_FILE = Path("/etc/brlapi.key")
@@ -44,6 +45,9 @@ def braille(
     fingers: Annotated[
         bool, typer.Option("--fingers", help="Refresh dots under fingers first, whose places a tracker reports.")
     ] = False,
+    touched_only: Annotated[
+        bool, typer.Option("--touched-only", help="With --fingers: leave dots dark that no finger touches.")
+    ] = False,
     url: UrlOption = DEFAULT_URL,
     hold: HoldOption = False,
 ) -> None:
@@ -73,6 +77,8 @@ def braille(
     )
     from optodrive.link.simulator.pseudo_terminal import check_link_path
 
+    if touched_only and not fingers:
+        raise InputError("--fingers", MISSING, "--fingers with --touched-only")
     is_server = protocol is ReaderProtocol.BRLAPI
     if is_server:
         number, key = parse_number(port), read_key(key_file)
@@ -105,7 +111,7 @@ def braille(
             size += f", {4 * len(graphic)} rows of {2 * len(graphic[0])} dots"
         pixels = [slot for line in text + graphic for slot in line]
         try:
-            with display.stream(standing=fingers) as stream:
+            with display.stream(standing=fingers, touched_only=touched_only) as stream:
                 print(f"{size} at {place}; Ctrl-C ends it", flush=True)
                 ReaderPort(channel, cells, stream, pixels, height_um, len(layout), _report, fingers).run()
         finally:

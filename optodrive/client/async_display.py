@@ -103,10 +103,11 @@ class AsyncDisplay(DisplayOperations):
         self._hold = held
         return await self.state()
 
-    def stream(self, policy: Policy = "trim", *, standing: bool = False) -> AsyncStream:
+    def stream(self, policy: Policy = "trim", *, standing: bool = False, touched_only: bool = False) -> AsyncStream:
         """Open a stream as `Display.stream` does: `async with display.stream() as stream: await stream.send(…)`."""
+        frames = (policy, standing, touched_only)
         return AsyncStream(
-            self._client.endpoint, self.layout, policy, standing, self._reconnect_timeout_s, self._record_emission
+            self._client.endpoint, self.layout, *frames, self._reconnect_timeout_s, self._record_emission
         )
 
     def fingers(self) -> AsyncFingers:

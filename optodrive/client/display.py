@@ -203,14 +203,16 @@ class Display:
         """Wait until a plan has ended and return it. Raise RefusedError if it failed or was stopped."""
         return run_blocking(self._operations.wait(plan))
 
-    def stream(self, policy: Policy = "trim", *, standing: bool = False) -> Stream:
+    def stream(self, policy: Policy = "trim", *, standing: bool = False, touched_only: bool = False) -> Stream:
         """Open a stream of frames, of which the newest wins: `with display.stream() as stream: stream.send(…)`.
 
         standing: refresh the newest frame until the next one, under fingers first
+        touched_only: with `standing`, leave dots dark that no finger touches
         """
         self._client.require_open()
         endpoint, layout = self._client.endpoint, self.layout
-        return Stream(endpoint, layout, policy, standing, self._reconnect_timeout_s, self._record_emission)
+        frames = (policy, standing, touched_only)
+        return Stream(endpoint, layout, *frames, self._reconnect_timeout_s, self._record_emission)
 
     def fingers(self) -> Fingers:
         """Open a connection for the places of fingertips, for which frames that stand are refreshed first."""

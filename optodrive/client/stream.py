@@ -17,7 +17,7 @@ from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_fram
 from optodrive.client.http import PROBE, PROBE_PERIOD_S, PROBE_TIMEOUT_S
 from optodrive.client.problems import build_error
 from optodrive.client.sockets import OPEN_TIMEOUT_S, BlockingConnection, open_connection
-from optodrive.core.errors import LinkError, NotReadyError, RefusedError
+from optodrive.core.errors import InputError, LinkError, NotReadyError, RefusedError
 from optodrive.core.types.push_options import Policy, check_keywords
 from optodrive.daemon.responses.messages import FrameResult
 from optodrive.device.config import PixelLayout
@@ -88,9 +88,12 @@ class ResultBuffer:
         return frame >= self._lost_before and frame not in self._final
 
 
-def build_stream_path(policy: Policy, standing: bool) -> str:
-    """Build the path of the stream's WebSocket."""
-    return f"/v1/stream?{urlencode({'policy': policy, 'standing': str(standing).lower()})}"
+def build_stream_path(policy: Policy, standing: bool, touched_only: bool) -> str:
+    """Build the path of the stream's WebSocket. Raise InputError for touched_only of frames that do not stand."""
+    if touched_only and not standing:
+        raise InputError("touched_only", touched_only, "standing=True with it: other frames are drawn once")
+    flags = {"standing": standing, "touched_only": touched_only}
+    return f"/v1/stream?{urlencode({'policy': policy} | {name: str(is_set).lower() for name, is_set in flags.items()})}"
 
 
 def build_closed_error() -> NotReadyError:
@@ -122,12 +125,13 @@ class AsyncStream:
         read_layout: Callable[[], Awaitable[PixelLayout]],
         policy: Policy,
         standing: bool,
+        touched_only: bool,
         reconnect_timeout_s: float,
         on_send: Callable[[], None],
     ) -> None:
         self._endpoint = endpoint
         self._read_layout = read_layout
-        self._path = build_stream_path(policy, standing)
+        self._path = build_stream_path(policy, standing, touched_only)
         self._on_send = on_send
         self._next_frame = 0
         self._results = ResultBuffer()
@@ -253,13 +257,15 @@ class Stream(BlockingConnection[AsyncStream]):
         layout: PixelLayout,
         policy: Policy,
         standing: bool,
+        touched_only: bool,
         reconnect_timeout_s: float,
         on_send: Callable[[], None],
     ) -> None:
         async def get_layout() -> PixelLayout:
             return layout
 
-        super().__init__(AsyncStream(endpoint, get_layout, policy, standing, reconnect_timeout_s, on_send), "stream")
+        stream = (endpoint, get_layout, policy, standing, touched_only, reconnect_timeout_s, on_send)
+        super().__init__(AsyncStream(*stream), "stream")
 
     def send(self, heights_um: HeightsLike) -> int:
         """Show a frame in place of the uncommitted rest of the previous one. Return its number.

@@ -18,7 +18,7 @@ class Push(NamedTuple):
 
     name: what the plan is called
     streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
-    standing: draw the part of a streamed page whose turn it is
+    standing: draw the part of a streamed page whose turn it is; touched_only: of its dots under fingers
     refreshes: whether the page stands already, and nobody waits for the plan's report or its end
     arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: name of its token
     lists_pulses: whether the answer lists the pulses one by one
@@ -32,6 +32,7 @@ class Push(NamedTuple):
     streamed: bool = False
     lists_pulses: bool = True
     standing: bool = False
+    touched_only: bool = False
     refreshes: bool = False
 
 

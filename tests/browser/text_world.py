@@ -509,7 +509,11 @@ class World:
             ),
             ("budget", board | {"caps": [], "panel_c": 25.0}),
             ("fingers", board | {"tracker": self.tracker, "fingers": fingers}),
-            ("page", board | {"height": encode(page_um, 0.1) if self.page else "", "limited_by": self.caps}),
+            (
+                "page",
+                board
+                | {"height": encode(page_um, 0.1) if self.page else "", "limited_by": self.caps, "touched_only": False},
+            ),
         ]
         if self.fresh or self.fresh_planned:
             pulses = {"planned": self.build_batches(self.fresh_planned), "executed": self.build_batches(self.fresh)}

@@ -1,6 +1,7 @@
 """Dots under fingers are drawn in time, by the board's log and the true places of the fingers, in virtual time."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,12 +55,13 @@ def jump(at_s):
     return [Touch(number, *place) for number, place in zip(numbers, places, strict=True)]
 
 
-def draw(monkeypatch, raised, find_touches, duration_s):
+def draw(monkeypatch, raised, find_touches, duration_s, touched_only=False):
     """Let a page stand under fingers that a noisy tracker reports. Return its pulses and the share in time."""
     # Of a link process with real-time priority, as benchmarks have it.
     monkeypatch.setattr(plan_queue, "SHARED_STREAM_LEAD_S", 0.0)
     rig = StandingRig(monkeypatch, DISPLAY).ready()
     rig.planning_s = PLANNING_S
+    monkeypatch.setattr(rig.page, "select", partial(rig.page.select, touched_only=touched_only))
     rig.arm()
     rig.run(0.02)
     target_m = np.where(raised & ~DISPLAY.dead, HEIGHT_UM * 1e-6, 0.0)
@@ -103,6 +105,21 @@ def test_dots_under_two_resting_fingers_get_25_pulses_per_second_on_a_raised_pag
     rate_hz, share = draw_under_rest(monkeypatch, 3.0)
     assert rate_hz >= 24.5  # each is due 40 ms after its last pulse
     assert share >= 0.95
+
+
+def test_untouched_dots_are_dark_where_only_touched_ones_are_drawn(monkeypatch):
+    braille = BRAILLE_UM > 0.0
+    whole, share = draw(monkeypatch, braille, jump, 3.0)
+    only, share_only = draw(monkeypatch, braille, jump, 3.0, touched_only=True)
+    assert share_only >= share - 0.02
+    assert only.energy_j.sum() <= 0.6 * whole.energy_j.sum()
+    layout, near = DISPLAY.layout, 0
+    for pixel, start_s in zip(only.pixel.tolist(), only.start_s.tolist(), strict=True):
+        # A dot is drawn for fingers that are there between their report, and the time for which they are foreseen.
+        touches = [touch for at_s in np.arange(start_s - 0.15, start_s + 0.05, 0.01) for touch in jump(max(0.0, at_s))]
+        distances_m = [np.hypot(layout.x_m[pixel] - each.x_m, layout.y_m[pixel] - each.y_m) for each in touches]
+        near += min(distances_m) <= RADIUS_M + 3.0 * NOISE_M + 1e-3
+    assert near >= 0.97 * len(only.pixel)  # of a finger that has just landed the speed is known badly
 
 
 def test_a_margin_with_the_priority_of_the_fingers_is_caught(monkeypatch):

@@ -53,6 +53,7 @@ NameQuery = Annotated[
 ]
 PolicyQuery = Annotated[Policy, Query(description="treatment of a frame that exceeds a cap")]
 StandingQuery = Annotated[bool, Query(description="keep the newest frame up until the next one")]
+TouchedOnlyQuery = Annotated[bool, Query(description="with standing: leave dots dark that no finger touches")]
 PulsesQuery = Annotated[bool, Query(description="list every pulse")]
 DRY_RUN_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"model": PlanReport, "description": "A dry run: the plan is not stored"}
@@ -181,10 +182,15 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         return await _plan_body(daemon, request, "sequence", name, options, newest, dry_run)
 
     @routes.websocket("/v1/stream", "operator")
-    async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim", standing: StandingQuery = False) -> None:
+    async def stream_frames(
+        socket: WebSocket,
+        policy: PolicyQuery = "trim",
+        standing: StandingQuery = False,
+        touched_only: TouchedOnlyQuery = False,
+    ) -> None:
         """Show streamed frames, of which the newest wins, and send the result of each."""
-        stream = StandingStream if standing else LiveStream
-        await stream(daemon, socket, policy, socket.scope[CALLER].name).run()
+        stream = (daemon, socket, policy, socket.scope[CALLER].name)
+        await (StandingStream(*stream, touched_only) if standing else LiveStream(*stream)).run()
 
     @routes.websocket("/v1/fingers", "operator")
     async def track_fingers(socket: WebSocket) -> None:

@@ -3,7 +3,7 @@
 import asyncio
 import time
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -208,10 +208,16 @@ TRIED_AGAIN = (BusyError.code,)
 
 
 class StandingStream(LiveStream):
-    """Stream of one client whose newest frame stands."""
+    """Stream of one client whose newest frame stands.
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    touched_only: leave dots dark that no finger touches
+    """
+
+    def __init__(
+        self, daemon: DaemonClient, socket: WebSocket, policy: Policy, caller: str, touched_only: bool
+    ) -> None:
+        super().__init__(daemon, socket, policy, caller)
+        self._touched_only = touched_only
         self._shown: Frame | None = None
         self._began_s = -inf
         self._fingers_arrived_s: float | None = None
@@ -248,7 +254,7 @@ class StandingStream(LiveStream):
     def _build_push(self, frame: Frame) -> Push:
         """Build the push of a refresh, whose latency counts from the arrival of the first fingers that it follows."""
         self._began_s = time.monotonic()
-        push = super()._build_push(frame)._replace(standing=True)
+        push = super()._build_push(frame)._replace(standing=True, touched_only=self._touched_only)
         arrived_s, self._fingers_arrived_s = self._fingers_arrived_s, None
         self._fingers_moved.clear()
         if frame is not self._shown:

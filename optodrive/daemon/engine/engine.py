@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -219,7 +220,7 @@ class Engine:
             if name != "policy" and value != "as_is":
                 raise InputError(name, value, "no such option: a stream has no time for more than a policy")
         arrived_s = self.board_s() - (self._clock.now_s() - push.arrived_s)
-        select = self.page.select if push.standing else None
+        select = partial(self.page.select, touched_only=push.touched_only) if push.standing else None
         future = self._planner.submit(PlanningRequest(build, push, arrived_s, caller_left, select))
         if push.standing:
             future.add_done_callback(self._note_page_limits)

@@ -48,6 +48,7 @@ class PageRefresh:
     """Selection of the pixels that a standing page needs next.
 
     layout: of the pixels; clock: of the host; board_s, lead_s: return the board's time and the lead of streams
+    touched_only: whether the page that stands leaves dots dark that no finger touches
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class PageRefresh:
         self._seen_s = -inf
         self._lock = threading.Lock()
         self._page_m, self._selected_s = np.zeros(len(layout)), -inf
+        self.touched_only = False
         self._tour = np.zeros(0, dtype=np.int64)
         self._intervals_s = deque([inf], INTERVALS_KEPT)
         self._limited_s: dict[str, float] = {}
@@ -100,15 +102,20 @@ class PageRefresh:
         stands = now_s - self._selected_s <= PAGE_TIMEOUT_S
         return tuple(sorted(cap for cap, at_s in self._limited_s.items() if stands and now_s - at_s <= CAP_GONE_S))
 
-    def select(self, display: DisplayModel, page: FrameSequence, snapshot: PlanningSnapshot) -> Refresh:
-        """Return the part of a page whose turn it is. Raise InputError for a height out of reach."""
+    def select(
+        self, display: DisplayModel, page: FrameSequence, snapshot: PlanningSnapshot, touched_only: bool = False
+    ) -> Refresh:
+        """Return the part of a page whose turn it is. Raise InputError for a height out of reach.
+
+        touched_only: leave dots dark that no finger touches
+        """
         (frame,) = remove_dead_pixels(display, page)[0].frames
         check_targets_reachable(display, page)
         now_s = self._clock.now_s()
         self._intervals_s.append(now_s - self._selected_s)
         if not np.array_equal(frame.target_m > 0.0, self._page_m > 0.0):
             self._tour = self._compute_tour(frame.target_m)
-        self._page_m, self._selected_s = frame.target_m, now_s
+        self._page_m, self._selected_s, self.touched_only = frame.target_m, now_s, touched_only
         pixel_time_s = _find_width_s(frame.target_m, snapshot.cycle) + MOVE_S
         begin_s = now_s + snapshot.start_s - self._board_s()
         margin_s = min(MARGIN_MAX_S, max(MARGIN_MIN_S, MARGIN_INTERVALS * max(self._intervals_s)))
@@ -116,7 +123,7 @@ class PageRefresh:
         touched = self._find_touched((begin_s + SLOT_S * np.arange(slots + LOOKAHEAD_SLOTS)).tolist())
         is_touched = np.logical_or.reduce([touched[step : slots + step] for step in range(LOOKAHEAD_SLOTS + 1)])
         drawn_s = self._find_drawn_s(snapshot)
-        bursts = select_bursts(self._tour, is_touched, drawn_s, snapshot.start_s, pixel_time_s)
+        bursts = select_bursts(self._tour, is_touched, drawn_s, snapshot.start_s, pixel_time_s, touched_only)
         return build_refresh(frame, bursts, pixel_time_s)
 
     def _compute_tour(self, page_m: FloatArray) -> IntArray:

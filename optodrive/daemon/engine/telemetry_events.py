@@ -151,10 +151,10 @@ def build_display_event(
     )
 
 
-def build_page_event(board_s: float, page_m: FloatArray, limited_by: tuple[str, ...]) -> PageEvent:
+def build_page_event(board_s: float, page_m: FloatArray, limited_by: tuple[str, ...], touched_only: bool) -> PageEvent:
     """Encode the heights of the standing page, [p], m, which are all 0 without one, and the caps that limit it."""
     height = _encode_base64(page_m / HEIGHT_UNIT_M) if page_m.any() else ""
-    return PageEvent(board_s=round(board_s, 6), height=height, limited_by=list(limited_by))
+    return PageEvent(board_s=round(board_s, 6), height=height, limited_by=list(limited_by), touched_only=touched_only)
 
 
 def build_pulse_batch(

@@ -67,6 +67,7 @@ class TelemetryProducer:
         self._touch = TouchReport(engine.display.layout)
         self._tracker, self._page_m = "", np.zeros(0)
         self._limited_by: tuple[str, ...] = ()
+        self._touched_only = False
         self._batches: deque[Message] = deque()
         self._batch_number = self._kept_pulses = 0
         self._announced_rows: dict[tuple[str, int], int] = {}
@@ -165,14 +166,16 @@ class TelemetryProducer:
     def _publish_touch(self, now_s: float, board_s: float) -> None:
         """Publish fingers while a tracker reports, the page when it changes, and both from time to time."""
         page, tracker = self._engine.page, self._engine.page.tracker
-        page_m, limited_by = page.page_m, page.limited_by
+        page_m, limited_by, touched_only = page.page_m, page.limited_by, page.touched_only
         if tracker == "seen" or tracker != self._tracker or self._is_due("fingers", now_s, PAGE_PERIOD_S):
             touched = self._touch.build(board_s, page.find_fingers(now_s), page_m)
             self._publish("fingers", FingersEvent(board_s=round(board_s, 6), tracker=tracker, fingers=touched))
         is_other = not np.array_equal(page_m, self._page_m) or limited_by != self._limited_by
+        is_other |= touched_only != self._touched_only
         if is_other or self._is_due("page", now_s, PAGE_PERIOD_S):
-            self._publish("page", build_page_event(board_s, page_m, limited_by))
+            self._publish("page", build_page_event(board_s, page_m, limited_by, touched_only))
         self._tracker, self._page_m, self._limited_by = tracker, page_m, limited_by
+        self._touched_only = touched_only
 
     def _collect_executed(self) -> None:
         waiting: list[EmittedPulses] = []

@@ -28,11 +28,13 @@ export class FingersView {
     this.announce = announce;
     this.dots = 0;
     this.caps = [];
+    this.touchedOnly = false;
   }
 
   // Show a page's outline of dots, none without a page, and the caps that take light from it.
-  showPage({ height, limited_by }) {
+  showPage({ height, limited_by, touched_only }) {
     this.caps = limited_by;
+    this.touchedOnly = touched_only;
     const values = decodeUint16(height);
     this.view.page = values.length === this.view.grid.pixels ? values : new Uint16Array(this.view.grid.pixels);
     this.dots = this.view.page.reduce((sum, value) => sum + (value > 0), 0);
@@ -61,7 +63,7 @@ export class FingersView {
 
   // Show nothing: where fingers are and what stands is unknown.
   clear() {
-    const [event, page] = [{ tracker: "unknown", fingers: [] }, { height: "", limited_by: [] }];
+    const [event, page] = [{ tracker: "unknown", fingers: [] }, { height: "", limited_by: [], touched_only: false }];
     this.showFingers(event);
     this.showPage(page);
   }
@@ -104,7 +106,8 @@ export class FingersView {
 
   #describeTracker() {
     const isAllDrawn = this.#tracker === "lost" && this.dots > 0;
-    return isAllDrawn ? "The tracker is lost: the whole page is drawn in turn." : TRACKERS[this.#tracker];
+    const lost = this.touchedOnly ? "all dots are dark" : "the whole page is drawn in turn";
+    return isAllDrawn ? `The tracker is lost: ${lost}.` : TRACKERS[this.#tracker];
   }
 
   // All texts at once, so that none is older than another.
@@ -113,7 +116,8 @@ export class FingersView {
     const isUsed = !["none", "unknown"].includes(this.#tracker) || this.dots > 0;
     this.find("fingers-panel").hidden &&= !isUsed; // once shown it stays, so that nothing moves
     const caps = this.caps.map((cap) => ` The cap “${labelCap(cap)}” takes light from it.`);
-    const page = this.dots ? `A page of ${this.dots} ${this.dots === 1 ? "dot" : "dots"} stands.${caps.join("")}` : "No page stands.";
+    const dark = this.touchedOnly ? " Dots that no finger touches are dark." : "";
+    const page = this.dots ? `A page of ${this.dots} ${this.dots === 1 ? "dot" : "dots"} stands.${dark}${caps.join("")}` : "No page stands.";
     this.find("standing").textContent = this.#tracker === "unknown" ? "" : page;
     this.find("tracker").textContent = this.#describeTracker();
   }

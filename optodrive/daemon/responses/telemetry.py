@@ -146,6 +146,7 @@ class PageEvent(JsonModel):
     """Heights of the standing page as base64 of little-endian u16 in 0.1 µm, empty without a page.
 
     limited_by: caps that took light from it in the last second
+    touched_only: whether dots are dark that no finger touches
     board_s: time of the board, s
     height: of each pixel, base64 of u16 in 0.1 µm
     """
@@ -153,6 +154,7 @@ class PageEvent(JsonModel):
     board_s: float
     height: str
     limited_by: list[str]
+    touched_only: bool
 
 
 EVENTS: Mapping[str, type[JsonModel]] = {

@@ -28,6 +28,7 @@ LATE_S = 0.01
 """A pixel under a finger that is due for this time is drawn first: it has just come there."""
 SLOT_S = 0.01
 """Light is planned for a number of slots, in each of which the places of the fingers are taken as fixed."""
+SLOT_ROUNDING = 1e-9
 REST_MIN = 6
 """Pixels away from the fingers that are worth the mirrors' way between two bursts under fingers."""
 WAY_S = 1.5e-3
@@ -51,20 +52,27 @@ class Refresh(NamedTuple):
 
 
 def select_bursts(
-    tour: IntArray, is_touched: BoolArray, drawn_s: FloatArray, begin_s: float, pixel_time_s: float
+    tour: IntArray,
+    is_touched: BoolArray,
+    drawn_s: FloatArray,
+    begin_s: float,
+    pixel_time_s: float,
+    touched_only: bool = False,
 ) -> list[Burst]:
     """Return the bursts of a page from `begin_s` on, their times relative to it.
 
     tour: [n] pixels of the page in their visiting order; is_touched: [slots, p] under fingers in the time of each slot;
     drawn_s: [p] start of the last pulse, −infinity without one; pixel_time_s: beam time per pixel
+    touched_only: leave the rest of the page dark
     """
     period_s = max(REFRESH_PERIOD_S, pixel_time_s + BURST_S)  # at the end of its light a pixel needs none
     is_touched, due_s = is_touched[:, tour], drawn_s[tour] + period_s - begin_s
     bursts: list[Burst] = []
     now_s, horizon_s = 0.0, len(is_touched) * SLOT_S
     while now_s < horizon_s and len(tour):
-        touched = is_touched[min(int(now_s / SLOT_S), len(is_touched) - 1)]
-        due_touched_s, due_rest_s = np.where(touched, due_s, inf), np.where(touched, inf, due_s)
+        slot = min(int(now_s / SLOT_S + SLOT_ROUNDING), len(is_touched) - 1)
+        touched = is_touched[slot]
+        due_touched_s, due_rest_s = np.where(touched, due_s, inf), np.where(touched | touched_only, inf, due_s)
         next_s, next_rest_s = float(due_touched_s.min(initial=inf)), float(due_rest_s.min(initial=inf))
         stands_at = int(np.argmax(due_s))  # the pixel that was drawn last
         stands_on_touched = bool(touched[stands_at])
@@ -73,7 +81,7 @@ def select_bursts(
         if is_in_burst and next_s <= now_s + pixel_time_s and np.argmin(due_touched_s) != stands_at:
             next_s = now_s  # the burst goes on, though a newer refresh has cut it
         if min(next_s, next_rest_s) > now_s:
-            now_s = min(next_s, next_rest_s)
+            now_s = min(next_s, next_rest_s, (slot + 1) * SLOT_S)  # fingers may have moved by then
             continue
         turn_s, until_s = (due_touched_s, horizon_s) if next_s <= now_s else (due_rest_s, min(next_s, horizon_s))
         count = _count_fitting(until_s - now_s, pixel_time_s)

@@ -45,7 +45,9 @@ def stream(certificate, monkeypatch):
     server = loop.run(start())
     port = server.sockets[0].getsockname()[1]
     layout = PixelLayout(PIXEL, PIXEL, PIXEL.astype(int), PIXEL.astype(int))
-    with Stream(Endpoint(f"https://localhost:{port}", "token"), layout, "trim", False, 0.0, lambda: None) as stream:
+    with Stream(
+        Endpoint(f"https://localhost:{port}", "token"), layout, "trim", False, False, 0.0, lambda: None
+    ) as stream:
         yield stream
 
     async def stop():

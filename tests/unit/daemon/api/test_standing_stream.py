@@ -90,7 +90,7 @@ def stand(report, outcomes, **options):
 
     async def run():
         client = Client(report, outcomes, **options)
-        await StandingStream(client, client, "trim", "ann").run()
+        await StandingStream(client, client, "trim", "ann", False).run()
         return client
 
     client = asyncio.run(run())

@@ -123,6 +123,19 @@ def test_beside_two_fingers_the_rest_of_the_page_gets_its_turn():
     assert counts[14:100].min() >= 4
 
 
+def test_only_touched_dots_are_drawn_where_the_rest_is_to_be_dark():
+    tour, slots = np.arange(20), 10
+    is_touched = np.zeros((slots, COUNT), dtype=bool)
+    is_touched[:4, [3, 4]] = is_touched[6:, [9]] = True
+    drawn_s = np.full(COUNT, -np.inf)
+    bursts = select_bursts(tour, is_touched, drawn_s, 0.0, PIXEL_S, touched_only=True)
+    drawn = [(burst.begin_s, pixel) for burst in bursts for pixel in burst.pixels.tolist()]
+    assert {pixel for begin_s, pixel in drawn if begin_s < 4 * SLOT_S} == {3, 4}
+    assert {pixel for begin_s, pixel in drawn if begin_s >= 4 * SLOT_S} == {9}
+    assert min(begin_s for begin_s, pixel in drawn if pixel == 9) == pytest.approx(6 * SLOT_S)
+    assert not select_bursts(tour, np.zeros_like(is_touched), drawn_s, 0.0, PIXEL_S, touched_only=True)
+
+
 def test_the_last_two_dots_beside_the_fingers_get_their_turn():
     target_m = np.zeros(COUNT)
     target_m[:7] = 50e-6
