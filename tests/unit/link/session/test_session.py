@@ -268,31 +268,6 @@ def test_arm_takes_the_board_s_two_seconds(rig):
 # --- lease, silence, faults -----------------------------------------------------------------------------------------
 
 
-def test_only_step_renews_the_lease(rig):
-    rig.arm()
-    rig.run(3.0)
-    assert rig.session.board.state == "ARMED"
-    rig.clock.sleep(0.2)  # the loop stalls
-    rig.session.step(STEP_S, renew_lease=True)
-    assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
-
-
-def test_a_withheld_lease_ends_the_job_within_its_length(rig):
-    rig.arm()
-    rig.play(plan(500))
-    rig.run(0.3)
-    stopped_us = round(rig.clock.now_s() * 1e6)
-    rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
-    (fault,) = [entry for entry in rig.log if entry["event"] == "fault"]
-    assert fault["fault"] == "LINK"
-    assert fault["t_us"] - stopped_us <= 100_000
-    assert not rig.core.gate
-    assert rig.session.board.to_dict()["hint"] == f"{FAULT_HINTS['LINK']}; then acknowledge the fault with disarm"
-    pulses = len(rig.pulses())
-    rig.run(1.0)
-    assert len(rig.pulses()) == pulses, "a new lease does not resume the job"
-
-
 def test_silence_is_a_link_error_with_the_error_counts(rig):
     rig.link.cut = True
     began_s = rig.clock.now_s()
@@ -366,26 +341,6 @@ def test_every_fault_except_those_of_the_electronics_has_a_hint():
 
 
 # --- aborting ---------------------------------------------------------------------------------------------------
-
-
-def test_a_job_after_an_abort(rig):
-    rig.arm()
-    rig.play(plan(500))
-    rig.run(0.3)
-    pulses = len(rig.pulses())
-    rig.session.abort()
-    rig.session.step(STEP_S, renew_lease=True)
-    assert not rig.core.gate
-    assert rig.core.state == "DISARMED"
-    rig.until(lambda: rig.session.is_acknowledged and rig.session.board.state == "DISARMED")
-    rig.run(0.5)
-    assert len(rig.pulses()) <= pulses + 1
-    assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj, "the new session tightens the limits again"
-    rig.arm()
-    planned = plan(50)
-    job = rig.play(planned)
-    rig.until(lambda: job.is_finished)
-    assert job.build_executed(planned, 2.45, 1e-6).complete
 
 
 def test_an_abort_is_confirmed_before_the_next_session_and_limits_precede_arming(rig):
