@@ -18,8 +18,8 @@ HEAD = """# REST API
 
 Generated from the daemon's [OpenAPI document](openapi.json), which the daemon serves at `/openapi.json`. Every route
 except `/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route.
-[Streaming](../how-to/stream-frames.md) describes the WebSocket, [the client](../how-to/use-the-python-client.md) the
-use from Python.
+[frames.json](formats/frames-json.md) describes the body of a push, [streaming](../how-to/stream-frames.md) the
+WebSocket, [the client](../how-to/use-the-python-client.md) the use from Python.
 
 Errors are problem documents (RFC 9457) with a stable `code`. A query or body with a name that the route does not read
 is refused with the nearest known name. Only STOP is never refused for that.
@@ -119,7 +119,10 @@ def format_model(name, schema, configured):
         for member, item in schema.get("properties", {}).items()
         if member not in inherited or "Effective" in str(item)
     }
-    summary, meanings = read_meanings(schema.get("description", ""), members)
+    description = re.sub(
+        r"\bNone\b", "null", schema.get("description", "")
+    )  # as JSON says what Python's docstrings say
+    summary, meanings = read_meanings(description, members)
     if summary:
         lines += [summary, ""]
     if "properties" not in schema:
